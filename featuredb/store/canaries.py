@@ -6,7 +6,7 @@ have versions of their own: a rollback of maps leaves them alone: they say what 
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -22,7 +22,7 @@ from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.store.commits import CHANGED, OPERATION, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
-from featuredb.store.encode import Row
+from featuredb.store.encode import Row, rows_of
 from featuredb.store.retry import retry_stale
 from featuredb.store.tables import CANARIES, SPECS
 
@@ -209,10 +209,7 @@ def _rows(table: Table) -> list[Row]:
         found = table.dataset().to_table(_LIGHT, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"cannot read the table canaries ({error}); run `featuredb verify`") from error
-    # As in commits.read_rows: no look into the system's time zone files.
-    times = found["created_at"].cast(pa.timestamp("us")).to_pylist()
-    rows: Iterable[Row] = found.drop_columns("created_at").to_pylist()
-    return [{**row, "created_at": time.replace(tzinfo=UTC)} for row, time in zip(rows, times, strict=True)]
+    return rows_of(found, "created_at")
 
 
 def _same(there: Row, wanted: Row) -> Row:
@@ -227,15 +224,20 @@ def _same(there: Row, wanted: Row) -> Row:
 
 
 def _pose_columns(pose: KnownPose | None) -> Row:
-    names = ("epsg", "easting", "northing", "height", "cam_from_utm_xyzw", "height_datum", "tolerance_m",
-             "tolerance_deg")  # fmt: skip
     if pose is None:
-        return {"expected": "not_localised", **dict.fromkeys(names)}
-    easting, northing, height = (float(v) for v in pose.utm)
-    rotation = [float(q) for q in pose.cam_from_utm_xyzw]
-    values = (pose.epsg, easting, northing, height, rotation, pose.height_datum, float(pose.tolerance_m),
-              float(pose.tolerance_deg))  # fmt: skip
-    return {"expected": "localised", **dict(zip(names, values, strict=True))}
+        return {"expected": "not_localised"}
+    easting, northing, height = pose.utm.tolist()
+    return {
+        "expected": "localised",
+        "epsg": pose.epsg,
+        "easting": easting,
+        "northing": northing,
+        "height": height,
+        "cam_from_utm_xyzw": pose.cam_from_utm_xyzw.tolist(),
+        "height_datum": pose.height_datum,
+        "tolerance_m": float(pose.tolerance_m),
+        "tolerance_deg": float(pose.tolerance_deg),
+    }
 
 
 def _canary(row: Row) -> Canary:

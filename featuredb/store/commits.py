@@ -10,7 +10,7 @@ import pyarrow as pa
 from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
 from featuredb.store.changes import Change
 from featuredb.store.delta import Commit, Table
-from featuredb.store.encode import EncodedMap, Row, map_rows_table
+from featuredb.store.encode import EncodedMap, Row, map_rows_table, rows_of
 from featuredb.store.tables import FORMAT_VERSION, MAPS, SPECS
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
@@ -103,21 +103,16 @@ def read_rows(maps: Table) -> list[Row]:
     """
     try:
         table = maps.dataset().to_table()
-        # Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
         for field in SPECS[MAPS].schema:  # those that an older format does not have
             if field.name not in table.column_names:
                 table = table.append_column(field.name, pa.nulls(len(table), field.type))
-        created = table["created_at"].cast(pa.timestamp("us")).to_pylist()
-        rows: list[Row] = table.drop_columns("created_at").to_pylist()
-        for row, time in zip(rows, created, strict=True):
-            row["created_at"] = time.replace(tzinfo=UTC)
+        return rows_of(table, "created_at")
     except FileNotFoundError as error:
         raise SnapshotNotFoundError(
             f"version {maps.version} is gone, vacuum removed its files ({error}); choose a newer one"
         ) from error
     except (OSError, ValueError) as error:
         raise StoreError(f"cannot read the table maps ({error}); run `featuredb verify`") from error
-    return rows
 
 
 def commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:

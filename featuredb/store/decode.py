@@ -7,19 +7,18 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from featuredb.errors import FeatureDbError, StoreError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObservations, MapPoints, Placement
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store.encode import Row
-from featuredb.store.tables import IMAGES, OBSERVATIONS, OWN_COORDINATES, POINT_COVARIANCE, POINTS
+from featuredb.store.tables import IMAGES, OBSERVATIONS, OWN_COORDINATES, POINT_COVARIANCE, POINTS, SPECS
 
 
 def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> AnyMap:
@@ -133,78 +132,67 @@ def _decode_image(row: Row) -> MapImage:
     )
 
 
-class _Scatter:
-    """Puts the rows of batches at their index; notices missing and double rows."""
+def _gathered(
+    batches: Iterable[pa.RecordBatch], name: str, index_column: str, count: int
+) -> tuple[pa.Table, NDArray[np.int64]]:
+    """The rows of a child table, and the index (count,) of each.
 
-    def __init__(self, table: str, index_column: str, count: int) -> None:
-        self._table, self._column, self._count = table, index_column, count
-        self._seen = np.zeros(count, dtype=np.bool_)
-        self._rows = 0
+    Raises:
+        StoreError: rows are missing or double.
+    """
+    parts = list(batches)
+    table = pa.Table.from_batches(parts) if parts else SPECS[name].schema.empty_table()
+    index: NDArray[np.int64] = table[index_column].to_numpy()
+    if not np.array_equal(np.sort(index), np.arange(count)):
+        raise StoreError(
+            f"{name}: expected {count} rows, {index_column} being each of 0 to {count - 1}, found "
+            f"{len(table)} of which {len(np.unique(index))} are different"
+        )
+    return table, index
 
-    def index(self, batch: pa.RecordBatch) -> NDArray[np.int64]:
-        index: NDArray[np.int64] = batch.column(self._column).to_numpy()
-        if len(index) and (index.min() < 0 or index.max() >= self._count):
-            raise StoreError(f"{self._table}: {self._column} outside 0..{self._count - 1}")
-        self._seen[index] = True
-        self._rows += len(index)
-        return index
 
-    def check(self) -> None:
-        if self._rows != self._count or not self._seen.all():
-            raise StoreError(
-                f"{self._table}: expected {self._count} rows, found {self._rows} of which "
-                f"{int(self._seen.sum())} different ones"
-            )
+def _placed(
+    table: pa.Table, index: NDArray[np.int64], names: Sequence[str], dtype: DTypeLike
+) -> NDArray[Any]:
+    """Columns of numbers (n, len(names)), each row at its index."""
+    placed = np.empty((len(table), len(names)), dtype)
+    for axis, name in enumerate(names):
+        placed[index, axis] = table[name].to_numpy()
+    return placed
 
 
 def _decode_points(
     batches: Iterable[pa.RecordBatch], count: int, coordinate_columns: Sequence[str]
 ) -> dict[str, Any]:
     """Arrays of PointColumns by name, and `coordinates` (count, 3)."""
-    coordinates: FloatArray = np.empty((count, 3))
-    rgb, track = np.empty((count, 3), np.uint8), np.empty(count, np.int32)
-    error, covariance = np.empty(count, np.float32), np.empty((count, 6), np.float32)
-    scatter = _Scatter(POINTS, "point_index", count)
-    for batch in batches:
-        index = scatter.index(batch)
-        for axis, name in enumerate(coordinate_columns):
-            coordinates[index, axis] = batch.column(name).to_numpy()
-        for axis, name in enumerate(("red", "green", "blue")):
-            rgb[index, axis] = batch.column(name).to_numpy()
-        for axis, name in enumerate(POINT_COVARIANCE):
-            covariance[index, axis] = batch.column(name).to_numpy()
-        track[index] = batch.column("track_length").to_numpy()
-        error[index] = batch.column("error_px").to_numpy()
-    scatter.check()
+    table, index = _gathered(batches, POINTS, "point_index", count)
     return {
-        "coordinates": coordinates,
-        "rgb": rgb,
-        "track_length": track,
-        "error_px": error,
-        "covariance": covariance,
+        "coordinates": _placed(table, index, coordinate_columns, np.float64),
+        "rgb": _placed(table, index, ("red", "green", "blue"), np.uint8),
+        "track_length": _placed(table, index, ["track_length"], np.int32)[:, 0],
+        "error_px": _placed(table, index, ["error_px"], np.float32)[:, 0],
+        "covariance": _placed(table, index, POINT_COVARIANCE, np.float32),
     }
 
 
 def _decode_observations(batches: Iterable[pa.RecordBatch], count: int) -> MapObservations:
-    columns: dict[str, NDArray[Any]] = {
-        "point_index": np.empty(count, np.int64),
-        "image_id": np.empty(count, np.int32),
-        "scale": np.empty(count, np.float32),
-        "angle": np.empty(count, np.float32),
-    }
-    xy, has = np.empty((count, 2), np.float32), np.zeros(count, np.bool_)
-    descriptors = np.zeros((count, DESCRIPTOR_SIZE), np.uint8)
-    scatter = _Scatter(OBSERVATIONS, "observation_index", count)
-    for batch in batches:
-        index = scatter.index(batch)
-        for name, column in columns.items():
-            column[index] = batch.column(name).to_numpy()
-        xy[index, 0], xy[index, 1] = batch.column("x").to_numpy(), batch.column("y").to_numpy()
-        valid, packed = _unpack_descriptors(batch.column("descriptor"))
-        has[index[valid]] = True
-        descriptors[index[valid]] = packed
-    scatter.check()
-    return MapObservations(xy=xy, has_descriptor=has, descriptors=descriptors, **columns)
+    table, index = _gathered(batches, OBSERVATIONS, "observation_index", count)
+    has, descriptors = np.zeros(count, np.bool_), np.zeros((count, DESCRIPTOR_SIZE), np.uint8)
+    start = 0
+    for chunk in table["descriptor"].chunks:
+        valid, packed = _unpack_descriptors(chunk)
+        rows = index[start : start + len(chunk)][valid]
+        has[rows], descriptors[rows] = True, packed
+        start += len(chunk)
+    return MapObservations(
+        point_index=_placed(table, index, ["point_index"], np.int64)[:, 0],
+        image_id=_placed(table, index, ["image_id"], np.int32)[:, 0],
+        xy=_placed(table, index, ("x", "y"), np.float32),
+        scale=_placed(table, index, ["scale"], np.float32)[:, 0],
+        angle=_placed(table, index, ["angle"], np.float32)[:, 0],
+        has_descriptor=has,
+        descriptors=descriptors,
+    )
 
 
 def _unpack_descriptors(column: pa.Array) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:

@@ -230,18 +230,16 @@ def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
         "error_px": points.error_px,
         "tile": tiles,
     }
-    here, empty = _UTM_COLUMNS, OWN_COORDINATES
+    here = _UTM_COLUMNS
     if isinstance(feature_map, UnplacedMap):
-        here, empty = OWN_COORDINATES, _UTM_COLUMNS
-        columns |= {name: np.full(len(points), np.nan) for name in empty}
-    else:
-        columns |= {name: pa.nulls(len(points), pa.float64()) for name in empty}
+        here = OWN_COORDINATES
+        columns |= {name: np.full(len(points), np.nan) for name in _UTM_COLUMNS}
     columns |= dict(zip(here, _coordinates(feature_map).T, strict=True))
     for axis, name in enumerate(("red", "green", "blue")):
         columns[name] = points.rgb[:, axis].astype(np.int16)
     for axis, name in enumerate(POINT_COVARIANCE):
         columns[name] = points.covariance[:, axis]
-    return _table(POINTS, _zone(feature_map), ids, columns, len(points))
+    return table_of(POINTS, {**ids, "zone": _zone(feature_map)}, columns, len(points))
 
 
 def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) -> pa.Table:
@@ -258,18 +256,19 @@ def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) 
         # An observation lies with its point, so that a tile's points come with all their descriptors.
         "tile": point_tiles[seen.point_index],
     }
-    return _table(OBSERVATIONS, _zone(feature_map), ids, columns, len(seen))
+    return table_of(OBSERVATIONS, {**ids, "zone": _zone(feature_map)}, columns, len(seen))
 
 
-def _table(name: str, zone: int, ids: Row, columns: dict[str, Any], count: int) -> pa.Table:
-    """Columns in the order and types of the table's schema; constants are repeated."""
-    constants = {**ids, "zone": zone}
+def table_of(name: str, constants: Row, columns: dict[str, Any], count: int) -> pa.Table:
+    """`count` rows in the order and types of a table's schema: values that all share, columns, else null."""
     arrays = []
     for field in SPECS[name].schema:
         if field.name in constants:
             arrays.append(pa.repeat(pa.scalar(constants[field.name], type=field.type), count))
-        else:
+        elif field.name in columns:
             arrays.append(pa.array(columns[field.name], type=field.type))
+        else:
+            arrays.append(pa.nulls(count, type=field.type))
     return pa.Table.from_arrays(arrays, schema=SPECS[name].schema)
 
 
@@ -285,6 +284,16 @@ def _descriptor_column(seen: MapObservations) -> pa.Array:
         pa.binary(DESCRIPTOR_SIZE), len(seen), [None, pa.py_buffer(packed)]
     )
     return pc.if_else(mask, pa.scalar(None, type=fixed.type), fixed).cast(pa.binary())
+
+
+def rows_of(table: pa.Table, time: str) -> list[Row]:
+    """The rows of a table whose column `time` has times of UTC.
+
+    Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
+    """
+    times = table[time].cast(pa.timestamp("us")).to_pylist()
+    rows = table.drop_columns(time).to_pylist()
+    return [{**row, time: at.replace(tzinfo=UTC)} for row, at in zip(rows, times, strict=True)]
 
 
 def map_rows_table(rows: list[Row]) -> pa.Table:

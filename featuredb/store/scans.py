@@ -25,7 +25,7 @@ from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, REASON, 
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
 from featuredb.store.durable.log import list_entries
-from featuredb.store.encode import Row
+from featuredb.store.encode import Row, table_of
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import UtmBox
 from featuredb.store.tables import BOUNDS, LIDAR, LIDAR_POINTS, LIDAR_TABLES, SPECS
@@ -338,15 +338,7 @@ def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
     if points.has_intensity:
         columns["intensity"] = rows["intensity"].astype(np.int16)
     constants = {"write_id": write_id, "zone": epsg, "tile": points.tile}
-    arrays = []
-    for field in SPECS[LIDAR_POINTS].schema:
-        if field.name in constants:
-            arrays.append(pa.repeat(pa.scalar(constants[field.name], type=field.type), n))
-        elif field.name in columns:
-            arrays.append(pa.array(columns[field.name], type=field.type))
-        else:
-            arrays.append(pa.nulls(n, type=field.type))
-    return pa.Table.from_arrays(arrays, schema=SPECS[LIDAR_POINTS].schema)
+    return table_of(LIDAR_POINTS, constants, columns, n)
 
 
 def _level_rows(

@@ -57,22 +57,27 @@ class TableSpec:
     row_group_rows: int = ROW_GROUP_ROWS
 
 
-def _required(name: str, kind: pa.DataType) -> pa.Field:
-    return pa.field(name, kind, nullable=False)
+def _required(kind: pa.DataType, *names: str) -> list[pa.Field]:
+    return [pa.field(name, kind, nullable=False) for name in names]
 
 
-_DOUBLES = pa.list_(pa.field("element", pa.float64(), nullable=False))
-_STRINGS = pa.list_(pa.field("element", pa.string(), nullable=False))
+def _nullable(kind: pa.DataType, *names: str) -> list[pa.Field]:
+    return [pa.field(name, kind) for name in names]
+
+
+def _list(element: pa.DataType) -> pa.DataType:
+    return pa.list_(pa.field("element", element, nullable=False))
+
+
+_TEXT, _TIME = pa.string(), pa.timestamp("us", tz="UTC")
+_INT, _LONG, _SHORT = pa.int32(), pa.int64(), pa.int16()
+_FLOAT, _DOUBLE, _DOUBLES = pa.float32(), pa.float64(), _list(pa.float64())
 _CAMERA = pa.struct(
-    [
-        _required("model", pa.string()),
-        _required("width", pa.int32()),
-        _required("height", pa.int32()),
-        _required("params", _DOUBLES),
-    ]
+    [*_required(_TEXT, "model"), *_required(_INT, "width", "height"), *_required(_DOUBLES, "params")]
 )
-_UTM = [_required(name, pa.float64()) for name in ("easting", "northing", "height")]
-_PARTITION = [_required("zone", pa.int32()), _required("tile", pa.string())]
+_COORDINATES = ("easting", "northing", "height")
+_UTM = _required(_DOUBLE, *_COORDINATES)
+_PARTITION = [*_required(_INT, "zone"), *_required(_TEXT, "tile")]
 
 BOUNDS = ("min_easting", "min_northing", "min_height", "max_easting", "max_northing", "max_height")
 OWN_COORDINATES = ("x", "y", "z")  # of points of maps without a place, in their own frame
@@ -96,261 +101,198 @@ POINT_COVARIANCE = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
 
 _MAPS_SCHEMA = pa.schema(
     [
-        _required("map_id", pa.string()),
-        _required("write_id", pa.string()),
-        _required("content_digest", pa.string()),
-        _required("name", pa.string()),
-        _required("status", pa.string()),
-        _required("status_reason", pa.string()),
-        _required("created_at", pa.timestamp("us", tz="UTC")),
-        pa.field("epsg", pa.int32()),
-        pa.field("height_datum", pa.string()),
-        *(pa.field(name, pa.float64()) for name in BOUNDS),
-        _required("tiles", _STRINGS),
-        _required("images", pa.int64()),
-        _required("points", pa.int64()),
-        _required("observations", pa.int64()),
-        _required("descriptors", pa.int64()),
-        pa.field("method", pa.string()),
-        _required("generation", pa.int32()),
-        _required("parents", _STRINGS),
-        pa.field("residual_rms_m", pa.float64()),
-        pa.field("origin_latitude_deg", pa.float64()),
-        pa.field("origin_longitude_deg", pa.float64()),
-        pa.field("origin_height_m", pa.float64()),
-        pa.field("local_from_sfm_scale", pa.float64()),
-        pa.field("local_from_sfm_rotation", _DOUBLES),
-        pa.field("local_from_sfm_translation", _DOUBLES),
-        pa.field("placement_covariance", _DOUBLES),
-        pa.field("placement_evidence", pa.string()),
-        _required("camera_keys", _STRINGS),
-        _required("cameras", pa.list_(pa.field("element", _CAMERA, nullable=False))),
-        _required("extractor_fingerprint", pa.string()),
-        _required("source", pa.string()),
-        _required("licence", pa.string()),
-        _required("provenance", pa.string()),
-        pa.field("frame_is_metric", pa.bool_()),
-        pa.field("frame_is_upright", pa.bool_()),
-        pa.field("no_place", pa.string()),
+        *_required(_TEXT, "map_id", "write_id", "content_digest", "name", "status", "status_reason"),
+        *_required(_TIME, "created_at"),
+        *_nullable(_INT, "epsg"),
+        *_nullable(_TEXT, "height_datum"),
+        *_nullable(_DOUBLE, *BOUNDS),
+        *_required(_list(_TEXT), "tiles"),
+        *_required(_LONG, "images", "points", "observations", "descriptors"),
+        *_nullable(_TEXT, "method"),
+        *_required(_INT, "generation"),
+        *_required(_list(_TEXT), "parents"),
+        *_nullable(_DOUBLE, "residual_rms_m"),
+        *_nullable(_DOUBLE, "origin_latitude_deg", "origin_longitude_deg", "origin_height_m"),
+        *_nullable(_DOUBLE, "local_from_sfm_scale"),
+        *_nullable(_DOUBLES, "local_from_sfm_rotation", "local_from_sfm_translation", "placement_covariance"),
+        *_nullable(_TEXT, "placement_evidence"),
+        *_required(_list(_TEXT), "camera_keys"),
+        *_required(_list(_CAMERA), "cameras"),
+        *_required(_TEXT, "extractor_fingerprint", "source", "licence", "provenance"),
+        *_nullable(pa.bool_(), "frame_is_metric", "frame_is_upright"),
+        *_nullable(_TEXT, "no_place"),
     ]
 )
 
 _IMAGES_SCHEMA = pa.schema(
     [
-        _required("write_id", pa.string()),
-        _required("map_id", pa.string()),
-        _required("image_id", pa.int32()),
-        _required("image_index", pa.int64()),
-        _required("name", pa.string()),
-        _required("sha256", pa.string()),
-        _required("camera_id", pa.int32()),
-        _required("cam_from_local_rotation", _DOUBLES),
-        _required("cam_from_local_translation", _DOUBLES),
-        pa.field("covariance", _DOUBLES),
+        *_required(_TEXT, "write_id", "map_id"),
+        *_required(_INT, "image_id"),
+        *_required(_LONG, "image_index"),
+        *_required(_TEXT, "name", "sha256"),
+        *_required(_INT, "camera_id"),
+        *_required(_DOUBLES, "cam_from_local_rotation", "cam_from_local_translation"),
+        *_nullable(_DOUBLES, "covariance"),
         *_UTM,
-        pa.field("capture_time", pa.string()),
-        pa.field("gps_latitude_deg", pa.float64()),
-        pa.field("gps_longitude_deg", pa.float64()),
-        pa.field("gps_height_m", pa.float64()),
-        pa.field("gps_sigma_horizontal_m", pa.float64()),
-        pa.field("gps_sigma_vertical_m", pa.float64()),
-        _required("owner", pa.string()),
-        _required("licence", pa.string()),
+        *_nullable(_TEXT, "capture_time"),
+        *_nullable(_DOUBLE, "gps_latitude_deg", "gps_longitude_deg", "gps_height_m"),
+        *_nullable(_DOUBLE, "gps_sigma_horizontal_m", "gps_sigma_vertical_m"),
+        *_required(_TEXT, "owner", "licence"),
         *_PARTITION,
     ]
 )
 
 _POINTS_SCHEMA = pa.schema(
     [
-        _required("write_id", pa.string()),
-        _required("map_id", pa.string()),
-        _required("point_index", pa.int64()),
+        *_required(_TEXT, "write_id", "map_id"),
+        *_required(_LONG, "point_index"),
         *_UTM,
-        *(_required(name, pa.int16()) for name in ("red", "green", "blue")),
-        _required("track_length", pa.int32()),
-        _required("error_px", pa.float32()),
-        *(_required(name, pa.float32()) for name in POINT_COVARIANCE),
+        *_required(_SHORT, "red", "green", "blue"),
+        *_required(_INT, "track_length"),
+        *_required(_FLOAT, "error_px", *POINT_COVARIANCE),
         *_PARTITION,
-        *(pa.field(name, pa.float64()) for name in OWN_COORDINATES),
+        *_nullable(_DOUBLE, *OWN_COORDINATES),
     ]
 )
 
 _OBSERVATIONS_SCHEMA = pa.schema(
     [
-        _required("write_id", pa.string()),
-        _required("map_id", pa.string()),
-        _required("observation_index", pa.int64()),
-        _required("point_index", pa.int64()),
-        _required("image_id", pa.int32()),
-        *(_required(name, pa.float32()) for name in ("x", "y", "scale", "angle")),
-        pa.field("descriptor", pa.binary()),
+        *_required(_TEXT, "write_id", "map_id"),
+        *_required(_LONG, "observation_index", "point_index"),
+        *_required(_INT, "image_id"),
+        *_required(_FLOAT, "x", "y", "scale", "angle"),
+        *_nullable(pa.binary(), "descriptor"),
         *_PARTITION,
     ]
 )
 
 _SCAN_FILE = pa.struct(
     [
-        _required("name", pa.string()),
-        _required("sha256", pa.string()),
-        _required("size_bytes", pa.int64()),
-        _required("points", pa.int64()),
-        _required("crs", pa.string()),
-        _required("transformation", pa.string()),
-        pa.field("transformation_accuracy_m", pa.float64()),
+        *_required(_TEXT, "name", "sha256"),
+        *_required(_LONG, "size_bytes", "points"),
+        *_required(_TEXT, "crs", "transformation"),
+        *_nullable(_DOUBLE, "transformation_accuracy_m"),
     ]
 )
-_CLASS_COUNT = pa.struct([_required("classification", pa.int32()), _required("points", pa.int64())])
+_CLASS_COUNT = pa.struct([*_required(_INT, "classification"), *_required(_LONG, "points")])
 
 _LIDAR_SCHEMA = pa.schema(
     [
-        _required("scan_id", pa.string()),
-        _required("write_id", pa.string()),
-        _required("points_checksum", pa.string()),
-        _required("name", pa.string()),
-        _required("status", pa.string()),
-        _required("status_reason", pa.string()),
-        _required("created_at", pa.timestamp("us", tz="UTC")),
-        _required("files", pa.list_(pa.field("element", _SCAN_FILE, nullable=False))),
-        _required("epsg", pa.int32()),
-        _required("height_datum", pa.string()),
-        *(_required(name, pa.float64()) for name in BOUNDS),
-        _required("tiles", _STRINGS),
-        _required("points", pa.int64()),
-        _required("points_in_files", pa.int64()),
-        _required("dropped_noise", pa.int64()),
-        _required("dropped_withheld", pa.int64()),
-        _required("dropped_outliers", pa.int64()),
-        _required("level_points", pa.list_(pa.field("element", pa.int64(), nullable=False))),
-        _required("spacing_m", pa.float64()),
-        _required("classes", pa.list_(pa.field("element", _CLASS_COUNT, nullable=False))),
-        _required("colour", pa.string()),
-        _required("ortho", pa.string()),
-        _required("has_intensity", pa.bool_()),
-        pa.field("intensity_low", pa.float64()),
-        pa.field("intensity_high", pa.float64()),
-        _required("crs_source", pa.string()),
-        _required("horizontal_unit", pa.string()),
-        _required("vertical_crs", pa.string()),
-        _required("height_unit", pa.string()),
-        _required("height_unit_m", pa.float64()),
-        _required("height_unit_reason", pa.string()),
-        _required("notes", _STRINGS),
-        _required("options", pa.string()),
-        _required("source", pa.string()),
-        _required("licence", pa.string()),
+        *_required(_TEXT, "scan_id", "write_id", "points_checksum", "name", "status", "status_reason"),
+        *_required(_TIME, "created_at"),
+        *_required(_list(_SCAN_FILE), "files"),
+        *_required(_INT, "epsg"),
+        *_required(_TEXT, "height_datum"),
+        *_required(_DOUBLE, *BOUNDS),
+        *_required(_list(_TEXT), "tiles"),
+        *_required(_LONG, "points", "points_in_files"),
+        *_required(_LONG, "dropped_noise", "dropped_withheld", "dropped_outliers"),
+        *_required(_list(_LONG), "level_points"),
+        *_required(_DOUBLE, "spacing_m"),
+        *_required(_list(_CLASS_COUNT), "classes"),
+        *_required(_TEXT, "colour", "ortho"),
+        *_required(pa.bool_(), "has_intensity"),
+        *_nullable(_DOUBLE, "intensity_low", "intensity_high"),
+        *_required(_TEXT, "crs_source", "horizontal_unit", "vertical_crs", "height_unit"),
+        *_required(_DOUBLE, "height_unit_m"),
+        *_required(_TEXT, "height_unit_reason"),
+        *_required(_list(_TEXT), "notes"),
+        *_required(_TEXT, "options", "source", "licence"),
     ]
 )
 
 _LIDAR_POINTS_SCHEMA = pa.schema(
     [
-        _required("write_id", pa.string()),
+        *_required(_TEXT, "write_id"),
         *_UTM,
-        *(pa.field(name, pa.int16()) for name in ("red", "green", "blue", "intensity")),
-        _required("classification", pa.int16()),
-        _required("node", pa.int64()),
-        _required("node_spacing_m", pa.float32()),
+        *_nullable(_SHORT, "red", "green", "blue", "intensity"),
+        *_required(_SHORT, "classification"),
+        *_required(_LONG, "node"),
+        *_required(_FLOAT, "node_spacing_m"),
         *_PARTITION,
-        _required("level", pa.int32()),
+        *_required(_INT, "level"),
     ]
 )
 
 _CANDIDATES_SCHEMA = pa.schema(
     [
-        _required("candidate_id", pa.string()),
-        _required("write_id", pa.string()),
-        _required("event_index", pa.int32()),
-        _required("event", pa.string()),
-        _required("happened_at", pa.timestamp("us", tz="UTC")),
-        pa.field("owner", pa.string()),
-        pa.field("licence", pa.string()),
-        pa.field("client_id", pa.string()),
-        pa.field("sha256", pa.string()),
-        pa.field("size_bytes", pa.int64()),
-        pa.field("width", pa.int32()),
-        pa.field("height", pa.int32()),
-        pa.field("snapshot", pa.int64()),
-        pa.field("answer_status", pa.string()),
-        pa.field("request", pa.string()),
-        pa.field("answer", pa.string()),
-        pa.field("map_id", pa.string()),
-        pa.field("reason_code", pa.string()),
-        pa.field("reason", pa.string()),
+        *_required(_TEXT, "candidate_id", "write_id"),
+        *_required(_INT, "event_index"),
+        *_required(_TEXT, "event"),
+        *_required(_TIME, "happened_at"),
+        *_nullable(_TEXT, "owner", "licence", "client_id", "sha256"),
+        *_nullable(_LONG, "size_bytes"),
+        *_nullable(_INT, "width", "height"),
+        *_nullable(_LONG, "snapshot"),
+        *_nullable(_TEXT, "answer_status", "request", "answer", "map_id", "reason_code", "reason"),
     ]
 )
 
 _CANDIDATE_IMAGES_SCHEMA = pa.schema(
-    [
-        _required("candidate_id", pa.string()),
-        _required("write_id", pa.string()),
-        _required("image", pa.binary()),
-    ]
+    [*_required(_TEXT, "candidate_id", "write_id"), *_required(pa.binary(), "image")]
 )
 
 _CANARIES_SCHEMA = pa.schema(
     [
-        _required("canary_id", pa.string()),
-        _required("write_id", pa.string()),
-        _required("name", pa.string()),
-        _required("created_at", pa.timestamp("us", tz="UTC")),
-        _required("sha256", pa.string()),
-        _required("request", pa.string()),
-        _required("expected", pa.string()),
-        pa.field("epsg", pa.int32()),
-        *(pa.field(name, pa.float64()) for name in ("easting", "northing", "height")),
-        pa.field("cam_from_utm_xyzw", _DOUBLES),
-        pa.field("height_datum", pa.string()),
-        pa.field("tolerance_m", pa.float64()),
-        pa.field("tolerance_deg", pa.float64()),
-        _required("origin", pa.string()),
-        pa.field("snapshot", pa.int64()),
-        _required("note", pa.string()),
-        _required("image", pa.binary()),
+        *_required(_TEXT, "canary_id", "write_id", "name"),
+        *_required(_TIME, "created_at"),
+        *_required(_TEXT, "sha256", "request", "expected"),
+        *_nullable(_INT, "epsg"),
+        *_nullable(_DOUBLE, *_COORDINATES),
+        *_nullable(_DOUBLES, "cam_from_utm_xyzw"),
+        *_nullable(_TEXT, "height_datum"),
+        *_nullable(_DOUBLE, "tolerance_m", "tolerance_deg"),
+        *_required(_TEXT, "origin"),
+        *_nullable(_LONG, "snapshot"),
+        *_required(_TEXT, "note"),
+        *_required(pa.binary(), "image"),
     ]
 )
 
 SPECS: dict[str, TableSpec] = {
-    MAPS: TableSpec(name=MAPS, schema=_MAPS_SCHEMA, statistics=("map_id", "write_id")),
-    IMAGES: TableSpec(
-        name=IMAGES,
-        schema=_IMAGES_SCHEMA,
-        partition_by=("zone", "tile"),
-        statistics=("write_id", "image_index"),
-    ),
-    POINTS: TableSpec(
-        name=POINTS,
-        schema=_POINTS_SCHEMA,
-        partition_by=("zone", "tile"),
-        statistics=("write_id", "point_index"),
-    ),
-    OBSERVATIONS: TableSpec(
-        name=OBSERVATIONS,
-        schema=_OBSERVATIONS_SCHEMA,
-        partition_by=("zone", "tile"),
-        statistics=("write_id", "observation_index"),
-        plain_bytes=("descriptor",),
-    ),
-    LIDAR: TableSpec(name=LIDAR, schema=_LIDAR_SCHEMA, statistics=("scan_id", "write_id")),
-    LIDAR_POINTS: TableSpec(
-        name=LIDAR_POINTS,
-        schema=_LIDAR_POINTS_SCHEMA,
-        partition_by=("zone", "tile", "level"),
-        statistics=("write_id", "easting", "northing"),
-    ),
-    CANDIDATES: TableSpec(
-        name=CANDIDATES, schema=_CANDIDATES_SCHEMA, statistics=("candidate_id", "write_id")
-    ),
-    CANDIDATE_IMAGES: TableSpec(
-        name=CANDIDATE_IMAGES,
-        schema=_CANDIDATE_IMAGES_SCHEMA,
-        statistics=("candidate_id", "write_id"),
-        plain_bytes=("image",),
-        row_group_rows=1,  # a photo has megabytes and is read alone
-    ),
-    CANARIES: TableSpec(
-        name=CANARIES,
-        schema=_CANARIES_SCHEMA,
-        statistics=("canary_id", "write_id"),
-        plain_bytes=("image",),
-        row_group_rows=1,
-    ),
+    spec.name: spec
+    for spec in (
+        TableSpec(name=MAPS, schema=_MAPS_SCHEMA, statistics=("map_id", "write_id")),
+        TableSpec(
+            name=IMAGES,
+            schema=_IMAGES_SCHEMA,
+            partition_by=("zone", "tile"),
+            statistics=("write_id", "image_index"),
+        ),
+        TableSpec(
+            name=POINTS,
+            schema=_POINTS_SCHEMA,
+            partition_by=("zone", "tile"),
+            statistics=("write_id", "point_index"),
+        ),
+        TableSpec(
+            name=OBSERVATIONS,
+            schema=_OBSERVATIONS_SCHEMA,
+            partition_by=("zone", "tile"),
+            statistics=("write_id", "observation_index"),
+            plain_bytes=("descriptor",),
+        ),
+        TableSpec(name=LIDAR, schema=_LIDAR_SCHEMA, statistics=("scan_id", "write_id")),
+        TableSpec(
+            name=LIDAR_POINTS,
+            schema=_LIDAR_POINTS_SCHEMA,
+            partition_by=("zone", "tile", "level"),
+            statistics=("write_id", "easting", "northing"),
+        ),
+        TableSpec(name=CANDIDATES, schema=_CANDIDATES_SCHEMA, statistics=("candidate_id", "write_id")),
+        TableSpec(
+            name=CANDIDATE_IMAGES,
+            schema=_CANDIDATE_IMAGES_SCHEMA,
+            statistics=("candidate_id", "write_id"),
+            plain_bytes=("image",),
+            row_group_rows=1,  # a photo has megabytes and is read alone
+        ),
+        TableSpec(
+            name=CANARIES,
+            schema=_CANARIES_SCHEMA,
+            statistics=("canary_id", "write_id"),
+            plain_bytes=("image",),
+            row_group_rows=1,
+        ),
+    )
 }

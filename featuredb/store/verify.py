@@ -2,7 +2,7 @@
 
 import hashlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,6 +99,9 @@ class VerifyReport:
         return not self.problems
 
 
+Found = tuple[str, str]  # where, and what
+
+
 def verify(database: Database) -> VerifyReport:
     """Check the newest snapshot, scans, contributed photos and known queries; reads all of them once.
 
@@ -107,7 +110,7 @@ def verify(database: Database) -> VerifyReport:
     """
     problems = list(check_logs(database))
     if unfinished := cut_off(database.url, database.storage_options):
-        problems.insert(0, DatabaseProblem(where=LIST, what=unfinished))
+        problems.insert(0, (LIST, unfinished))
     try:
         snapshot = database.snapshot()
         scans = list_scans(database)
@@ -116,7 +119,7 @@ def verify(database: Database) -> VerifyReport:
         if not problems:
             raise
         logger.debug("nothing but the logs can be checked: %s", error)
-        return VerifyReport(problems=tuple(problems))
+        return VerifyReport(problems=_said(problems))
     files = rows = 0
     lidar = LIDAR_TABLES if has_scans(database) else ()
     for name in (*TABLES, *lidar, *growth_tables(database)):
@@ -129,7 +132,7 @@ def verify(database: Database) -> VerifyReport:
         problems += check_map(snapshot, row)
     for scan in scans:
         problems += check_scan(database, scan)
-    problems += [DatabaseProblem(where=where, what=what) for where, what in check_growth_tables(database)]
+    problems += check_growth_tables(database)
     orphans = [] if problems else _orphans(database)
     return VerifyReport(
         version=snapshot.version,
@@ -139,21 +142,21 @@ def verify(database: Database) -> VerifyReport:
         canaries=0 if problems else len(list_canaries(database)),
         files=files,
         rows=rows,
-        problems=tuple(problems),
+        problems=_said(problems),
         orphans=tuple(orphans),
     )
 
 
-def check_logs(database: Database) -> Iterator[DatabaseProblem]:
+def check_logs(database: Database) -> Iterator[Found]:
     """Is every entry of every log there and whole, and does the log end where it was acknowledged to end?"""
     for name in SPECS:
         files = table_files(database.table_url(name), database.storage_options)
         for problem in log_problems(files):
             what = f"{problem.what}; `featuredb repair` says what can be done"
-            yield DatabaseProblem(where=f"{name}/{LOG}/{problem.name}", what=what)
+            yield f"{name}/{LOG}/{problem.name}", what
 
 
-def check_files(table: Table) -> list[DatabaseProblem]:
+def check_files(table: Table) -> list[Found]:
     """Does every file open, has it as many rows as the log says, and the bytes that were written?
 
     Where there are problems the table moves to its newest version: files that others have replaced meanwhile,
@@ -163,10 +166,10 @@ def check_files(table: Table) -> list[DatabaseProblem]:
     if found:
         table.refresh()
     live = {f"{table.spec.name}/{file.path}" for file in table.files()} if found else set()
-    return [problem for problem in found if problem.where in live]
+    return [(where, what) for where, what in found if where in live]
 
 
-def _file_problems(table: Table) -> Iterator[DatabaseProblem]:
+def _file_problems(table: Table) -> Iterator[Found]:
     expected = {file.path: file.rows for file in table.files()}
     try:
         digests = file_digests(table.storage)
@@ -179,19 +182,15 @@ def _file_problems(table: Table) -> Iterator[DatabaseProblem]:
             digest = digests.get(fragment.path)
             same = digest is None or digest == _sha256(table.storage, fragment.path)
         except (OSError, pa.ArrowException) as error:
-            yield DatabaseProblem(where=where, what=f"cannot be opened: {_one_line(error)}")
+            yield where, f"cannot be opened: {_one_line(error)}"
             continue
         if found != expected[fragment.path]:
-            yield DatabaseProblem(
-                where=where, what=f"expected {expected[fragment.path]} rows by the log, found {found}"
-            )
+            yield where, f"expected {expected[fragment.path]} rows by the log, found {found}"
         if not same:
-            yield DatabaseProblem(
-                where=where, what="its bytes are not those that were written: hashes differ"
-            )
+            yield where, "its bytes are not those that were written: hashes differ"
 
 
-def check_map(snapshot: Snapshot, row: Row) -> Iterator[DatabaseProblem]:
+def check_map(snapshot: Snapshot, row: Row) -> Iterator[Found]:
     """Do the child rows of one map agree with its row, with each other and with what was committed?"""
     where = f"map {row['map_id']}"
     mine = ds.field("write_id") == row["write_id"]
@@ -206,7 +205,7 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[DatabaseProblem]:
         except (OSError, pa.ArrowException) as error:
             # Types that Arrow cannot filter: older releases left them in files of which they removed rows.
             advice = "; run `featuredb upgrade`" if isinstance(error, pa.ArrowNotImplementedError) else ""
-            yield DatabaseProblem(where=where, what=f"cannot read its {name}: {_one_line(error)}{advice}")
+            yield where, f"cannot read its {name}: {_one_line(error)}{advice}"
     if len(tables) < len(CHILD_TABLES):
         return
     found = [
@@ -214,21 +213,19 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[DatabaseProblem]:
         *_check_references(row, tables),
         *(_check_places(row, tables) if has_place(row) else _check_no_place(tables)),
     ]
-    yield from (DatabaseProblem(where=where, what=what) for what in found)
+    yield from ((where, what) for what in found)
     if found:
         return
     try:
         digest = content_digest(snapshot.load_any(row["map_id"]))
     except FeatureDbError as error:
-        yield DatabaseProblem(where=where, what=f"cannot be loaded: {_one_line(error)}")
+        yield where, f"cannot be loaded: {_one_line(error)}"
         return
     if digest != row["content_digest"]:
-        yield DatabaseProblem(
-            where=where, what="its rows are not those that were committed: content digests differ"
-        )
+        yield where, "its rows are not those that were committed: content digests differ"
 
 
-def check_scan(database: Database, scan: ScanSummary) -> Iterator[DatabaseProblem]:
+def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
     """Do the points of a scan agree with its row, and are they those that were committed?"""
     where = f"scan {scan.scan_id}"
     levels, coordinates = np.zeros(len(scan.level_points), np.int64), PointsChecksum()
@@ -240,25 +237,21 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[DatabaseProble
             coordinates.add(utm)
             levels += np.bincount(batch["level"].to_numpy(), minlength=len(levels))[: len(levels)]
             if not np.isfinite(utm).all():
-                yield DatabaseProblem(where=where, what="coordinates that are not finite")
+                yield where, "coordinates that are not finite"
                 return
             elsewhere += int((tile_of(utm) != batch["tile"].to_numpy(zero_copy_only=False)).sum())
             outside += int((~((utm >= low) & (utm <= high)).all(axis=1)).sum())
     except (OSError, pa.ArrowException) as error:
-        yield DatabaseProblem(where=where, what=f"cannot read its points: {_one_line(error)}")
+        yield where, f"cannot read its points: {_one_line(error)}"
         return
     if levels.tolist() != list(scan.level_points):
-        yield DatabaseProblem(
-            where=where, what=f"expected {list(scan.level_points)} points by level, found {levels.tolist()}"
-        )
+        yield where, f"expected {list(scan.level_points)} points by level, found {levels.tolist()}"
     elif coordinates.text() != scan.row["points_checksum"]:
-        yield DatabaseProblem(
-            where=where, what="its points are not those that were committed: checksums differ"
-        )
+        yield where, "its points are not those that were committed: checksums differ"
     if elsewhere:
-        yield DatabaseProblem(where=where, what=f"{elsewhere} points in another tile than their coordinates'")
+        yield where, f"{elsewhere} points in another tile than their coordinates'"
     if outside:
-        yield DatabaseProblem(where=where, what=f"{outside} points outside the scan's box")
+        yield where, f"{outside} points outside the scan's box"
 
 
 def _check_counts(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:
@@ -331,6 +324,10 @@ def _observations_in_wrong_tile(tables: dict[str, pa.Table]) -> int:
     known = pc.is_valid(position)
     tiles = points["tile"].take(position.filter(known))
     return int(pc.sum(pc.not_equal(tiles, seen["tile"].filter(known))).as_py() or 0)
+
+
+def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
+    return tuple(DatabaseProblem(where=where, what=what) for where, what in problems)
 
 
 def _utm(table: pa.Table | pa.RecordBatch) -> FloatArray:

@@ -22,7 +22,6 @@ from featuredb.store.candidates.photos import (
     load_images,
     mark_used,
     refuse,
-    reopen,
     withdraw,
 )
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
@@ -96,8 +95,6 @@ class GrowthSuite:
         assert load_image(database, other) == contribution(2).image
         assert find_candidate(database, one).state == "withdrawn"
         assert withdraw(database, [one], "again").candidates == (one,)
-        with pytest.raises(StoreError, match="only its owner can give it again"):
-            reopen(database, [one], "we want it")
         with pytest.raises(StoreError, match="reason"):
             withdraw(database, [other], "")
         with pytest.raises(CandidateNotFoundError):
@@ -162,11 +159,8 @@ class DecisionsSuite(GrowthSuite):
         assert count_candidates(database).by_state == {"used": 2}
         database.rollback(0)
         assert count_candidates(database).by_state == {"waiting": 2}
-        assert [c.state for c in list_candidates(database, snapshot=database.snapshot(version))] == [
-            "used"
-        ] * 2
 
-    def test_refused_reopened_and_unknown(self, database: Database) -> None:
+    def test_refused_and_unknown(self, database: Database) -> None:
         (one,) = contribute(database, [contribution(1)])
         refuse(database, {one: ("ALTERED", "its bytes were edited")})
         found = find_candidate(database, one)
@@ -175,8 +169,7 @@ class DecisionsSuite(GrowthSuite):
             "ALTERED",
             "its bytes were edited",
         )
-        reopen(database, [one], "the editor was the owner")
-        assert [c.candidate_id for c in list_candidates(database, state="waiting")] == [one]
+        assert list_candidates(database, state="waiting") == []
         before = list_candidates(database)
         with pytest.raises(StoreError, match="expected a reason code"):
             refuse(database, {one: (" ", "x")})

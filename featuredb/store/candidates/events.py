@@ -11,8 +11,7 @@ from featuredb.store.candidates.states import CONTRIBUTED, event_order
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
-from featuredb.store.encode import Row
-from featuredb.store.snapshot import Snapshot
+from featuredb.store.encode import Row, rows_of
 from featuredb.store.tables import CANDIDATES, SPECS
 
 
@@ -39,12 +38,7 @@ def read_events(
         table = dataset.to_table(list(columns) if columns else None, filter=wanted, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"cannot read the table candidates ({error}); run `featuredb verify`") from error
-    # As in commits.read_rows: no look into the system's time zone files.
-    times = table["happened_at"].cast(pa.timestamp("us")).to_pylist()
-    rows: list[Row] = table.drop_columns("happened_at").to_pylist()
-    for row, time in zip(rows, times, strict=True):
-        row["happened_at"] = time.replace(tzinfo=UTC)
-    return sorted(rows, key=event_order)
+    return sorted(rows_of(table, "happened_at"), key=event_order)
 
 
 def by_candidate(events: Iterable[Row]) -> dict[str, list[Row]]:
@@ -55,9 +49,9 @@ def by_candidate(events: Iterable[Row]) -> dict[str, list[Row]]:
     return {c: rows for c, rows in found.items() if any(r["event"] == CONTRIBUTED for r in rows)}
 
 
-def live_maps(database: Database, snapshot: Snapshot | None) -> frozenset[str]:
-    """Ids of the maps that are not retired, in the snapshot or the newest one."""
-    return frozenset(m.map_id for m in (snapshot or database.snapshot()).maps())
+def live_maps(database: Database) -> frozenset[str]:
+    """Ids of the maps that are not retired, in the newest snapshot."""
+    return frozenset(m.map_id for m in database.snapshot().maps())
 
 
 def note_events(database: Database, events: Mapping[str, Row]) -> None:

@@ -30,7 +30,6 @@ from featuredb.store.candidates.states import (
     CONFIRMED,
     CONTRIBUTED,
     REFUSED,
-    REOPENED,
     USED,
     WITHDRAWN,
     Candidate,
@@ -46,7 +45,6 @@ from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
 from featuredb.store.encode import Row
-from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATE_TABLES, SPECS
 
 _ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "request")
@@ -158,19 +156,6 @@ def refuse(database: Database, reasons: Mapping[str, tuple[str, str]]) -> None:
     )
 
 
-def reopen(database: Database, candidate_ids: Iterable[str], reason: str) -> None:
-    """Let refused photos wait again.
-
-    Raises:
-        CandidateNotFoundError, StoreError: also where one is withdrawn.
-    """
-    wanted = list(candidate_ids)
-    withdrawn = [c.candidate_id for c in list_candidates(database, state="withdrawn")]
-    if gone := sorted(set(wanted) & set(withdrawn)):
-        raise StoreError(f"candidate {', '.join(gone)} is withdrawn; only its owner can give it again")
-    note_events(database, {c: {"event": REOPENED, "reason": reason} for c in wanted})
-
-
 def withdraw(database: Database, candidate_ids: Iterable[str], reason: str) -> WithdrawReport:
     """Delete the bytes of photos, as their owner asks: from the table and from the disk or bucket, at once.
 
@@ -201,16 +186,9 @@ def delete_images(database: Database, candidate_ids: Iterable[str]) -> list[str]
     return [f"{CANDIDATE_IMAGES}/{path}" for path in removed]
 
 
-def list_candidates(
-    database: Database, *, state: CandidateState | None = None, snapshot: Snapshot | None = None
-) -> list[Candidate]:
-    """The contributed photos, oldest first.
-
-    Args:
-        state: only those in this state.
-        snapshot: whose maps decide what is used; None: the newest.
-    """
-    live = live_maps(database, snapshot)
+def list_candidates(database: Database, *, state: CandidateState | None = None) -> list[Candidate]:
+    """The contributed photos, or only those in one state, oldest first."""
+    live = live_maps(database)
     found = [candidate_of(events, live) for events in by_candidate(read_events(database)).values()]
     wanted = [c for c in found if state is None or c.state == state]
     return sorted(wanted, key=lambda c: (c.received_at, c.candidate_id))
@@ -218,7 +196,7 @@ def list_candidates(
 
 def count_candidates(database: Database) -> InboxCounts:
     """How many there are in each state, how many wait of each owner, and how many bytes they take."""
-    live = live_maps(database, None)
+    live = live_maps(database)
     states: Counter[str] = Counter()
     owners: Counter[str] = Counter()
     stored = 0

@@ -42,7 +42,7 @@ def superfluous_images(
     """
     if not has_candidates(database):
         return set()
-    live = live_maps(database, None)
+    live = live_maps(database)
     found = set()
     for candidate_id, events in by_candidate(read_events(database, columns=_COLUMNS)).items():
         state = standing_of(events, live).state
@@ -79,7 +79,7 @@ def _check_candidates(database: Database) -> Iterator[tuple[str, str]]:
         return
     try:
         events = read_events(database, columns=_COLUMNS)
-        live = live_maps(database, None)
+        live = live_maps(database)
         digests = dict(_stored_digests(database))
     except (FeatureDbError, OSError, pa.ArrowException) as error:
         yield "candidates", f"cannot be read: {' '.join(str(error).split())[:300]}"

@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import pyarrow.fs as fs
 
-from featuredb.store.durable.log import list_entries, read_entry, utc
+from featuredb.store.durable.log import list_entries, utc, whole_entry
 from featuredb.store.durable.publish import SCRATCH, flush
 
 
@@ -58,7 +58,7 @@ def old_files(files: fs.FileSystem, unused: Iterable[str], grace: timedelta) -> 
         unquote(action["remove"]["path"])
         for version, written in list_entries(files).items()
         if now - written < grace
-        for action in read_entry(files, version)
+        for action in whole_entry(files, version)[1]
         if "remove" in action
     }
     candidates = {path for path in unused if path in times} - dropped

@@ -110,15 +110,6 @@ def list_entries(files: fs.FileSystem) -> dict[int, datetime]:
     return dict(sorted(_numbered(files, LOG, _ENTRY)))
 
 
-def read_entry(files: fs.FileSystem, version: int) -> list[Action]:
-    """The actions of a table's log entry.
-
-    Raises:
-        StoreError: it is missing, empty or torn.
-    """
-    return whole_entry(files, version)[1]
-
-
 def whole_entry(files: fs.FileSystem, version: int) -> tuple[bytes, list[Action]]:
     """A table's log entry as it is written, and its actions.
 
@@ -153,7 +144,7 @@ def file_digests(files: fs.FileSystem) -> dict[str, str]:
     Raises:
         StoreError: an entry is missing, empty or torn.
     """
-    adds = (a["add"] for v in list_entries(files) for a in read_entry(files, v) if "add" in a)
+    adds = (a["add"] for v in list_entries(files) for a in whole_entry(files, v)[1] if "add" in a)
     return {unquote(add["path"]): add["tags"][DIGEST] for add in adds if DIGEST in (add.get("tags") or {})}
 
 
