@@ -6,10 +6,9 @@ One map has one UTM zone and one local east-north-up frame. Poses and covariance
 local frame, points in UTM, as they are stored; `featuredb.geo.LocalFrame` goes between the two.
 """
 
-from collections.abc import Sized
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
-from typing import Any, Protocol
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,25 +109,27 @@ class PointColumns:
     error_px: NDArray[np.float32]
     covariance: NDArray[np.float32]
 
+    coordinates: ClassVar[str]
+    """Name of the field with the (n, 3) coordinates, which decides how many points there are."""
+
+    def __post_init__(self) -> None:
+        freeze(self, **{self.coordinates: (None, 3)})
+        n = len(self)
+        freeze(self, np.uint8, rgb=(n, 3))
+        freeze(self, np.int32, track_length=(n,))
+        freeze(self, np.float32, error_px=(n,), covariance=(n, 6))
+
+    def __len__(self) -> int:
+        return len(getattr(self, self.coordinates))
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Self:
+        """Some rows, by a mask (n,) or their numbers."""
+        coordinates = {self.coordinates: getattr(self, self.coordinates)[rows]}
+        return replace(self, **coordinates, **self.columns(rows))
+
     def columns(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> dict[str, Any]:
-        """Some rows of each of these columns, by name."""
-        return {name: getattr(self, name)[rows] for name in _POINT_COLUMNS}
-
-
-_POINT_COLUMNS = ("rgb", "track_length", "error_px", "covariance")
-
-
-def check_points(points: PointColumns, coordinates: str) -> None:
-    """Make the arrays read-only and raise InvalidValueError where they do not fit together.
-
-    Args:
-        coordinates: name of the field with the (n, 3) coordinates, which decides how many points there are.
-    """
-    freeze(points, **{coordinates: (None, 3)})
-    n = len(getattr(points, coordinates))
-    freeze(points, np.uint8, rgb=(n, 3))
-    freeze(points, np.int32, track_length=(n,))
-    freeze(points, np.float32, error_px=(n,), covariance=(n, 6))
+        """Some rows of each column but the coordinates, by name."""
+        return {f.name: getattr(self, f.name)[rows] for f in fields(PointColumns)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -140,17 +141,8 @@ class MapPoints(PointColumns):
         covariance: as in PointColumns: (ee, en, eu, nn, nu, uu) in the map's local frame, square metres.
     """
 
+    coordinates = "utm"
     utm: FloatArray
-
-    def __post_init__(self) -> None:
-        check_points(self, "utm")
-
-    def __len__(self) -> int:
-        return len(self.utm)
-
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "MapPoints":
-        """Some rows, by a mask (n,) or their numbers."""
-        return MapPoints(utm=self.utm[rows], **self.columns(rows))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -222,58 +214,96 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FeatureMap:
-    """A geo-registered feature map, complete.
+class MapParts:
+    """What maps with and without a place have in common.
 
     Attributes:
         map_id: unique in the database; ingest derives it from the photos and options, so that the same
             job gives the same map.
         name: for people.
-        epsg: UTM zone of the points, 326zz or 327zz.
-        height_datum: vertical datum of all heights, see featuredb.geo.datum.
-        frame: the local east-north-up frame of poses and covariances.
         cameras: intrinsics; images name them by index.
+        observations: of `points`, by `images`.
+        extractor_fingerprint: of all descriptors.
+        status: one of `statuses`.
         camera_keys: for each camera the EXIF key (make, model, size, focal) that a query may share, ""
             where the camera belongs to one image only; same length as cameras, or empty.
-        extractor_fingerprint: of all descriptors.
-        status: quarantined, active or retired; only active maps answer queries.
-        generation: 0 for maps placed by GPS, LiDAR or control points; parents' maximum + 1 otherwise.
         parents: map ids that placed this one.
         provenance: options and versions that made it, JSON-able.
 
     Raises:
-        InvalidValueError: parts that contradict each other, or an unknown status or datum.
-        GeodesyError: `epsg` is no UTM zone.
+        InvalidValueError: parts that contradict each other, or an unknown status.
     """
+
+    statuses: ClassVar[tuple[str, ...]]
 
     map_id: str
     name: str
-    epsg: int
-    height_datum: str
-    frame: LocalFrame
     cameras: tuple[Camera, ...]
     images: tuple[MapImage, ...]
-    points: MapPoints
+    points: PointColumns
     observations: MapObservations
-    placement: Placement
     extractor_fingerprint: str
+    status: str
     camera_keys: tuple[str, ...] = ()
-    status: MapStatus = "active"
-    generation: int = 0
     parents: tuple[str, ...] = ()
     source: str = ""
     licence: str = ""
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        where = f"FeatureMap {self.map_id}"
+        where = f"{type(self).__name__} {self.map_id}"
         if not self.map_id:
-            raise InvalidValueError("FeatureMap: expected a map_id, found an empty one")
+            raise InvalidValueError(f"{type(self).__name__}: expected a map_id, found an empty one")
+        if self.status not in self.statuses:
+            raise InvalidValueError(f"{where}: expected a status of {self.statuses}, found {self.status!r}")
+        if self.camera_keys and len(self.camera_keys) != len(self.cameras):
+            raise InvalidValueError(
+                f"{where}: expected as many camera keys as cameras ({len(self.cameras)}) or none, "
+                f"found {len(self.camera_keys)}"
+            )
+        ids = [image.image_id for image in self.images]
+        if len(set(ids)) != len(ids):
+            raise InvalidValueError(f"{where}: image ids repeat")
+        if any(not 0 <= image.camera_id < len(self.cameras) for image in self.images):
+            raise InvalidValueError(f"{where}: an image names a camera that the map does not have")
+        observations = self.observations
+        if len(observations):
+            if observations.point_index.min() < 0 or observations.point_index.max() >= len(self.points):
+                raise InvalidValueError(f"{where}: an observation names a point that the map does not have")
+            if not np.isin(observations.image_id, np.asarray(ids, dtype=np.int32)).all():
+                raise InvalidValueError(f"{where}: an observation names an image that the map does not have")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FeatureMap(MapParts):
+    """A geo-registered feature map, complete.
+
+    Attributes:
+        epsg: UTM zone of the points, 326zz or 327zz.
+        height_datum: vertical datum of all heights, see featuredb.geo.datum.
+        frame: the local east-north-up frame of poses and covariances.
+        status: quarantined, active or retired; only active maps answer queries.
+        generation: 0 for maps placed by GPS, LiDAR or control points; parents' maximum + 1 otherwise.
+
+    Raises:
+        InvalidValueError: parts that contradict each other, or an unknown status or datum.
+        GeodesyError: `epsg` is no UTM zone.
+    """
+
+    statuses = MAP_STATUSES
+
+    epsg: int
+    height_datum: str
+    frame: LocalFrame
+    points: MapPoints
+    placement: Placement
+    status: MapStatus = "active"
+    generation: int = 0
+
+    def __post_init__(self) -> None:
+        MapParts.__post_init__(self)
         zone_of(self.epsg)
         check_datum(self.height_datum)
-        if self.status not in MAP_STATUSES:
-            raise InvalidValueError(f"{where}: expected a status of {MAP_STATUSES}, found {self.status!r}")
-        check_parts(where, self)
 
     def points_local(self, frame: LocalFrame | None = None) -> FloatArray:
         """Points (n, 3) in metres in the given local frame (default: the map's own)."""
@@ -281,41 +311,6 @@ class FeatureMap:
 
     def with_status(self, status: MapStatus) -> "FeatureMap":
         return replace(self, status=status)
-
-
-class MapParts(Protocol):
-    """What maps with and without a place have in common."""
-
-    @property
-    def cameras(self) -> tuple[Camera, ...]: ...
-    @property
-    def camera_keys(self) -> tuple[str, ...]: ...
-    @property
-    def images(self) -> tuple[MapImage, ...]: ...
-    @property
-    def observations(self) -> MapObservations: ...
-    @property
-    def points(self) -> Sized: ...
-
-
-def check_parts(where: str, parts: MapParts) -> None:
-    """Raise InvalidValueError where images, cameras, points and observations contradict each other."""
-    if parts.camera_keys and len(parts.camera_keys) != len(parts.cameras):
-        raise InvalidValueError(
-            f"{where}: expected as many camera keys as cameras ({len(parts.cameras)}) or none, "
-            f"found {len(parts.camera_keys)}"
-        )
-    ids = [image.image_id for image in parts.images]
-    if len(set(ids)) != len(ids):
-        raise InvalidValueError(f"{where}: image ids repeat")
-    if any(not 0 <= image.camera_id < len(parts.cameras) for image in parts.images):
-        raise InvalidValueError(f"{where}: an image names a camera that the map does not have")
-    observations = parts.observations
-    if len(observations):
-        if observations.point_index.min() < 0 or observations.point_index.max() >= len(parts.points):
-            raise InvalidValueError(f"{where}: an observation names a point that the map does not have")
-        if not np.isin(observations.image_id, np.asarray(ids, dtype=np.int32)).all():
-            raise InvalidValueError(f"{where}: an observation names an image that the map does not have")
 
 
 def _covariance(name: str, value: ArrayLike, size: int) -> FloatArray:

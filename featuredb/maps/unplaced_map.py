@@ -7,20 +7,9 @@ makes a FeatureMap of it, under the same map id.
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
-from featuredb.maps.feature_map import (
-    FeatureMap,
-    MapImage,
-    MapObservations,
-    PointColumns,
-    check_parts,
-    check_points,
-)
+from featuredb.maps.feature_map import FeatureMap, MapParts, PointColumns
 from featuredb.maps.statuses import UNPLACED_STATUSES as UNPLACED_STATUSES
 from featuredb.maps.statuses import UnplacedStatus as UnplacedStatus
 
@@ -72,28 +61,17 @@ class OwnPoints(PointColumns):
         xyz: (n, 3) float64 in the map's own frame.
     """
 
+    coordinates = "xyz"
     xyz: FloatArray
-
-    def __post_init__(self) -> None:
-        check_points(self, "xyz")
-
-    def __len__(self) -> int:
-        return len(self.xyz)
-
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "OwnPoints":
-        """Some rows, by a mask (n,) or their numbers."""
-        return OwnPoints(xyz=self.xyz[rows], **self.columns(rows))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class UnplacedMap:
+class UnplacedMap(MapParts):
     """A reconstruction without a place, complete.
 
     Attributes:
-        map_id, name, cameras, camera_keys, observations, extractor_fingerprint, parents, source, licence,
-            provenance: as in FeatureMap.
         frame: of poses, points and covariances.
-        images: as in FeatureMap; `cam_from_local` leads from the own frame to the camera.
+        images: `cam_from_local` leads from the own frame to the camera.
         points: in the own frame.
         no_place: why it has no place, and what would give it one.
         status: unplaced or retired.
@@ -102,30 +80,12 @@ class UnplacedMap:
         InvalidValueError: parts that contradict each other, or an unknown status.
     """
 
-    map_id: str
-    name: str
-    frame: OwnFrame
-    cameras: tuple[Camera, ...]
-    images: tuple[MapImage, ...]
-    points: OwnPoints
-    observations: MapObservations
-    no_place: NoPlace
-    extractor_fingerprint: str
-    camera_keys: tuple[str, ...] = ()
-    status: UnplacedStatus = "unplaced"
-    parents: tuple[str, ...] = ()
-    source: str = ""
-    licence: str = ""
-    provenance: dict[str, Any] = field(default_factory=dict)
+    statuses = UNPLACED_STATUSES
 
-    def __post_init__(self) -> None:
-        if not self.map_id:
-            raise InvalidValueError("UnplacedMap: expected a map_id, found an empty one")
-        if self.status not in UNPLACED_STATUSES:
-            raise InvalidValueError(
-                f"UnplacedMap {self.map_id}: expected a status of {UNPLACED_STATUSES}, found {self.status!r}"
-            )
-        check_parts(f"UnplacedMap {self.map_id}", self)
+    frame: OwnFrame
+    points: OwnPoints
+    no_place: NoPlace
+    status: UnplacedStatus = "unplaced"
 
     def points_local(self) -> FloatArray:
         """Points (n, 3) in the own frame."""

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime
 
 import pyarrow as pa
@@ -41,68 +41,64 @@ class UtmBox:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MapSummary:
-    """A map with a place as its row in `maps` describes it, without its points.
+class _Summary:
+    """A map as its row in `maps` describes it, without its points.
 
     Attributes:
         write_id: names the child rows; changes with each re-placement, so it is a key for derived artefacts.
         content_digest: SHA-256 of everything but the status.
         status_reason: why it was promoted, quarantined or retired; "" where it has its first status.
         created_at: UTC.
-        box: of the points; None for a map without points.
-        tiles: names of all tiles that hold rows of the map.
         images, points, observations, descriptors: counts.
-        residual_rms_m: of the placement, metres.
-        drift_m, budget_m: of a map that other maps placed: 95 % bound of its position against its anchors,
-            and what growth allowed, metres; None where the placement does not say.
     """
 
     map_id: str
     write_id: str
     content_digest: str
     name: str
-    status: MapStatus
     status_reason: str
     created_at: datetime
-    epsg: int
-    height_datum: str
-    box: UtmBox | None
-    tiles: tuple[str, ...]
     images: int
     points: int
     observations: int
     descriptors: int
+    extractor_fingerprint: str
+    source: str
+    licence: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapSummary(_Summary):
+    """A map with a place.
+
+    Attributes:
+        box: of the points; None for a map without points.
+        tiles: names of all tiles that hold rows of the map.
+        residual_rms_m: of the placement, metres.
+        drift_m, budget_m: of a map that other maps placed: 95 % bound of its position against its anchors,
+            and what growth allowed, metres; None where the placement does not say.
+    """
+
+    status: MapStatus
+    epsg: int
+    height_datum: str
+    box: UtmBox | None
+    tiles: tuple[str, ...]
     method: MapMethod
     generation: int
     parents: tuple[str, ...]
     residual_rms_m: float
-    extractor_fingerprint: str
-    source: str
-    licence: str
     drift_m: float | None = None
     budget_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class UnplacedSummary:
-    """A map without a place as its row in `maps` describes it; attributes as in the map and MapSummary."""
+class UnplacedSummary(_Summary):
+    """A map without a place; attributes as in the map."""
 
-    map_id: str
-    write_id: str
-    content_digest: str
-    name: str
     status: UnplacedStatus
-    status_reason: str
-    created_at: datetime
     frame: OwnFrame
     no_place: NoPlace
-    images: int
-    points: int
-    observations: int
-    descriptors: int
-    extractor_fingerprint: str
-    source: str
-    licence: str
 
 
 class Snapshot:
@@ -278,10 +274,7 @@ def _unplaced_summary(row: Row) -> UnplacedSummary:
     )
 
 
-_AS_STORED = (
-    "map_id", "write_id", "content_digest", "name", "status", "status_reason", "created_at", "images",
-    "points", "observations", "descriptors", "extractor_fingerprint", "source", "licence",
-)  # fmt: skip
+_AS_STORED = (*(field.name for field in fields(_Summary)), "status")
 _PLACED_AS_STORED = ("epsg", "height_datum", "method", "generation", "residual_rms_m")
 
 
