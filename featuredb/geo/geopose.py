@@ -5,11 +5,9 @@ y down, z forward. A level camera that looks true east has the identity rotation
 pose's own position, not to a map's origin: verticals differ by a degree in 111 km, and meridians converge.
 """
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
@@ -97,22 +95,6 @@ class GeoPose:
             "quaternion": {"x": x, "y": y, "z": z, "w": w},
         }
 
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any] | str | bytes) -> Self:
-        """From a Basic-Quaternion object or its text; further members are allowed and ignored.
-
-        Raises:
-            InvalidValueError: not JSON, a missing member, not numbers, out of range, or not of unit length.
-        """
-        if isinstance(document, (str, bytes)):
-            try:
-                document = json.loads(document)
-            except (ValueError, RecursionError) as error:
-                raise InvalidValueError(f"GeoPose: expected JSON, found {document!r:.80}") from error
-        lat, lon, h = _numbers(document, "position", ("lat", "lon", "h"))
-        x, y, z, w = _numbers(document, "quaternion", ("x", "y", "z", "w"))
-        return cls(latitude_deg=lat, longitude_deg=lon, height_m=h, quaternion_xyzw=(x, y, z, w))
-
 
 def geopose_from_camera(cam_from_local: Rigid3, frame: LocalFrame) -> GeoPose:
     """The GeoPose of a camera whose pose is known in a local frame.
@@ -131,17 +113,3 @@ def geopose_from_camera(cam_from_local: Rigid3, frame: LocalFrame) -> GeoPose:
         height_m=float(height),
         quaternion_xyzw=(float(x), float(y), float(z), float(w)),
     )
-
-
-def _numbers(document: Any, member: str, names: tuple[str, ...]) -> list[float]:
-    """The numbers of an object within an object, in the order of `names`."""
-    inner = document.get(member) if isinstance(document, Mapping) else None
-    values = [inner.get(name) for name in names] if isinstance(inner, Mapping) else [None]
-    if any(isinstance(value, bool) or not isinstance(value, (int, float)) for value in values):
-        raise InvalidValueError(
-            f"GeoPose: expected member {member!r} with numbers {', '.join(names)}, found {inner!r:.200}"
-        )
-    try:
-        return [float(value) for value in values if value is not None]
-    except OverflowError as error:
-        raise InvalidValueError(f"GeoPose.{member}: a number is out of range") from error

@@ -108,17 +108,6 @@ class Rigid3:
         ad[3:, :3] = skew(self.translation) @ self.rotation
         return ad
 
-    def inverse_covariance(self, covariance: ArrayLike) -> FloatArray:
-        """Covariance (6, 6) of `self.inverse()`, given that of `self`."""
-        ad = self.inverse().adjoint()
-        return ad @ np.asarray(covariance, dtype=np.float64) @ ad.T
-
-    def compose_covariance(self, covariance: ArrayLike, other_covariance: ArrayLike) -> FloatArray:
-        """Covariance (6, 6) of `self @ other` for independent errors of both, to first order."""
-        ad = self.adjoint()
-        other = np.asarray(other_covariance, dtype=np.float64)
-        return np.asarray(covariance, dtype=np.float64) + ad @ other @ ad.T
-
     @property
     def quaternion_xyzw(self) -> FloatArray:
         """Hamilton quaternion (x, y, z, w), w >= 0."""

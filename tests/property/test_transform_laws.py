@@ -154,40 +154,19 @@ def random_covariance(rng: np.random.Generator, size: int) -> FloatArray:
     return np.asarray(root @ root.T, dtype=np.float64)
 
 
-def example(kind: type[Rigid3] | type[Sim3], rng: np.random.Generator) -> Transform:
-    tangent = np.concatenate([rng.normal(size=3), 5.0 * rng.normal(size=3)])
-    return kind.exp(tangent if kind is Rigid3 else np.concatenate([[0.5 * rng.normal()], tangent]))
+def example(rng: np.random.Generator) -> Sim3:
+    return Sim3.exp(np.concatenate([[0.5 * rng.normal()], rng.normal(size=3), 5.0 * rng.normal(size=3)]))
 
 
-@pytest.mark.parametrize("kind", [Rigid3, Sim3])
 @pytest.mark.parametrize("seed", range(5))
-def test_covariance_of_inverse_against_numerical_jacobian(kind: type[Rigid3] | type[Sim3], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    transform = example(kind, rng)
-    size = len(transform.log())
-
-    def error_of_inverse(xi: FloatArray) -> FloatArray:
-        perturbed = kind.exp(xi) @ transform  # type: ignore[operator]
-        return np.asarray((perturbed.inverse() @ transform).log(), dtype=np.float64)
-
-    jacobian = numerical_jacobian(error_of_inverse, size)
-    covariance = random_covariance(rng, size)
-    expected = jacobian @ covariance @ jacobian.T
-    np.testing.assert_allclose(
-        transform.inverse_covariance(covariance), expected, atol=1e-7 * np.abs(expected).max()
-    )
-
-
-@pytest.mark.parametrize("kind", [Rigid3, Sim3])
-@pytest.mark.parametrize("seed", range(5))
-def test_covariance_of_product_against_numerical_jacobian(kind: type[Rigid3] | type[Sim3], seed: int) -> None:
+def test_covariance_of_product_against_numerical_jacobian(seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
-    outer, inner = example(kind, rng), example(kind, rng)
+    outer, inner = example(rng), example(rng)
     size = len(outer.log())
-    product = outer @ inner  # type: ignore[operator]
+    product = outer @ inner
 
     def error_of_product(xi: FloatArray) -> FloatArray:
-        perturbed = (kind.exp(xi[:size]) @ outer) @ (kind.exp(xi[size:]) @ inner)  # type: ignore[operator]
+        perturbed = (Sim3.exp(xi[:size]) @ outer) @ (Sim3.exp(xi[size:]) @ inner)
         return np.asarray((perturbed @ product.inverse()).log(), dtype=np.float64)
 
     jacobian = numerical_jacobian(error_of_product, 2 * size)
@@ -197,19 +176,6 @@ def test_covariance_of_product_against_numerical_jacobian(kind: type[Rigid3] | t
     np.testing.assert_allclose(
         outer.compose_covariance(first, second), expected, atol=1e-7 * np.abs(expected).max()
     )
-
-
-def test_covariance_of_inverse_against_sampling() -> None:
-    rng = np.random.default_rng(3)
-    transform = Rigid3.exp(np.array([0.3, -0.7, 1.1, 4.0, -2.0, 1.0]))
-    covariance = 1e-6 * random_covariance(rng, 6)
-    samples = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
-    inverse = transform.inverse()
-    errors = [((Rigid3.exp(xi) @ transform).inverse() @ inverse.inverse()).log() for xi in samples]
-    expected = transform.inverse_covariance(covariance)
-    # 4000 samples give a variance to 2 %; whitened by the prediction the sample covariance is the identity.
-    white = np.linalg.solve(np.linalg.cholesky(expected), np.array(errors).T)
-    np.testing.assert_allclose(np.cov(white), np.eye(6), atol=0.12)
 
 
 @LAWS
