@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.view_cones import view_cones
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.move import full_covariances
 
 _LOG = logging.getLogger(__name__)
 
@@ -136,36 +138,26 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
         )
     frame = frame or max(maps, key=lambda m: len(m.points)).frame
     parts = [_lay_out(feature_map, frame) for feature_map in maps]
-    point_offset = np.cumsum([0] + [len(p.points) for p in parts])
-    image_offset = np.cumsum([0] + [len(p.image_center) for p in parts])
-    see_image = np.concatenate(
-        [p.see_image + o for p, o in zip(parts, image_offset[:-1], strict=True)]
-    ).astype(np.int32)
-    see_point = np.concatenate(
-        [p.see_point + o for p, o in zip(parts, point_offset[:-1], strict=True)]
-    ).astype(np.int32)
-    image_map = _repeat([len(p.image_center) for p in parts])
-    image_scene = np.concatenate([p.image_scene for p in parts])
-    image_reach = np.concatenate([p.image_reach for p in parts])
+    points, images = ([len(part[name]) for part in parts] for name in ("points", "image_center"))
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    see_image, see_point = (
+        np.concatenate(
+            [part[name] + offset for part, offset in zip(parts, np.cumsum([0, *counts]), strict=False)]
+        ).astype(np.int32)
+        for name, counts in (("see_image", images), ("see_point", points))
+    )
+    joined |= {"see_image": see_image, "see_point": see_point}
+    image_map = _repeat(images)
     return Area(
         frame=frame,
         maps=tuple(replace(m, observations=m.observations.none()) for m in maps),
-        points=np.concatenate([p.points for p in parts]),
-        point_map=_repeat([len(p.points) for p in parts]),
-        point_row=np.concatenate([p.point_row for p in parts]),
-        point_covariance=np.concatenate([p.point_covariance for p in parts]),
-        view_direction=np.concatenate([p.view_direction for p in parts]),
-        view_spread_cos=np.concatenate([p.view_spread_cos for p in parts]),
-        view_distance=np.concatenate([p.view_distance for p in parts]),
-        descriptors=np.concatenate([p.descriptors for p in parts]),
-        see_image=see_image,
-        see_point=see_point,
+        **joined,
+        point_map=_repeat(points),
         image_start=np.searchsorted(see_image, np.arange(len(image_map) + 1)).astype(np.int64),
         image_map=image_map,
-        image_center=np.concatenate([p.image_center for p in parts]),
-        image_scene=image_scene,
-        image_reach=image_reach,
-        covisible=_covisibility(see_image, see_point, image_map, image_scene, image_reach),
+        covisible=_covisibility(
+            see_image, see_point, image_map, joined["image_scene"], joined["image_reach"]
+        ),
         extractor_fingerprint=fingerprints[0],
         modes=tuple(_modes(feature_map) for feature_map in maps),
         searched=np.ones(len(maps), dtype=np.bool_),
@@ -181,25 +173,8 @@ def _modes(feature_map: FeatureMap) -> ErrorModes | None:
         return None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Part:
-    """One map, laid out; fields as in Area, counted from zero."""
-
-    points: FloatArray
-    point_row: NDArray[np.int64]
-    point_covariance: FloatArray
-    view_direction: FloatArray
-    view_spread_cos: FloatArray
-    view_distance: FloatArray
-    descriptors: NDArray[np.uint8]
-    see_image: NDArray[np.int32]
-    see_point: NDArray[np.int32]
-    image_center: FloatArray
-    image_scene: FloatArray
-    image_reach: FloatArray
-
-
-def _lay_out(feature_map: FeatureMap, frame: LocalFrame) -> _Part:
+def _lay_out(feature_map: FeatureMap, frame: LocalFrame) -> dict[str, NDArray[Any]]:
+    """One map's arrays by their names in Area, counted from zero."""
     area_from_map = frame.enu_from(feature_map.frame)
     observations = feature_map.observations
     keep = np.flatnonzero(observations.has_descriptor)
@@ -225,20 +200,21 @@ def _lay_out(feature_map: FeatureMap, frame: LocalFrame) -> _Part:
         if len(seen):
             scene[i] = np.median(seen, axis=0)
             reach[i] = np.median(np.linalg.norm(seen - centers[i], axis=1))
-    return _Part(
-        points=points,
-        point_row=rows,
-        point_covariance=_full_covariance(feature_map.points.covariance[rows], area_from_map.rotation),
-        view_direction=cones.direction,
-        view_spread_cos=cones.spread_cos,
-        view_distance=np.stack([near, far], axis=1),
-        descriptors=_mean_descriptors(observations.descriptors[keep][order], see_point, len(rows)),
-        see_image=see_image.astype(np.int32),
-        see_point=see_point.astype(np.int32),
-        image_center=centers,
-        image_scene=scene,
-        image_reach=reach,
-    )
+    turn = area_from_map.rotation
+    return {
+        "points": points,
+        "point_row": rows,
+        "point_covariance": turn @ full_covariances(feature_map.points.covariance[rows]) @ turn.T,
+        "view_direction": cones.direction,
+        "view_spread_cos": cones.spread_cos,
+        "view_distance": np.stack([near, far], axis=1),
+        "descriptors": _mean_descriptors(observations.descriptors[keep][order], see_point, len(rows)),
+        "see_image": see_image.astype(np.int32),
+        "see_point": see_point.astype(np.int32),
+        "image_center": centers,
+        "image_scene": scene,
+        "image_reach": reach,
+    }
 
 
 def _mean_descriptors(
@@ -256,13 +232,6 @@ def _sum_by(group: NDArray[np.intp], values: NDArray[np.floating], count: int) -
         (np.ones(len(group)), (group, np.arange(len(group)))), shape=(count, len(group))
     )
     return np.asarray(matrix @ values, dtype=np.float64).reshape(count, values.shape[1])
-
-
-def _full_covariance(upper: NDArray[np.float32], rotation: FloatArray) -> FloatArray:
-    """(n, 3, 3) in turned axes from upper triangles (n, 6)."""
-    ee, en, eu, nn, nu, uu = np.asarray(upper, dtype=np.float64).T
-    full = np.stack([ee, en, eu, en, nn, nu, eu, nu, uu], axis=1).reshape(-1, 3, 3)
-    return np.asarray(rotation @ full @ rotation.T, dtype=np.float64)
 
 
 def _covisibility(

@@ -18,17 +18,17 @@ def nearest(query: NDArray[Any], base: NDArray[Any], k: int) -> tuple[NDArray[np
     if len(query) == 0 or len(base) == 0:
         return np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int64)
     found = min(k, len(base))
-    distance, row = _search(query.astype(np.float32), base.astype(np.float32), found)
+    distance, row = knn(query.astype(np.float32), base.astype(np.float32), found)
     if found < k:
         distance = np.pad(distance, ((0, 0), (0, k - found)), constant_values=np.inf)
         row = np.pad(row, ((0, 0), (0, k - found)), constant_values=-1)
     return distance, row
 
 
-def _search(
-    query: NDArray[np.float32], base: NDArray[np.float32], k: int
+def knn(
+    query: NDArray[np.float32], base: NDArray[np.float32], k: int, metric: int = faiss.METRIC_L2
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """FAISS's search in one thread.
+    """FAISS's exhaustive search in one thread: scores (n, k) of a metric, best first, and rows (n, k).
 
     Its OpenMP and that of its OpenBLAS get into each other's way: two threads take two thirds of the time on
     two idle cores, and three times as long beside other work.
@@ -36,7 +36,7 @@ def _search(
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)
     try:
-        distance, row = faiss.knn(query, base, k)
+        score, row = faiss.knn(query, base, k, metric=metric)
     finally:
         faiss.omp_set_num_threads(before)
-    return distance, row
+    return score, row

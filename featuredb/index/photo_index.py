@@ -4,6 +4,8 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.index.nearest import knn
+
 _CHUNK = 1024  # queries at a time: bounds the float32 copies
 
 
@@ -28,17 +30,12 @@ def most_similar(
     if count < 2 or not len(rows):
         return found, cosines
     base = vectors.astype(np.float32)
-    before = faiss.omp_get_max_threads()
-    faiss.omp_set_num_threads(1)  # see featuredb.index.nearest
-    try:
-        for start in range(0, len(rows), _CHUNK):
-            own = rows[start : start + _CHUNK]
-            score, row = faiss.knn(base[own], base, count, metric=faiss.METRIC_INNER_PRODUCT)
-            for place, (me, near, cosine) in enumerate(zip(own, row, score, strict=True), start=start):
-                good = (near != me) & (cosine > 0.0)
-                best = near[good][:k]
-                found[place, : len(best)] = best
-                cosines[place, : len(best)] = cosine[good][:k]
-    finally:
-        faiss.omp_set_num_threads(before)
+    for start in range(0, len(rows), _CHUNK):
+        own = rows[start : start + _CHUNK]
+        score, row = knn(base[own], base, count, faiss.METRIC_INNER_PRODUCT)
+        for place, (me, near, cosine) in enumerate(zip(own, row, score, strict=True), start=start):
+            good = (near != me) & (cosine > 0.0)
+            best = near[good][:k]
+            found[place, : len(best)] = best
+            cosines[place, : len(best)] = cosine[good][:k]
     return found, cosines
