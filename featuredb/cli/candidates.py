@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from featuredb.cli.common import add_database_argument, format_table, open_database, write_json
+from featuredb.cli.common import add_command, format_table, open_database, write_json
 from featuredb.errors import CandidateNotFoundError, InvalidValueError
 from featuredb.store.candidates.states import ANONYMOUS, CANDIDATE_STATES, Candidate
 
@@ -17,14 +17,15 @@ _SHORTEST_ID = 8
 
 def register(subparsers: Any) -> None:
     """Add `candidates` to the parser of `featuredb`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "candidates",
-        help="list contributed photos, or withdraw some",
+        run_candidates,
+        "list contributed photos, or withdraw some",
         description="List the photos that clients contributed: waiting for growth, used by a map, refused "
         "or withdrawn. With --withdraw, --withdraw-owner or --withdraw-credit their images are deleted, at "
         "once and for good.",
     )
-    add_database_argument(parser)
     parser.add_argument("--state", choices=CANDIDATE_STATES, help="only those in this state")
     parser.add_argument(
         "--owner",
@@ -47,7 +48,6 @@ def register(subparsers: Any) -> None:
         "--withdraw-credit", metavar="NAME", help="delete all images with which this name was given"
     )
     parser.add_argument("--reason", default="", help="kept with a withdrawal, which needs one")
-    parser.set_defaults(run=run_candidates)
 
 
 def run_candidates(args: argparse.Namespace) -> int:

@@ -36,10 +36,18 @@ def add_database_argument(
 
 
 def add_command(
-    subparsers: Any, name: str, run: Callable[[argparse.Namespace], int], text: str, epilog: str | None = None
+    subparsers: Any,
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    text: str,
+    *,
+    description: str | None = None,
+    epilog: str | None = None,
 ) -> argparse.ArgumentParser:
-    """Add a subcommand on a database."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(name, help=text, description=text, epilog=epilog)
+    """Add a subcommand on a database; `description` is `text` where none is given."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        name, help=text, description=description or text, epilog=epilog
+    )
     add_database_argument(parser)
     parser.set_defaults(run=run)
     return parser
@@ -117,16 +125,12 @@ def hours(text: str) -> float:
 
 def progress_of_maps() -> Callable[[int, int], None]:
     """Says on stderr how many maps are done, where a person looks on."""
-    return _on_terminal if sys.stderr.isatty() else _silent
 
+    def told(done: int, total: int) -> None:
+        if sys.stderr.isatty():
+            print(f"\r{done} of {total} maps", end="\n" if done == total else "", file=sys.stderr, flush=True)
 
-def _on_terminal(done: int, total: int) -> None:
-    sys.stderr.write(f"\r{done} of {total} maps" + ("\n" if done == total else ""))
-    sys.stderr.flush()
-
-
-def _silent(done: int, total: int) -> None:
-    pass
+    return told
 
 
 def count_bars() -> "Progress":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from featuredb.cli.common import (
     add_as_of_argument,
-    add_database_argument,
+    add_command,
     open_database,
     progress_of_maps,
     write_json,
@@ -31,14 +31,15 @@ _STATUSES = tuple(dict.fromkeys((*MAP_STATUSES, *UNPLACED_STATUSES)))
 def register(subparsers: Any) -> None:
     """Add `export` to the parser of `featuredb`."""
     text = "write maps for other systems"
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "export",
-        help=text,
+        run_export,
+        text,
         description=f"{text}; by default every active map.",
         epilog="formats: " + "; ".join(f"{name}: {entry.text}" for name, entry in FORMATS.items()),
     )
     parser._negative_number_matcher = _NEGATIVE
-    add_database_argument(parser)
     parser.add_argument("out", metavar="OUT", type=Path, help="file or folder to be made")
     parser.add_argument("--format", required=True, choices=tuple(FORMATS), help="see below")
     add_selection_arguments(parser)
@@ -53,7 +54,6 @@ def register(subparsers: Any) -> None:
         help="dataset: also the tiles of scans that touch the maps, as LAZ",
     )
     parser.add_argument("--json", action="store_true", help="the summary as JSON")
-    parser.set_defaults(run=run_export)
 
 
 def add_selection_arguments(parser: argparse.ArgumentParser) -> None:

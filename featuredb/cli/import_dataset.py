@@ -5,14 +5,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from featuredb.cli.common import add_database_argument, open_database, progress_of_maps
+from featuredb.cli.common import add_command, open_database, progress_of_maps
 
 
 def register(subparsers: Any) -> None:
     """Add `import` to the parser of `featuredb`."""
     text = "bring the maps of an exported dataset into a database"
-    parser = subparsers.add_parser("import", help=text, description=f"{text}; see docs/export.md")
-    add_database_argument(parser)
+    parser = add_command(subparsers, "import", run_import, text, description=f"{text}; see docs/export.md")
     parser.add_argument(
         "folder", metavar="FOLDER", type=Path, help="a dataset, as `featuredb export` makes it"
     )
@@ -22,7 +21,6 @@ def register(subparsers: Any) -> None:
         help="vouch for the dataset: its maps keep their status; default: what was active is quarantined",
     )
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
-    parser.set_defaults(run=run_import)
 
 
 def run_import(args: argparse.Namespace) -> int:

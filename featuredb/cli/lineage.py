@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from featuredb.cli.common import add_as_of_argument, add_database_argument, open_database, write_json
+from featuredb.cli.common import add_as_of_argument, add_command, open_database, write_json
 from featuredb.maps.lineage import MapLineage, describe_lineage, family_of
 
 if TYPE_CHECKING:
@@ -19,13 +19,14 @@ _DOT_STYLE = {"active": "solid", "quarantined": "dashed", "retired": "dotted"}
 
 def register(subparsers: Any) -> None:
     """Add `lineage` to the parser of `featuredb`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "lineage",
-        help="draw which map stands on which",
+        run_lineage,
+        "draw which map stands on which",
         description="Draw the tree of maps: which one placed which, how many steps each is from its anchor, "
         "how far it may have drifted of what growth allows (95 %), and why some are not active.",
     )
-    add_database_argument(parser)
     parser.add_argument(
         "map_id", metavar="MAP", nargs="?", help="only this map, what it stands on and what stands on it"
     )
@@ -34,7 +35,6 @@ def register(subparsers: Any) -> None:
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="as JSON")
     form.add_argument("--dot", action="store_true", help="as a graph for Graphviz: ... --dot | dot -Tsvg")
-    parser.set_defaults(run=run_lineage)
 
 
 def run_lineage(args: argparse.Namespace) -> int:

@@ -15,7 +15,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from importlib.metadata import EntryPoint, entry_points, version
 from typing import Any
 
 from featuredb.errors import FeatureDbError
@@ -62,7 +62,7 @@ def build_parser(commands: Iterable[EntryPoint]) -> argparse.ArgumentParser:
         description="Geo-registered feature maps and visual relocalisation.",
         parents=[_common_parser()],
     )
-    parser.add_argument("--version", action="version", version=f"featuredb {_version()}")
+    parser.add_argument("--version", action="version", version=f"featuredb {version('featuredb')}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     tried = set()
     for command in sorted(commands, key=lambda c: c.name):
@@ -98,13 +98,6 @@ def run_command(run: Callable[[argparse.Namespace], int | None], args: argparse.
     except Exception:
         logger.exception("a defect of the program; please report it with the lines below")
         return EXIT_DEFECT
-
-
-def _version() -> str:
-    try:
-        return version("featuredb")
-    except PackageNotFoundError:
-        return "(not installed)"
 
 
 def _common_parser() -> argparse.ArgumentParser:

@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from featuredb.cli.common import add_database_argument, open_database
+from featuredb.cli.common import add_command, open_database
 from featuredb.errors import StoreError
 from featuredb.maps.thin_options import ThinOptions
 
@@ -18,8 +18,7 @@ _DEFAULTS = ThinOptions()
 def register(subparsers: Any) -> None:
     """Add `thin` to the parser of `featuredb`."""
     text = "keep only as many descriptors as answers need; the earlier state stays, see rollback"
-    parser = subparsers.add_parser("thin", help=text, description=text)
-    add_database_argument(parser)
+    parser = add_command(subparsers, "thin", run_thin, text)
     parser.add_argument(
         "map_id", metavar="MAP", help="id of a map that is active or has no place, or its first letters"
     )
@@ -43,7 +42,6 @@ def register(subparsers: Any) -> None:
         help="remove the other points altogether; by default they stay as geometry without descriptors",
     )
     parser.add_argument("--dry-run", action="store_true", help="only say what would become of the map")
-    parser.set_defaults(run=run_thin)
 
 
 def run_thin(args: argparse.Namespace) -> int:
