@@ -1,12 +1,14 @@
 """Where a model in a local frame lies on Earth, as JSON that other programs, and the import, can use."""
 
 import json
+from collections import Counter
+from dataclasses import asdict
 from typing import Any
 
 from featuredb.export.selection import licence_of
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import meridian_convergence_deg, point_scale, zone_of
-from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage
+from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 
 GEOREFERENCE = "georeference.json"
@@ -36,11 +38,7 @@ def georeference(feature_map: FeatureMap, names: list[str]) -> dict[str, Any]:
         "format": FORMAT,
         "frame": {
             "axes": "x east, y north, z up at the origin; metres",
-            "origin": {
-                "latitude_deg": frame.latitude_deg,
-                "longitude_deg": frame.longitude_deg,
-                "height_m": frame.height_m,
-            },
+            "origin": asdict(frame),
             "ecef_from_local": frame.ecef_from_enu().matrix().tolist(),
         },
         "crs": {
@@ -126,19 +124,12 @@ def _map(feature_map: AnyMap) -> dict[str, Any]:
 
 
 def _images(feature_map: AnyMap, names: list[str]) -> list[dict[str, Any]]:
-    return [
-        _image(image, feature_map, name, seen)
-        for (image, seen), name in zip(_with_descriptors(feature_map), names, strict=True)
-    ]
-
-
-def _with_descriptors(feature_map: AnyMap) -> list[tuple[MapImage, int]]:
-    """Every image with how many of its keypoints carry a descriptor."""
     seen = feature_map.observations
-    counts: dict[int, int] = {}
-    for image_id in seen.image_id[seen.has_descriptor].tolist():
-        counts[image_id] = counts.get(image_id, 0) + 1
-    return [(image, counts.get(image.image_id, 0)) for image in feature_map.images]
+    described = Counter(seen.image_id[seen.has_descriptor].tolist())
+    return [
+        _image(image, feature_map, name, described[image.image_id])
+        for image, name in zip(feature_map.images, names, strict=True)
+    ]
 
 
 def _image(image: MapImage, feature_map: AnyMap, name: str, descriptors: int) -> dict[str, Any]:
@@ -150,16 +141,6 @@ def _image(image: MapImage, feature_map: AnyMap, name: str, descriptors: int) ->
         "owner": image.owner,
         "licence": licence_of(image, feature_map),
         "capture_time": None if image.capture_time is None else image.capture_time.isoformat(),
-        "gps": None if image.gps is None else _gps(image.gps),
+        "gps": None if image.gps is None else asdict(image.gps),
         "descriptors": descriptors,
-    }
-
-
-def _gps(gps: GeoPrior) -> dict[str, Any]:
-    return {
-        "latitude_deg": gps.latitude_deg,
-        "longitude_deg": gps.longitude_deg,
-        "height_m": gps.height_m,
-        "sigma_horizontal_m": gps.sigma_horizontal_m,
-        "sigma_vertical_m": gps.sigma_vertical_m,
     }

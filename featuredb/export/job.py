@@ -4,10 +4,10 @@ import csv
 import json
 import shutil
 import uuid
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,6 +30,7 @@ class ExportJob:
         out: the file or folder to be made, in a folder that exists.
         selection: which maps, and what of them.
         told: progress.
+        counts: maps, images, points and observations of the maps that it has given.
     """
 
     database: Database
@@ -37,6 +38,7 @@ class ExportJob:
     selection: Selection
     out: Path
     told: Told = field(default=lambda done, total: None)
+    counts: Counter[str] = field(default_factory=Counter, init=False)
 
     def summaries(self) -> list[MapSummary]:
         """Of the selected maps, before licences; see `selected_maps`."""
@@ -55,11 +57,19 @@ class ExportJob:
         return self._telling(self.any_summaries())
 
     def _telling(self, summaries: Sequence[MapSummary | UnplacedSummary]) -> Iterator[AnyMap]:
-        done = count(1)
+        self.counts.clear()
         for feature_map in exported(self.snapshot, summaries, self.selection.licences):
+            self.counts["maps"] += 1
+            for name in ("images", "points", "observations"):
+                self.counts[name] += len(getattr(feature_map, name))
             yield feature_map
-            del feature_map  # or it would stay while the next one is loaded, as it would with `enumerate`
-            self.told(next(done), len(summaries))
+            del feature_map  # or it would stay while the next one is loaded
+            self.told(self.counts["maps"], len(summaries))
+
+    def exported(self, path: Path) -> "Exported":
+        """What was written to `path` of the maps that it has given."""
+        names = ("maps", "images", "points", "observations")
+        return Exported(**{name: self.counts[name] for name in names}, bytes=size_of(path))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,6 @@
 """The features of one image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,13 +48,5 @@ class Features:
 
     def take(self, rows: NDArray[Any]) -> "Features":
         """The features of the given rows (index or boolean array (n,)), in that order."""
-        return Features(
-            xy=self.xy[rows],
-            scale=self.scale[rows],
-            angle=self.angle[rows],
-            response=self.response[rows],
-            descriptors=self.descriptors[rows],
-            width=self.width,
-            height=self.height,
-            fingerprint=self.fingerprint,
-        )
+        arrays = ("xy", "scale", "angle", "response", "descriptors")
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays})

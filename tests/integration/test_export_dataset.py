@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from featuredb.errors import ExportError, MissingExtraError
+from featuredb.errors import ExportError
 from featuredb.export.dataset import read_dataset, write_dataset
 from featuredb.export.job import size_of
 from featuredb.export.selection import Selection
@@ -24,7 +24,7 @@ from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
 from featuredb.store.encode import content_digest
 from featuredb.store.snapshot import Snapshot
-from tests.support.datasets import EVERYTHING, export, files_of, job_of, varied_database
+from tests.support.datasets import export, files_of, job_of, varied_database
 from tests.support.maps import assert_same_map, random_map
 
 
@@ -255,7 +255,7 @@ def test_the_picture_shows_every_place(folder: Path) -> None:
 def test_large_tables_are_cut_between_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from featuredb.export.dataset import partitions
 
-    monkeypatch.setattr(partitions.PartitionFiles.__init__, "__defaults__", (100,))
+    monkeypatch.setattr(partitions, "LARGEST_ROWS", 100)
     database = Database.create(tmp_path / "db")
     for k in range(5):
         database.commit_map(random_map(k))
@@ -265,18 +265,3 @@ def test_large_tables_are_cut_between_maps(tmp_path: Path, monkeypatch: pytest.M
     found = {m.map_id: m for m in read_dataset(tmp_path / "out")}
     for k in range(5):
         assert_same_map(found[f"map-{k}"], random_map(k))
-
-
-def test_without_pystac_it_says_which_extra(
-    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import pystac
-
-    with monkeypatch.context() as patch:
-        patch.setattr(pystac, "get_stac_version", lambda: "1.1.0")
-        with pytest.raises(MissingExtraError, match=r"writes STAC 1\.0\.0, found one that writes 1\.1\.0"):
-            export(database, tmp_path / "out", EVERYTHING)
-    monkeypatch.setitem(sys.modules, "pystac", None)
-    with pytest.raises(MissingExtraError, match=r"featuredb\[dataset\]"):
-        export(database, tmp_path / "out", EVERYTHING)
-    assert list(tmp_path.iterdir()) == []

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from featuredb.export.selection import licence_of
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.store.durable.log import utc
+from featuredb.store.tables import BOUNDS
 
 # Of each map, for the picture; more would not show.
 _DRAWN_POINTS = 1500
@@ -41,6 +43,11 @@ class MapEntry:
     @property
     def map_id(self) -> str:
         return str(self.row["map_id"])
+
+    @property
+    def plan_box(self) -> list[float]:
+        """Smallest easting and northing, largest ones of its points, metres; empty without points."""
+        return [self.row[name] for name in (*BOUNDS[0:2], *BOUNDS[3:5])] if self.row["points"] else []
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +89,7 @@ def entry_of(feature_map: FeatureMap, row: dict[str, Any]) -> MapEntry:
     """What is kept of a map when it has passed."""
     step = max(1, len(feature_map.points) // _DRAWN_POINTS)
     centers = np.array([i.cam_from_local.center for i in feature_map.images], np.float64).reshape(-1, 3)
-    times = [_aware(i.capture_time) for i in feature_map.images if i.capture_time is not None]
+    times = [utc(i.capture_time) for i in feature_map.images if i.capture_time is not None]
     return MapEntry(
         row=row,
         footprint=footprint_of(feature_map),
@@ -96,10 +103,6 @@ def entry_of(feature_map: FeatureMap, row: dict[str, Any]) -> MapEntry:
 
 def _lon_lat(lat_lon_h: FloatArray) -> FloatArray:
     return np.ascontiguousarray(lat_lon_h[:, 1::-1])
-
-
-def _aware(time: datetime) -> datetime:
-    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
 
 
 def _around(west: FloatArray, east: FloatArray) -> tuple[float, float]:

@@ -89,30 +89,19 @@ def _places(contents: Contents) -> str:
         for e in shown
     ]
     more = len(contents.maps) - len(shown)
-    return (
-        "## Where\n"
-        + _prose(
+    about = (
+        *("map", "name", "status", "placed", "zone", "heights", "images", "points"),
+        "west, south, east, north",
+    )
+    return _section(
+        "Where",
+        _prose(
             f"Places: {len(places_of(contents))}. Coordinates are UTM on WGS84, in metres; heights are "
             "counted from what is named here, and nothing has been converted."
-        )
-        + "\n"
-        + _table(("zone", "heights", "CRS of the files", "maps", "images", "points"), rows)
-        + "\n"
-        + _table(
-            (
-                "map",
-                "name",
-                "status",
-                "placed",
-                "zone",
-                "heights",
-                "images",
-                "points",
-                "west, south, east, north",
-            ),
-            maps,
-        )
-        + (f"\nand {more:,} more, in `{layout.MAPS}`.\n" if more else "")
+        ),
+        _table(("zone", "heights", "CRS of the files", "maps", "images", "points"), rows),
+        _table(about, maps),
+        *([f"and {more:,} more, in `{layout.MAPS}`.\n"] if more else []),
     )
 
 
@@ -120,14 +109,13 @@ def _licences(contents: Contents) -> str:
     rows = [
         (_plain(name) or "not stated", f"{count:,}") for name, count in sorted(contents.licences().items())
     ]
-    return (
-        "## Licences\n"
-        + _prose(
+    return _section(
+        "Licences",
+        _prose(
             "Of the photos that the maps were made of; owner, licence and capture time of each are in "
             f"`{ATTRIBUTION}`. The photos themselves are not part of the dataset."
-        )
-        + "\n"
-        + _table(("licence", "photos"), rows)
+        ),
+        _table(("licence", "photos"), rows),
     )
 
 
@@ -138,19 +126,17 @@ def _made(contents: Contents, description: Mapping[str, Any]) -> str:
         for name, count in sorted(contents.count("extractor_fingerprint").items())
     ]
     chosen = "; ".join(f"{k}: {_words(v)}" for k, v in description["selection"].items() if v)
-    return (
-        "## How it was made\n"
-        + _prose(
+    return _section(
+        "How it was made",
+        _prose(
             "SIFT keypoints were matched between photos, reconstructed by structure from motion and placed "
             "on Earth. What was placed by other maps hangs on them (`parents`, `lineage`). Options, versions "
             f"and the figures behind each placement are in `{layout.MAPS}` (`provenance`, "
             "`placement_evidence`)."
-        )
-        + "\n"
-        + _table(("placed", "maps"), methods)
-        + "\n"
-        + _table(("descriptors of", "maps"), extractors)
-        + f"\nSelected of the snapshot: {chosen}.\n"
+        ),
+        _table(("placed", "maps"), methods),
+        _table(("descriptors of", "maps"), extractors),
+        f"Selected of the snapshot: {chosen}.\n",
     )
 
 
@@ -171,21 +157,19 @@ def _files(folder: Path, contents: Contents) -> str:
         *([row(f"{FOLDER}/*.parquet", "maps without a place, own frames; Parquet")] if own else []),
         row(ATTRIBUTION, "every photo's owner, licence and capture time; CSV"),
     ]
-    return (
-        "## Files\n"
-        + _table(("file", "bytes", "what"), rows)
-        + "\n"
-        + _prose(
+    return _section(
+        "Files",
+        _table(("file", "bytes", "what"), rows),
+        _prose(
             f"`{layout.STAC}/collection.json` is a STAC 1.0 catalogue with an item for each map, "
             f"`{layout.DESCRIPTION}` says what this is for programs, `{SUMS}` lists every file: "
             f"`sha256sum --check {SUMS}`."
-        )
-        + "\n"
-        + _prose(
+        ),
+        _prose(
             "Files of points and images are named by zone, height datum and number, since a GeoParquet "
             "column has one reference system. A map is in one file of each table, which its row in "
             f"`{layout.MAPS}` names."
-        )
+        ),
     )
 
 
@@ -207,20 +191,23 @@ def _scans(contents: Contents) -> str:
         )
         for s in contents.scans
     ]
-    return (
-        "## LiDAR\n"
-        + _prose(
+    return _section(
+        "LiDAR",
+        _prose(
             "The tiles of 512 m that touch the maps, with coordinates rounded to a millimetre; "
             f"`{layout.LIDAR}/scans.json` has all that is known of the scans."
-        )
-        + "\n"
-        + _table(("scan", "name", "licence", "zone", "heights", "tiles", "points"), rows)
+        ),
+        _table(("scan", "name", "licence", "zone", "heights", "tiles", "points"), rows),
     )
 
 
 def _columns(title: str, table: columns.Columns) -> str:
     rows = [(f"`{f.name}`", str(f.type), table.meaning[f.name]) for f in table.schema]
     return f"\n### {title}\n" + _table(("column", "type", "what"), rows)
+
+
+def _section(title: str, *parts: str) -> str:
+    return f"## {title}\n" + "\n".join(parts)
 
 
 def _prose(text: str) -> str:

@@ -14,10 +14,8 @@ from featuredb.extras import require
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geo.utm import geodetic_from_utm, utm_from_geodetic
 from featuredb.store.scans import ScanSummary, list_scans
-from featuredb.store.tables import BOUNDS
 
 SCANS = f"{layout.LIDAR}/scans.json"
-_BOX = [BOUNDS[i] for i in (0, 1, 3, 4)]  # min easting, min northing, max easting, max northing
 
 
 def check_lidar() -> None:
@@ -68,13 +66,11 @@ def touched_tiles(scan: ScanSummary, maps: Iterable[MapEntry]) -> set[str]:
     own = set(scan.row["tiles"])
     found: set[str] = set()
     for entry in maps:
-        if entry.row[_BOX[0]] is None:
-            continue
-        box = [float(entry.row[name]) for name in _BOX]
-        if entry.partition.epsg != scan.epsg:
+        box = entry.plan_box
+        if box and entry.partition.epsg != scan.epsg:
             box = _in_zone(box, entry.partition.epsg, scan)
-        if box and scan.box.touches(box[0], box[1], box[2], box[3]):
-            found |= own & set(tiles_touching(box[0], box[1], box[2], box[3]))
+        if box and scan.box.touches(*box):
+            found |= own & set(tiles_touching(*box))
     return found
 
 

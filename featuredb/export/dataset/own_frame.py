@@ -48,10 +48,6 @@ class OwnFrameFiles:
             if len(rows):
                 self._open[table].write(rows.cast(SPECS[table].schema))
 
-    def total(self, column: str) -> int:
-        """Sum of `images`, `points`, `observations` or `descriptors`."""
-        return sum(int(row[column]) for row in self.rows)
-
     def __enter__(self) -> "OwnFrameFiles":
         return self
 

@@ -18,7 +18,8 @@ from featuredb.store.encode import EncodedMap
 
 COLUMNS = {POINTS: columns.POINTS, IMAGES: columns.IMAGES, OBSERVATIONS: columns.OBSERVATIONS}
 
-# Half a gigabyte of observations: few files, and none that a viewer or an upload chokes on.
+# A map after which a file has more begins the next one. Half a gigabyte of observations: few files, and none
+# that a viewer or an upload chokes on.
 LARGEST_ROWS = 4_000_000
 
 
@@ -29,12 +30,8 @@ class PartitionFiles:
     rows of one map only, so that reading a map reads nothing else.
     """
 
-    def __init__(self, folder: Path, largest_rows: int = LARGEST_ROWS) -> None:
-        """
-        Args:
-            largest_rows: a map after which a file has more begins the next one.
-        """
-        self._folder, self._largest_rows = folder, largest_rows
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._open: dict[tuple[str, Partition], TableFile] = {}
         self._number: dict[tuple[str, Partition], int] = {}
 
@@ -50,7 +47,7 @@ class PartitionFiles:
     def _append(self, table: str, partition: Partition, feature_map: FeatureMap, stored: pa.Table) -> str:
         key = (table, partition)
         file = self._open.get(key)
-        if file is not None and file.rows >= self._largest_rows:
+        if file is not None and file.rows >= LARGEST_ROWS:
             file.close()
             file = None
         if file is None:

@@ -1,23 +1,23 @@
-"""The STAC 1.0 catalogue: a collection, and an item for each map, with the projection extension."""
+"""The STAC 1.0 catalogue: a collection, and an item for each map, with the projection extension 1.1.
+
+https://github.com/radiantearth/stac-spec/tree/v1.0.0 is the source of every field here.
+"""
 
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from featuredb.errors import MissingExtraError
 from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.contents import Contents, MapEntry
-from featuredb.extras import require
 from featuredb.geo.crs.wkt import utm_projjson
-from featuredb.store.tables import BOUNDS
 
 STAC_VERSION = "1.0.0"
+PROJECTION = "https://stac-extensions.github.io/projection/v1.1.0/schema.json"
 COLLECTION = f"{layout.STAC}/collection.json"
 _PARQUET = "application/vnd.apache.parquet"
 _LAZ = "application/vnd.laszip"
-_BOX = [BOUNDS[i] for i in (0, 1, 3, 4)]  # min easting, min northing, max easting, max northing
 _PARTS = {
     "points": "points, GeoParquet; the map's rows have its map_id",
     "images": "images with their poses, GeoParquet; the map's rows have its map_id",
@@ -25,131 +25,87 @@ _PARTS = {
 }
 
 
-def check_stac() -> None:
-    """Refuse early where the catalogue could not be made.
-
-    Raises:
-        MissingExtraError: pystac is not installed, or one that writes another version of STAC.
-    """
-    require("dataset", "A dataset's catalogue", "pystac")
-    import pystac
-
-    found = pystac.get_stac_version()
-    if found != STAC_VERSION:
-        raise MissingExtraError(
-            f"expected a pystac that writes STAC {STAC_VERSION}, found one that writes {found}; "
-            "install it by: pip install 'featuredb[dataset]'"
-        )
-
-
 def write_catalogue(contents: Contents, description: Mapping[str, Any], folder: Path) -> None:
-    """Write `stac/collection.json` and `stac/items/*.json`, with relative links to the files beside them."""
-    import pystac
+    """Write `stac/collection.json` and `stac/items/*.json`.
 
-    collection = pystac.Collection(
-        id=description["name"],
-        title=description["name"],
-        description=_about(description),
-        extent=_extent(contents, description),
-        license=_licence(contents),
-        href=str(folder / COLLECTION),
-    )
-    for name, title, kind in (
-        (layout.MAPS, "the maps", _PARQUET),
-        (layout.CAMERAS, "the cameras", _PARQUET),
-        (ATTRIBUTION, "owner and licence of every photo", "text/csv"),
-        (layout.DATASHEET, "datasheet", "text/markdown"),
-        (layout.PICTURE, "coverage", "image/png"),
-    ):
-        role = "thumbnail" if kind == "image/png" else "metadata"
-        collection.add_asset(name, pystac.Asset(f"../{name}", title=title, media_type=kind, roles=[role]))
-    for scan in contents.scans:
-        for tile in scan["tiles"]:
-            collection.add_asset(
-                tile["file"],
-                pystac.Asset(f"../{tile['file']}", title="LiDAR tile", media_type=_LAZ, roles=["data"]),
-            )
-    items = [_item(entry) for entry in contents.maps]
-    for item in items:
-        item.set_self_href(str(folder / layout.STAC / "items" / f"{layout.file_name(item.id)}.json"))
-        collection.add_link(pystac.Link(pystac.RelType.ITEM, _item_href(item.id), pystac.MediaType.JSON))
-        item.add_links(
-            [
-                pystac.Link(rel, "../collection.json", pystac.MediaType.JSON)
-                for rel in (pystac.RelType.ROOT, pystac.RelType.PARENT, pystac.RelType.COLLECTION)
-            ]
+    Links and files are said relative to the document, so that the folder may lie anywhere; none to itself.
+    """
+    time = datetime.fromisoformat(description["snapshot_time"])
+    assets = {
+        name: _asset(f"../{name}", title, kind, "thumbnail" if kind == "image/png" else "metadata")
+        for name, title, kind in (
+            (layout.MAPS, "the maps", _PARQUET),
+            (layout.CAMERAS, "the cameras", _PARQUET),
+            (ATTRIBUTION, "owner and licence of every photo", "text/csv"),
+            (layout.DATASHEET, "datasheet", "text/markdown"),
+            (layout.PICTURE, "coverage", "image/png"),
         )
-        item.collection_id = collection.id
-        _write(item, folder / layout.STAC / "items" / f"{layout.file_name(item.id)}.json")
-    _write(collection, folder / COLLECTION)
+    }
+    for tile in (tile for scan in contents.scans for tile in scan["tiles"]):
+        assets[tile["file"]] = _asset(f"../{tile['file']}", "LiDAR tile", _LAZ, "data")
+    items = {f"items/{layout.file_name(entry.map_id)}.json": entry for entry in contents.maps}
+    collection = {
+        "type": "Collection",
+        "stac_version": STAC_VERSION,
+        "id": description["name"],
+        "title": description["name"],
+        "description": (
+            f"{description['maps']} geo-registered feature maps with {description['images']} photos' poses, "
+            f"{description['points']} points and {description['descriptors']} descriptors; see README.md"
+        ),
+        "license": _licence(contents),
+        "extent": {
+            "spatial": {"bbox": [list(contents.bbox())]},
+            "temporal": {"interval": [[_time(t) for t in contents.taken() or (time, time)]]},
+        },
+        "assets": assets,
+        "links": [*(_link("item", f"./{name}") for name in items), _link("root", "./collection.json")],
+    }
+    for name, entry in items.items():
+        layout.write_json(folder / layout.STAC / name, _item(entry, collection["id"]))
+    layout.write_json(folder / COLLECTION, collection)
 
 
-def _item_href(map_id: str) -> str:
-    return f"./items/{layout.file_name(map_id)}.json"
+def _asset(href: str, title: str, kind: str, role: str) -> dict[str, Any]:
+    return {"href": href, "title": title, "type": kind, "roles": [role]}
 
 
-def _write(thing: Any, path: Path) -> None:
-    """As JSON. Links say where things are from here, so that the folder may lie anywhere; none to itself."""
-    document = thing.to_dict(include_self_link=False, transform_hrefs=False)
-    if document["type"] == "Collection":
-        document["links"] = [link for link in document["links"] if link["rel"] != "root"] + [
-            {"rel": "root", "href": "./collection.json", "type": "application/json"}
-        ]
-    layout.write_json(path, document)
+def _link(rel: str, href: str) -> dict[str, str]:
+    return {"rel": rel, "href": href, "type": "application/json"}
 
 
-def _item(entry: MapEntry) -> Any:
-    import pystac
-    from pystac.extensions.projection import ProjectionExtension
-
-    row, taken = entry.row, entry.taken
-    single = (
-        None if taken is not None and taken[0] != taken[1] else (taken[0] if taken else row["created_at"])
-    )
-    item = pystac.Item(
-        id=entry.map_id,
-        geometry=entry.footprint.geometry,
-        bbox=list(entry.footprint.bbox),
-        datetime=single,
-        properties=_properties(entry),
-        start_datetime=taken[0] if taken and single is None else None,
-        end_datetime=taken[1] if taken and single is None else None,
-    )
-    projection = ProjectionExtension.ext(item, add_if_missing=True)
-    projection.epsg = row["epsg"]
-    projection.projjson = utm_projjson(row["epsg"], row["height_datum"])
-    if row["points"]:
-        projection.bbox = [row[name] for name in _BOX]
-    for table, title in _PARTS.items():
-        name = row[f"{table}_file"]
-        if name is not None:
-            item.add_asset(
-                table, pystac.Asset(f"../../{name}", title=title, media_type=_PARQUET, roles=["data"])
-            )
-    return item
-
-
-def _properties(entry: MapEntry) -> dict[str, Any]:
+def _item(entry: MapEntry, collection: str) -> dict[str, Any]:
     row = entry.row
+    first, last = entry.taken or (row["created_at"], row["created_at"])
     names = ("status", "method", "generation", "parents", "images", "points", "observations", "height_datum")
-    licences = {licence or "not stated": count for licence, count in sorted(entry.licences.items())}
-    return {
+    properties = {
         "title": row["name"],
         "created": _time(row["created_at"]),
+        "datetime": _time(first) if first == last else None,
+        **({} if first == last else {"start_datetime": _time(first), "end_datetime": _time(last)}),
         **{f"featuredb:{name}": row[name] for name in names},
-        "featuredb:licences": licences,
+        "featuredb:licences": {licence or "not stated": count for licence, count in entry.licences.items()},
         "featuredb:descriptors": row["extractor_fingerprint"],
+        "proj:epsg": row["epsg"],
+        "proj:projjson": utm_projjson(row["epsg"], row["height_datum"]),
+        **({"proj:bbox": entry.plan_box} if row["points"] else {}),
     }
-
-
-def _extent(contents: Contents, description: Mapping[str, Any]) -> Any:
-    import pystac
-
-    taken = contents.taken()
-    time = datetime.fromisoformat(description["snapshot_time"])
-    first, last = taken or (time, time)
-    boxes = [list(contents.bbox())]
-    return pystac.Extent(pystac.SpatialExtent(boxes), pystac.TemporalExtent([[first, last]]))
+    return {
+        "type": "Feature",
+        "stac_version": STAC_VERSION,
+        "stac_extensions": [PROJECTION],
+        "id": entry.map_id,
+        "collection": collection,
+        "geometry": entry.footprint.geometry,
+        "bbox": list(entry.footprint.bbox),
+        "properties": properties,
+        "assets": {
+            table: _asset(f"../../{row[f'{table}_file']}", title, _PARQUET, "data")
+            for table, title in _PARTS.items()
+            if row[f"{table}_file"] is not None
+        },
+        "links": [_link(rel, "../collection.json") for rel in ("root", "parent", "collection")],
+    }
 
 
 def _licence(contents: Contents) -> str:
@@ -158,13 +114,6 @@ def _licence(contents: Contents) -> str:
     if len(found) > 1:
         return "various"
     return next(iter(found), "") or "proprietary"
-
-
-def _about(description: Mapping[str, Any]) -> str:
-    return (
-        f"{description['maps']} geo-registered feature maps with {description['images']} photos' poses, "
-        f"{description['points']} points and {description['descriptors']} descriptors; see README.md"
-    )
 
 
 def _time(time: datetime) -> str:

@@ -13,7 +13,7 @@ and names follow from ids.
 """
 
 import json
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +31,16 @@ from featuredb.export.dataset.lidar_part import check_lidar, write_scans
 from featuredb.export.dataset.own_frame import OwnFrameFiles
 from featuredb.export.dataset.partitions import PartitionFiles
 from featuredb.export.dataset.picture import write_picture
-from featuredb.export.dataset.stac import check_stac, write_catalogue
+from featuredb.export.dataset.stac import write_catalogue
 from featuredb.export.dataset.sums import write_sums
-from featuredb.export.job import Exported, ExportJob, size_of, whole_or_nothing
+from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store.encode import encode_map
 from featuredb.store.snapshot import MapSummary, UnplacedSummary
 
-# Rows of maps.parquet and cameras.parquet that are kept before they are written.
+# Of maps.parquet, in a row group.
 _ROWS_AT_ONCE = 256
 
 
@@ -52,10 +52,9 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
 
     Raises:
         ExportError: nothing is selected, or `job.out` is not free.
-        MissingExtraError: pystac (extra `dataset`) or, with `with_lidar`, laspy (extra `lidar`) is missing.
+        MissingExtraError: with `with_lidar`, laspy (extra `lidar`) is missing.
         StoreError: the database cannot be read.
     """
-    check_stac()
     if with_lidar:
         check_lidar()
     with whole_or_nothing(job.out) as folder:
@@ -69,26 +68,15 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
         write_datasheet(contents, description, folder)
         write_catalogue(contents, description, folder)
         write_sums(folder)
-        size = size_of(folder)
-    return Exported(
-        maps=len(contents.maps) + len(own.rows),
-        images=contents.total("images") + own.total("images"),
-        points=contents.total("points") + own.total("points"),
-        observations=contents.total("observations") + own.total("observations"),
-        bytes=size,
-    )
+        return job.exported(folder)
 
 
 def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
     """All tables and the attribution, with one map in memory at a time."""
     contents, lineages = Contents(), job.snapshot.lineages()
     credits: list[Attribution] = []
-    with (
-        PartitionFiles(folder) as files,
-        _RowFile(GeoFile(folder / layout.MAPS, MAPS.schema, MAPS.repeating, None), MAPS.schema) as maps,
-        _RowFile(TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()), CAMERAS.schema) as cameras,
-        OwnFrameFiles(folder) as own,
-    ):
+    cameras: list[dict[str, Any]] = []
+    with PartitionFiles(folder) as files, OwnFrameFiles(folder) as own:
         for feature_map in job.any_maps():
             credits += attribution_of(feature_map)
             if isinstance(feature_map, UnplacedMap):
@@ -96,11 +84,8 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
                 continue
             row = _write_rows(feature_map, job.snapshot.get(feature_map.map_id), files)
             row["lineage"] = _lineage_json(lineages[feature_map.map_id])
-            entry = entry_of(feature_map, row)
-            contents.maps.append(entry)
-            maps.add(_area_columns(entry))
-            for camera in _camera_rows(feature_map):
-                cameras.add(camera)
+            contents.maps.append(entry_of(feature_map, row))
+            cameras += _camera_rows(feature_map)
             del feature_map  # before the next one is loaded
     write_attribution(folder, credits)
     if not contents.maps:
@@ -108,6 +93,9 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
         raise ExportError(
             "a dataset says where maps lie: expected one with a place in the selection, found none"
         )
+    _write_areas(contents.maps, folder)
+    with TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()) as file:
+        file.write(pa.Table.from_pylist(cameras, schema=CAMERAS.schema))
     return contents, own
 
 
@@ -126,46 +114,20 @@ def _write_rows(feature_map: FeatureMap, summary: MapSummary, files: PartitionFi
     return encoded.row
 
 
-class _RowFile:
-    """Rows one by one into a table's file, some hundred at a time."""
-
-    def __init__(self, file: TableFile, schema: pa.Schema) -> None:
-        self._file, self._schema = file, schema
-        self._rows: list[dict[str, Any]] = []
-
-    def add(self, row: dict[str, Any]) -> None:
-        self._rows.append(row)
-        if len(self._rows) == _ROWS_AT_ONCE:
-            self._flush()
-
-    def _flush(self) -> None:
-        if not self._rows:
-            return
-        if isinstance(self._file, GeoFile):
-            boxes = np.array([list(row["bbox"].values()) for row in self._rows])
-            kinds = {row.pop("kind") for row in self._rows}
-            self._file.covers(kinds, boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0))
-        self._file.write(pa.Table.from_pylist(self._rows, schema=self._schema))
-        self._rows.clear()
-
-    def __enter__(self) -> "_RowFile":
-        return self
-
-    def __exit__(self, failed: object, *more: object) -> None:
-        if failed is None:
-            self._flush()
-        self._file.close()
-
-
-def _area_columns(entry: MapEntry) -> dict[str, Any]:
-    west, south, east, north = entry.footprint.bbox
-    if west > east:  # readers compare numbers: a box that begins in the east would never be found
-        west, east = -180.0, 180.0
-    return entry.row | {
-        "geometry": wkb_of(entry.footprint.geometry),
-        "kind": entry.footprint.geometry["type"],
-        "bbox": {"xmin": west, "ymin": south, "xmax": east, "ymax": north},
-    }
+def _write_areas(maps: list[MapEntry], folder: Path) -> None:
+    """maps.parquet, in small row groups: provenance and evidence make rows long."""
+    rows = []
+    with GeoFile(folder / layout.MAPS, MAPS.schema, MAPS.repeating, None) as file:
+        for entry in maps:
+            west, south, east, north = entry.footprint.bbox
+            if west > east:  # readers compare numbers: a box that begins in the east would never be found
+                west, east = -180.0, 180.0
+            geometry = entry.footprint.geometry
+            file.covers([geometry["type"]], np.array([west, south]), np.array([east, north]))
+            box = {"xmin": west, "ymin": south, "xmax": east, "ymax": north}
+            rows.append(entry.row | {"geometry": wkb_of(geometry), "bbox": box})
+        for start in range(0, len(rows), _ROWS_AT_ONCE):
+            file.write(pa.Table.from_pylist(rows[start : start + _ROWS_AT_ONCE], schema=MAPS.schema))
 
 
 def _camera_rows(feature_map: FeatureMap) -> list[dict[str, Any]]:
@@ -204,7 +166,7 @@ def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict
         "name": job.database.name,
         "snapshot": job.snapshot.version,
         "snapshot_time": job.snapshot.timestamp.isoformat(),
-        "featuredb": _own_version(),
+        "featuredb": version("featuredb"),
         "selection": {
             "maps": list(chosen.maps),
             "statuses": list(chosen.statuses),
@@ -218,10 +180,3 @@ def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict
         "scans": len(contents.scans),
         "bbox": list(contents.bbox()),
     }
-
-
-def _own_version() -> str:
-    try:
-        return version("featuredb")
-    except PackageNotFoundError:
-        return "unknown"

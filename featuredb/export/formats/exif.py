@@ -4,6 +4,7 @@ Photos are found by the SHA-256 of their bytes, whatever they are called. Origin
 its segments can be exchanged without touching the picture.
 """
 
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -12,7 +13,6 @@ from featuredb.export.attribution import Attribution, attribution_of, folder_nam
 from featuredb.export.formats.colmap import image_names
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_csv
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
-from featuredb.export.tally import ExportTally
 from featuredb.features.exif.gps_write import GpsFields, with_gps
 from featuredb.features.exif.xmp_write import with_properties
 from featuredb.features.image_header import read_header
@@ -53,14 +53,12 @@ def write_exif(job: ExportJob, photos: Path | None) -> Exported:
     if not photos.is_dir():
         raise ExportError(f"--photos {photos}: expected the folder of the photos, found none")
     found = files_by_sha256(photos)
-    tally = ExportTally()
     files: list[_File] = []
     attribution: list[Attribution] = []
     with whole_or_nothing(job.out) as part:
         part.mkdir()
         for feature_map in job.maps():
             folder = Path(folder_name(feature_map.map_id))
-            written = 0
             names = image_names(feature_map)
             rows = zip(shots_of(feature_map), names, attribution_of(feature_map), strict=True)
             for shot, name, credit in rows:
@@ -68,8 +66,6 @@ def write_exif(job: ExportJob, photos: Path | None) -> Exported:
                 files.append(outcome)
                 if not outcome.reason:
                     attribution.append(credit)
-                    written += 1
-            tally.add(feature_map, images=written)
         if not attribution:
             raise ExportError(
                 f"--photos {photos}: none of the {len(files)} photos of the selected maps can be written; "
@@ -79,7 +75,7 @@ def write_exif(job: ExportJob, photos: Path | None) -> Exported:
             )
         write_csv(part / FILES_TABLE, _File._fields, files)
         write_attribution(part, attribution)
-        return tally.exported(part)
+        return replace(job.exported(part), images=len(attribution))
 
 
 def files_by_sha256(folder: Path) -> dict[str, Path]:

@@ -5,7 +5,6 @@ from typing import Any
 
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.export.tally import ExportTally
 
 
 def write_geojson(job: ExportJob) -> Exported:
@@ -14,7 +13,6 @@ def write_geojson(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    tally = ExportTally()
     with whole_or_nothing(job.out) as part:
         with part.open("w", encoding="utf-8", newline="\n") as out:
             out.write('{"type": "FeatureCollection", "features": [')
@@ -23,9 +21,8 @@ def write_geojson(job: ExportJob) -> Exported:
                 for shot in shots_of(feature_map):
                     out.write(separator + json.dumps(feature(shot), allow_nan=False, ensure_ascii=False))
                     separator = ",\n"
-                tally.add(feature_map)
             out.write("\n]}\n")
-        return tally.exported(part)
+        return job.exported(part)
 
 
 def feature(shot: PosedPhoto) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from featuredb.export.attribution import attribution_of, folder_name, write_attribution
 from featuredb.export.job import Exported, ExportJob, write_json
+from featuredb.export.map_folders import folder_for_each
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.export.tally import folder_for_each
 from featuredb.geo.geopose_documents import advanced, basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
 
@@ -34,13 +34,13 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
     names = _file_names(shots)
     for shot, name in zip(shots, names, strict=True):
         write_json(folder / BASIC / name, basic_ypr(shot.geopose))
-    timed = [(shot, name) for shot, name in zip(shots, names, strict=True) if shot.unix_ms is not None]
+    timed = [(s.unix_ms, s, name) for s, name in zip(shots, names, strict=True) if s.unix_ms is not None]
     if timed:
         (folder / ADVANCED).mkdir()
-        for shot, name in timed:
-            write_json(folder / ADVANCED / name, advanced(shot.geopose, _time(shot)))
-        in_time = sorted((_time(shot), shot.number, shot.geopose) for shot, _ in timed)
-        write_json(folder / SERIES, irregular_series([(unix_ms, pose) for unix_ms, _, pose in in_time]))
+        for unix_ms, shot, name in timed:
+            write_json(folder / ADVANCED / name, advanced(shot.geopose, unix_ms))
+        timed.sort(key=lambda row: (row[0], row[1].number))
+        write_json(folder / SERIES, irregular_series([(unix_ms, shot.geopose) for unix_ms, shot, _ in timed]))
     manifest = {
         "map_id": feature_map.map_id,
         "height_datum": shots[0].height_datum if shots else feature_map.height_datum,
@@ -54,12 +54,6 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
     }
     write_json(folder / MANIFEST, manifest)
     write_attribution(folder, attribution_of(feature_map))
-
-
-def _time(shot: PosedPhoto) -> int:
-    if shot.unix_ms is None:
-        raise ValueError(f"{shot.name}: expected a time with its zone, found {shot.capture_time}")
-    return shot.unix_ms
 
 
 def _file_names(shots: Sequence[PosedPhoto]) -> list[str]:

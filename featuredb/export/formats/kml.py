@@ -5,7 +5,6 @@ from xml.sax.saxutils import escape
 
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
-from featuredb.export.tally import ExportTally
 from featuredb.maps.feature_map import FeatureMap
 
 _NEAR_M = 10.0  # where the picture hangs ahead of the camera
@@ -20,7 +19,6 @@ def write_kml(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    tally = ExportTally()
     with whole_or_nothing(job.out) as part:
         with part.open("w", encoding="utf-8", newline="\n") as out:
             out.write(
@@ -34,9 +32,8 @@ def write_kml(job: ExportJob) -> Exported:
                 )
                 out.writelines(overlay(shot) for shot in shots)
                 out.write("</Folder>\n")
-                tally.add(feature_map)
             out.write("</Document></kml>\n")
-        return tally.exported(part)
+        return job.exported(part)
 
 
 def overlay(shot: PosedPhoto) -> str:
@@ -50,7 +47,9 @@ def overlay(shot: PosedPhoto) -> str:
     altitude, _ = altitude_of(shot)
     left, right, bottom, top = field_of_view_deg(shot)
     where = f"{place.longitude_deg:.10f},{place.latitude_deg:.10f},{altitude:.4f}"
-    when = "" if shot.capture_time is None else f"<TimeStamp><when>{_when(shot)}</when></TimeStamp>"
+    when = ""
+    if shot.capture_time is not None:  # without a zone where the photo names none
+        when = f"<TimeStamp><when>{shot.capture_time.isoformat(timespec='seconds')}</when></TimeStamp>"
     data = "".join(
         f'<Data name="{name}"><value>{_text(value)}</value></Data>'
         for name, value in (
@@ -104,12 +103,6 @@ def _credit(shot: PosedPhoto) -> str:
     horizontal = float((shot.sigma_enu_m[0] ** 2 + shot.sigma_enu_m[1] ** 2) ** 0.5)
     accuracy = f"{horizontal:.2f} m horizontally, {shot.sigma_enu_m[2]:.2f} m vertically"
     return f"{owner}; {licence}; position +- {accuracy}"
-
-
-def _when(shot: PosedPhoto) -> str:
-    """XML's time; without a zone where the photo names none."""
-    assert shot.capture_time is not None
-    return shot.capture_time.isoformat(timespec="seconds")
 
 
 def _text(value: str) -> str:

@@ -8,7 +8,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from featuredb.export.formats.point_files import MapList, sigma_m, zones_of
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
-from featuredb.export.tally import ExportTally
 from featuredb.lidar.formats.las_stream import LasStream, offset_and_step
 
 EXTRA: dict[str, tuple[DTypeLike, str]] = {
@@ -26,7 +25,7 @@ def write_las_files(job: ExportJob, *, compressed: bool) -> Exported:
         ExportError: nothing is selected, no points, or there is something at `job.out`.
         InvalidValueError: maps of one zone too far apart for one file. MissingExtraError: no laspy.
     """
-    zones, tally, maps = zones_of(job.summaries()), ExportTally(), MapList()
+    zones, maps = zones_of(job.summaries()), MapList()
     ending = ".laz" if compressed else ".las"
     with whole_or_nothing(job.out) as part:
         part.mkdir()
@@ -35,7 +34,6 @@ def write_las_files(job: ExportJob, *, compressed: bool) -> Exported:
             for feature_map in job.maps():
                 key = feature_map.epsg, feature_map.height_datum
                 index = maps.add(feature_map, zones[key].name + ending if key in zones else "")
-                tally.add(feature_map)
                 if not len(feature_map.points):
                     continue
                 if key not in streams:
@@ -59,4 +57,4 @@ def write_las_files(job: ExportJob, *, compressed: bool) -> Exported:
                 }
                 streams[key].write(points.utm, columns, points.rgb)
         maps.write(part)
-        return tally.exported(part)
+        return job.exported(part)

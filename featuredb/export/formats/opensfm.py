@@ -16,8 +16,8 @@ from featuredb.export.formats.colmap import image_names
 from featuredb.export.formats.opensfm_camera import opensfm_camera
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob, write_json
+from featuredb.export.map_folders import folder_for_each
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.export.tally import folder_for_each
 from featuredb.geometry.rotation import so3_log
 from featuredb.maps.feature_map import FeatureMap, MapImage
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from featuredb.export.attribution import folder_name
 from featuredb.export.formats.point_files import MapList, Zone, sigma_m, zones_of
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
-from featuredb.export.tally import ExportTally
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import PointColumns
 from featuredb.maps.unplaced_map import UnplacedMap
@@ -41,7 +40,7 @@ def write_ply_files(job: ExportJob) -> Exported:
         ExportError: nothing is selected, no points, or there is something at `job.out`.
     """
     placed = [m for m in job.any_summaries() if isinstance(m, MapSummary)]
-    zones, tally, maps = zones_of(placed) if placed else {}, ExportTally(), MapList()
+    zones, maps = zones_of(placed) if placed else {}, MapList()
     with whole_or_nothing(job.out) as part:
         part.mkdir()
         counts: dict[tuple[int, str], int] = {}
@@ -50,12 +49,10 @@ def write_ply_files(job: ExportJob) -> Exported:
             for feature_map in job.any_maps():
                 if isinstance(feature_map, UnplacedMap):
                     _write_own(part, feature_map, maps)
-                    tally.add(feature_map)
                     continue
                 key = feature_map.epsg, feature_map.height_datum
                 file = f"{zones[key].name}.ply" if key in zones else ""
                 index = maps.add(feature_map, file)
-                tally.add(feature_map)
                 if not len(feature_map.points):
                     continue
                 if key not in bodies:
@@ -68,7 +65,7 @@ def write_ply_files(job: ExportJob) -> Exported:
             _finish(_body(part, zone), part / f"{zone.name}.ply", comment, count)
             (part / f"{zone.name}.wkt").write_text(zone.wkt + "\n", encoding="utf-8")
         maps.write(part)
-        return tally.exported(part)
+        return job.exported(part)
 
 
 def _body(folder: Path, zone: Zone) -> Path:

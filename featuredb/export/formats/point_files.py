@@ -14,6 +14,7 @@ from featuredb.export.job import write_csv
 from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, PointColumns
+from featuredb.maps.move import full_covariances
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store.snapshot import MapSummary
 
@@ -77,10 +78,8 @@ def sigma_m(points: PointColumns) -> NDArray[np.float32]:
 
     Metres; own units of a map without a place.
     """
-    c = points.covariance.astype(np.float64)
-    matrices = c[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    largest = np.linalg.eigvalsh(matrices)[:, -1] if len(c) else np.zeros(0)
-    return np.sqrt(np.maximum(largest, 0.0)).astype(np.float32)
+    largest = np.linalg.eigvalsh(full_covariances(points.covariance))[:, -1]
+    return np.asarray(np.sqrt(np.maximum(largest, 0.0)), np.float32)
 
 
 class MapList:
