@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from featuredb.cli.common import (
 from featuredb.geo.heights import HEIGHT_DATUMS, HEIGHT_UNITS
 
 if TYPE_CHECKING:
-    from featuredb.lidar.add import Progress as Step
+    from featuredb.lidar.add import OnProgress
     from featuredb.store.scans import ScanSummary
 
 _TITLES = {"read": "Reading points", "clean": "Cleaning and ordering", "write": "Writing"}
@@ -205,18 +205,18 @@ def _register_add(commands: Any) -> None:
 
 
 @contextmanager
-def _progress(quiet: bool) -> Iterator[Callable[["Step"], None]]:
+def _progress(quiet: bool) -> Iterator["OnProgress"]:
     """A callback that draws bars on stderr, if somebody watches."""
     bars = count_bars()
     if quiet or not bars.console.is_terminal:
-        yield lambda step: None
+        yield lambda step, done, total: None
         return
     with bars:
         tasks: dict[str, Any] = {}
 
-        def show(step: "Step") -> None:
-            if step.step not in tasks:
-                tasks[step.step] = bars.add_task(_TITLES[step.step], total=step.total)
-            bars.update(tasks[step.step], completed=step.done, total=step.total)
+        def show(step: str, done: int, total: int) -> None:
+            if step not in tasks:
+                tasks[step] = bars.add_task(_TITLES[step], total=total)
+            bars.update(tasks[step], completed=done, total=total)
 
         yield show

@@ -28,20 +28,10 @@ from featuredb.lidar.work import WorkFolder, work_folder
 from featuredb.store import Database
 from featuredb.store.encode import Row
 from featuredb.store.scans import ScanSummary, commit_scan, find_scan, list_scans
-from featuredb.store.tables import BOUNDS
 
 logger = logging.getLogger(__name__)
 
 _LARGEST_8_BIT = 255
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Progress:
-    """How far a job is: points done of all, in a step ("read", "clean", "write")."""
-
-    step: str
-    done: int
-    total: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +56,8 @@ class ScanInput:
     to_utm: UtmTransform
 
 
-OnProgress = Callable[[Progress], None]
+OnProgress = Callable[[str, int, int], None]
+"""Told the step ("read", "clean", "write"), and how many points of how many are done in it."""
 
 
 def add_scan(
@@ -77,7 +68,7 @@ def add_scan(
     *,
     ortho: OrthoChoice | None = None,
     work: Path | None = None,
-    on_progress: OnProgress = lambda progress: None,
+    on_progress: OnProgress = lambda step, done, total: None,
 ) -> AddResult:
     """Add the scan that one or several LAS, LAZ or COPC files, or rasters of heights, make.
 
@@ -119,9 +110,9 @@ def add_scan(
             database,
             row,
             staged.groups(),
-            lambda points: on_progress(Progress(step="write", done=points, total=row["points"])),
+            lambda points: on_progress("write", points, row["points"]),
         )
-        folder.finished()
+        folder.keep = False
     return AddResult(created=created, scan=find_scan(database, scan_id))
 
 
@@ -200,7 +191,7 @@ def _read_all(
             number,
             (read_dsm if is_raster(item.file.path) else read_points)(item.file.path, options.chunk_points),
             item.to_utm.apply,
-            lambda read: on_progress(Progress(step="read", done=read, total=total)),
+            lambda read: on_progress("read", read, total),
         )
     counts = spill.counts
     if counts.kept == 0:
@@ -219,7 +210,7 @@ def _read_all(
         colour_bits=tuple(_colour_bits(largest) for largest in counts.largest_rgb),
         blocks=tuple(spill.split(options.block_points)),
     )
-    folder.write("spill.json", plan.to_json())
+    folder.write("spill.json", asdict(plan))
     folder.keep = True
     return plan
 
@@ -243,7 +234,7 @@ def _clean_all(
         if not staged.has(block):
             staged.put(block, *clean_block(spill, plan, block, options.outliers, colouring))
         done += block.points
-        on_progress(Progress(step="clean", done=done, total=total))
+        on_progress("clean", done, total)
     return staged
 
 
@@ -256,7 +247,7 @@ def _row(
     labels: ScanLabels,
 ) -> Row:
     """The scan's row in `lidar`."""
-    crs, counts = inputs[0].crs, staged.counts()
+    crs = inputs[0].crs
     notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
     return {
         "scan_id": scan_id,
@@ -264,16 +255,12 @@ def _row(
         "files": [_file_row(item) for item in inputs],
         "epsg": inputs[0].to_utm.epsg,
         "height_datum": crs.height_datum,
-        **dict(zip(BOUNDS, (*counts.low, *counts.high), strict=True)),
+        **staged.totals(),
         "tiles": sorted({block.tile for block in plan.blocks}),
-        "points": counts.points,
         "points_in_files": plan.read,
         "dropped_noise": plan.noise,
         "dropped_withheld": plan.withheld,
-        "dropped_outliers": counts.outliers,
-        "level_points": list(counts.level_points),
         "spacing_m": plan.spacing_m,
-        "classes": [{"classification": c, "points": n} for c, n in sorted(counts.classes.items())],
         "colour": "file" if any(plan.colour_bits) else "",
         "ortho": "",
         "has_intensity": plan.stretch is not None,

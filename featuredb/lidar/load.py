@@ -27,16 +27,8 @@ _GREY = 128  # of points that have neither colour nor intensity in a cloud that 
 PlanBox = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoadOptions:
-    """How much of a scan is loaded.
-
-    Attributes:
-        largest_points: finer levels are left out from the one on that would exceed this many points.
-    """
-
-    # About 30 bytes each in memory, and what two cores draw ten times a second.
-    largest_points: int = 20_000_000
+# About 30 bytes each in memory, and what two cores draw ten times a second.
+_LARGEST_POINTS = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +58,7 @@ def load_cloud(
     box_local: PlanBox | None = None,
     *,
     scan_ids: Sequence[str] | None = None,
-    options: LoadOptions | None = None,
+    largest_points: int = _LARGEST_POINTS,
 ) -> PointCloud:
     """The points of all scans, or of some, around a place.
 
@@ -77,6 +69,7 @@ def load_cloud(
         box_local: (east0, north0, east1, north1) metres in `frame`; what lies in the box is loaded, and a
             little around it where the frame is turned against the UTM grid. None for everything.
         scan_ids: the scans to load; None for all that are not retired.
+        largest_points: finer levels are left out from the one on that would exceed this many points.
 
     Returns:
         The cloud, with levels as they are stored: level l has a point every 4 m / 2^l. Without any point
@@ -89,7 +82,6 @@ def load_cloud(
     """
     if not isinstance(database, Database):
         database = Database.open(database)
-    options = options or LoadOptions()
     scans = _chosen(database, scan_ids)
     boxes = {scan.scan_id: _utm_box(frame, box_local, scan.epsg) for scan in scans}
     touched = [s for s in scans if (b := boxes[s.scan_id]) is None or s.box.touches(*b)]
@@ -100,10 +92,10 @@ def load_cloud(
     total = 0
     for level in range(max((len(scan.level_points) for scan in touched), default=0)):
         total += sum(count_points(database, scan, level, boxes[scan.scan_id]) for scan in touched)
-        if total > options.largest_points:
+        if total > largest_points:
             if level == 0:
                 raise ScanError(
-                    f"expected at most {options.largest_points} points, found {total} in the coarsest level "
+                    f"expected at most {largest_points} points, found {total} in the coarsest level "
                     "alone; ask for a smaller area"
                 )
             break

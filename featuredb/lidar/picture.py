@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ScanError
-from featuredb.lidar.load import LoadOptions, load_cloud, scan_frame
+from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary
@@ -31,7 +31,7 @@ def write_plan_view(database: Database, scan: ScanSummary, path: Path) -> None:
         database,
         scan_frame(scan),
         scan_ids=[scan.scan_id],
-        options=LoadOptions(largest_points=_LARGEST_POINTS),
+        largest_points=_LARGEST_POINTS,
     )
     image, pixel_m = plan_view(cloud, scan.spacing_m)
     shown = "colours" if cloud.rgb is not None else "intensity" if cloud.intensity is not None else "heights"

@@ -3,7 +3,7 @@
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from featuredb.errors import ScanError
 from featuredb.lidar.intensity import IntensityStretch
 from featuredb.lidar.spill import TileBlock
+from featuredb.store.encode import Row
 from featuredb.store.scans import TilePoints
+from featuredb.store.tables import BOUNDS
 
 # Tiles are committed together until they have this many points: fewer, larger commits.
 _POINTS_PER_COMMIT = 5_000_000
@@ -42,13 +44,9 @@ class BlockPlan:
     colour_bits: tuple[int, ...]
     blocks: tuple[TileBlock, ...]
 
-    def to_json(self) -> dict[str, Any]:
-        """As JSON can hold it."""
-        return asdict(self)
-
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> "BlockPlan":
-        """The inverse of `to_json`."""
+        """The inverse of `asdict`, through JSON."""
         stretch = value["stretch"]
         return cls(
             **{
@@ -58,18 +56,6 @@ class BlockPlan:
                 "blocks": tuple(TileBlock(**block) for block in value["blocks"]),
             }
         )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StagedCounts:
-    """What all finished blocks hold together; low and high are the corners of their box, UTM."""
-
-    points: int
-    outliers: int
-    level_points: tuple[int, ...]
-    classes: dict[int, int]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
 
 
 class Staged:
@@ -109,8 +95,8 @@ class Staged:
         )
         done.replace(self._path(block, "json"))
 
-    def counts(self) -> StagedCounts:
-        """Counts and box of all blocks.
+    def totals(self) -> Row:
+        """What all blocks hold together, by columns of the table `lidar`: counts, and their box in UTM.
 
         Raises:
             ScanError: no point is left.
@@ -127,14 +113,13 @@ class Staged:
             )
         low = np.min([f["low"] for f in facts if f["low"]], axis=0)
         high = np.max([f["high"] for f in facts if f["high"]], axis=0)
-        return StagedCounts(
-            points=points,
-            outliers=outliers,
-            level_points=tuple(np.sum([f["levels"] for f in facts], axis=0).tolist()),
-            classes=dict(classes),
-            low=tuple(low.tolist()),
-            high=tuple(high.tolist()),
-        )
+        return {
+            **dict(zip(BOUNDS, (*low.tolist(), *high.tolist()), strict=True)),
+            "points": points,
+            "dropped_outliers": outliers,
+            "level_points": np.sum([f["levels"] for f in facts], axis=0).tolist(),
+            "classes": [{"classification": c, "points": n} for c, n in sorted(classes.items())],
+        }
 
     def groups(self) -> list[Callable[[], Iterator[TilePoints]]]:
         """What is to be committed, tile after tile."""

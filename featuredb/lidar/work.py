@@ -39,10 +39,6 @@ class WorkFolder:
         temporary.write_text(json.dumps(value))
         temporary.replace(self.path / name)
 
-    def finished(self) -> None:
-        """Nothing of it is needed any more."""
-        self.keep = False
-
 
 @contextmanager
 def work_folder(database: Database, work: Path | None, name: str, points: int) -> Iterator[WorkFolder]:

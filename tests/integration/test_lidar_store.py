@@ -25,9 +25,9 @@ from featuredb.errors import (
     ScanNotFoundError,
 )
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.lidar.add import Progress, add_scan
+from featuredb.lidar.add import add_scan
 from featuredb.lidar.formats.geotiff import write_geotiff
-from featuredb.lidar.load import LoadOptions, load_cloud, scan_frame
+from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 from featuredb.lidar.work import work_folder
 from featuredb.store import Database
@@ -219,11 +219,11 @@ def test_blocks_do_not_show_in_the_result(tmp_path: Path) -> None:
 def test_a_job_that_was_stopped_goes_on(database: Database, tmp_path: Path) -> None:
     path = write_scan(tmp_path / "a.laz", grid_points(6000))
     options = AddOptions(block_points=800)
-    seen: list[Progress] = []
+    seen: list[str] = []
 
-    def stop_in_the_middle(progress: Progress) -> None:
-        seen.append(progress)
-        if progress.step == "clean" and progress.done > 3000:
+    def stop_in_the_middle(step: str, done: int, total: int) -> None:
+        seen.append(step)
+        if step == "clean" and done > 3000:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -235,16 +235,16 @@ def test_a_job_that_was_stopped_goes_on(database: Database, tmp_path: Path) -> N
     seen.clear()
     left: dict[Path, int] = {}
 
-    def look(progress: Progress) -> None:
-        seen.append(progress)
-        if progress.step == "clean" and progress.done == progress.total:
+    def look(step: str, done: int, total: int) -> None:
+        seen.append(step)
+        if step == "clean" and done == total:
             left.update({p: p.stat().st_mtime_ns for p in work.rglob("*.npy")})
 
     result = add_scan(database, [path], options, on_progress=look)
     assert result.created
     assert {p: left[p] for p in done} == done  # not done again
     assert len(left) > len(done)
-    assert "read" not in {p.step for p in seen}
+    assert "read" not in seen
     assert not work.exists()
     assert verify(database).ok
     fresh = Database(str(tmp_path / "fresh.db"))
@@ -258,8 +258,8 @@ from featuredb.lidar.add import add_scan
 from featuredb.lidar.options import AddOptions
 from featuredb.store import Database
 
-def on_progress(progress):
-    if progress.step == sys.argv[3] and progress.done > 3000:
+def on_progress(step, done, total):
+    if step == sys.argv[3] and done > 3000:
         os.kill(os.getpid(), signal.SIGKILL)
 
 options = AddOptions(block_points=800)
@@ -405,10 +405,10 @@ def test_parts_of_scans_are_loaded(database: Database, tmp_path: Path) -> None:
         run = cloud.xyz[nodes.start[k] : nodes.start[k] + nodes.count[k]]
         np.testing.assert_array_equal(nodes.box_min[k], run.min(axis=0))
         np.testing.assert_array_equal(nodes.box_max[k], run.max(axis=0))
-    capped = load_cloud(database, frame, options=LoadOptions(largest_points=5000))
+    capped = load_cloud(database, frame, largest_points=5000)
     assert len(capped) == np.cumsum(scan.level_points)[np.cumsum(scan.level_points) <= 5000][-1]
     with pytest.raises(ScanError, match="smaller area"):
-        load_cloud(database, frame, options=LoadOptions(largest_points=10))
+        load_cloud(database, frame, largest_points=10)
     elsewhere = LocalFrame.from_utm(WEST + 9000.0, SOUTH, 100.0, 32632)
     assert len(load_cloud(database, elsewhere, (0.0, 0.0, 50.0, 50.0))) == 0
 

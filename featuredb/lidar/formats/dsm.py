@@ -47,7 +47,6 @@ def open_dsm(path: Path) -> ScanFile:
         path=path,
         sha256=file_sha256(path),
         size_bytes=path.stat().st_size,
-        version="",
         points=points,
         low=low,
         high=high,

@@ -39,7 +39,6 @@ class ScanFile:
         path: of the file.
         sha256: of its bytes.
         size_bytes: of the file.
-        version: of LAS, "1.2" to "1.4".
         points: number of points by the header.
         low, high: (3,) box in file coordinates, by the header or, where that is wrong, by the points.
         wkt: the WKT record, or None.
@@ -50,7 +49,6 @@ class ScanFile:
     path: Path
     sha256: str
     size_bytes: int
-    version: str
     points: int
     low: FloatArray
     high: FloatArray
@@ -101,7 +99,6 @@ def open_scan_file(path: Path) -> ScanFile:
         wkt, keys = _crs_records(header)
         low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
         first = _raw_points(reader.read_points(min(int(header.point_count), 10_000)))
-        version = str(header.version)
         points, wkt_counts = int(header.point_count), bool(header.global_encoding.wkt)
     slack = 1e-6 * (1.0 + np.abs(np.concatenate([low, high])).max())
     if not (
@@ -115,7 +112,6 @@ def open_scan_file(path: Path) -> ScanFile:
         path=path,
         sha256=file_sha256(path),
         size_bytes=size,
-        version=version,
         points=points,
         low=low,
         high=high,
