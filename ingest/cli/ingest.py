@@ -49,11 +49,9 @@ def _register_model(kinds: Any) -> None:
 
     model = kinds.add_parser(
         "model",
-        help="a model of COLMAP, OpenSfM, ODM or kapture, geo-referenced or of photos with GPS",
-        description="Import a model of COLMAP, OpenSfM, OpenDroneMap or kapture as a map: as `featuredb "
-        "export` "
-        "wrote it, "
-        "aligned to a known place, or of photos with GPS.",
+        help="a model of COLMAP, OpenSfM or ODM, geo-referenced or of photos with GPS",
+        description="Import a model of COLMAP, OpenSfM or OpenDroneMap as a map: as `featuredb export` "
+        "wrote it, aligned to a known place, or of photos with GPS.",
     )
     add_database_argument(model)
     add_model_arguments(model)

@@ -17,9 +17,8 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
         "folder",
         metavar="FOLDER",
         type=Path,
-        help="with a COLMAP model (itself, or in sparse/ or sparse/0), OpenSfM's reconstruction.json "
-        "(itself, "
-        "or in opensfm/), or kapture's sensors/ and reconstruction/",
+        help="with a COLMAP model (itself, or in sparse/ or sparse/0), or OpenSfM's reconstruction.json "
+        "(itself, or in opensfm/)",
     )
     parser.add_argument(
         "--photos",
@@ -27,7 +26,7 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
         default=None,
         metavar="FOLDER",
         help="the model's photos under its names; needed unless georeference.json names them; "
-        "default: images/ of OpenSfM, sensors/records_data of kapture",
+        "default: images/ of OpenSfM",
     )
     parser.add_argument(
         "--database", type=Path, default=None, metavar="FILE", help="COLMAP's; default: FOLDER/database.db"
