@@ -17,7 +17,7 @@ from ingest.fingerprint import digest
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
 from ingest.growth.growth_report import GrowthReport, PhotoFate
 from ingest.growth.run import extractor_for, grow
-from ingest.growth.run_record import GrowthOptions, GrowthPhotos, no_photos
+from ingest.growth.values import GrowthOptions, GrowthPhotos, no_photos
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.workspace import Workspace, default_root, remove_leftovers
 
@@ -163,7 +163,9 @@ def watch_and_grow(
             state = _state(database)
             if state != seen:
                 on_report(grow_candidates(database, options))
-                seen = _state_after(database, state)
+                seen = _state(database)
+                if seen[1] > state[1]:  # photos arrived meanwhile
+                    seen = state
         except FeatureDbError:
             _LOG.exception("growth failed; the next try is in %.0f s", poll_s)
         stop.wait(poll_s)
@@ -172,9 +174,3 @@ def watch_and_grow(
 def _state(database: Database) -> tuple[int, int]:
     """What a run depends on: version of the maps, number of waiting photos."""
     return database.poll_version(), len(list_candidates(database, state="waiting"))
-
-
-def _state_after(database: Database, before: tuple[int, int]) -> tuple[int, int]:
-    """The state that needs no run: what this one left, unless photos arrived meanwhile."""
-    after = _state(database)
-    return after if after[1] <= before[1] else before

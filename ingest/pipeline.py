@@ -156,7 +156,10 @@ def ingest_photos(
             *scanned.notes,
             *_warnings(result, outcomes, options),
             *_quarantine_note(quarantined),
-            *_lost(result),
+            *(
+                f"Matching of {lost.task} is lost: {lost.reason}"
+                for lost in result.lost_matches[:_MOST_NOTES]
+            ),
         ),
     )
 
@@ -318,10 +321,6 @@ def _quarantine_note(quarantined: Mapping[str, str]) -> tuple[str, ...]:
             f"{reason}. They answer only queries that name them, until something better confirms them: {way}."
         )
     return tuple(notes[:_MOST_NOTES])
-
-
-def _lost(result: Reconstructed) -> tuple[str, ...]:
-    return tuple(f"Matching of {task.task} is lost: {task.reason}" for task in result.lost_matches[:20])
 
 
 def _warnings(

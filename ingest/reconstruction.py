@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.geometry.camera import Camera
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
 from featuredb.stage_clock import StageClock
 from ingest.clusters.graph import ClusterOptions, find_clusters
@@ -129,7 +128,10 @@ def reconstruct_photos(
         return done
 
     cameras, camera_rows = photo_cameras(usable, options.cameras, options.sfm.camera_model)
-    views = _views(usable, features, cameras, camera_rows)
+    views = [
+        PhotoView(sha256=photo.sha256, features=path, camera=cameras[row][0], focal_known=cameras[row][1])
+        for photo, path, row in zip(usable, features.paths, camera_rows, strict=True)
+    ]
     words = vocabulary or shipped_vocabulary()
     with clock.stage("pairs"):
         vectors = None
@@ -173,18 +175,6 @@ def reconstruct_photos(
         counts |= {"reused": made.reused, "total": made.blocks}
     lost = {usable[row].name: reason for row, reason in made.lost.items()}
     return replace(done, reconstruction=made, lost=lost)
-
-
-def _views(
-    photos: Sequence[Photo],
-    features: FeatureFiles,
-    cameras: Sequence[tuple[Camera, bool]],
-    camera_rows: Sequence[int],
-) -> list[PhotoView]:
-    return [
-        PhotoView(sha256=photo.sha256, features=path, camera=cameras[row][0], focal_known=cameras[row][1])
-        for photo, path, row in zip(photos, features.paths, camera_rows, strict=True)
-    ]
 
 
 def _reconstruct(

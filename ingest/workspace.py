@@ -158,15 +158,13 @@ def read_array(path: Path, name: str) -> NDArray[Any]:
 def remove_leftovers(root: Path) -> int:
     """Delete temporary files of killed jobs under `root` that are older than a day; how many there were."""
     count = 0
+    now = time.time()
     for path in root.rglob(f"{_TEMPORARY}*"):
-        if path.exists() and _age_s(path) > 86_400.0:  # a day: no stage of one photo or pair takes that long
+        # A day: no stage of one photo or pair takes that long.
+        if path.exists() and now - path.stat().st_mtime > 86_400.0:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
             count += 1
     return count
-
-
-def _age_s(path: Path) -> float:
-    return time.time() - path.stat().st_mtime
 
 
 def _flush(path: Path) -> None:

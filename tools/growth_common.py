@@ -27,7 +27,7 @@ from featuredb.store.candidates.states import Contribution, candidate_id_of
 from ingest.growing import GrowingOptions
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.map_places import drift_m, places_of
-from ingest.growth.run_record import GrowthOptions
+from ingest.growth.values import GrowthOptions
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions

@@ -30,7 +30,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from ingest.growth import gates, run
 from ingest.growth.gates import Gate
-from ingest.growth.graph import budget
+from ingest.growth.graph import map_graph
 from ingest.growth.place import component
 from ingest.growth.values import Refused
 from ingest.photos.photo import Photo
@@ -76,7 +76,7 @@ def recorded(path: Path, frame: LocalFrame, true_place: TruePlace) -> Iterator[N
         for module, name, wrapped in (
             (component, "place_by_maps", note.placing),
             (component, "refine_placed", note.refining),
-            (budget, "with_drift", note.drifting),
+            (map_graph, "with_drift", note.drifting),
             (run, "promote_confirmed", note.promoting),
         ):
             stack.enter_context(patch.object(module, name, wrapped(getattr(module, name))))
@@ -92,22 +92,22 @@ class _Note:
 
     def placing(self, step: Any) -> Any:
         def place_by_maps(model: Any, localised: Any, correspondences: Any, photos: Any, *more: Any) -> Any:
-            held = step(model, localised, correspondences, photos, *more)
+            placement = step(model, localised, correspondences, photos, *more)
             self._photos = photos
-            self._model("place", model, held.placement, held.placement.gates)
-            return held
+            self._model("place", model, placement, placement.gates)
+            return placement
 
         return place_by_maps
 
     def refining(self, step: Any) -> Any:
-        def refine_placed(model: Any, held: Any, *more: Any) -> Any:
-            refined = step(model, held, *more)
+        def refine_placed(model: Any, placement: Any, *more: Any) -> Any:
+            refined = step(model, placement, *more)
             refused = isinstance(refined, Refused)
             asked = refined.gates if refused else refined.placement.gates
-            own = [gate for gate in asked if gate.name not in {g.name for g in held.placement.gates}]
+            own = [gate for gate in asked if gate.name not in {g.name for g in placement.gates}]
             if refused and all(gate.passes for gate in own):  # by photos that are left out
                 own.append(_said_no(refined.reason))
-            self._model("refine", model, held.placement, own)
+            self._model("refine", model, placement, own)
             return refined
 
         return refine_placed

@@ -37,10 +37,10 @@ from featuredb.store import Database
 from ingest.executor import InProcessExecutor
 from ingest.fingerprint import digest
 from ingest.growing import reconstructed_photos
-from ingest.growth.graph.joint.in_database import adjust_maps
+from ingest.growth.graph.joint.adjust import adjust_maps
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.run import grow
-from ingest.growth.run_record import GrowthOptions
+from ingest.growth.values import GrowthOptions
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, require_usable, scan_folder
@@ -234,8 +234,8 @@ def _adjust(state: State) -> None:
         print("  adjust: nothing to do, there is one map")
         return
     found = adjust_maps(state.database, ids, free=ids)
-    print(f"  adjust: {found.message}; {found.adjustment.shared_points} points in several maps")
-    for report in found.adjustment.reports:
+    print(f"  adjust: {found.message}; {found.shared_points} points in several maps")
+    for report in found.reports:
         moved = f"moved {report.move_m:.2f} m, bent {report.shape_m:.2f} m"
         print(f"    {report.map_id}: {moved}, {report.kept:.1%} of its observations fit")
     _find_centers(state)

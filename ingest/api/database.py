@@ -125,7 +125,8 @@ class FeatureDatabase:
             InvalidValueError: none or several ways. RegistrationError: photos or scans are missing.
             ControlFileError, MapNotFoundError, StoreError, ConflictError
         """
-        ways = [name for name, on in _ways(control_points, photos, by_maps).items() if on]
+        asked = {"control_points": control_points, "photos": photos, "by_maps": by_maps or None}
+        ways = [name for name, value in asked.items() if value is not None]
         if len(ways) != 1:
             raise InvalidValueError(
                 "align: expected one of control_points, photos (with scans) and by_maps, found "
@@ -284,10 +285,6 @@ def open_database(
         return FeatureDatabase(Database.open(url, storage_options=storage_options))
     check_place(Database(str(url), storage_options).url)
     return FeatureDatabase(Database.create(url, storage_options=storage_options))
-
-
-def _ways(control_points: object, photos: object, by_maps: bool) -> dict[str, bool]:
-    return {"control_points": control_points is not None, "photos": photos is not None, "by_maps": by_maps}
 
 
 def _path(path: PathLike | None) -> Path | None:

@@ -6,7 +6,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ingest.growth.graph.joint.in_database import DatabaseAdjustment
+    from ingest.growth.graph.joint.adjust import JointAdjustment
 
 
 def register(subparsers: Any) -> None:
@@ -45,14 +45,14 @@ def run_adjust(args: argparse.Namespace) -> int:
         InvalidValueError, ConflictError, MapNotFoundError, StoreError
     """
     from featuredb.cli.common import open_database
-    from ingest.growth.graph.joint.in_database import adjust_maps
+    from ingest.growth.graph.joint.adjust import adjust_maps
 
     found = adjust_maps(open_database(args), args.maps, free=args.free, dry_run=args.dry_run)
     sys.stdout.write(json.dumps(found.as_json()) + "\n" if args.json else _text(found))
     return 0 if found.reason is None else 1
 
 
-def _text(found: "DatabaseAdjustment") -> str:
+def _text(found: "JointAdjustment") -> str:
     from featuredb.cli.common import format_table
 
     rows = [
@@ -60,7 +60,7 @@ def _text(found: "DatabaseAdjustment") -> str:
             r.map_id, "held" if r.held else "", r.photos, round(r.move_m, 3), round(r.shape_m, 3),
             round(r.sigma_before_px, 2), round(r.sigma_px, 2),
         )
-        for r in found.adjustment.reports
+        for r in found.reports
     ]  # fmt: skip
     head = ("map", "", "photos", "move_m", "shape_m", "px_before", "px")
     lines = [format_table(head, rows)] if rows else []
@@ -70,9 +70,9 @@ def _text(found: "DatabaseAdjustment") -> str:
         lines.append(
             f"quarantined, they hang on a moved map and could not join: {', '.join(found.flagged)}\n"
         )
-    if found.adjustment.elsewhere:
-        lines.append(f"not heard, other maps have them elsewhere: {', '.join(found.adjustment.elsewhere)}\n")
-    lines.append(f"{found.adjustment.shared_points} points in several maps\n")
+    if found.elsewhere:
+        lines.append(f"not heard, other maps have them elsewhere: {', '.join(found.elsewhere)}\n")
+    lines.append(f"{found.shared_points} points in several maps\n")
     if found.reason is not None:
         lines.append(f"refused, {found.reason}: {found.message}\n")
     elif found.version < 0:

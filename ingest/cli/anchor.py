@@ -36,10 +36,8 @@ def register(subparsers: Any) -> None:
     anchor.add_argument(
         "--scan", action="append", default=[], metavar="ID", help="default: all scans around the map"
     )
-    anchor.add_argument(
-        "--out", type=Path, default=None, metavar="DIR", help="pictures and report; default: ./anchor-MAP"
-    )
-    anchor.add_argument("--frames", type=int, default=None, metavar="N", help="to register; default: 3")
+    anchor.add_argument("--out", type=Path, metavar="DIR", help="pictures and report; default: ./anchor-MAP")
+    anchor.add_argument("--frames", type=int, metavar="N", help="to register; default: 3")
     deciding = anchor.add_argument_group("who decides")
     deciding.add_argument(
         "--auto", action="store_true", help="place the map without a person if every gate is passed"
@@ -52,9 +50,9 @@ def register(subparsers: Any) -> None:
         help="place the map by this frame as it was proposed; may be repeated",
     )
     helping = anchor.add_argument_group("where a registration starts, instead of the map's placement")
-    helping.add_argument("--pose", type=Path, default=None, metavar="FILE", help="a rough pose, JSON")
-    helping.add_argument("--picks", type=Path, default=None, metavar="FILE", help="picked points, CSV")
-    helping.add_argument("--image", default=None, metavar="NAME", help="photo of --pose or --picks")
+    helping.add_argument("--pose", type=Path, metavar="FILE", help="a rough pose, JSON")
+    helping.add_argument("--picks", type=Path, metavar="FILE", help="picked points, CSV")
+    helping.add_argument("--image", metavar="NAME", help="photo of --pose or --picks")
     page = anchor.add_argument_group("picking in a page")
     page.add_argument(
         "--page",

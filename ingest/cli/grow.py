@@ -34,9 +34,7 @@ def _register_grow(subparsers: Any) -> None:
     when.add_argument("--once", action="store_true", help="one run (the default)")
     when.add_argument("--watch", action="store_true", help="run whenever photos arrive, until Ctrl-C")
     grow.add_argument("--poll", type=float, default=30.0, metavar="SECONDS", help="of --watch; default 30")
-    grow.add_argument(
-        "--budget", type=float, default=None, metavar="M", help="drift from the anchors; default: 0.5"
-    )
+    grow.add_argument("--budget", type=float, metavar="M", help="drift from the anchors; default: 0.5")
     grow.add_argument(
         "--trust",
         action="append",
@@ -45,10 +43,10 @@ def _register_grow(subparsers: Any) -> None:
         help="vouch for this client: its photos need nobody else's confirmation; may be repeated. anonymous: "
         "all that comes without a certificate",
     )
-    grow.add_argument("--max-features", type=int, default=None, help="per photo; default: 12000")
+    grow.add_argument("--max-features", type=int, help="per photo; default: 12000")
     grow.add_argument("--workers", type=int, default=1, help="processes; default: 1")
-    grow.add_argument("--work", type=Path, default=None, metavar="DIR", help="default: DB/_work")
-    grow.add_argument("--report", type=Path, default=None, metavar="FILE", help="write the report as JSON")
+    grow.add_argument("--work", type=Path, metavar="DIR", help="default: DB/_work")
+    grow.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
     grow.add_argument("--json", action="store_true", help="print the report as JSON")
     grow.set_defaults(run=run_grow)
 
@@ -131,15 +129,13 @@ def _show(report: "GrowthReport", args: argparse.Namespace) -> None:
 def _options(args: argparse.Namespace) -> "GrowingOptions":
     from featuredb.features.extractor import ExtractorOptions
     from ingest.growing import GrowingOptions
-    from ingest.growth.run_record import GrowthOptions
-    from ingest.growth.trust.confirmation import ConfirmationOptions
+    from ingest.growth.values import GrowthOptions
     from ingest.reconstruction import MapMakingOptions
 
-    confirmation = ConfirmationOptions(trusted=tuple(args.trust))
     budget = {} if args.budget is None else {"drift_budget_m": args.budget}
     extractor = {} if args.max_features is None else {"max_features": args.max_features}
     return GrowingOptions(
-        growth=GrowthOptions(confirmation=confirmation, **budget),
+        growth=GrowthOptions(trusted=tuple(args.trust), **budget),
         making=MapMakingOptions(extractor=ExtractorOptions(**extractor)),
         workers=args.workers,
         work=args.work,

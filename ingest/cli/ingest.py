@@ -49,11 +49,9 @@ def _register_model(kinds: Any) -> None:
 
     model = kinds.add_parser(
         "model",
-        help="a model of COLMAP, OpenSfM, ODM or kapture, geo-referenced or of photos with GPS",
-        description="Import a model of COLMAP, OpenSfM, OpenDroneMap or kapture as a map: as `featuredb "
-        "export` "
-        "wrote it, "
-        "aligned to a known place, or of photos with GPS.",
+        help="a model of COLMAP, OpenSfM or ODM, geo-referenced or of photos with GPS",
+        description="Import a model of COLMAP, OpenSfM or OpenDroneMap as a map: as `featuredb export` "
+        "wrote it, aligned to a known place, or of photos with GPS.",
     )
     add_database_argument(model)
     add_model_arguments(model)
@@ -109,7 +107,7 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         help="whether photos of one make, model, size and focal length share their intrinsics, and photos "
         "that name no camera those of the same owner, day (if known) and size; default: shared",
     )
-    group.add_argument("--camera-model", default=None, help="COLMAP's name; default: SIMPLE_RADIAL")
+    group.add_argument("--camera-model", help="COLMAP's name; default: SIMPLE_RADIAL")
     group.add_argument(
         "--keep-focal",
         action="store_true",
@@ -119,14 +117,12 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--max-features",
         type=int,
-        default=None,
         help="per photo; default: 12000, for films 5000; fewer match faster",
     )
-    group.add_argument("--max-side", type=int, default=None, metavar="PX", help="default: 1600")
+    group.add_argument("--max-side", type=int, metavar="PX", help="default: 1600")
     group.add_argument(
         "--min-track-length",
         type=int,
-        default=None,
         metavar="N",
         help="points seen by at least N photos carry descriptors; default: see the README",
     )
@@ -138,7 +134,6 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--gps-sigma",
         type=sigmas_m,
-        default=None,
         metavar="M[,M]",
         help="standard deviation of the photos' positions in metres, horizontal and vertical, instead of "
         "what EXIF suggests",
@@ -150,7 +145,6 @@ def _add_control(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--gcp",
         type=Path,
-        default=None,
         metavar="FILE",
         help="control points, OpenDroneMap's gcp_list.txt, which place the map instead of the photos' GPS",
     )
@@ -159,34 +153,27 @@ def _add_control(parser: argparse.ArgumentParser) -> None:
 
 def _add_running(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("how the job runs")
-    group.add_argument("--workers", type=int, default=None, help="processes; default: one per core")
+    group.add_argument("--workers", type=int, help="processes; default: one per core")
     group.add_argument(
         "--dask",
         metavar="ADDRESS",
-        default=None,
         help="of a Dask scheduler, e.g. tcp://10.0.0.1:8786, whose workers do the work; they need the work "
         "folder and the photos under the same paths (extra dask)",
     )
     group.add_argument(
         "--vocabulary",
         type=Path,
-        default=None,
         metavar="FILE",
         help="of visual words for finding similar photos; default: the one that comes with featuredb",
     )
     group.add_argument(
         "--work",
         type=Path,
-        default=None,
         metavar="DIR",
         help="where unfinished work is kept; default: DB/_work, or a cache folder for object stores",
     )
-    group.add_argument(
-        "--report", type=Path, default=None, metavar="DIR", help="write report.json and report.html there"
-    )
-    group.add_argument(
-        "--stop-after", choices=_STAGES, default=None, help="end after that stage; the next run goes on"
-    )
+    group.add_argument("--report", type=Path, metavar="DIR", help="write report.json and report.html there")
+    group.add_argument("--stop-after", choices=_STAGES, help="end after that stage; the next run goes on")
     group.add_argument("--quiet", action="store_true", help="no progress bars")
 
 

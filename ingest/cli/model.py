@@ -17,39 +17,31 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
         "folder",
         metavar="FOLDER",
         type=Path,
-        help="with a COLMAP model (itself, or in sparse/ or sparse/0), OpenSfM's reconstruction.json "
-        "(itself, "
-        "or in opensfm/), or kapture's sensors/ and reconstruction/",
+        help="with a COLMAP model (itself, or in sparse/ or sparse/0), or OpenSfM's reconstruction.json "
+        "(itself, or in opensfm/)",
     )
     parser.add_argument(
         "--photos",
         type=Path,
-        default=None,
         metavar="FOLDER",
         help="the model's photos under its names; needed unless georeference.json names them; "
-        "default: images/ of OpenSfM, sensors/records_data of kapture",
+        "default: images/ of OpenSfM",
     )
-    parser.add_argument(
-        "--database", type=Path, default=None, metavar="FILE", help="COLMAP's; default: FOLDER/database.db"
-    )
+    parser.add_argument("--database", type=Path, metavar="FILE", help="COLMAP's; default: FOLDER/database.db")
     parser.add_argument(
         "--descriptors",
         choices=("stored", "photos"),
-        default=None,
         help="those of COLMAP's database (default), or made anew of the photos at the model's keypoints (the "
         "only way for OpenSfM)",
     )
-    parser.add_argument(
-        "--reconstruction", type=int, default=None, metavar="N", help="which of several of OpenSfM, from 0"
-    )
+    parser.add_argument("--reconstruction", type=int, metavar="N", help="which of several of OpenSfM, from 0")
     place = parser.add_argument_group(
         "where it lies; without these as georeference.json says, or by the GPS of its photos"
     )
-    place.add_argument("--epsg", type=int, default=None, help="UTM zone, 326zz or 327zz")
+    place.add_argument("--epsg", type=int, help="UTM zone, 326zz or 327zz")
     place.add_argument(
         "--origin",
         type=_three,
-        default=None,
         metavar="E,N,H",
         help="of the model's coordinates in that zone, metres",
     )
@@ -62,7 +54,6 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     place.add_argument(
         "--sigma",
         type=sigmas_m,
-        default=None,
         metavar="M[,M]",
         help="how well that is known, horizontally and vertically: one standard deviation in metres; alone: "
         "how "

@@ -29,22 +29,17 @@ def register(subparsers: Any) -> None:
         help="of the surveyed heights, where their reference system does not say it: ellipsoidal, egm96, "
         "egm2008, navd88 or unknown (default)",
     )
-    parser.add_argument(
-        "--report", type=Path, default=None, metavar="DIR", help="write control.html, .json and .png there"
-    )
+    parser.add_argument("--report", type=Path, metavar="DIR", help="write control.html, .json and .png there")
     parser.add_argument("--dry-run", action="store_true", help="show the residuals and commit nothing")
     parser.set_defaults(run=run_register)
 
 
 def add_control_arguments(parser: Any) -> None:
     """What belongs to a control point file."""
-    parser.add_argument(
-        "--gcp-crs", default=None, metavar="CRS", help="reference system, instead of the file's first line"
-    )
+    parser.add_argument("--gcp-crs", metavar="CRS", help="reference system, instead of the file's first line")
     parser.add_argument(
         "--gcp-sigma",
         type=sigmas_m,
-        default=None,
         metavar="M[,M]",
         help="standard deviation of surveyed coordinates in metres, horizontal and vertical; default: from "
         "the residuals",
@@ -52,7 +47,6 @@ def add_control_arguments(parser: Any) -> None:
     parser.add_argument(
         "--ground-height",
         type=_height,
-        default=None,
         metavar="M[,SIGMA]",
         help="height of the control points in metres where the file has none, and its standard deviation "
         "(default 10); without it such a map is put at height 0",

@@ -31,7 +31,6 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--telemetry",
         type=Path,
-        default=None,
         metavar="FILE",
         help="of one film: a drone's .srt, or a log (GPX, CSV); default: what is in the film (GoPro, DJI) or "
         "beside it under its name",
@@ -41,7 +40,6 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--film-start",
-        default=None,
         metavar="WHEN",
         help="when the film begins on the clock of a GPX or CSV log, like 2024-05-31T12:00:00Z; seconds of "
         "the log where it has no clock; default: found by the movements of picture and receiver",
@@ -49,7 +47,6 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--telemetry-late",
         type=float,
-        default=None,
         metavar="S",
         help="how much later than the picture the telemetry shows a place; default: estimated from the "
         "speeds of both; of a log with a clock of its own: beside --film-start only",
@@ -57,10 +54,8 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--keyframes", type=int, default=60, metavar="N", help="of each film, about so many; default: 60"
     )
-    group.add_argument(
-        "--start", type=float, default=None, metavar="S", help="default: each film's beginning"
-    )
-    group.add_argument("--end", type=float, default=None, metavar="S", help="default: each film's end")
+    group.add_argument("--start", type=float, metavar="S", help="default: each film's beginning")
+    group.add_argument("--end", type=float, metavar="S", help="default: each film's end")
 
 
 def run_video(args: argparse.Namespace) -> int:

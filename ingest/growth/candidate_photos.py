@@ -86,10 +86,9 @@ def _write_files(database: Database, folder: Path, wanted: Sequence[Candidate]) 
 
 def _remove_withdrawn(folder: Path, candidates: Sequence[Candidate]) -> None:
     """Withdrawn photos leave the work folder, too."""
-    gone = {c.candidate_id for c in candidates if c.state == "withdrawn"}
-    known = {c.candidate_id for c in candidates}
+    kept = {c.candidate_id for c in candidates if c.state != "withdrawn"}
     for file in folder.glob("*.img"):
-        if file.stem in gone or (_HEX.fullmatch(file.stem) and file.stem not in known):
+        if _HEX.fullmatch(file.stem) and file.stem not in kept:
             file.unlink(missing_ok=True)
 
 

@@ -18,20 +18,18 @@ from featuredb.store.candidates.photos import mark_used
 from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.growth.gates import figures
-from ingest.growth.graph.budget import grow_within_budget
-from ingest.growth.graph.map_graph import placed_maps
+from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.graph.replacing import replace_descendants
-from ingest.growth.growth_report import GrowthReport
+from ingest.growth.growth_report import GrowthReport, Run, fates_of, grown_entry, split_reason
 from ingest.growth.not_found import NotFound, NotFoundRows
-from ingest.growth.place.component import AT_SEVERAL_PLACES, grow_component, split
+from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, grow_component, split
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
-from ingest.growth.run_record import GrowthOptions, GrowthPhotos, Run, fates_of, grown_entry, split_reason
 from ingest.growth.trust.corroboration import NewPhotos
 from ingest.growth.trust.promotion import promote_confirmed
 from ingest.growth.trust.scan_check import checked_by_scan
 from ingest.growth.unplaced import place_unplaced_maps
-from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
+from ingest.growth.values import GrowthOptions, GrowthPhotos, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo, shared_key
 from ingest.sfm.links import keep_photos
@@ -76,10 +74,9 @@ def grow(
         if replaced is not None:
             run.replacements.append(replaced)
         localiser = Localiser.open(database, previous=localiser)
-        done = place_unplaced_maps(database, localiser.areas, work, options)
-        run.entries.update({entry.map_id: entry for entry in done.placed})
-        run.unplaced = done.unplaced
-        run.notes |= dict.fromkeys(done.notes)
+        placed, run.unplaced, notes = place_unplaced_maps(database, localiser.areas, work, options)
+        run.entries.update({entry.map_id: entry for entry in placed})
+        run.notes |= dict.fromkeys(notes)
         this = _Round(database=database, new=new, work=work, options=options, run=run, localiser=localiser)
         this.localise()
         this.place()
@@ -171,7 +168,7 @@ class _Round:
         outcomes = promote_confirmed(
             self.database,
             self.localiser,
-            self.options.confirmation,
+            self.options.trusted,
             outside,
             budget_m=self.options.drift_budget_m,
             work=self.work,

@@ -8,7 +8,7 @@ believe it. It keeps its id, and what could not be taken along stays a map witho
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +22,14 @@ from featuredb.store.snapshot import UnplacedSummary
 from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.growth.gates import figures
-from ingest.growth.graph.budget import grow_within_budget
-from ingest.growth.graph.map_graph import placed_maps
-from ingest.growth.growth_report import GrownEntry
+from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
+from ingest.growth.growth_report import GrownEntry, grown_entry
 from ingest.growth.map_images import model_of, observed_features, observed_rows
-from ingest.growth.place.component import grow_component
+from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.place.localised import QUERY, localise_photos
-from ingest.growth.run_record import GrowthOptions, grown_entry
 from ingest.growth.trust.examined import recall, remember
 from ingest.growth.trust.scan_check import NOT_ASKED, checked_by_scan
-from ingest.growth.values import LEAST_PHOTOS, GrownMap, Refused
+from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
@@ -40,19 +38,13 @@ from reloc.localise.candidates import IndexedArea
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Placed:
-    """Maps without a place that have one now, in quarantine, and those that still have none, and why."""
-
-    placed: tuple[GrownEntry, ...] = ()
-    unplaced: tuple[GrownEntry, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
 def place_unplaced_maps(
     database: Database, areas: Sequence[IndexedArea], work: Path, options: GrowthOptions
-) -> Placed:
+) -> tuple[list[GrownEntry], list[GrownEntry], list[str]]:
     """Try every map without a place in the active areas; a question is not asked twice.
+
+    Returns:
+        Maps that have a place now, in quarantine; those that still have none, and why; notes for people.
 
     Raises:
         StoreError: the database cannot be read or written; what is committed stands.
@@ -67,20 +59,27 @@ def place_unplaced_maps(
     notes: list[str] = []
     for summary in waiting:
         asked = digest(asks, summary.write_id, *sorted(write_ids))
-        known = recall(work, summary.map_id, asked)
-        if known is not None:
-            code, reason, gates = known
-            refused = Refused(reason=code, message=reason, gates=gates)
-        else:
+        refused = recall(work, summary.map_id, asked)
+        if refused is None:
             done = _place(database, snapshot, summary, areas, options, notes)
             if isinstance(done, GrownEntry):
                 placed.append(done)
                 continue
             refused = done
             if refused.reason not in ("CONFLICT", NOT_ASKED):
-                remember(work, summary.map_id, asked, refused.reason, refused.message, refused.gates)
-        unplaced.append(_unplaced_entry(summary, refused))
-    return Placed(placed=tuple(placed), unplaced=tuple(unplaced), notes=tuple(dict.fromkeys(notes)))
+                remember(work, summary.map_id, asked, refused)
+        unplaced.append(
+            GrownEntry(
+                map_id=summary.map_id,
+                status="unplaced",
+                reason_code=refused.reason,
+                reason=refused.message,
+                photos=(),
+                points=summary.points,
+                gates=figures(refused.gates),
+            )
+        )
+    return placed, unplaced, notes
 
 
 def _place(
@@ -99,7 +98,7 @@ def _place(
     feature_map, scan, unasked = checked_by_scan(database, grown.feature_map)
     notes += [unasked] if unasked else []
     if scan is not None and not scan.passes:
-        return Refused(reason=scan.reason, message=scan.message, gates=(*grown.placement.gates, scan))
+        return Refused.by(scan, *grown.placement.gates)
     rest = left_over(unplaced, feature_map, grown.left_out)
     try:
         database.commit_maps(
@@ -188,18 +187,6 @@ def left_over(
             no_place=NoPlace(reason_code=code, reason=reason, ways=unplaced.no_place.ways),
         )
     ]
-
-
-def _unplaced_entry(summary: UnplacedSummary, refused: Refused) -> GrownEntry:
-    return GrownEntry(
-        map_id=summary.map_id,
-        status="unplaced",
-        reason_code=refused.reason,
-        reason=refused.message,
-        photos=(),
-        points=summary.points,
-        gates=figures(refused.gates),
-    )
 
 
 def _photo(unplaced: UnplacedMap, image: MapImage) -> Photo:

@@ -1,6 +1,6 @@
-"""The values that pass between the steps of growth: localised photos, overlaps, placements, maps."""
+"""The values that pass between the steps of growth: new photos, localised ones, overlaps, refusals."""
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.bridge import Model
 from ingest.growth.gates import Gate
+from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.pairs import Pair
 from reloc.localise.result import LocaliseResult
 
 FeaturesOf = Callable[[int], PhotoFeatures]
@@ -79,22 +79,6 @@ class LocalisedPhoto:
     point_covariance: FloatArray
     result: LocaliseResult
 
-    def __post_init__(self) -> None:
-        k = len(self.feature_rows)
-        for name, shape, kind in (
-            ("covariance", (6, 6), np.float64),
-            ("feature_rows", (k,), np.int64),
-            ("pixels", (k, 2), np.float64),
-            ("map_of", (k,), np.int64),
-            ("point_of", (k,), np.int64),
-            ("points", (k, 3), np.float64),
-            ("point_covariance", (k, 3, 3), np.float64),
-        ):
-            value = frozen_array(f"LocalisedPhoto.{name}", getattr(self, name), shape, kind)
-            object.__setattr__(self, name, value)
-        if k and not 0 <= self.map_of.min() <= self.map_of.max() < len(self.map_ids):
-            raise InvalidValueError("LocalisedPhoto.map_of: names a map that map_ids does not have")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Edge:
@@ -141,61 +125,6 @@ class Edge:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapsPlacement:
-    """A reconstruction placed by existing maps; accepted when `reason` is None.
-
-    Attributes:
-        reason: code of the first gate that refused it, or None; `message` says it for people.
-        frame: local frame in which the similarity places the model.
-        local_from_sfm: None where none could be estimated.
-        covariance_relative: (7, 7) of its left perturbation, relative to the existing maps.
-        on_earth: (7, 7) what the existing maps' own uncertainty on Earth adds.
-        agreeing, disagreeing: rows of the localised photos that agree with the placement, and of those
-            that do not. Photos that no map localises are in neither.
-        blind: those that show too little of what existing maps, or the others' points, say they should.
-        edges: one for each existing map that holds it, most shared points first: the correction that this
-            map alone would apply to the placed one.
-        residual_rms_m: of the agreeing photos' centres, placed minus localised, metres; NaN without any.
-        gates: every gate with its figure, in the order they were asked.
-    """
-
-    reason: str | None
-    message: str
-    frame: LocalFrame
-    local_from_sfm: Sim3 | None = None
-    covariance_relative: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
-    on_earth: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
-    agreeing: tuple[int, ...] = ()
-    disagreeing: tuple[int, ...] = ()
-    blind: tuple[int, ...] = ()
-    edges: tuple[Edge, ...] = ()
-    residual_rms_m: float = float("nan")
-    gates: tuple[Gate, ...] = ()
-
-    @property
-    def parents(self) -> tuple[str, ...]:
-        """Maps that hold the new one, most shared points first."""
-        return tuple(edge.map_id for edge in self.edges)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GrownMap:
-    """A new map, ready to be committed (as quarantined, by whoever commits it).
-
-    Attributes:
-        model: the reconstruction after refinement; metric, in the frame of the map.
-        agreements: sentences on how well the existing maps agree that it overlaps.
-        left_out: photos of the reconstruction that are not in the map, by row, with reason and message.
-    """
-
-    feature_map: FeatureMap
-    placement: MapsPlacement
-    model: Model
-    agreements: Sequence[str] = ()
-    left_out: Mapping[int, tuple[str, str]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Refused:
     """What did not become a map, or an overlap: code of the reason for programs, a message with figures for
     people, rows of the photos concerned, and every gate that was asked."""
@@ -204,3 +133,50 @@ class Refused:
     message: str
     rows: tuple[int, ...] = ()
     gates: tuple[Gate, ...] = ()
+
+    @classmethod
+    def by(cls, gate: Gate, *before: Gate, rows: tuple[int, ...] = ()) -> "Refused":
+        """By a gate, after others that were asked."""
+        return cls(reason=gate.reason, message=gate.message, rows=rows, gates=(*before, gate))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GrowthOptions:
+    """How a database grows.
+
+    Attributes:
+        drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken: what
+            a survey's points are usually wanted for. Photos beyond it wait for an anchor.
+        trusted: identities that the operator vouches for: their photos need nobody else, as his own.
+        threads: photos that are localised at a time.
+    """
+
+    drift_budget_m: float = 0.5
+    trusted: tuple[str, ...] = ()
+    threads: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GrowthPhotos:
+    """New photos, matched and reconstructed.
+
+    Attributes:
+        models: their reconstructions, called once a round; rows of a model are rows of `photos`.
+        candidate_ids: of contributed photos, by row.
+        overlaps: pairs of rows whose matches were verified; None: not known.
+    """
+
+    photos: Sequence[Photo]
+    features_of: FeaturesOf
+    models: Callable[[], Iterable[Model]]
+    candidate_ids: Mapping[int, str] = field(default_factory=dict)
+    overlaps: Collection[Pair] | None = None
+
+
+def no_photos() -> GrowthPhotos:
+    """Nothing new: old quarantined maps are examined, and new anchors looked for."""
+
+    def none(row: int) -> PhotoFeatures:
+        raise IndexError(f"there is no photo {row}")
+
+    return GrowthPhotos(photos=(), features_of=none, models=lambda: ())

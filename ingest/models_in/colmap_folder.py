@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from featuredb.errors import IngestError, InvalidValueError
-from ingest.colmap.bridge import Model, model_of
+from ingest.colmap.bridge import model_of
 from ingest.models_in.stored import StoredModel
 
 
@@ -55,17 +55,13 @@ def read_colmap(folder: Path) -> StoredModel:
     images = [reconstruction.image(i) for i in image_ids]
     point_ids = sorted(reconstruction.point3D_ids())
     return StoredModel(
-        model=_numbered(model),
+        # Rows are those of this model alone: ids of COLMAP may have gaps.
+        model=replace(model, rows=np.arange(len(model.rows), dtype=np.int64)),
         names=tuple(image.name for image in images),
         camera_ids=tuple(sorted({image.camera_id for image in images})),
         xy=tuple(np.array([p.xy for p in i.points2D], dtype=np.float64).reshape(-1, 2) for i in images),
         rgb=np.array([reconstruction.point3D(i).color for i in point_ids], dtype=np.uint8),
     )
-
-
-def _numbered(model: Model) -> Model:
-    """Rows are those of this model alone: ids of COLMAP may have gaps."""
-    return replace(model, rows=np.arange(len(model.rows), dtype=np.int64))
 
 
 # Whether the binary files of a COLMAP model are whole: their records end where the file does.

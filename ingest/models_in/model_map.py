@@ -70,7 +70,7 @@ class ModelOptions:
 
 
 def map_of_model(folder: Path, options: ModelOptions) -> AnyMap:
-    """The map of the model in a folder: of COLMAP, of OpenSfM or OpenDroneMap, or of kapture.
+    """The map of the model in a folder: of COLMAP, of OpenSfM or of OpenDroneMap.
 
     Without a place where nobody says it, and the photos' GPS does not.
 

@@ -7,11 +7,10 @@ from featuredb.errors import IngestError
 from featuredb.export.formats.colmap import DATABASE
 from ingest.models_in.colmap_database import open_features
 from ingest.models_in.colmap_folder import model_folder, read_colmap
-from ingest.models_in.kapture_folder import is_kapture, read_kapture
 from ingest.models_in.opensfm_folder import opensfm_folder, read_opensfm
 from ingest.models_in.stored import ModelFormat, ModelSource
 
-NAMES: dict[ModelFormat, str] = {"colmap": "COLMAP", "opensfm": "OpenSfM", "kapture": "kapture"}
+NAMES: dict[ModelFormat, str] = {"colmap": "COLMAP", "opensfm": "OpenSfM"}
 
 
 def open_model(folder: Path, colmap_database: Path | None, reconstruction: int | None) -> ModelSource:
@@ -29,15 +28,13 @@ def open_model(folder: Path, colmap_database: Path | None, reconstruction: int |
         raise IngestError(
             "--reconstruction: expected OpenSfM's reconstruction.json, found none; leave it out"
         )
-    kapture = place is None and is_kapture(folder)
-    if colmap_database is not None and (place is not None or kapture):
-        found = "kapture" if kapture else "OpenSfM"
+    if place is None:
+        return _colmap(folder, colmap_database)
+    if colmap_database is not None:
         raise IngestError(
-            f"--database: expected a COLMAP model, found one of {found} in {folder}; leave it out"
+            f"--database: expected a COLMAP model, found one of OpenSfM in {folder}; leave it out"
         )
-    if place is not None:
-        return _opensfm(folder, place, reconstruction)
-    return read_kapture(folder) if kapture else _colmap(folder, colmap_database)
+    return _opensfm(folder, place, reconstruction)
 
 
 def _colmap(folder: Path, database: Path | None) -> ModelSource:

@@ -25,7 +25,7 @@ from ingest.sfm.extract import LazyFeatures, PhotoFeatures
 _NORM_RANGE, _MEAN_RANGE = (500.0, 524.0), (33.0, 42.0)
 
 
-ModelFormat = Literal["colmap", "opensfm", "kapture"]
+ModelFormat = Literal["colmap", "opensfm"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

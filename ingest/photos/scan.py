@@ -49,7 +49,6 @@ class ScanOptions:
 
     Attributes:
         limits: sizes that are refused.
-        recursive: folders in the folder are entered.
         exclude: shell patterns; a file whose name, with or without its folder, fits one is left out.
         workers: threads; 0 for one per core, at most 8 (decoding is limited by memory bandwidth then).
         owner, licence: attribution of photos that do not name their own.
@@ -58,7 +57,6 @@ class ScanOptions:
     """
 
     limits: DecodeLimits = INGEST_LIMITS
-    recursive: bool = True
     exclude: tuple[str, ...] = ()
     workers: int = 0
     owner: str = ""
@@ -114,7 +112,7 @@ def scan_folder(
         IngestError: the folder cannot be listed.
     """
     options = options or ScanOptions()
-    files = [_excluded(file, options.exclude) for file in walk(folder, options.recursive)]
+    files = [_excluded(file, options.exclude) for file in walk(folder)]
     return _scan_files(files, options, progress, cache_file, {})
 
 

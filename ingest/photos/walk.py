@@ -36,7 +36,7 @@ class FoundFile:
     reason: str = ""
 
 
-def walk(folder: Path, recursive: bool = True) -> tuple[FoundFile, ...]:
+def walk(folder: Path) -> tuple[FoundFile, ...]:
     """All entries of the folder and of the folders in it, sorted by name; nothing is opened.
 
     Links are followed, each folder is entered once. Hidden entries, special files, unreadable folders and
@@ -53,13 +53,11 @@ def walk(folder: Path, recursive: bool = True) -> tuple[FoundFile, ...]:
             f"{folder}: expected a folder of photos that can be listed, found: {error.strerror or error}"
         ) from error
     seen = {(info.st_dev, info.st_ino)}
-    found = list(_entries(folder, sorted(names), "", recursive, seen))
+    found = list(_entries(folder, sorted(names), "", seen))
     return tuple(sorted(found, key=lambda file: file.name))
 
 
-def _entries(
-    folder: Path, names: list[str], prefix: str, recursive: bool, seen: set[tuple[int, int]]
-) -> Iterator[FoundFile]:
+def _entries(folder: Path, names: list[str], prefix: str, seen: set[tuple[int, int]]) -> Iterator[FoundFile]:
     for raw in names:
         path = folder / raw
         text = os.fsencode(raw).decode("utf-8", "backslashreplace")
@@ -76,12 +74,7 @@ def _entries(
             yield _refused(name, path, "unreadable", f"cannot be read: {error.strerror or error}")
             continue
         if stat.S_ISDIR(info.st_mode):
-            if recursive:
-                yield from _subfolder(path, name, (info.st_dev, info.st_ino), seen)
-            else:
-                yield _refused(
-                    name, path, "folder", "a folder, and folders are not entered (recursive is off)"
-                )
+            yield from _subfolder(path, name, (info.st_dev, info.st_ino), seen)
         elif stat.S_ISREG(info.st_mode):
             yield FoundFile(name=name, path=path, size=info.st_size, mtime_ns=info.st_mtime_ns)
         else:
@@ -100,7 +93,7 @@ def _subfolder(
     except OSError as error:
         yield _refused(name, path, "unreadable", f"the folder cannot be listed: {error.strerror or error}")
         return
-    yield from _entries(path, names, name + "/", True, seen)
+    yield from _entries(path, names, name + "/", seen)
 
 
 def _refused(name: str, path: Path, code: str, reason: str) -> FoundFile:

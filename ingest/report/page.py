@@ -39,6 +39,7 @@ def write_report(folder: Path, report: IngestReport) -> tuple[Path, Path]:
 def report_page(report: IngestReport) -> str:
     """The page as HTML. Everything that comes from files is escaped."""
     title = f"Ingest of {report.folder.rstrip('/').rsplit('/', 1)[-1] or report.folder}"
+    document = report_json(report)
     parts = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="soft">from <code>{escape(report.folder)}</code> '
@@ -50,7 +51,8 @@ def report_page(report: IngestReport) -> str:
         films_html(report.films, report.photos),
         _stages(report),
         _files(report),
-        _options(report),
+        folded("Options", document["options"]),
+        folded("Versions", document["versions"]),
     ]
     return page(title, parts)
 
@@ -86,6 +88,9 @@ def _map(outcome: MapOutcome) -> str:
         ("coordinates", f"EPSG:{outcome.epsg}, heights: {outcome.height_datum}" if outcome.epsg else "none"),
         ("map id", outcome.map_id or "none"),
     ]
+    control = ""
+    if outcome.control is not None and outcome.control.control.marks:
+        control = control_html(outcome.control.placement, outcome.control.control)
     notes = "".join(note(warning) for warning in outcome.warnings)
     pictures = ""
     if outcome.plan is not None:
@@ -96,17 +101,11 @@ def _map(outcome: MapOutcome) -> str:
         f"<h2>Map {escape(outcome.name)} {pill(*_MAP_PILLS[outcome.status])}</h2><section>{reason}{notes}"
         + table((), facts, names=(0,))
         + pictures
-        + _control(outcome)
+        + control
         + _cameras(outcome)
         + folded("Gates and their figures", outcome.gates)
         + "</section>"
     )
-
-
-def _control(outcome: MapOutcome) -> str:
-    if outcome.control is None or not outcome.control.control.marks:
-        return ""
-    return control_html(outcome.control.placement, outcome.control.control)
 
 
 def _cameras(outcome: MapOutcome) -> str:
@@ -193,11 +192,6 @@ def _file_row(photo: PhotoOutcome) -> str:
         + "".join(f'<td class="n">{figure}</td>' for figure in figures)
         + "</tr>"
     )
-
-
-def _options(report: IngestReport) -> str:
-    document = report_json(report)
-    return folded("Options", document["options"]) + folded("Versions", document["versions"])
 
 
 def _count(value: int | None) -> str:

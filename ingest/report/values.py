@@ -273,16 +273,12 @@ def report_json(report: IngestReport) -> dict[str, Any]:
 
 
 def _map_json(outcome: MapOutcome) -> dict[str, Any]:
-    tracks = outcome.track_lengths
+    tracks, errors = outcome.track_lengths, outcome.errors_px
     edges = [*_TRACK_BINS, 1 << 30]
     counts: list[int] = np.histogram(tracks, bins=edges)[0].tolist() if len(tracks) else []
     return {name: getattr(outcome, name) for name in MapOutcome.__slots__ if name not in _DRAWN} | {
         "warnings": outcome.warnings,
         "cameras": [asdict(camera) for camera in outcome.cameras],
-        "reprojection_px": _percentiles(outcome.errors_px),
+        "reprojection_px": {f"p{p}": float(np.percentile(errors, p)) for p in _PERCENTILES if len(errors)},
         "track_lengths": [{"from": low, "points": n} for low, n in zip(_TRACK_BINS, counts, strict=False)],
     }
-
-
-def _percentiles(errors: NDArray[np.float32]) -> dict[str, float]:
-    return {f"p{p}": float(np.percentile(errors, p)) for p in _PERCENTILES} if len(errors) else {}

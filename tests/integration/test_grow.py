@@ -24,7 +24,6 @@ from featuredb.store.candidates.states import Contribution
 from featuredb.store.verify import verify
 from ingest.growing import grow_candidates, watch_and_grow
 from ingest.growth.growth_report import GrowthReport
-from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.result import LocaliseRequest
@@ -375,7 +374,7 @@ def test_trusted_owners_and_commands(given: Path, tmp_path: Path, capsys: pytest
 
 def test_a_trusted_owner_alone(database: Database, shots: list[Shot]) -> None:
     give(database, shots[:3])
-    options = growing(confirmation=ConfirmationOptions(trusted=("anna",)))
+    options = growing(trusted=("anna",))
     assert grow_candidates(database, options).count("promoted") == 3
 
 

@@ -14,8 +14,8 @@ from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from featuredb.store import Database
 from featuredb.store.encode import content_digest
 from ingest.growth.run import grow
-from ingest.growth.run_record import GrowthOptions, no_photos
 from ingest.growth.unplaced import left_over, place_unplaced_maps
+from ingest.growth.values import GrowthOptions, no_photos
 from ingest.map_builder import MapOptions, build_unplaced_map
 from ingest.register.place_map import placed_map
 from reloc.localiser import Localiser
@@ -56,8 +56,8 @@ def test_a_map_without_a_place_is_placed_by_one_that_shows_the_same(
     unplaced = _unplaced("loose", range(4))
     before = database.commit_map(unplaced).version
     areas, options = Localiser.open(database).areas, GrowthOptions()
-    done = place_unplaced_maps(database, areas, tmp_path / "work", options)
-    assert [entry.map_id for entry in done.placed] == ["loose"], done
+    done, _, _ = place_unplaced_maps(database, areas, tmp_path / "work", options)
+    assert [entry.map_id for entry in done] == ["loose"], done
     placed = database.snapshot().load_map("loose")
     assert (placed.status, placed.generation, placed.parents) == ("quarantined", 1, ("old",))
     assert (placed.placement.method, placed.name) == ("map", "loose")

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.camera import Camera
-from ingest.growth.place.component import grow_component
+from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
-from ingest.growth.values import GrownMap
 from reloc.localise.candidates import IndexedArea
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, centers_error, existing, walk
 from tests.support.new_photos import NewPhotos, identity, moved, take_photos

@@ -15,7 +15,6 @@ from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from featuredb.store.changes import IMPORTED
 from featuredb.store.verify import verify
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
-from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from reloc.localiser import Localiser
 from tests.support.scene_strip import FRAME, note_contributed, put_on_record, strip_map
@@ -42,8 +41,7 @@ def _add(database: Database, feature_map: FeatureMap, owner: str = "") -> None:
 
 
 def _promoted(database: Database, *trusted: str) -> dict[str, Promotion]:
-    options = ConfirmationOptions(trusted=trusted)
-    found = promote_confirmed(database, Localiser.open(database), options, budget_m=0.5)
+    found = promote_confirmed(database, Localiser.open(database), trusted, budget_m=0.5)
     return {outcome.map_id: outcome for outcome in found}
 
 

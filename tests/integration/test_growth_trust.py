@@ -18,7 +18,6 @@ from ingest.growth.graph.replacing import replace_descendants
 from ingest.growth.map_images import features_and_points
 from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, own_canaries, run_canaries
-from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from ingest.growth.values import Edge, Refused
 from reloc.localise.localise import localise_features
@@ -61,9 +60,9 @@ def _add(database: Database, feature_map: FeatureMap) -> None:
     database.commit_map(feature_map)
 
 
-def _promoted(database: Database, options: ConfirmationOptions | None = None) -> dict[str, Promotion]:
+def _promoted(database: Database, trusted: tuple[str, ...] = ()) -> dict[str, Promotion]:
     localiser = Localiser.open(database)
-    found = promote_confirmed(database, localiser, options, budget_m=_BUDGET_M)
+    found = promote_confirmed(database, localiser, trusted, budget_m=_BUDGET_M)
     return {outcome.map_id: outcome for outcome in found}
 
 
@@ -111,7 +110,7 @@ def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytes
 
     first = ask()
     with monkeypatch.context() as patch:
-        patch.setattr("ingest.growth.trust.promotion.examine", None)
+        patch.setattr("ingest.growth.trust.promotion.corroborate", None)
         assert ask() == first
     _add(database, strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
     assert not ask().promoted  # something new has come, of somebody whose word does not count yet
@@ -378,8 +377,7 @@ def test_a_parent_that_is_placed_anew_takes_its_children_along(tmp_path: Path) -
 
 def test_a_trusted_owner_is_promoted_alone(tmp_path: Path) -> None:
     mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
-    options = ConfirmationOptions(trusted=("anna",))
-    assert _promoted(_database(tmp_path, _ANCHOR, mine), options)["m"].promoted
+    assert _promoted(_database(tmp_path, _ANCHOR, mine), trusted=("anna",))["m"].promoted
 
 
 def test_what_is_retired_cannot_be_promoted(tmp_path: Path) -> None:

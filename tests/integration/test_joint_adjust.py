@@ -17,10 +17,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, MapObservations
 from featuredb.store import Database
-from ingest.growth.graph.joint.adjust import adjust_together
-from ingest.growth.graph.joint.in_database import adjust_maps
-from ingest.growth.graph.joint.joined import join_maps
-from ingest.growth.graph.joint.links import Links
+from ingest.growth.graph.joint.adjust import adjust_maps, adjust_together
+from ingest.growth.graph.joint.joined import Links, join_maps
 from ingest.growth.graph.map_graph import place_of
 from ingest.growth.map_places import growth_of
 from tests.support.scene_strip import POINTS, east, grown, strip_map
@@ -184,7 +182,7 @@ def test_maps_that_contradict_each_other_are_refused(
     """No poses and points fit both; the robust loss would rather leave one's observations out."""
     maps = [strip_map("anchor", 40.0), of_another_scene(metres)]
     if reason == "OBSERVATIONS_LOST":
-        monkeypatch.setattr("ingest.growth.graph.joint.judge._MOST_GROWTH", np.inf)
+        monkeypatch.setattr("ingest.growth.graph.joint.adjusted_map._MOST_GROWTH", np.inf)
     found = adjust_together(maps)
     assert (found.reason, found.maps) == (reason, ())
     assert "map other" in found.message
@@ -209,8 +207,6 @@ def test_bad_requests_say_what_is_wrong(anchor: FeatureMap, child: FeatureMap) -
         adjust_together([anchor, replace(child, extractor_fingerprint="other")])
     with pytest.raises(InvalidValueError, match="all maps are held"):
         adjust_together([anchor, child], held=["anchor", "child"])
-    with pytest.raises(InvalidValueError, match="named twice"):
-        adjust_together([anchor, anchor])
 
 
 @pytest.fixture
@@ -256,7 +252,7 @@ def test_a_parent_that_is_not_named_holds_its_children(anchor: FeatureMap, tmp_p
     database.commit_maps([straight, *wrong])
     found = adjust_maps(database, ["first", "second"])
     assert found.reason is None, found.message
-    assert [(r.map_id, r.held) for r in found.adjustment.reports] == [
+    assert [(r.map_id, r.held) for r in found.reports] == [
         ("anchor", True), ("first", False), ("second", False),
     ]  # fmt: skip
     snapshot = database.snapshot()
@@ -288,9 +284,9 @@ def test_measured_anchors_stay_unless_freed(anchor: FeatureMap, child: FeatureMa
     surveyed = replace(anchor, placement=replace(anchor.placement, method="lidar"))
     database.commit_maps([surveyed, child])
     held = adjust_maps(database, ["anchor"], dry_run=True)
-    assert [r.held for r in held.adjustment.reports] == [True, False]
+    assert [r.held for r in held.reports] == [True, False]
     freed = adjust_maps(database, ["anchor"], free=["anchor"], dry_run=True)
-    assert [r.held for r in freed.adjustment.reports] == [False, False]
+    assert [r.held for r in freed.reports] == [False, False]
 
 
 def test_a_known_query_that_would_be_lost_stops_it(
@@ -300,7 +296,7 @@ def test_a_known_query_that_would_be_lost_stops_it(
 
     check = CanaryCheck(name="known", before="right", after="moved", regression="2.00 m off")
     monkeypatch.setattr(
-        "ingest.growth.graph.joint.in_database.ask_persons_canaries",
+        "ingest.growth.graph.joint.adjust.ask_persons_canaries",
         lambda *_: CanaryRun(checks=(check,), note="1 known queries"),
     )
     version = database.snapshot().version
@@ -333,16 +329,12 @@ def test_the_command(database: Database, capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_focal_lengths_that_exif_told_are_known_beforehand(anchor: FeatureMap, child: FeatureMap) -> None:
-    none = Links(
-        **{name: np.zeros(0, dtype=np.int64) for name in ("map_a", "point_a", "map_b", "point_b")},
-        heard=0,
-        elsewhere=(),
-    )
-    assert join_maps([anchor, child], none, anchor.frame).known_focal_px == {}
+    none = Links(pairs=np.zeros((0, 4), dtype=np.int64), heard=0, elsewhere=())
+    assert join_maps([anchor, child], none).known_focal_px == {}
     films = [replace(m, camera_keys=("film|x|640x480|unknown",)) for m in (anchor, child)]
-    assert join_maps(films, none, anchor.frame).known_focal_px == {}
-    assert len(join_maps(films, none, anchor.frame).model.cameras) == 2
+    assert join_maps(films, none).known_focal_px == {}
+    assert len(join_maps(films, none).model.cameras) == 2
     keyed = [replace(m, camera_keys=("maker|drone|640x480|f600|7",)) for m in (anchor, child)]
-    joined = join_maps(keyed, none, anchor.frame)
+    joined = join_maps(keyed, none)
     assert len(joined.model.cameras) == 1
     assert joined.known_focal_px == {0: anchor.cameras[0].focal_px}

@@ -80,13 +80,6 @@ def test_every_entry_has_its_outcome_in_the_order_of_names(tmp_path: Path) -> No
     assert by_name(result.photos)["no_extension"].camera_key == ""
 
 
-def test_not_recursive(tmp_path: Path) -> None:
-    save(tmp_path / "a" / "x.jpg", scene(1))
-    save(tmp_path / "b.jpg", scene(2))
-    result = scan_folder(tmp_path, ScanOptions(recursive=False))
-    assert [(p.name, p.reason_code) for p in result.photos] == [("a", "folder"), ("b.jpg", "")]
-
-
 def test_loops_of_links_end_and_linked_files_are_copies(tmp_path: Path) -> None:
     save(tmp_path / "a.jpg", scene(1))
     (tmp_path / "sub").mkdir()

@@ -6,7 +6,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
-from ingest.growth.values import GrownMap
+from ingest.growth.place.component import GrownMap
 from tests.support.new_photos import FINGERPRINT, NewPhotos
 from tests.support.scenes import (
     EASTING,

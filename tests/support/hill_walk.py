@@ -13,8 +13,7 @@ from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution
 from ingest.growing import GrowingOptions
-from ingest.growth.run_record import GrowthOptions
-from ingest.growth.trust.confirmation import ConfirmationOptions
+from ingest.growth.values import GrowthOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from tests.support.hill_map import MAKING
 from tests.support.hill_photos import CAMERA, FRAME, _exif, _render
@@ -83,12 +82,11 @@ def give(database: Database, shots: list[Shot], at: datetime = NOW) -> list[str]
 
 
 def growing(
-    *, budget_m: float = 0.5, confirmation: ConfirmationOptions | None = None, give_up_days: float = 1e6
+    *, budget_m: float = 0.5, trusted: tuple[str, ...] = (), give_up_days: float = 1e6
 ) -> GrowingOptions:
     """Options that fit these small photos."""
-    confirmation = confirmation or ConfirmationOptions()
     return GrowingOptions(
-        growth=GrowthOptions(drift_budget_m=budget_m, confirmation=confirmation),
+        growth=GrowthOptions(drift_budget_m=budget_m, trusted=trusted),
         making=MAKING,
         give_up_days=give_up_days,
     )

@@ -10,7 +10,6 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.trust.confirmation import (
     Confirmation,
-    ConfirmationOptions,
     CorroboratingImage,
     Source,
     confirm,
@@ -18,7 +17,6 @@ from ingest.growth.trust.confirmation import (
 )
 from tests.support.scene_strip import sources_of, strip_map
 
-_OPTIONS = ConfirmationOptions()
 _KNOWN = ("anna", "ben", "carl", "eve")  # have a record, where a test does not say otherwise
 
 
@@ -35,13 +33,12 @@ def _confirm(
     feature_map: FeatureMap,
     corroborating: Sequence[CorroboratingImage] = (),
     *,
-    options: ConfirmationOptions = _OPTIONS,
     on_record: Sequence[str] = _KNOWN,
     trusted: Sequence[str] = (),
     against: Sequence[tuple[Source, str]] = (),
 ) -> Confirmation:
     sources = sources_of(feature_map, on_record=on_record, trusted=trusted)
-    return confirm(feature_map, sources, options, corroborating, against)
+    return confirm(feature_map, sources, corroborating, against)
 
 
 def test_two_owners_on_record_confirm_each_other() -> None:
@@ -109,14 +106,13 @@ def test_photos_that_share_no_points_confirm_nothing() -> None:
     assert _reason(_confirm(apart)) == "ONE_SOURCE"
 
 
-def test_the_same_picture_given_by_two_is_one_source() -> None:
+def test_the_same_picture_given_by_two_is_one_source(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every second photo is the one before it, sent again by someone else: no parallax."""
     feature_map = _owned(["anna", "eve"])
     images = list(feature_map.images)
     for k in range(1, 8, 2):
         images[k] = replace(images[k], cam_from_local=images[k - 1].cam_from_local)
     copied = replace(feature_map, images=tuple(images))
-    alone = replace(_OPTIONS, min_parallax=0.0)
     pair_only = replace(
         copied,
         images=tuple(images[:2]),
@@ -127,8 +123,9 @@ def test_the_same_picture_given_by_two_is_one_source() -> None:
             }
         ),
     )
-    assert _reason(_confirm(pair_only, options=alone)) == "FEW_PAIRS"
     assert _reason(_confirm(pair_only)) == "ONE_SOURCE"
+    monkeypatch.setattr("ingest.growth.trust.confirmation._LEAST_PARALLAX", 0.0)
+    assert _reason(_confirm(pair_only)) == "FEW_PAIRS"
 
 
 def test_one_pair_at_the_rim_confirms_no_map() -> None:

@@ -11,9 +11,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from ingest.growth import gates
-from ingest.growth.graph import budget
-from ingest.growth.graph.budget import rows_within
-from ingest.growth.values import GrownMap, MapsPlacement
+from ingest.growth.graph import map_graph
+from ingest.growth.graph.map_graph import rows_within
+from ingest.growth.place.component import GrownMap
+from ingest.growth.place.placement import MapsPlacement
 from tests.support.scenes import box_points, random_descriptors, ring, scene_map
 
 RNG = np.random.default_rng(4)
@@ -73,11 +74,11 @@ def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) ->
 
     whole = SimpleNamespace(rows=np.arange(6))
     monkeypatch.setattr(
-        budget, "with_drift", lambda found, *_: (found.model, 0.1 * len(found.model.rows), None)
+        map_graph, "with_drift", lambda found, *_: (found.model, 0.1 * len(found.model.rows), None)
     )
-    monkeypatch.setattr(budget, "rows_within", lambda *_: [0, 1, 2, 4])
-    monkeypatch.setattr(budget, "keep_photos", cut)
-    found = budget.grow_within_budget(whole, grown, {}, BUDGET_M)  # type: ignore[arg-type]
+    monkeypatch.setattr(map_graph, "rows_within", lambda *_: [0, 1, 2, 4])
+    monkeypatch.setattr(map_graph, "keep_photos", cut)
+    found = map_graph.grow_within_budget(whole, grown, {}, BUDGET_M)  # type: ignore[arg-type]
     assert isinstance(found, GrownMap)
     codes = {row: code for row, (code, _) in found.left_out.items()}
     assert codes == {3: "WEAK_LINK", 4: "DRIFT_BUDGET", 5: "DRIFT_BUDGET"}

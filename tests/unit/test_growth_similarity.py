@@ -7,10 +7,11 @@ import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.growth.place.correspondences import Correspondences, find_correspondences
 from ingest.growth.place.similarity_fit import (
+    Correspondences,
     agreeing_photos,
     correspondence_errors,
+    find_correspondences,
     fit_similarity,
     neighbours_factor,
     tolerances_px,

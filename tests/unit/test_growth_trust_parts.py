@@ -27,9 +27,8 @@ from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.map_images import model_of
 from ingest.growth.map_places import drift_m, growth_of, places_of
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
-from ingest.growth.trust.confirmation import ConfirmationOptions, CorroboratingImage, Source
+from ingest.growth.trust.confirmation import CorroboratingImage, Source, answering_with, confirmed_points
 from ingest.growth.trust.promotion import Promotion
-from ingest.growth.trust.trusted_points import answering_with, confirmed_points
 from ingest.growth.values import Edge
 from ingest.sfm.links import keep_photos
 from tests.support.scene_strip import EDGE, FRAME, east, sources_of, strip_map
@@ -211,7 +210,7 @@ def test_only_points_of_two_sources_answer() -> None:
     parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
     poisoned = replace(feature_map, observations=type(seen)(**parts))
     known = ("anna", "ben", "eve")
-    points = confirmed_points(poisoned, sources_of(poisoned, on_record=known), ConfirmationOptions())
+    points = confirmed_points(poisoned, sources_of(poisoned, on_record=known))
     assert not points[fake].any()
     assert points[~fake].mean() > 0.9
     part = answering_with(poisoned, points)
@@ -222,12 +221,10 @@ def test_only_points_of_two_sources_answer() -> None:
     # Where all is seen by two, nothing changes; a trusted owner's points need nobody.
     clean = strip_map("m", 40.0, owners=["anna", "ben"])
     assert answering_with(clean, np.ones(len(clean.points), dtype=bool)) is clean
-    trusted = confirmed_points(poisoned, sources_of(poisoned, trusted=("eve",)), ConfirmationOptions())
+    trusted = confirmed_points(poisoned, sources_of(poisoned, trusted=("eve",)))
     assert trusted[fake].mean() > 0.5
     # Whose word does not count yet takes no part.
-    assert not confirmed_points(
-        poisoned, sources_of(poisoned, on_record=["eve"]), ConfirmationOptions()
-    ).any()
+    assert not confirmed_points(poisoned, sources_of(poisoned, on_record=["eve"])).any()
 
 
 def test_a_witness_makes_points_answer() -> None:
@@ -237,8 +234,8 @@ def test_a_witness_makes_points_answer() -> None:
         name="w", source=Source(owner="ben", proven=True), center=np.array([0.0, -60.0, 20.0]), points=rows
     )
     sources = sources_of(feature_map)
-    alone = confirmed_points(feature_map, sources, ConfirmationOptions())
-    found = confirmed_points(feature_map, sources, ConfirmationOptions(), [outside])
+    alone = confirmed_points(feature_map, sources)
+    found = confirmed_points(feature_map, sources, [outside])
     assert not alone.any()
     assert found[rows].mean() > 0.9
     assert not found[100:].any()
@@ -267,7 +264,7 @@ def test_a_report_tells_all_in_both_forms() -> None:
         maps=(
             GrownEntry(
                 map_id="m", status="active", reason_code="", reason="2 sources", photos=("p",), points=9,
-                steps=1, drift_m=0.31, budget_m=0.5, agreements=("maps A and B differ by 0.42 m",),
+                steps=1, drift_m=0.31, budget_m=0.5,
             ),
         ),
         promotions=(
@@ -286,7 +283,7 @@ def test_a_report_tells_all_in_both_forms() -> None:
     text = report.as_text()
     for part in (
         "1 in active maps", "1 waiting", "ALONE: 1 photos", "1 step from an anchor", "0.31 of 0.50 m",
-        "differ by 0.42 m", "map old: stays in quarantine: ONE_SOURCE", "moved by 0.20 m", "overlap a - b",
+        "map old: stays in quarantine: ONE_SOURCE", "moved by 0.20 m", "overlap a - b",
         "note: a note", "quarantined, because nothing holds them any more: z",
     ):  # fmt: skip
         assert part in text

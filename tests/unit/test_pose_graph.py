@@ -13,9 +13,10 @@ from ingest.growth.graph.pose_graph import (
     GraphEdge,
     GraphNode,
     equivalent_sigmas,
+    left_jacobian,
+    small_adjoint,
     solve_pose_graph,
 )
-from ingest.growth.graph.pose_graph_fit import left_jacobian, small_adjoint
 
 _SIGMA = np.array([1e-4, 2e-4, 2e-4, 3e-4, 0.03, 0.02, 0.04])
 _EDGE = np.diag(_SIGMA**2)

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,16 +10,16 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import without_modes
-from featuredb.maps.feature_map import Placement
+from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import GROWTH
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.map_places import drift_m, growth_of, places_of
-from ingest.growth.place.correspondences import Correspondences, find_correspondences
 from ingest.growth.place.localised import in_frame, with_lens
-from ingest.growth.place.placement import map_agreements, parents_covariance, place_by_maps
+from ingest.growth.place.placement import MapsPlacement, parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
-from ingest.growth.values import LEAST_PHOTOS, FeaturesOf, GrownMap, LocalisedPhoto, Refused
+from ingest.growth.place.similarity_fit import find_correspondences
+from ingest.growth.values import LEAST_PHOTOS, FeaturesOf, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
 from ingest.sfm.links import connected_parts, keep_photos
@@ -35,6 +35,21 @@ _MAPS = MapOptions(min_track_length=2)
 # whose tags were at its twin, the parts with those tags were left over, small enough for one forged photo to
 # confirm them: twelve photos promoted 277 m off.
 AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "RESIDUALS", "NOT_VISIBLE")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GrownMap:
+    """A new map, ready to be committed (as quarantined, by whoever commits it).
+
+    Attributes:
+        model: the reconstruction after refinement; metric, in the frame of the map.
+        left_out: photos of the reconstruction that are not in the map, by row, with reason and message.
+    """
+
+    feature_map: FeatureMap
+    placement: MapsPlacement
+    model: Model
+    left_out: Mapping[int, tuple[str, str]] = field(default_factory=dict)
 
 
 def grow_component(
@@ -90,14 +105,13 @@ def _grown(
     camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
     mine = {r: with_lens(photo, model.cameras[camera_of[r]]) for r, photo in mine.items()}
     correspondences = find_correspondences(model, mine, dict(zip(rows, keypoints, strict=True)))
-    held = place_by_maps(model, mine, correspondences, photos, near, frame)
-    placement = held.placement
+    placement = place_by_maps(model, mine, correspondences, photos, near, frame)
     if placement.reason is not None:
         return Refused(reason=placement.reason, message=placement.message, rows=rows, gates=placement.gates)
-    refined = refine_placed(model, held, correspondences, mine, keypoints, lenses, max_bound_m)
+    refined = refine_placed(model, placement, correspondences, mine, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
-    return _assembled(refined, correspondences.take(held.used), photos, features_of, near, identity)
+    return _assembled(refined, photos, features_of, near, identity)
 
 
 def _meeting_place(
@@ -114,13 +128,12 @@ def _meeting_place(
 
 def _assembled(
     refined: Refinement,
-    held: Correspondences,
     photos: Sequence[Photo],
     features_of: FeaturesOf,
     areas: Sequence[Area],
     identity: MapIdentity,
 ) -> GrownMap | Refused:
-    """The map of a refined model held by these correspondences, with what growth knows of it as evidence."""
+    """The map of a refined model, with what growth knows of it as evidence."""
     model, placement = refined.model, refined.placement
     maps = {m.map_id: m for area in areas for m in area.maps}
     parents = [(maps[e.map_id], e.shared_points) for e in placement.edges]
@@ -172,7 +185,6 @@ def _assembled(
         feature_map=grown,
         placement=placement,
         model=model,
-        agreements=map_agreements(placement, held),
         left_out=refined.left_out,
     )
 

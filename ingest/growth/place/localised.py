@@ -1,11 +1,12 @@
 """Step: every new photo is localised by the existing maps, by itself."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.features.features import Features
 from featuredb.geo.local_frame import LocalFrame
@@ -20,7 +21,7 @@ from reloc.localise.acceptance import AcceptanceOptions, agreement
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.lens_prior import LensPriors
 from reloc.localise.localise import Localised, localise_features
-from reloc.localise.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
+from reloc.localise.matching import POSSIBLE_DEG, guided_matches, visible_points
 from reloc.localise.options import LocaliseOptions, PoseOptions
 from reloc.localise.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
 from reloc.localise.result import LocaliseRequest
@@ -60,29 +61,18 @@ def localise_photos(
     Returns:
         What was localised by row, and for the others the reason by row.
     """
-    outcomes = dict(localise_each(photos, rows, features_of, areas, threads))
+
+    def one(row: int) -> LocalisedPhoto | str:
+        return localise_photo(photos[row], row, features_of(row).features, areas)
+
+    if threads <= 1 or len(rows) < 2:
+        outcomes = dict(zip(rows, map(one, rows), strict=True))
+    else:
+        with ThreadPoolExecutor(threads, initializer=use_threads, initargs=(1,)) as pool:
+            outcomes = dict(zip(rows, pool.map(one, rows), strict=True))
     found = {row: outcome for row, outcome in outcomes.items() if isinstance(outcome, LocalisedPhoto)}
     _LOG.info("%d of %d photos localised in %d areas", len(found), len(rows), len(areas))
     return found, {row: outcome for row, outcome in outcomes.items() if isinstance(outcome, str)}
-
-
-def localise_each(
-    photos: Sequence[Photo],
-    rows: Sequence[int],
-    features_of: FeaturesOf,
-    areas: Sequence[IndexedArea],
-    threads: int,
-) -> Iterator[tuple[int, LocalisedPhoto | str]]:
-    """Each row with what `localise_photo` says of it, in their order."""
-
-    def one(row: int) -> tuple[int, LocalisedPhoto | str]:
-        return row, localise_photo(photos[row], row, features_of(row).features, areas)
-
-    if threads <= 1 or len(rows) < 2:
-        yield from map(one, rows)
-        return
-    with ThreadPoolExecutor(threads, initializer=use_threads, initargs=(1,)) as pool:
-        yield from pool.map(one, rows)
 
 
 def localise_photo(
@@ -153,14 +143,16 @@ def _densified(row: int, features: Features, outcome: Localised) -> LocalisedPho
     assert outcome.best is not None
     assert outcome.uncertainty is not None
     area, pose, uncertainty = outcome.best.area, outcome.best.pose, outcome.uncertainty
-    matches = _match_each_map(features, area, pose)
-    if len(matches) >= 4:
-        better = refine_pose(*pairs(features, area, matches), pose, QUERY.pose)
-        matches = _take(matches, better.inliers)
-        if len(matches) >= outcome.best.evidence.inliers:
-            pose, spread = better, area.point_covariance[matches.point]
-            uncertainty = pose_uncertainty(*pairs(features, area, matches), spread, better, QUERY.pose)
-    of_map = area.point_map[matches.point]
+    feature, point = _match_each_map(features, area, pose)
+    pixels, points = features.xy[feature].astype(np.float64), area.points[point]
+    if len(feature) >= 4:
+        better = refine_pose(pixels, points, pose, QUERY.pose)
+        feature, point = feature[better.inliers], point[better.inliers]
+        pixels, points = pixels[better.inliers], points[better.inliers]
+        if len(feature) >= outcome.best.evidence.inliers:
+            pose, spread = better, area.point_covariance[point]
+            uncertainty = pose_uncertainty(pixels, points, spread, better, QUERY.pose)
+    of_map = area.point_map[point]
     counts = np.bincount(of_map, minlength=len(area.maps))
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
     place = np.full(len(area.maps), -1)
@@ -171,41 +163,38 @@ def _densified(row: int, features: Features, outcome: Localised) -> LocalisedPho
         cam_from_local=pose.cam_from_local,
         covariance=uncertainty.covariance,
         camera=pose.camera,
-        feature_rows=matches.feature,
-        pixels=features.xy[matches.feature].astype(np.float64),
+        feature_rows=feature,
+        pixels=pixels,
         map_ids=tuple(area.maps[i].map_id for i in order),
         map_of=place[of_map],
-        point_of=area.point_row[matches.point],
-        points=area.points[matches.point],
-        point_covariance=area.point_covariance[matches.point],
+        point_of=area.point_row[point],
+        points=points,
+        point_covariance=area.point_covariance[point],
         result=outcome.result,
     )
 
 
-def _match_each_map(features: Features, area: Area, pose: PoseHypothesis) -> Matches:
+def _match_each_map(
+    features: Features, area: Area, pose: PoseHypothesis
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Guided matches of all features with the points that each map should show, map by map.
 
     Two maps of one place have the same points twice; each may have its match. Maps with fewer matches
     within the tolerance than a pose needs are left out: chance alone gives a few.
+
+    Returns:
+        Rows (m,) of the features, and of the area's points.
     """
     visible = visible_points(area, area.searched_points(), pose.camera, pose.cam_from_local, POSSIBLE_DEG)
-    parts = [
-        Matches(feature=np.zeros(0, np.int64), point=np.zeros(0, np.int64), distance=np.zeros(0, np.float32))
-    ]
+    found = np.zeros((2, 0), dtype=np.int64)
     for map_row in np.unique(area.point_map[visible]):
         points = visible[area.point_map[visible] == map_row].astype(np.int32)
         matches = guided_matches(features, area, points, pose.camera, pose.cam_from_local, QUERY.matching)
-        if len(matches) == 0:
-            continue
         pixels, places = pairs(features, area, matches)
         near = _errors_px(pose.camera, pose.cam_from_local, places, pixels) < 2.0 * _tolerance_px(pose.camera)
         if near.sum() >= QUERY.acceptance.min_inliers:
-            parts.append(_take(matches, near))
-    return Matches(
-        feature=np.concatenate([p.feature for p in parts]),
-        point=np.concatenate([p.point for p in parts]),
-        distance=np.concatenate([p.distance for p in parts]),
-    )
+            found = np.concatenate([found, np.stack([matches.feature[near], matches.point[near]])], axis=1)
+    return found[0], found[1]
 
 
 def _tolerance_px(camera: Camera) -> float:
@@ -262,10 +251,6 @@ def in_frame(photo: LocalisedPhoto, frame: LocalFrame) -> LocalisedPhoto:
         points=frame_from_old.act(photo.points),
         point_covariance=frame_from_old.rotation @ photo.point_covariance @ frame_from_old.rotation.T,
     )
-
-
-def _take(matches: Matches, rows: np.ndarray) -> Matches:
-    return Matches(feature=matches.feature[rows], point=matches.point[rows], distance=matches.distance[rows])
 
 
 def with_shared_lenses(

@@ -14,9 +14,14 @@ from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, features_and_points, model_of
-from ingest.growth.place.correspondences import find_correspondences
 from ingest.growth.place.localised import in_frame, localise_photo
-from ingest.growth.place.similarity_fit import agreeing_photos, best_proposal, fit_similarity, tolerances_px
+from ingest.growth.place.similarity_fit import (
+    agreeing_photos,
+    best_proposal,
+    find_correspondences,
+    fit_similarity,
+    tolerances_px,
+)
 from ingest.growth.values import LEAST_PHOTOS, Edge, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea

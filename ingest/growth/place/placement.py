@@ -6,7 +6,7 @@ of real sets.
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,40 +15,76 @@ from numpy.typing import NDArray
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.view_cones import in_view, view_cones
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
+from ingest.growth.gates import Gate
 from ingest.growth.place.contradictions import center_variance_m2
-from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.place.similarity_fit import (
+    Correspondences,
     FittedSimilarity,
     agreeing_photos,
     best_proposal,
     fit_similarity,
     tolerances_px,
 )
-from ingest.growth.place.visibility import LEAST_SHOWN, shown_parts
-from ingest.growth.values import LEAST_SHARED_POINTS, Edge, LocalisedPhoto, MapsPlacement
+from ingest.growth.values import LEAST_SHARED_POINTS, LEAST_VIEWS, Edge, LocalisedPhoto
 from ingest.photos.photo import Photo
+from reloc.localise.acceptance import agreement
+from reloc.localise.matching import EXPECTED_DEG, visible_points
 
 _LEAST_PHOTOS = 2  # of the new ones that must see an existing map for it to be a parent
+# Least share of the parts that should show points of existing maps or of the photo's own reconstruction. A
+# re-upload 13.3 m off showed 0.17; right photos of that database 0.32 and more, of the one that grew with
+# this limit 0.23 and more.
+_LEAST_SHOWN = 0.25
+_LEAST_POINTS = 30  # a photo that should see fewer says nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SupportedPlacement:
-    """A placement with what it rests on.
+class MapsPlacement:
+    """A reconstruction placed by existing maps; accepted when `reason` is None.
 
     Attributes:
+        reason: code of the first gate that refused it, or None; `message` says it for people.
+        frame: local frame in which the similarity places the model.
+        local_from_sfm: None where none could be estimated.
+        covariance_relative: (7, 7) of its left perturbation, relative to the existing maps.
+        on_earth: (7, 7) what the existing maps' own uncertainty on Earth adds.
+        agreeing, disagreeing: rows of the localised photos that agree with the placement, and of those
+            that do not. Photos that no map localises are in neither.
+        blind: those that show too little of what existing maps, or the others' points, say they should.
+        edges: one for each existing map that holds it, most shared points first: the correction that this
+            map alone would apply to the placed one.
         fit: over the correspondences that agree; None where nothing fits.
         used: (m,) correspondences that agree with the placement.
+        residual_rms_m: of the agreeing photos' centres, placed minus localised, metres; NaN without any.
+        gates: every gate with its figure, in the order they were asked.
     """
 
-    placement: MapsPlacement
-    fit: FittedSimilarity | None
-    used: NDArray[np.bool_]
+    reason: str | None
+    message: str
+    frame: LocalFrame
+    local_from_sfm: Sim3 | None = None
+    covariance_relative: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
+    on_earth: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
+    agreeing: tuple[int, ...] = ()
+    disagreeing: tuple[int, ...] = ()
+    blind: tuple[int, ...] = ()
+    edges: tuple[Edge, ...] = ()
+    fit: FittedSimilarity | None = None
+    used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    residual_rms_m: float = float("nan")
+    gates: tuple[Gate, ...] = ()
+
+    @property
+    def parents(self) -> tuple[str, ...]:
+        """Maps that hold the new one, most shared points first."""
+        return tuple(edge.map_id for edge in self.edges)
 
 
 def place_by_maps(
@@ -58,7 +94,7 @@ def place_by_maps(
     photos: Sequence[Photo],
     areas: Sequence[Area],
     frame: LocalFrame,
-) -> SupportedPlacement:
+) -> MapsPlacement:
     """Place a model by the localisations of its photos.
 
     Args:
@@ -76,27 +112,40 @@ def place_by_maps(
         used &= fit.errors_px < tolerances_px(model, correspondences)
         edges = edges_of(model, fit, correspondences, used)
     if found is None or not edges:
-        return _nowhere(model, own, frame, len(correspondences))
+        gate = gates.agreement(0, len(own))
+        return MapsPlacement(
+            reason=gate.reason,
+            message=f"no placement: {gate.message}",
+            frame=frame,
+            disagreeing=_rows(model, own),
+            gates=(gate,),
+        )
     maps = {m.map_id: m for area in areas for m in area.maps}
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
     sim, held = fit.local_from_sfm, correspondences.take(np.flatnonzero(used))
-    existing, with_own = shown_parts(model, sim, held, areas, frame)
+    existing, with_own = _shown_parts(model, sim, held, areas, frame)
     disagree = own.keys() - agree
     # Those that disagree are left out as such.
-    blind = set(np.flatnonzero(with_own < LEAST_SHOWN).tolist()) - disagree
+    blind = set(np.flatnonzero(with_own < _LEAST_SHOWN).tolist()) - disagree
     blind |= {k for k in agree if existing[k] < gates.LEAST_VISIBLE}
-    centers, offsets = sim.act(model.centers()), _center_offsets(model, sim, own, agree)
+    centers = sim.act(model.centers())
+    # From the placed to the localised centres of the photos that agree, metres.
+    offsets = np.array([own[k].cam_from_local.center - centers[k] for k in sorted(agree)])
+    squared = (offsets**2).sum(axis=1)
+    # Beyond what they are uncertain by: photos at the rim of a map are localised badly, which bends no model.
+    own_m2 = np.array([center_variance_m2(own[k]) for k in sorted(agree)])
+    excess_m = float(np.sqrt(np.median(np.maximum(squared - own_m2, 0.0))))
     reach = float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1)))
     positions = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
     parents = ", ".join(e.map_id for e in edges)
     asked = (
         gates.agreement(len(agree), len(disagree)),
-        gates.residuals(_typical_excess_m(offsets, [own[k] for k in sorted(agree)]), reach),
+        gates.residuals(excess_m, reach),
         gates.geotags(*positions, by=parents),
         gates.visibility(existing[np.isfinite(existing)]),
     )
     refusal = gates.first_refusal(asked)
-    placement = MapsPlacement(
+    return MapsPlacement(
         reason=refusal.reason if refusal else None,
         message=refusal.message if refusal else f"placed by {parents}",
         frame=frame,
@@ -107,27 +156,15 @@ def place_by_maps(
         disagreeing=_rows(model, disagree),
         blind=_rows(model, blind),
         edges=edges,
-        residual_rms_m=float(np.sqrt((offsets**2).sum(axis=1).mean())),
+        fit=fit,
+        used=used,
+        residual_rms_m=float(np.sqrt(squared.mean())),
         gates=asked,
     )
-    return SupportedPlacement(placement=placement, fit=fit, used=used)
 
 
 def _rows(model: Model, photos: Collection[int]) -> tuple[int, ...]:
     return tuple(int(model.rows[k]) for k in sorted(photos))
-
-
-def _nowhere(model: Model, own: Collection[int], frame: LocalFrame, count: int) -> SupportedPlacement:
-    """Nothing that photos agree upon, or no existing map that would hold them."""
-    gate = gates.agreement(0, len(own))
-    placement = MapsPlacement(
-        reason=gate.reason,
-        message=f"no placement: {gate.message}",
-        frame=frame,
-        disagreeing=_rows(model, own),
-        gates=(gate,),
-    )
-    return SupportedPlacement(placement=placement, fit=None, used=np.zeros(count, dtype=np.bool_))
 
 
 def _agreed(
@@ -157,15 +194,6 @@ def _agreed(
     return fit, chosen
 
 
-def _center_offsets(
-    model: Model, sim: Sim3, own: Mapping[int, LocalisedPhoto], agree: set[int]
-) -> FloatArray:
-    """(n, 3) metres, from the placed to the localised centres of the photos that agree."""
-    return np.array(
-        [own[k].cam_from_local.center - sim.act(model.cam_from_sfm[k].center) for k in sorted(agree)]
-    )
-
-
 def _against_positions(
     model: Model, centers: FloatArray, photos: Sequence[Photo], frame: LocalFrame, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -184,15 +212,6 @@ def _against_positions(
         offsets.append((center - place)[:2])
         spreads.append(jacobian @ covariance @ jacobian.T + np.eye(2) * gps.sigma_horizontal_m**2)
     return np.array(offsets).reshape(-1, 2), np.array(spreads).reshape(-1, 2, 2)
-
-
-def _typical_excess_m(offsets: FloatArray, photos: Sequence[LocalisedPhoto]) -> float:
-    """Median distance of the localised centres from the placed ones beyond what they are uncertain by.
-
-    Photos at the rim of a map are localised badly, which bends no model.
-    """
-    own_m2 = np.array([center_variance_m2(photo) for photo in photos])
-    return float(np.sqrt(np.median(np.maximum((offsets**2).sum(axis=1) - own_m2, 0.0))))
 
 
 def edges_of(
@@ -241,24 +260,37 @@ def parents_covariance(
     return covariance
 
 
-def map_agreements(placement: MapsPlacement, held: Correspondences) -> tuple[str, ...]:
-    """How well each pair of parents agrees, as the new map that overlaps both sees it: in the middle of it.
+def _shown_parts(
+    model: Model, sim: Sim3, held: Correspondences, areas: Sequence[Area], frame: LocalFrame
+) -> tuple[FloatArray, FloatArray]:
+    """For each photo the share of the image's parts that should show points where it does so.
 
     Args:
-        held: correspondences that agree with the placement.
+        sim: frame from the model's.
+        held: pixels of the model's photos in which existing points are seen, where the placement has them.
+
+    Returns:
+        Shares (k,) of the points of existing maps, and (k,) of these and of the points of the model itself
+        that several photos bear out; NaN for photos that should show hardly any. Photos that no map localised
+        are asked as well: a camera that looks through a wall, and a copy that was joined at a look-alike, fit
+        what they see and do not show the rest.
     """
-    found: list[str] = []
-    for i, a in enumerate(placement.edges):
-        for b in placement.edges[i + 1 :]:
-            a_from_b = a.other_from_map @ b.other_from_map.inverse()
-            adjoint = a_from_b.adjoint()
-            covariance = a.covariance + adjoint @ b.covariance @ adjoint.T
-            both = np.isin(held.map_of, [held.map_ids.index(a.map_id), held.map_ids.index(b.map_id)])
-            middle = held.points[both].mean(axis=0)
-            offset, jacobian = a_from_b.act(middle) - middle, point_jacobian(middle)
-            sigmas = float(np.sqrt(offset @ np.linalg.solve(jacobian @ covariance @ jacobian.T, offset)))
-            found.append(
-                f"maps {a.map_id} and {b.map_id} differ by {np.linalg.norm(offset):.2f} m here, "
-                f"{sigmas:.1f} sigma"
-            )
-    return tuple(found)
+    often = model.track_lengths() >= LEAST_VIEWS
+    cones = view_cones(model.xyz, model.centers(), model.point_of, model.photo_of)
+    shares = np.full((2, len(model.rows)), np.nan)
+    for k, pose in enumerate(model.cam_from_sfm):
+        camera = model.cameras[int(model.camera_of[k])]
+        expected, seen = [np.zeros((0, 2))], [held.pixels[held.photo_of == k]]
+        for area in areas:
+            in_area = sim.act_on_pose(pose) @ frame.enu_from(area.frame)
+            rows = visible_points(area, area.searched_points(), camera, in_area)
+            expected.append(camera.project(in_area.act(area.points[rows])))
+        own = often & in_view(model.xyz, cones, camera, pose, EXPECTED_DEG)
+        seen_own = model.point_of[(model.photo_of == k) & often[model.point_of]]
+        for row in range(2):
+            should = np.concatenate(expected)
+            if len(should) >= _LEAST_POINTS:
+                shares[row, k] = agreement(np.concatenate(seen), should, camera.width, camera.height)
+            expected.append(camera.project(pose.act(model.xyz[own])))
+            seen.append(camera.project(pose.act(model.xyz[seen_own])))
+    return shares[0], shares[1]

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -27,7 +26,6 @@ from ingest.colmap.bridge import Model, with_observations
 from ingest.growth import gates
 from ingest.growth.map_places import SIGMAS_95
 from ingest.growth.place.contradictions import contradicting_photos
-from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.place.drift import (
     bending_variance_m2,
     center_covariances,
@@ -35,9 +33,9 @@ from ingest.growth.place.drift import (
     shared_turn,
     turning_covariance,
 )
-from ingest.growth.place.placement import SupportedPlacement, edges_of
-from ingest.growth.place.similarity_fit import fit_similarity
-from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, MapsPlacement, Refused, pixel_scale
+from ingest.growth.place.placement import MapsPlacement, edges_of
+from ingest.growth.place.similarity_fit import Correspondences, fit_similarity
+from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused, pixel_scale
 from ingest.photos.photo import Photo
 from ingest.sfm.links import bottleneck_share, select_photos
 
@@ -123,7 +121,7 @@ def _lens_for_key(keys: set[str], areas: Sequence[Area]) -> Camera | None:
 
 def refine_placed(
     model: Model,
-    held: SupportedPlacement,
+    placement: MapsPlacement,
     correspondences: Correspondences,
     localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
@@ -138,9 +136,8 @@ def refine_placed(
         max_bound_m: photos that may be further off (95 %), against the existing points and with what their
             lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
     """
-    placement = held.placement
     assert placement.local_from_sfm is not None
-    assert held.fit is not None
+    assert placement.fit is not None
     rows = tuple(int(r) for r in model.rows)
     placed = in_metres(model, placement.local_from_sfm)
     outside = [rows.index(r) for r in (*placement.disagreeing, *placement.blind)]
@@ -151,13 +148,15 @@ def refine_placed(
     left_out |= {rows[k]: ("WEAK_LINK", message) for k, message in weak.items()}
     outside += sorted(weak)
     for _ in range(_ROUNDS):
-        good = correspondences.take(np.flatnonzero(held.used & ~np.isin(correspondences.photo_of, outside)))
+        good = correspondences.take(
+            np.flatnonzero(placement.used & ~np.isin(correspondences.photo_of, outside))
+        )
         good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)
         adjusted, fixed = _refined(placed, outside, good, lenses, keypoints)
         spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses, _ADJUST)
         fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
         inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
-        against = contradicting_photos(adjusted.model, inside, spread.poses, (held.fit, fit))
+        against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
         loose = {
             k: message
             for k, message in loose_photos(adjusted.model, spread.poses, max_bound_m).items()
@@ -266,16 +265,9 @@ def _refined(
     first, number = held.existing()
     fixed = FixedPoints(xyz=held.points[first], point_of=number, photo_of=held.photo_of, pixels=held.pixels)
     size = int(max(model.keypoint_of.max(initial=0), held.feature.max(initial=0))) + 1
-    free = _in_tracks(model, ~np.isin(model.photo_of, outside))
     taken = np.isin(model.photo_of * size + model.keypoint_of, held.photo_of * size + held.feature)
-    free = _in_tracks(model, free & ~taken)
+    free = ~np.isin(model.photo_of, outside) & ~taken
     return adjust_anchored(with_observations(model, free), keypoints, fixed, lenses, _ADJUST), fixed
-
-
-def _in_tracks(model: Model, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Those observations (m,) whose points at least two of them see."""
-    views = np.bincount(model.point_of[seen], minlength=len(model.xyz))
-    return np.asarray(seen & (views[model.point_of] >= 2))
 
 
 def _sigma_px(model: Model, correspondences: Correspondences) -> FloatArray:

@@ -18,7 +18,6 @@ import numpy as np
 from featuredb.features.decode import DecodeLimits, decode_gray
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.features.features import Features
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.feature_map import FeatureMap, MapImage
@@ -192,14 +191,22 @@ def own_canaries(
     """
     near: list[tuple[str, str, MapImage]] = []
     far: list[tuple[str, str, MapImage]] = []
-    boxes = [_box(m) for m in new_maps if len(m.points)]
+    boxes = []  # in plan, (2, 2), of the maps' points without the few wild ones, with a margin
+    for m in new_maps:
+        if len(m.points):
+            low, high = np.percentile(m.points_local()[:, :2], (2, 98), axis=0)
+            boxes.append((m.frame, low - NEAR_M, high + NEAR_M))
     for indexed in before.areas:
         images = [(m, image) for m in indexed.area.maps for image in m.images]
         for (feature_map, image), described in zip(images, np.diff(indexed.area.image_start), strict=True):
             if described < LEAST_FEATURES:
                 continue
             key = hashlib.sha256(f"{feature_map.map_id} {image.name}".encode()).hexdigest()
-            around = any(_near(feature_map, image, frame, box) for frame, box in boxes)
+            center = image.cam_from_local.center
+            around = False
+            for frame, low, high in boxes:
+                there = frame.enu_from(feature_map.frame).act(center)[:2]
+                around |= bool(((there >= low) & (there <= high)).all())
             (near if around else far).append((key, feature_map.map_id, image))
     chosen = sorted(near, key=lambda e: e[0])[:_OWN_NEAR]
     chosen += sorted(far, key=lambda e: e[0])[:_OWN_ELSEWHERE]
@@ -280,14 +287,3 @@ def _miss(pose: LocalisedPose, center: FloatArray, cam_from_local: FloatArray) -
         degrees=float(np.degrees(rotation_angle(turn))),
         sigma_m=float(np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
     )
-
-
-def _box(feature_map: FeatureMap) -> tuple[LocalFrame, FloatArray]:
-    """Plan box (2, 2) of a map's points, without the few wild ones, and its frame."""
-    points = feature_map.points_local()[:, :2]
-    return feature_map.frame, np.percentile(points, (2, 98), axis=0)
-
-
-def _near(feature_map: FeatureMap, image: MapImage, frame: LocalFrame, box: FloatArray) -> bool:
-    center = frame.enu_from(feature_map.frame).act(image.cam_from_local.center)[:2]
-    return bool((center >= box[0] - NEAR_M).all() and (center <= box[1] + NEAR_M).all())

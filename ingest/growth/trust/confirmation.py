@@ -22,24 +22,12 @@ from ingest.growth.gates import Gate
 # A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
 # photo in common count as one, three photos that confirm each other as one and a half.
 _ONE_PAIR = 1.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ConfirmationOptions:
-    """When a map counts as confirmed.
-
-    Attributes:
-        trusted: identities that the operator vouches for: their photos need nobody else, as his own.
-        min_shared_points: two photos confirm each other from so many common points of the map on. An
-            accepted pose has at least so many inliers (reloc.localise.options), and chance gives a few.
-        min_parallax: distance of two cameras over their distance from what both see. The same picture given
-            by two people, cut or compressed anew, shows no parallax; poses of one place are good to some
-            thousandths.
-    """
-
-    trusted: tuple[str, ...] = ()
-    min_shared_points: int = 15
-    min_parallax: float = 0.01
+# Common points of the map from which on two photos confirm each other. An accepted pose has at least so many
+# inliers (reloc.localise.options), and chance gives a few.
+_LEAST_SHARED_POINTS = 15
+# Distance of two cameras over their distance from what both see. The same picture given by two people, cut or
+# compressed anew, shows no parallax; poses of one place are good to some thousandths.
+_LEAST_PARALLAX = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +56,7 @@ class Sources:
 
     Attributes:
         owners: of the database as it is; by default, one to which nobody has contributed.
-        trusted: see `ConfirmationOptions`.
+        trusted: identities that the operator vouches for: their photos need nobody else, as his own.
     """
 
     owners: Owners = field(default_factory=Owners)
@@ -144,7 +132,6 @@ class Confirmation:
 def confirm(
     feature_map: FeatureMap,
     sources: Sources,
-    options: ConfirmationOptions,
     corroborating: Sequence[CorroboratingImage] = (),
     against: Sequence[tuple[Source, str]] = (),
 ) -> Confirmation:
@@ -158,8 +145,9 @@ def confirm(
     """
     everyone = [*sources.of_map(feature_map), *(w.source for w in corroborating)]
     own = len(feature_map.images)
-    sees_same = _shared_points(feature_map, corroborating) >= options.min_shared_points
-    apart = parallax(feature_map, corroborating) >= options.min_parallax
+    sees = _sees(feature_map, corroborating)
+    sees_same = (sees @ sees.T).toarray() >= _LEAST_SHARED_POINTS
+    apart = parallax(feature_map, corroborating) >= _LEAST_PARALLAX
     agree = sees_same & apart & independent_pairs(everyone)
     proven = np.array([s.proven for s in everyone], dtype=bool)
     confirmed: NDArray[np.bool_] = np.asarray(agree.any(axis=1) | proven, dtype=np.bool_)
@@ -235,23 +223,18 @@ def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[tuple[So
     )
 
 
-def _shared_points(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage]) -> NDArray[np.int64]:
-    """Numbers of common points of the map's images and those from outside, (n, n)."""
+def _sees(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage]) -> sparse.csr_array:
+    """Which points each photo sees, (photos, points), 1 or 0: images of the map, then photos from outside."""
     row = {image.image_id: i for i, image in enumerate(feature_map.images)}
     seen = feature_map.observations
-    images = np.array([row[int(i)] for i in seen.image_id], dtype=np.int64)
-    points = seen.point_index
-    for k, outside in enumerate(corroborating, start=len(row)):
-        images = np.concatenate([images, np.full(len(outside.points), k)])
-        points = np.concatenate([points, outside.points])
-    count = len(row) + len(corroborating)
-    sees = sparse.csr_array(
-        (np.ones(len(images), dtype=np.int64), (images, points)),
-        shape=(count, max(len(feature_map.points), 1)),
-    )
+    images = [np.array([row[int(i)] for i in seen.image_id], dtype=np.int64)]
+    images += [np.full(len(outside.points), k) for k, outside in enumerate(corroborating, start=len(row))]
+    points = np.concatenate([seen.point_index, *(outside.points for outside in corroborating)])
+    shape = (len(row) + len(corroborating), max(len(feature_map.points), 1))
+    sees = sparse.csr_array((np.ones(len(points), np.int64), (np.concatenate(images), points)), shape=shape)
     sees.sum_duplicates()
     sees.data[:] = 1
-    return np.asarray((sees @ sees.T).toarray(), dtype=np.int64)
+    return sees
 
 
 def parallax(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage]) -> FloatArray:
@@ -271,3 +254,31 @@ def parallax(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage
     )
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     return np.asarray(apart / np.maximum(np.minimum(reach[:, None], reach[None]), 1e-9), dtype=np.float64)
+
+
+def confirmed_points(
+    feature_map: FeatureMap, sources: Sources, corroborating: Sequence[CorroboratingImage] = ()
+) -> NDArray[np.bool_]:
+    """Which points (n,) two independent photos see, the map's or from outside, or a proven one of the map.
+
+    A photo can be true in most of its parts and altered in one: it then fits its neighbours, and the altered
+    part makes points that only its owner has seen.
+    """
+    own = sources.of_map(feature_map)
+    everyone = [*own, *(w.source for w in corroborating)]
+    sees = _sees(feature_map, corroborating)
+    pairs = (parallax(feature_map, corroborating) >= _LEAST_PARALLAX) & independent_pairs(everyone)
+    others = sparse.csr_array(pairs.astype(np.int64)) @ sees  # how many independent photos see the point, too
+    both = np.asarray(sees.multiply(others).sum(axis=0)).ravel() > 0
+    proven = np.asarray(sees[[k for k, s in enumerate(own) if s.proven]].sum(axis=0)).ravel() > 0
+    return np.asarray((both | proven)[: len(feature_map.points)], dtype=np.bool_)
+
+
+def answering_with(feature_map: FeatureMap, points: NDArray[np.bool_]) -> FeatureMap:
+    """The map with descriptors for the given points only; the same map where all that had some keep them."""
+    seen = feature_map.observations
+    keep = seen.has_descriptor & points[seen.point_index]
+    if np.array_equal(keep, seen.has_descriptor):
+        return feature_map
+    descriptors = np.where(keep[:, None], seen.descriptors, np.uint8(0))
+    return replace(feature_map, observations=replace(seen, has_descriptor=keep, descriptors=descriptors))

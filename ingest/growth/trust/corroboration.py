@@ -1,16 +1,16 @@
 """Photos that look at a quarantined map from outside, localised in it alone: of other maps, and new ones."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.states import OPERATOR
 from ingest.growth.gates import SIGMAS
 from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, NEAR_M, features_and_points
-from ingest.growth.place.localised import in_frame, localise_each
+from ingest.growth.place.localised import in_frame, localise_photos
 from ingest.growth.place.overlaps import indexed_area, localise_image
 from ingest.growth.trust.confirmation import CorroboratingImage, Source, Sources
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
@@ -79,85 +79,85 @@ def corroborate(
         write_id: of the map as it is.
     """
     indexed = indexed_area(feature_map)
-    if not len(indexed.area.points):
-        return Corroboration(corroborating=(), contradictions=())
-    own = set(sources.of_map(feature_map))
-    names = {image.sha256 for image in feature_map.images}
     corroborating: list[CorroboratingImage] = []
     against: list[tuple[Source, str]] = []
-    for other, image, source in _images_around(feature_map, others, own, sources):
-        found = localise_image(other, image, 0, [indexed])
-        if found is None or image.sha256 in names:
-            continue
-        found = in_frame(found, feature_map.frame)
-        known = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
-        apart = float(np.linalg.norm(known.center - found.cam_from_local.center))
-        spread = _spread(found) + _center_variance(other, image)
-        what = f"{image.name} of map {other.map_id}"
-        _sort_in(found, source, what, apart, spread, corroborating, against)
-    if new is not None:
-        _hear_new(feature_map, write_id, indexed, new, own, names, sources, threads, corroborating, against)
+    if len(indexed.area.points):
+        own = set(sources.of_map(feature_map))
+        heard = list(_of_maps(feature_map, others, indexed, own, sources))
+        if new is not None:
+            heard += _of_new(feature_map, write_id, indexed, new, own, sources, threads)
+        for one in heard:
+            if one.apart_m > max(_LEAST_M, SIGMAS * float(np.sqrt(one.variance_m2))):
+                against.append((one.source, f"{one.name} is {one.apart_m:.2f} m from where the map has it"))
+                continue
+            corroborating.append(
+                CorroboratingImage(
+                    name=one.name,
+                    source=one.source,
+                    center=one.found.cam_from_local.center,
+                    points=np.unique(one.found.point_of),
+                )
+            )
     return Corroboration(corroborating=tuple(corroborating), contradictions=tuple(against))
 
 
-def _hear_new(
+class _Heard(NamedTuple):
+    """A photo localised in the map, in its frame; how far from its known place, and the variance of that."""
+
+    found: LocalisedPhoto
+    source: Source
+    name: str
+    apart_m: float
+    variance_m2: float
+
+
+def _of_maps(
+    feature_map: FeatureMap,
+    others: Sequence[FeatureMap],
+    indexed: IndexedArea,
+    own: set[Source],
+    sources: Sources,
+) -> Iterator[_Heard]:
+    names = {image.sha256 for image in feature_map.images}
+    for other, image, source in _images_around(feature_map, others, own, sources):
+        found = None if image.sha256 in names else localise_image(other, image, 0, [indexed])
+        if found is not None:
+            found = in_frame(found, feature_map.frame)
+            known = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
+            apart = float(np.linalg.norm(known.center - found.cam_from_local.center))
+            variance = _spread(found) + _center_variance(other, image)
+            yield _Heard(found, source, f"{image.name} of map {other.map_id}", apart, variance)
+
+
+def _of_new(
     feature_map: FeatureMap,
     write_id: str,
     indexed: IndexedArea,
     new: NewPhotos,
     own: set[Source],
-    names: set[str],
     sources: Sources,
     threads: int,
-    corroborating: list[CorroboratingImage],
-    against: list[tuple[Source, str]],
-) -> None:
-    source_of = {
-        row: sources.of_owner(new.photos[row].contributor or OPERATOR)
-        for row in new.that_may_see(feature_map)
-    }
-    asked = [
-        row
-        for row, source in source_of.items()
-        if new.photos[row].sha256 not in names and source.speaks_to(own)
-    ]
+) -> Iterator[_Heard]:
+    names = {image.sha256 for image in feature_map.images}
+    asked: dict[int, Source] = {}
+    for row in new.that_may_see(feature_map):
+        source = sources.of_owner(new.photos[row].contributor or OPERATOR)
+        if new.photos[row].sha256 not in names and source.speaks_to(own):
+            asked[row] = source
     unheard = [row for row in asked if (write_id, row) not in new.heard]
-    for row, said in localise_each(new.photos, unheard, new.features_of, [indexed], threads):
-        new.heard[write_id, row] = said if isinstance(said, LocalisedPhoto) else None
-    for row in asked:
-        found = new.heard[write_id, row]
-        if found is None:
+    said = localise_photos(new.photos, unheard, new.features_of, [indexed], threads)[0]
+    new.heard.update({(write_id, row): said.get(row) for row in unheard})
+    for row, source in asked.items():
+        heard = new.heard[write_id, row]
+        if heard is None:
             continue
-        found = in_frame(found, feature_map.frame)
-        apart, spread = 0.0, _spread(found)
+        found = in_frame(heard, feature_map.frame)
+        apart, variance = 0.0, _spread(found)
         if row in new.localised:
             there = in_frame(new.localised[row], feature_map.frame)
             apart = float(np.linalg.norm(there.cam_from_local.center - found.cam_from_local.center))
-            spread += _spread(there)
-        _sort_in(found, source_of[row], new.photos[row].name, apart, spread, corroborating, against)
-
-
-def _sort_in(
-    found: LocalisedPhoto,
-    source: Source,
-    name: str,
-    apart_m: float,
-    variance: float,
-    corroborating: list[CorroboratingImage],
-    against: list[tuple[Source, str]],
-) -> None:
-    """A photo that the map has where it is known to be speaks for it, another one against it."""
-    if apart_m > max(_LEAST_M, SIGMAS * float(np.sqrt(variance))):
-        against.append((source, f"{name} is {apart_m:.2f} m from where the map has it"))
-        return
-    corroborating.append(
-        CorroboratingImage(
-            name=name,
-            source=source,
-            center=found.cam_from_local.center,
-            points=np.unique(found.point_of),
-        )
-    )
+            variance += _spread(there)
+        yield _Heard(found, source, new.photos[row].name, apart, variance)
 
 
 def _spread(photo: LocalisedPhoto) -> float:
@@ -181,6 +181,7 @@ def _images_around(
 ) -> list[tuple[FeatureMap, MapImage, Source]]:
     """Images of other maps whose owners' word counts, nearest to the map's cameras first."""
     centers = np.array([image.cam_from_local.center for image in feature_map.images])
+    reach = NEAR_M + 0.5 * float(np.linalg.norm(np.ptp(centers, axis=0)))
     found: list[tuple[float, str, FeatureMap, MapImage, Source]] = []
     for other in others:
         if other.map_id == feature_map.map_id:
@@ -191,7 +192,7 @@ def _images_around(
                 continue
             center = here_from_other.act(image.cam_from_local.center)
             distance = float(np.linalg.norm(centers - center, axis=1).min())
-            if distance <= NEAR_M + _reach(centers):
+            if distance <= reach:
                 found.append((distance, f"{other.map_id} {image.name}", other, image, source))
     chosen = []
     for _, _, other, image, source in sorted(found, key=lambda e: e[:2]):
@@ -200,7 +201,3 @@ def _images_around(
         if len(chosen) == MOST_IMAGES:
             break
     return chosen
-
-
-def _reach(centers: FloatArray) -> float:
-    return 0.5 * float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0)))

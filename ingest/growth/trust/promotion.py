@@ -9,16 +9,25 @@ from typing import Any
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database, MapSummary, Snapshot
+from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.owners import read_owners
 from featuredb.store.candidates.photos import mark_confirmed
 from featuredb.store.changes import is_imported
+from ingest.fingerprint import digest, options_fingerprint
 from ingest.growth import gates
 from ingest.growth.gates import Gate
+from ingest.growth.place.localised import QUERY
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import Confirmation, ConfirmationOptions, Sources, confirm
+from ingest.growth.trust.confirmation import (
+    Confirmation,
+    Sources,
+    answering_with,
+    confirm,
+    confirmed_points,
+)
 from ingest.growth.trust.corroboration import NewPhotos, corroborate
-from ingest.growth.trust.examined import question, recall, remember
-from ingest.growth.trust.trusted_points import answering_with, confirmed_points
+from ingest.growth.trust.examined import recall, remember
+from ingest.growth.values import Refused
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
@@ -65,7 +74,7 @@ class Promotion:
 def promote_confirmed(
     database: Database,
     localiser: Localiser,
-    confirmation: ConfirmationOptions | None = None,
+    trusted: Sequence[str] = (),
     new: NewPhotos | None = None,
     *,
     budget_m: float,
@@ -76,6 +85,7 @@ def promote_confirmed(
 
     Args:
         localiser: of the active maps of the newest snapshot.
+        trusted: identities that the operator vouches for.
         new: photos that may corroborate a map, beside the images of other maps.
         budget_m: maps that have drifted further stay.
         work: work folder, where it is kept what was found out: without anything new nothing is asked again.
@@ -83,64 +93,55 @@ def promote_confirmed(
     Raises:
         StoreError
     """
-    confirmation = confirmation or ConfirmationOptions()
     snapshot = database.snapshot()
-    sources = Sources(owners=read_owners(database, snapshot), trusted=confirmation.trusted)
-    asked = _question(database, snapshot, sources, new, confirmation)
+    sources = Sources(owners=read_owners(database, snapshot), trusted=tuple(trusted))
+    asked = _question(database, snapshot, sources, new)
     open_maps: list[MapSummary] = []
     ready: list[ExaminedMap] = []
     outcomes: list[Promotion] = []
     for summary in snapshot.maps():
         if summary.status != "quarantined" or summary.method != "map":
             continue
-        held_back = _held_back(summary, snapshot, budget_m)
-        known = None if held_back else recall(work, summary.map_id, asked)
-        if held_back is not None:
-            outcomes.append(held_back)
-        elif known is not None:
-            outcomes.append(_stays(summary.map_id, *known))
-        else:
+        why = _held_back(summary, snapshot, budget_m) or recall(work, summary.map_id, asked)
+        if why is None:
             open_maps.append(summary)
-    found = _examined(open_maps, snapshot, sources, confirmation, new, threads)
+        else:
+            outcomes.append(_stays(summary.map_id, why))
+    found = _examined(open_maps, snapshot, sources, new, threads)
     for summary, one in zip(open_maps, found, strict=True):
         if isinstance(one, ExaminedMap):
             ready.append(_committed(database, summary, one))
         else:
-            outcomes.append(_stays(summary.map_id, one.gate.reason, one.gate.message, (one.gate,)))
-            remember(work, summary.map_id, asked, one.gate.reason, one.gate.message, (one.gate,))
+            outcomes.append(_stays(summary.map_id, one))
+            remember(work, summary.map_id, asked, one)
 
-    def by_itself(was: ExaminedMap) -> ExaminedMap | Confirmation:
+    def by_itself(was: ExaminedMap) -> ExaminedMap | Refused:
         summary = snapshot.get(was.feature_map.map_id)
         as_is = replace(sources, owners=read_owners(database, database.snapshot()))
-        (one,) = _examined([summary], snapshot, as_is, confirmation, new, threads)
+        (one,) = _examined([summary], snapshot, as_is, new, threads)
         there = replace(summary, write_id=was.write_id, descriptors=_descriptors(was.feature_map))
         return _committed(database, there, one) if isinstance(one, ExaminedMap) else one
 
     if ready:
         decided = _promote(database, localiser, ready, by_itself)
         now = database.snapshot()
-        sources = replace(sources, owners=read_owners(database, now))
-        after = _question(database, now, sources, new, confirmation)
+        after = _question(database, now, replace(sources, owners=read_owners(database, now)), new)
         for outcome in decided:
             if not outcome.promoted and outcome.reason_code != "CONFLICT":
-                remember(work, outcome.map_id, after, outcome.reason_code, outcome.reason, outcome.gates)
+                why = Refused(reason=outcome.reason_code, message=outcome.reason, gates=outcome.gates)
+                remember(work, outcome.map_id, after, why)
         outcomes += decided
     return outcomes
 
 
 def _examined(
-    waiting: Sequence[MapSummary],
-    snapshot: Snapshot,
-    sources: Sources,
-    by: ConfirmationOptions,
-    new: NewPhotos | None,
-    threads: int,
-) -> list[ExaminedMap | Confirmation]:
+    waiting: Sequence[MapSummary], snapshot: Snapshot, sources: Sources, new: NewPhotos | None, threads: int
+) -> list[ExaminedMap | Refused]:
     """All of them, with the records that they make for each other: else what two newcomers show beside what
     an anchor shows would lose its descriptors, which do not come back.
     """
     while True:
-        found = [examine(snapshot.load_map(m.map_id), snapshot, sources, by, new, threads) for m in waiting]
+        found = [_examine(summary, snapshot, sources, new, threads) for summary in waiting]
         more = sources.with_records(
             sources.owners.of_image(one.feature_map, image)
             for one in found
@@ -153,16 +154,15 @@ def _examined(
         sources = more
 
 
-def _question(
-    database: Database,
-    snapshot: Snapshot,
-    sources: Sources,
-    new: NewPhotos | None,
-    by: ConfirmationOptions,
-) -> str:
+def _question(database: Database, snapshot: Snapshot, sources: Sources, new: NewPhotos | None) -> str:
+    """Digest of all that an examination depends on: live maps, canaries, photos, whose word counts."""
+    maps = sorted(f"{m.write_id} {m.status}" for m in snapshot.maps())
+    canaries = [f"{c.name} {c.created_at.isoformat()}" for c in list_canaries(database)]
     photos = [] if new is None else [new.photos[row].sha256 for row in new.rows]
     records = [f"{owner} is on record" for owner in sources.owners.on_record]
-    return question(database, snapshot, [*photos, *records], by)
+    trusted = [f"{owner} is trusted" for owner in sources.trusted]
+    asks = options_fingerprint(QUERY)
+    return digest(asks, *maps, "|", *canaries, "|", *sorted([*photos, *records, *trusted]))
 
 
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
@@ -180,60 +180,55 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
         raise StoreError(f"map {map_id} is retired ({summary.status_reason}); commit it again")
     gate = _tried(database, Localiser.open(database), [snapshot.load_map(map_id)]).gate
     if not gate.passes and not force:
-        return _stays(map_id, gate.reason, gate.message, (gate,))
+        return _stays(map_id, Refused.by(gate))
     text = f"{reason} (by hand; {gate.message})"
     mark_confirmed(database, read_owners(database, snapshot).made_of.get(map_id, ()), map_id)
     database.set_status([map_id], "active", text, based_on={map_id: summary.write_id})
     return Promotion(map_id=map_id, promoted=True, reason_code="", reason=text, gates=(gate,))
 
 
-def examine(
-    feature_map: FeatureMap,
-    snapshot: Snapshot,
-    sources: Sources,
-    by: ConfirmationOptions,
-    new: NewPhotos | None,
-    threads: int = 1,
-) -> ExaminedMap | Confirmation:
+def _examine(
+    summary: MapSummary, snapshot: Snapshot, sources: Sources, new: NewPhotos | None, threads: int
+) -> ExaminedMap | Refused:
     """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
-    write_id = snapshot.get(feature_map.map_id).write_id
-    others = _others(feature_map.map_id, snapshot)
-    heard = corroborate(feature_map, others, new, sources, write_id=write_id, threads=threads)
-    confirmation = confirm(feature_map, sources, by, heard.corroborating, heard.contradictions)
+    feature_map, others = snapshot.load_map(summary.map_id), _others(summary, snapshot)
+    heard = corroborate(feature_map, others, new, sources, write_id=summary.write_id, threads=threads)
+    confirmation = confirm(feature_map, sources, heard.corroborating, heard.contradictions)
     if not confirmation.gate.passes:
-        return confirmation
-    points = confirmed_points(feature_map, sources, by, heard.corroborating)
+        return Refused.by(confirmation.gate)
+    points = confirmed_points(feature_map, sources, heard.corroborating)
     contributed = sources.owners.made_of.get(feature_map.map_id, frozenset())
     earned = {i.sha256[:32] for i in feature_map.images if i.image_id in confirmation.earned}
     return ExaminedMap(
         feature_map=answering_with(feature_map, points),
         confirmation=confirmation,
-        write_id=write_id,
+        write_id=summary.write_id,
         earned=frozenset(earned & contributed),
     )
 
 
-def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Promotion | None:
+def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Refused | None:
     """What keeps a map in quarantine before anybody is asked."""
     if is_imported(summary.status, summary.status_reason):
-        return _stays(summary.map_id, "IMPORTED", summary.status_reason)
+        return Refused(reason="IMPORTED", message=summary.status_reason)
     if PARENT_MOVED in summary.status_reason:
-        return _stays(summary.map_id, "PARENT_MOVED", summary.status_reason)
+        return Refused(reason="PARENT_MOVED", message=summary.status_reason)
     active = {m.map_id for m in snapshot.maps() if m.status == "active"}
     if not active.intersection(summary.parents):
         text = f"no active map holds it: {', '.join(summary.parents)} is not active"
-        return _stays(summary.map_id, "NO_PARENT", text)
+        return Refused(reason="NO_PARENT", message=text)
     gate = gates.drift(summary.drift_m or 0.0, budget_m)
-    return None if gate.passes else _stays(summary.map_id, gate.reason, gate.message)
+    return None if gate.passes else Refused(reason=gate.reason, message=gate.message)
 
 
-def _stays(map_id: str, code: str, reason: str, asked: tuple[Gate, ...] = ()) -> Promotion:
-    return Promotion(map_id=map_id, promoted=False, reason_code=code, reason=reason, gates=asked)
+def _stays(map_id: str, why: Refused) -> Promotion:
+    return Promotion(
+        map_id=map_id, promoted=False, reason_code=why.reason, reason=why.message, gates=why.gates
+    )
 
 
-def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
+def _others(me: MapSummary, snapshot: Snapshot) -> list[FeatureMap]:
     """Maps around one, active or quarantined."""
-    me = snapshot.get(map_id)
     if me.box is None:
         return []
     near = snapshot.maps_in(
@@ -243,7 +238,7 @@ def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
         me.box.max_easting + _AROUND_M,
         me.box.max_northing + _AROUND_M,
     )
-    heard = [m for m in near if m.map_id != map_id and not is_imported(m.status, m.status_reason)]
+    heard = [m for m in near if m.map_id != me.map_id and not is_imported(m.status, m.status_reason)]
     same = [m for m in heard if m.extractor_fingerprint == me.extractor_fingerprint]
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
@@ -266,7 +261,7 @@ def _promote(
     database: Database,
     before: Localiser,
     ready: Sequence[ExaminedMap],
-    by_itself: Callable[[ExaminedMap], ExaminedMap | Confirmation],
+    by_itself: Callable[[ExaminedMap], ExaminedMap | Refused],
 ) -> list[Promotion]:
     """Ask the canaries: of all of them together, and one by one where that shows a regression.
 
@@ -281,7 +276,7 @@ def _promote(
         map_id = waiting[asked].feature_map.map_id
         found = by_itself(waiting[asked])
         if not isinstance(found, ExaminedMap):
-            outcomes[map_id] = _stays(map_id, found.gate.reason, found.gate.message, (found.gate,))
+            outcomes[map_id] = _stays(map_id, found)
             asked += 1
             continue
         run = _tried(database, before, [found.feature_map])
@@ -302,7 +297,7 @@ def _decide(
 ) -> list[Promotion]:
     asked = {found.feature_map.map_id: (found.confirmation.gate, run.gate) for found in ready}
     if not run.gate.passes:
-        return [_stays(m, run.gate.reason, run.message, of) for m, of in asked.items()]
+        return [_stays(m, Refused.by(run.gate, of[0])) for m, of in asked.items()]
     confirmed = "; ".join(dict.fromkeys(found.confirmation.message for found in ready))
     reason = f"{confirmed}; {run.message}"
     active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
@@ -313,7 +308,9 @@ def _decide(
         database.set_status(list(asked), "active", reason, based_on=based_on, active=active)
     except ConflictError as error:
         _LOG.info("promotion of %s waits: %s", list(asked), error)
-        return [_stays(m, "CONFLICT", str(error), of) for m, of in asked.items()]
+        return [
+            _stays(m, Refused(reason="CONFLICT", message=str(error), gates=of)) for m, of in asked.items()
+        ]
     _LOG.info("promoted %s: %s", list(asked), reason)
     return [
         Promotion(map_id=m, promoted=True, reason_code="", reason=reason, gates=of) for m, of in asked.items()

@@ -274,7 +274,7 @@ def _judged(
     evidence = new.placement.evidence | {
         "anchor": checks
         | {
-            "frames": _names(old, found.used),
+            "frames": [image.name for image in old.images if image.image_id in found.used],
             "rounds": [
                 {"focal_px": list(r.focal_px), "structure_s": r.structure_s, "adjust_s": r.adjust_s}
                 for r in found.rounds
@@ -304,7 +304,3 @@ def _contradiction(move: MapMove) -> str | None:
         f"the map would {what} of its present placement, {far:.0f} allowed; if that placement is known to be "
         "wrong, confirm the frames (--confirm)"
     )
-
-
-def _names(feature_map: FeatureMap, ids: Sequence[int]) -> list[str]:
-    return [image.name for image in feature_map.images if image.image_id in ids]

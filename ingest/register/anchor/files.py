@@ -138,15 +138,11 @@ def find_photos(feature_map: AnyMap, folder: Path) -> PhotoFiles:
     paths: dict[int, Path] = {}
     missing: dict[int, str] = {}
     for image in feature_map.images:
-        path, reason = search.by_name(image)
+        path, reason = search.find(image)
         if path is None:
             missing[image.image_id] = reason
         else:
             paths[image.image_id] = path
-    for image in feature_map.images:
-        if image.image_id in missing and (path := search.by_content(image)) is not None:
-            paths[image.image_id] = path
-            del missing[image.image_id]
     if not paths:
         reasons = sorted(set(missing.values()))
         raise RegistrationError(

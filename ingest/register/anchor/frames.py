@@ -80,16 +80,19 @@ class TriedFrames:
     ) -> "TriedFrames":
         """Frames that were registered earlier, as they were; their ranks and priors are no longer known."""
         images = {image.image_id: image for image in feature_map.images}
-        tried = tuple(
-            TriedFrame(
-                proposal=_unranked(images[image_id], _prior_at(registration)),
-                registration=registration,
-                seconds=sum(registration.seconds.values()),
-                cpu_s=float("nan"),
+        tried = []
+        for image_id, registration in registrations.items():
+            assert registration.cam_from_local is not None
+            prior = FramePrior.around(registration.cam_from_local, 1.0, 1.0)
+            tried.append(
+                TriedFrame(
+                    proposal=_unranked(images[image_id], prior),
+                    registration=registration,
+                    seconds=sum(registration.seconds.values()),
+                    cpu_s=float("nan"),
+                )
             )
-            for image_id, registration in registrations.items()
-        )
-        return cls(shift=None, ranking=(), tried=tried)
+        return cls(shift=None, ranking=(), tried=tuple(tried))
 
 
 def try_frames(
@@ -124,7 +127,10 @@ def try_frames(
     }
     reader = _Reader(read_gray)
     ranking = propose_frames(feature_map, cloud, priors, reader.for_ranking)
-    order = [_started(feature_map, i, starts[i], ranking) for i in starts]
+    ranked = {p.image.image_id: p for p in ranking}
+    images = {image.image_id: image for image in feature_map.images}
+    # A frame that a person chose is tried whether it sees much of the scan or not.
+    order = [ranked.get(i) or _unranked(images[i], prior) for i, prior in starts.items()]
     order += [p for p in ranking if p.image.image_id not in starts]
     tried: list[TriedFrame] = []
     least = max(max_tries, len(starts))
@@ -139,28 +145,12 @@ def try_frames(
     return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(tried), unreadable=reader.unreadable)
 
 
-def _started(
-    feature_map: FeatureMap, image_id: int, prior: FramePrior, ranking: Sequence[FrameProposal]
-) -> FrameProposal:
-    """The proposal of a frame that a person chose, whether it sees much of the scan or not."""
-    ranked = [p for p in ranking if p.image.image_id == image_id]
-    if ranked:
-        return ranked[0]
-    return _unranked(next(i for i in feature_map.images if i.image_id == image_id), prior)
-
-
 def _unranked(image: MapImage, prior: FramePrior) -> FrameProposal:
     nan = float("nan")
     score = FrameScore(
         score=nan, coverage=nan, downward=nan, points=0, spread=nan, texture=nan, sharpness=nan
     )
     return FrameProposal(image=image, score=score, prior=prior)
-
-
-def _prior_at(registration: FrameRegistration) -> FramePrior:
-    """A prior around a pose that was found already."""
-    assert registration.cam_from_local is not None
-    return FramePrior.around(registration.cam_from_local, 1.0, 1.0)
 
 
 def _try(

@@ -1,7 +1,7 @@
 """Which frames of a map are worth registering first."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import cv2
 import numpy as np
@@ -96,10 +96,10 @@ def propose_frames(
     if read_gray is not None:
         read = [_photo_figures(read_gray(p.image)) for p in rough[:_MAX_PHOTOS_READ]]
         best = max((sharpness for _, sharpness in read), default=1.0) or 1.0
-        rough = [
-            _with_photo(p, *(read[i] if i < len(read) else (np.nan, np.nan)), best)
-            for i, p in enumerate(rough)
-        ]
+        for i, p in enumerate(rough):
+            texture, sharpness = read[i] if i < len(read) else (np.nan, np.nan)
+            score = _scored(replace(p.score, texture=texture, sharpness=sharpness / best))
+            rough[i] = replace(p, score=score)
     return _spread_out(feature_map, rough)
 
 
@@ -150,7 +150,7 @@ def _scored(score: FrameScore) -> FrameScore:
         score.sharpness,
     ]
     value = float(np.prod([np.sqrt(f) for f in factors if np.isfinite(f)]))
-    return FrameScore(**{**asdict(score), "score": value})
+    return replace(score, score=value)
 
 
 def _photo_figures(gray: NDArray[np.uint8]) -> tuple[float, float]:
@@ -163,12 +163,6 @@ def _photo_figures(gray: NDArray[np.uint8]) -> tuple[float, float]:
     coarse = cv2.GaussianBlur(small, (0, 0), 1.0) - cv2.GaussianBlur(small, (0, 0), 2.0)
     sharpness = float(fine.std() / max(float(coarse.std()), 1e-6))
     return float((contrast >= _CELL_CONTRAST).mean()), sharpness
-
-
-def _with_photo(proposal: FrameProposal, texture: float, sharpness: float, best: float) -> FrameProposal:
-    figures = asdict(proposal.score) | {"texture": texture, "sharpness": sharpness / best}
-    score = _scored(FrameScore(**figures))
-    return FrameProposal(image=proposal.image, score=score, prior=proposal.prior)
 
 
 def _spread_out(feature_map: FeatureMap, proposals: Sequence[FrameProposal]) -> list[FrameProposal]:

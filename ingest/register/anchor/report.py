@@ -282,9 +282,8 @@ def _page(report: AnchorReport, old: FeatureMap, cloud: PointCloud, overlays: Ma
     parts += [note(text) for text in report.notes]
     if result is not None and result.feature_map is not None:
         parts.append(_placed_section(report, result, old, cloud))
-    parts.append(
-        "<h2>Time</h2><section>" + table((), _times(report), numbers=(1,), names=(0,)) + "</section>"
-    )
+    times = [(name, f"{seconds:.2f} s") for name, seconds in report.times_s().items()]
+    parts.append("<h2>Time</h2><section>" + table((), times, numbers=(1,), names=(0,)) + "</section>")
     rows = [["" if v is None else str(v) for v in row] for row in frame_rows(report)]
     parts.append(
         "<h2>Frames</h2><section class='wide'>"
@@ -338,10 +337,6 @@ def _sigmas(feature_map: FeatureMap) -> str:
     spread = np.sqrt(np.diag(jacobian @ feature_map.placement.covariance @ jacobian.T))
     turn = np.degrees(np.sqrt(np.diag(feature_map.placement.covariance)[1:4]).max())
     return f"east {spread[0]:.3f}, north {spread[1]:.3f}, up {spread[2]:.3f} m, {turn:.3f} degrees"
-
-
-def _times(report: AnchorReport) -> list[tuple[str, str]]:
-    return [(name, f"{seconds:.2f} s") for name, seconds in report.times_s().items()]
 
 
 def _rounded(value: float) -> float | None:

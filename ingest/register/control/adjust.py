@@ -14,7 +14,6 @@ from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.marginals import Whitened
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import (
-    LensPrior,
     LensWidths,
     Orientations,
     PointPriors,
@@ -23,7 +22,6 @@ from featuredb.adjust.terms import (
     lens_prior,
 )
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.similarity import refined_similarity
@@ -165,7 +163,7 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
     located = np.unique(control.point_of[weights.marks])
     terms = Terms(
         keypoint_px=task.weight_px,
-        lenses=tuple(_lens_prior(camera, task.keep_lens) for camera in task.block.cameras),
+        lenses=tuple(None if task.keep_lens else lens_prior(camera, _LENS) for camera in task.block.cameras),
         orientations=None if vertical is None else _upright(start, vertical),
         points=None if vertical is None else _anchor(start, vertical),
         targets=Targets(
@@ -231,10 +229,6 @@ def _sample(block: Block, per_photo: int) -> Block:
         photo_of=block.photo_of[rows],
         xy=block.xy[rows],
     )
-
-
-def _lens_prior(camera: Camera, keep_lens: bool) -> LensPrior | None:
-    return None if keep_lens else lens_prior(camera, _LENS)
 
 
 def _of_all(values: FloatArray, rows: NDArray[np.int64], count: int, otherwise: float) -> FloatArray:

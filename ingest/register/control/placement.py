@@ -27,7 +27,6 @@ from ingest.register.control.adjust import (
 )
 from ingest.register.control.fit import (
     ControlFit,
-    Hypothesis,
     Vertical,
     fit_similarity,
     hypotheses,
@@ -155,7 +154,9 @@ def place_by_gcp(
         notes.append(vertical.source)
     elif needed and vertical is not None:
         notes.append(f"tilt and height are kept from {vertical.source}")
-    fit = _fit(found, usable, control, vertical if needed else None)
+    row = {point: k for k, point in enumerate(usable)}  # of the fit
+    renumbered = [replace(h, point=row[h.point]) for h in found]
+    fit = fit_similarity(renumbered, control.surveyed[usable], vertical if needed else None)
     refused = _gate_fit(fit, control, usable)
     if refused is not None or fit is None:
         return refused or GcpPlacement(reason="DEGENERATE_LINE", message="the control points coincide")
@@ -209,15 +210,6 @@ def _vertical_is_needed(control: Control, usable: list[int]) -> bool:
         return True
     spread = np.linalg.svd(control.surveyed[rows] - control.surveyed[rows].mean(axis=0))[1]
     return bool(spread[1] < _MIN_LINE_RATIO * spread[0])
-
-
-def _fit(
-    found: list[Hypothesis], usable: list[int], control: Control, vertical: Vertical | None
-) -> ControlFit | None:
-    """The robust fit over the usable points, its rows being those of `usable`."""
-    row = {point: k for k, point in enumerate(usable)}
-    renumbered = [replace(h, point=row[h.point]) for h in found]
-    return fit_similarity(renumbered, control.surveyed[usable], vertical)
 
 
 def _gate_fit(fit: ControlFit | None, control: Control, usable: list[int]) -> GcpPlacement | None:

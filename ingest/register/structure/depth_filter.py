@@ -5,7 +5,7 @@ closed across a gap, ambiguous along silhouettes, and amplified by every pixel o
 surface is seen at a grazing angle (structure-projection paper, 3.1: "not all depth values are valid").
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,13 +52,7 @@ class SurfaceHits:
     depths: FloatArray
 
     def rows(self, chosen: NDArray[np.intp]) -> "SurfaceHits":
-        return SurfaceHits(
-            valid=self.valid[chosen],
-            points=self.points[chosen],
-            normals=self.normals[chosen],
-            sigma_ray_m=self.sigma_ray_m[chosen],
-            depths=self.depths[chosen],
-        )
+        return SurfaceHits(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
 
 def _reliable_at(

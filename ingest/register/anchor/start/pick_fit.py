@@ -148,7 +148,7 @@ def fit_picks(
         cam_from_local=state.pose,
         camera=state.camera,
         covariance=np.asarray(np.linalg.pinv(state.information, hermitian=True)[:6, :6], dtype=np.float64),
-        residuals_px=_residuals(problem, state, rows),
+        residuals_px=np.asarray(pixels - state.camera.project(state.pose.act(points))),
         normalised=_normalised(problem, state, kept),
         chi_square=state.cost,
         redundancy=redundancy,
@@ -288,10 +288,6 @@ def _moved(pose: Rigid3, step: FloatArray) -> Rigid3:
     """The camera turned about the local axes and displaced: R_true = R(dtheta) R, C_true = C + dC."""
     rotation = pose.rotation @ so3_exp(step[:3]).T
     return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + step[3:6]))
-
-
-def _residuals(problem: _Problem, state: _State, rows: list[int]) -> FloatArray:
-    return np.asarray(problem.pixels[rows] - state.camera.project(state.pose.act(problem.points[rows])))
 
 
 def _normalised(problem: _Problem, state: _State, kept: list[int]) -> FloatArray:

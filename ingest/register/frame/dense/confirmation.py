@@ -44,10 +44,7 @@ _SIDE_PX = 480  # longer side of the view on which pieces are compared, where th
 _SEARCH_PX = 16  # radius of the window in which a piece is searched
 _NEAR_PX = 3.0  # a piece agrees with the pose when its best place is this near
 _MIN_PIECES = 25  # fewer pieces with structure cannot confirm anything
-# Side of a piece, as a share of the view's longer side, between these.
-_PIECE_SHARE = 0.21
-_MIN_PIECE_PX = 40
-_MAX_PIECE_PX = 40
+_PIECES = TemplateOptions(size_px=40, spacing_px=20, max_count=600)  # overlapping by half
 # A pose is refused when less than that share of the lower half of the pieces, by height, agrees while of the
 # upper half that many times as many do, and the halves lie that far apart: then what stands on the ground was
 # matched, which an ortho image shows displaced, and not the ground.
@@ -113,7 +110,7 @@ def confirm_pose(
     """
     finest = finest_side_px(camera, cam_from_local, cloud, options.finest_spacing)
     view = pinhole_view(photo_gray, camera, min(_SIDE_PX, finest))
-    maps = _maps(view, cam_from_local, cloud, source, options)
+    maps = _maps(view, cam_from_local, cloud, source)
     n = len(maps)
     if n < _MIN_PIECES:
         return PictureConfirmation(
@@ -146,17 +143,11 @@ def confirm_pose(
     )
 
 
-def _maps(
-    view: PinholeView, pose: Rigid3, cloud: PointCloud, source: RenderSource, options: ConfirmOptions
-) -> ScoreMaps:
-    # Overlapping by half.
-    size = round(_PIECE_SHARE * max(view.camera.width, view.camera.height) / 2.0) * 2
-    size = int(np.clip(size, _MIN_PIECE_PX, _MAX_PIECE_PX))
-    pieces = TemplateOptions(size_px=size, spacing_px=size // 2, max_count=600)
-    margin = pieces.size_px // 2
+def _maps(view: PinholeView, pose: Rigid3, cloud: PointCloud, source: RenderSource) -> ScoreMaps:
+    margin = _PIECES.size_px // 2
     rendering = render(cloud, with_margin(view.camera, margin), pose, RenderOptions(threads=1))
     channels = oriented_gradients(source_picture(rendering, source), rendering.valid)
-    templates = cut_templates(channels, rendering, pieces)
+    templates = cut_templates(channels, rendering, _PIECES)
     photo = oriented_gradients(view.image, view.valid)
     return search_around(templates, photo, view.camera, pose, _SEARCH_PX)
 
