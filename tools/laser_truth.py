@@ -27,7 +27,8 @@ from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
-from reloc.localise.answer import error_radius, placement_covariance
+from reloc.localise.answer import placement_covariance
+from reloc.localise.result import error_radius
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
 from reloc.wire.query import CameraRequest
 from tools.figures import add_json_option, write_figures

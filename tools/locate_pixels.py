@@ -36,7 +36,7 @@ from featuredb.store import Database
 from reloc.localiser import Localiser
 from reloc.pixels.locate import PixelPlace, locate
 from reloc.pixels.surfaces import RaySurface, scan_surface
-from reloc.pixels.view import AnsweredView
+from reloc.answered_view import AnsweredView
 from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored, featuredb

@@ -23,7 +23,7 @@ from reloc.localiser import Localiser
 from reloc.service.handler import answer_query
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
-from reloc.service.threads import capped_process
+from reloc.service.workers.answering import capped_process
 from reloc.wire.query import LocaliseWireRequest, RequestOptions
 from tools.figures import add_json_option, write_figures
 

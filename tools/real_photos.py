@@ -29,7 +29,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import PoseError, pose_difference
 from featuredb.store import Database
 from reloc.client import Client, LocaliseReply
-from reloc.localise.answer import error_radius
+from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest

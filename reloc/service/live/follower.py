@@ -8,6 +8,7 @@ from typing import Self
 from featuredb.stage_clock import StageClock
 from reloc.service.live.frames import FrameAnswerer, FrameAsk
 from reloc.service.live.latest import Arrival
+from reloc.service.logs import fields
 from reloc.service.workers.answering import WorkerLimits
 from reloc.service.workers.area_files import LocaliserFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
@@ -108,7 +109,7 @@ class Follower:
         except (WorkerEndedError, WorkerDefectError) as error:
             self._close()
             self._check_not_stopped(error)
-            logger.exception("a frame failed", extra={"fields": {"event": "frame_failed"}})
+            logger.exception("a frame failed", extra=fields("frame_failed"))
             code, why = self._failure(error)
             raise FrameError(code, why, header.sequence) from error
         self._last_time_s = header.time_s
