@@ -325,17 +325,11 @@ def _answer_all(
                 target = _overlay_path(args.overlay, path, args.image)
                 write_overlay(target, data, reply, other_points(reply))
                 sys.stderr.write(f"wrote {target}\n")
-        except OSError as error:
-            sys.stderr.write(f"featuredb: {path}: {error.strerror or error}\n")
+        except (OSError, FeatureDbError) as error:
+            sys.stderr.write(f"featuredb: {path}: {getattr(error, 'strerror', None) or error}\n")
             codes.add(2)
-        except ServiceError as error:
-            sys.stderr.write(f"featuredb: {path}: {error}\n")
-            codes.add(2)
-            if error.code == "NO_SERVER":
+            if isinstance(error, ServiceError) and error.code == "NO_SERVER":
                 break
-        except FeatureDbError as error:
-            sys.stderr.write(f"featuredb: {path}: {error}\n")
-            codes.add(2)
     return max(codes)
 
 

@@ -14,7 +14,6 @@ import zenoh
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.exposure import authenticates, check_exposure
 from reloc.service.live.follower import Follower
-from reloc.service.live.frames import FrameAnswerer
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
@@ -93,7 +92,7 @@ class Server:
             session,
             self._keys,
             lambda: self._area,
-            self._follower,
+            lambda answerer: Follower(answerer, options, lambda: self._workers.published),
             options.live,
             self.server_id,
             authenticates=authenticates,
@@ -239,17 +238,6 @@ class Server:
             localised=tally.count("localised"),
             not_localised=tally.by_code("not_localised"),
             errors=tally.by_code("error"),
-        )
-
-    def _follower(self, answerer: FrameAnswerer) -> Follower:
-        """A live session's, with the limits of a query."""
-        options = self._options
-        return Follower(
-            answerer,
-            limits=options.worker_limits,
-            frame_s=options.work_s,
-            max_bytes=options.live.limits.max_bytes,
-            files=lambda: self._workers.published,
         )
 
     # Zenoh calls these in threads of its own; they must return at once.
