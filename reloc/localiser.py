@@ -217,7 +217,7 @@ class Localiser:
                 f"the maps were made by extractor {found}, queries here use {fingerprint}: descriptors "
                 "cannot be compared; start the server with the extractor options of the ingest"
             )
-        return self.with_lineage(localise(gray, request, matching, self.options, self.snapshot))
+        return self._with_lineage(localise(gray, request, matching, self.options, self.snapshot))
 
     def _named_unplaced(self, map_ids: tuple[str, ...] | None) -> str | None:
         """The map without a place that the request names, if it does.
@@ -241,22 +241,15 @@ class Localiser:
         told = replace(request, prior=None, own_position=None, beyond=None, map_ids=None)
         return in_own_frame(localise(gray, told, [indexed], self.options, self.snapshot), unplaced)
 
-    def with_lineage(self, result: LocaliseResult) -> LocaliseResult:
+    def _with_lineage(self, result: LocaliseResult) -> LocaliseResult:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""
         if result.pose is None:
             return result
         told = []
         for entry in result.pose.lineage:
-            lineage = self._lineages[entry["map_id"]]
-            told.append(
-                {
-                    **entry,
-                    "steps": lineage.steps,
-                    "anchors": list(lineage.anchors),
-                    "drift_m": lineage.drift_m,
-                    "budget_m": lineage.budget_m,
-                }
-            )
+            found = self._lineages[entry["map_id"]]
+            names = ("steps", "anchors", "drift_m", "budget_m")
+            told.append(entry | {name: getattr(found, name) for name in names})
         return replace(result, pose=replace(result.pose, lineage=tuple(told)))
 
 

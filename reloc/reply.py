@@ -108,19 +108,7 @@ def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
         else tuple(_floats(row) for row in pose.view_covariance),
         "residual_rms_px": pose.residual_rms_px,
         "maps": pose.map_ids,
-        "lineage": tuple(
-            Lineage(
-                map_id=map_id,
-                method=str(entry["method"]),
-                generation=int(entry["generation"]),
-                parents=tuple(entry["parents"]),
-                steps=entry.get("steps"),
-                anchors=tuple(entry.get("anchors", ())),
-                drift_m=entry.get("drift_m"),
-                budget_m=entry.get("budget_m"),
-            )
-            for map_id, entry in zip(pose.map_ids, pose.lineage, strict=True)
-        ),
+        "lineage": tuple(Lineage(**entry) for entry in pose.lineage),
         "inlier_points": None if pose.inliers is None else _inlier_points(pose.inliers),
     }
 

@@ -1,6 +1,7 @@
 """Windows of an ortho image registered to an airborne scan as nadir telephoto photos, from intensity alone.
 
-    python -m tools.autzen_windows STADIUM.laz STADIUM_ORTHO.tif [--photos FOLDER ...] [--seed 0]
+    python -m tools.autzen_windows STADIUM.laz STADIUM_ORTHO.tif [--photos FOLDER ...] [--seed 0] \\
+        [--figure FILE.png]
 
 The scan is added to a database as any other; its colours are thrown away, for they come from that ortho
 image. Each window of 400 x 400 pixels becomes the photo of a camera 1000 m above the ground, whose prior is
@@ -35,6 +36,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from featuredb.features.decode import decode_gray
@@ -45,7 +48,9 @@ from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
 from featuredb.store.database import Database
+from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
+from ingest.register.frame.verdict import MIN_CONFIRMATION_LOG_NFA
 from ingest.register.frame_registration import FramePrior
 from tools.figures import study_parser, write_figures
 from tools.ortho_place import WINDOW_PX, Floats, OrthoOverScan, has_structure, measured_offset, place_of
@@ -97,6 +102,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         outcome = _one(place, cloud, kind, column, row, photo, offset, rng)
         outcomes.append(outcome)
         print(_line(outcome), flush=True)
+    if args.figure is not None:
+        _draw(outcomes, args.figure)
     _summary(outcomes, args.json)
     return 0
 
@@ -220,6 +227,27 @@ def _line(o: WindowOutcome) -> str:
     )
 
 
+def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
+    """Evidence of the pictures against the error on the ground, with the verdict's two lines."""
+    chart = Figure(figsize=(7.5, 3.6), dpi=110, facecolor="white", layout="constrained")
+    FigureCanvasAgg(chart)
+    axes = chart.subplots()
+    looks = {"window": ("o", "#2e7d32"), "mirrored": ("x", "#c62828"), "elsewhere": ("+", "#ad1457")}
+    for kind in _KINDS:
+        marker, colour = looks.get(kind, ("^", "#6a1b9a"))
+        some = np.array(
+            [(o.error_m, o.log_nfa) for o in outcomes if o.kind == kind and o.error_m is not None]
+        )
+        if len(some):
+            axes.plot(some[:, 0], some[:, 1], marker, color=colour, ms=5, label=kind)
+    for limit in (MIN_CONFIRMATION_LOG_NFA, MIN_LOG_NFA):
+        axes.axhline(limit, color="#1b2733", lw=0.8, ls="--")
+    axes.set(xscale="log", xlabel="error on the ground, m", ylabel="evidence, -log10(NFA)", ylim=(0, None))
+    axes.legend(fontsize=8)
+    axes.grid(color="#e6ebef", lw=0.6)
+    chart.savefig(path)
+
+
 def _summary(outcomes: Sequence[WindowOutcome], figures: Path | None) -> None:
     windows = [o for o in outcomes if o.kind == "window"]
     structured = [o for o in windows if o.has_structure]
@@ -257,6 +285,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = study_parser(__doc__)
     parser.add_argument("scan", type=Path)
     parser.add_argument("ortho", type=Path)
+    parser.add_argument("--figure", type=Path, help="draw evidence against error")
     parser.add_argument(
         "--photos", type=Path, nargs="*", default=[], help="folders with photos of other places"
     )

@@ -159,10 +159,9 @@ def on_earth(
 def _lineage(feature_map: FeatureMap) -> dict[str, Any]:
     return {
         "map_id": feature_map.map_id,
-        "name": feature_map.name,
         "method": feature_map.placement.method,
-        "generation": feature_map.generation,
-        "parents": list(feature_map.parents),
+        "generation": int(feature_map.generation),
+        "parents": tuple(feature_map.parents),
     }
 
 

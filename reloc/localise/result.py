@@ -133,8 +133,8 @@ class LocalisedPose(OnEarth):
             in the picture. None where the lens is exact: then it is `covariance`.
         camera: intrinsics used, full image size.
         map_ids: maps whose points are among the inliers, most inliers first.
-        lineage: for each of map_ids, what placed it: method, generation, parents; from a `Localiser`, which
-            knows the other maps, too, also steps, anchors, drift_m, budget_m (featuredb.maps.lineage).
+        lineage: for each of map_ids, what placed it: map_id, method, generation, parents; from a `Localiser`,
+            which knows the other maps, too, also steps, anchors, drift_m, budget_m (featuredb.maps.lineage).
         residual_rms_px: of the inliers, in full-size pixels.
     """
 
