@@ -14,8 +14,6 @@ from reloc.localise.result import LocaliseRequest, LocaliseResult
 from tests.support.planar_map import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, view
 
 KNOWN = LocaliseRequest(camera=CAMERA)
-
-
 POSE = view(5.0, -6.0, 40.0, 8.0, 33.0)
 
 

@@ -8,8 +8,6 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 
 OPTIONS = GpsOptions()
-
-
 TRUE = Sim3(scale=8.5, rotation=so3_exp([0.3, -0.2, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
 
 

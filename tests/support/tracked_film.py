@@ -13,8 +13,6 @@ from tests.support.hill_walk import WEST_M
 from tests.support.planar_map import view
 
 OPTIONS = TrackOptions(keyframe_every=4, answer_after=4, lost_answer_after=6, catch_up=6, min_matches=20)
-
-
 FRAMES, CUT = 44, range(20, 24)
 
 
