@@ -3,7 +3,7 @@
 import base64
 import threading
 import uuid
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
+from reloc.answered_view import AnsweredView, geopose_of
 from reloc.localiser import Localiser
 from reloc.overlay import draw_overlay, map_points_in_view
 from reloc.service.handler import answer_query
@@ -30,7 +31,7 @@ from reloc.wire.query import (
     RequestOptions,
     explain,
 )
-from reloc.wording import angles, describe
+from reloc.wording import describe
 
 Image = bytes | str | Path | NDArray[np.uint8]
 _SHOWN_PX = 900  # longer side of a picture in a notebook
@@ -68,7 +69,7 @@ class PhotoAnswer:
     @property
     def heading_pitch_roll_deg(self) -> tuple[float, float, float] | None:
         """Degrees: heading clockwise from true north, pitch up from level, roll clockwise; or None."""
-        return None if self.reply.quaternion is None else angles(self.reply).heading_pitch_roll_deg
+        return None if self.reply.quaternion is None else geopose_of(self.reply).heading_pitch_roll_deg
 
     @property
     def covariance(self) -> FloatArray | None:
@@ -99,19 +100,24 @@ class PhotoAnswer:
 
 
 class PhotoAsker:
-    """Answers photos from the newest snapshot; its index is kept between calls. Threads may share it."""
+    """Answers photos from a snapshot; its index is kept between calls. Threads may share it."""
 
-    def __init__(self, database: Database) -> None:
-        self._database = database
+    def __init__(self, database: Database, as_of: int | None = None) -> None:
+        """
+        Args:
+            as_of: answer from this snapshot for ever; None: from the newest.
+        """
+        self._database, self._as_of = database, as_of
         self.name = wire_name_of(database.url)  # as a server calls it
         self._lock = threading.Lock()
         self._localiser: Localiser | None = None
 
     def localiser(self) -> Localiser:
-        """The maps of the newest snapshot; what did not change is not indexed again."""
+        """The maps of the snapshot; what did not change is not indexed again."""
         with self._lock:
-            if self._localiser is None or self._localiser.snapshot != self._database.poll_version():
-                self._localiser = Localiser.open(self._database, previous=self._localiser)
+            wanted = self._database.poll_version() if self._as_of is None else self._as_of
+            if self._localiser is None or self._localiser.snapshot != wanted:
+                self._localiser = Localiser.open(self._database, as_of=self._as_of, previous=self._localiser)
             return self._localiser
 
     def ask(
@@ -156,7 +162,9 @@ class PhotoAsker:
             database=self.name,
             reply=reply,
             photo=photo,
-            other_points_utm=map_points_in_view(localiser.areas, reply) if on_earth and inliers else None,
+            other_points_utm=map_points_in_view(localiser.areas, AnsweredView.of_reply(reply))
+            if on_earth and inliers
+            else None,
         )
 
 
@@ -191,9 +199,7 @@ def _request(
             lat, lon, sigma_m = map(float, prior)
             prior = PriorRequest(lat=lat, lon=lon, sigma_m=sigma_m)
         if isinstance(camera, Camera):
-            camera = CameraRequest(
-                model=camera.model, width=camera.width, height=camera.height, params=camera.params
-            )
+            camera = CameraRequest(**asdict(camera))
         options = RequestOptions(inliers=inliers, exif_prior=exif_prior, maps=maps)
         return LocaliseWireRequest(prior=prior, camera=camera, options=options)
     except ValidationError as error:
@@ -217,7 +223,7 @@ def _plan_svg(answer: PhotoAnswer, side_px: int = 360) -> str:
         f'<circle cx="{middle + scale * e:.1f}" cy="{middle - scale * n:.1f}" r="1.5" fill="#3cb043"/>'
         for e, n in points[::step]
     )
-    up = angles(reply).true_enu_from_body
+    up = geopose_of(reply).true_enu_from_body
     # Looking down, a camera has no direction in plan; its top has.
     ahead = up[:2, 0] if abs(up[2, 0]) < 0.9 else up[:2, 2]
     east, north = 0.12 * side_px * ahead / max(float(np.linalg.norm(ahead)), 1e-9)

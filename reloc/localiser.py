@@ -50,22 +50,6 @@ class _Loaded:
     indexed: IndexedArea
 
 
-@dataclass(frozen=True, slots=True)
-class _Given(Generic[_Value]):
-    value: _Value
-
-    def __call__(self) -> _Value:
-        return self.value
-
-
-@dataclass(frozen=True, slots=True)
-class _Unreadable:
-    message: str
-
-    def __call__(self) -> Any:
-        raise StoreError(self.message)
-
-
 class OnDemand(Generic[_Value]):
     """An area that answers only where it is named: read when somebody first names it, and kept."""
 
@@ -87,15 +71,28 @@ class OnDemand(Generic[_Value]):
             value = self._read() if self._value is None else self._value
         except FeatureDbError as error:
             _LOG.warning("a map that answers only where it is named cannot be read: %s", error)
-            return OnDemand, (self.write_id, _Unreadable(str(error)))
-        return OnDemand, (self.write_id, _Given(value))
+            return OnDemand, (self.write_id, partial(_unreadable, str(error)))
+        return OnDemand, (self.write_id, partial(_given, value))
+
+
+def _given(value: _Value) -> _Value:
+    return value
+
+
+def _unreadable(message: str) -> Any:
+    raise StoreError(message)
 
 
 _OwnArea = tuple[UnplacedMap, IndexedArea]
 
 
 class Localiser:
-    """Answers queries from one snapshot, which never changes; threads may share it."""
+    """Answers queries from one snapshot, which never changes; threads may share it.
+
+    Attributes:
+        areas: all, of whatever extractor; those whose maps did not change stay the same over reloads.
+        options: settings by which it answers. snapshot: version of the database that it answers from.
+    """
 
     def __init__(
         self,
@@ -107,8 +104,8 @@ class Localiser:
         provisional: Mapping[str, OnDemand[IndexedArea]] | None = None,
     ) -> None:
         self._loaded = tuple(loaded)
-        self._options = options
-        self._snapshot = snapshot
+        self.areas = tuple(one.indexed for one in loaded)
+        self.options, self.snapshot = options, snapshot
         # Of the snapshot, not of an area: an area that is taken over may hang on maps that have changed.
         self._lineages = dict(lineages)
         self._unplaced = dict(unplaced or {})
@@ -164,28 +161,29 @@ class Localiser:
         }
         return cls(loaded, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
 
-    @property
-    def snapshot(self) -> int:
-        """Version of the database that it answers from."""
-        return self._snapshot
-
-    @property
-    def options(self) -> LocaliseOptions:
-        """Settings by which it answers."""
-        return self._options
-
-    @property
-    def areas(self) -> tuple[IndexedArea, ...]:
-        """All areas, of whatever extractor."""
-        return tuple(loaded.indexed for loaded in self._loaded)
-
     def areas_of(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
-        """All areas, or areas of the named maps only.
+        """All areas, or those of the named maps, of which only these are searched.
 
         Raises:
             MapNotFoundError: the snapshot serves no such map.
         """
-        return self._chosen(map_ids)
+        if map_ids is None:
+            return list(self.areas)
+        wanted = set(map_ids)
+        unknown = wanted - self._provisional.keys() - {m for loaded in self._loaded for m in loaded.map_ids}
+        if unknown:
+            raise MapNotFoundError(
+                f"snapshot {self.snapshot} serves no map {', '.join(sorted(unknown))}; "
+                "`featuredb maps` lists what there is"
+            )
+        chosen = [
+            loaded.indexed if loaded.map_ids <= wanted else loaded.indexed.only(wanted)
+            for loaded in self._loaded
+            if loaded.map_ids & wanted
+        ]
+        return chosen + [
+            self._provisional[map_id].get() for map_id in sorted(wanted & self._provisional.keys())
+        ]
 
     def own_area_of(self, map_ids: tuple[str, ...] | None) -> tuple[UnplacedMap, IndexedArea] | None:
         """The map without a place that is named alone, and its area, whose local frame is the map's own.
@@ -210,8 +208,8 @@ class Localiser:
         unplaced = self._named_unplaced(request.map_ids)
         if unplaced is not None:
             return self._in_own_frame(gray, request, unplaced)
-        areas = self._chosen(request.map_ids)
-        fingerprint = self._options.extractor.fingerprint
+        areas = self.areas_of(request.map_ids)
+        fingerprint = self.options.extractor.fingerprint
         matching = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
         if areas and not matching:
             found = ", ".join(sorted({a.area.extractor_fingerprint for a in areas}))
@@ -219,7 +217,7 @@ class Localiser:
                 f"the maps were made by extractor {found}, queries here use {fingerprint}: descriptors "
                 "cannot be compared; start the server with the extractor options of the ingest"
             )
-        return self.with_lineage(localise(gray, request, matching, self._options, self._snapshot))
+        return self._with_lineage(localise(gray, request, matching, self.options, self.snapshot))
 
     def _named_unplaced(self, map_ids: tuple[str, ...] | None) -> str | None:
         """The map without a place that the request names, if it does.
@@ -241,45 +239,18 @@ class Localiser:
         """The pose in the own frame of a map without a place, or the reason why there is none."""
         unplaced, indexed = self._unplaced[map_id].get()
         told = replace(request, prior=None, own_position=None, beyond=None, map_ids=None)
-        return in_own_frame(localise(gray, told, [indexed], self._options, self._snapshot), unplaced)
+        return in_own_frame(localise(gray, told, [indexed], self.options, self.snapshot), unplaced)
 
-    def with_lineage(self, result: LocaliseResult) -> LocaliseResult:
+    def _with_lineage(self, result: LocaliseResult) -> LocaliseResult:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""
         if result.pose is None:
             return result
         told = []
         for entry in result.pose.lineage:
-            lineage = self._lineages[entry["map_id"]]
-            told.append(
-                {
-                    **entry,
-                    "steps": lineage.steps,
-                    "anchors": list(lineage.anchors),
-                    "drift_m": lineage.drift_m,
-                    "budget_m": lineage.budget_m,
-                }
-            )
+            found = self._lineages[entry["map_id"]]
+            names = ("steps", "anchors", "drift_m", "budget_m")
+            told.append(entry | {name: getattr(found, name) for name in names})
         return replace(result, pose=replace(result.pose, lineage=tuple(told)))
-
-    def _chosen(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
-        """The areas, or those of the named maps, of which only these are searched."""
-        if map_ids is None:
-            return [loaded.indexed for loaded in self._loaded]
-        wanted = set(map_ids)
-        unknown = wanted - self._provisional.keys() - {m for loaded in self._loaded for m in loaded.map_ids}
-        if unknown:
-            raise MapNotFoundError(
-                f"snapshot {self._snapshot} serves no map {', '.join(sorted(unknown))}; "
-                "`featuredb maps` lists what there is"
-            )
-        chosen = [
-            loaded.indexed if loaded.map_ids <= wanted else loaded.indexed.only(wanted)
-            for loaded in self._loaded
-            if loaded.map_ids & wanted
-        ]
-        return chosen + [
-            self._provisional[map_id].get() for map_id in sorted(wanted & self._provisional.keys())
-        ]
 
 
 def _indexed(maps: Sequence[FeatureMap]) -> IndexedArea:

@@ -14,11 +14,9 @@ from scipy.spatial import cKDTree
 
 from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import decode_rgb
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import matrix_from_quaternion
+from reloc.answered_view import AnsweredView
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.matching import visible_points
 from reloc.wire.query import LocaliseReply
@@ -56,12 +54,13 @@ def draw_overlay(
         image = np.asarray(
             cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), dtype=np.uint8
         )
+    view, inliers_utm = AnsweredView.of_reply(reply), np.array(reply.inlier_points.utm).reshape(-1, 3)
     if other_points_utm is not None and len(other_points_utm):
-        others = _thinned(_without(other_points_utm, np.array(reply.inlier_points.utm).reshape(-1, 3)))
-        for x, y in _inside(project_utm(reply, others), reply) * shrink:
+        others = _thinned(_without(other_points_utm, inliers_utm))
+        for x, y in _inside(view.project_utm(others), view.camera) * shrink:
             cv2.circle(image, (round(x), round(y)), 2, _OTHER_BGR, -1, cv2.LINE_AA)
     keypoints = np.array(reply.inlier_points.pixels).reshape(-1, 2)
-    projected = project_utm(reply, np.array(reply.inlier_points.utm).reshape(-1, 3))
+    projected = view.project_utm(inliers_utm)
     for (x, y), (u, v) in zip(keypoints * shrink, projected * shrink, strict=True):
         cv2.circle(image, (round(x), round(y)), 4, _INLIER_BGR, 1, cv2.LINE_AA)
         if np.isfinite([u, v]).all():
@@ -85,49 +84,23 @@ def write_overlay(
         raise FeatureDbError(f"overlay: cannot write {path}: {error.strerror or error}") from error
 
 
-def project_utm(reply: LocaliseReply, points_utm: FloatArray) -> FloatArray:
-    """Pixels (n, 2) of points (n, 3) in the reply's UTM zone; NaN behind the camera.
-
-    Through a local frame at the camera, because UTM itself is not metric.
-    """
-    utm, used = reply.utm, reply.camera
-    if utm is None or used is None:
-        raise InvalidValueError("project_utm: expected a localised reply")
-    camera = Camera(model=used.model, width=used.width, height=used.height, params=used.params)
-    frame = LocalFrame.from_utm(utm.easting, utm.northing, utm.height, utm.epsg)
-    grid_from_local = frame.grid_from_enu(np.zeros(3), utm.epsg)
-    rotation = matrix_from_quaternion(utm.cam_from_utm_xyzw) @ grid_from_local
-    cam_from_local = Rigid3(rotation=rotation, translation=np.zeros(3))
-    return camera.project(cam_from_local.act(frame.enu_from_utm(points_utm, utm.epsg)))
-
-
-def map_points_in_view(areas: Sequence[IndexedArea], reply: LocaliseReply) -> FloatArray:
+def map_points_in_view(areas: Sequence[IndexedArea], view: AnsweredView) -> FloatArray:
     """Points (n, 3) of the answering area that the photo should show: easting, northing, height in its zone.
 
     Args:
-        areas: those of the localiser that gave the reply.
+        areas: those of the localiser that gave the answer.
     """
-    utm, used = reply.utm, reply.camera
-    if utm is None or used is None:
-        raise InvalidValueError("map_points_in_view: expected a localised reply")
-    camera = Camera(model=used.model, width=used.width, height=used.height, params=used.params)
-    for indexed in areas:
-        area = indexed.area
-        if reply.maps[0] not in {feature_map.map_id for feature_map in area.maps}:
-            continue
-        center = area.frame.enu_from_utm((utm.easting, utm.northing, utm.height), utm.epsg)
-        grid_from_local = area.frame.grid_from_enu(center, utm.epsg)
-        rotation = matrix_from_quaternion(utm.cam_from_utm_xyzw) @ grid_from_local
-        cam_from_local = Rigid3(rotation=rotation, translation=-rotation @ center)
-        rows = visible_points(area, area.searched_points(), camera, cam_from_local)
-        return area.frame.utm_from_enu(area.points[rows], utm.epsg)
+    for area in (indexed.area for indexed in areas):
+        if view.map_ids[0] in {feature_map.map_id for feature_map in area.maps}:
+            pose = view.seen_in(area.frame).cam_from_local
+            rows = visible_points(area, area.searched_points(), view.camera, pose)
+            return area.frame.utm_from_enu(area.points[rows], view.epsg)
     return np.empty((0, 3))
 
 
-def _inside(pixels: FloatArray, reply: LocaliseReply) -> FloatArray:
-    assert reply.camera is not None
+def _inside(pixels: FloatArray, camera: Camera) -> FloatArray:
     with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 0) & (pixels < [reply.camera.width, reply.camera.height])).all(axis=1)
+        inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
     return pixels[inside]
 
 

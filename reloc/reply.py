@@ -1,14 +1,14 @@
 """Poses as the wire says them, and the reply out of a localisation result."""
 
-from typing import Any, Literal, Protocol
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
-from featuredb.geo.geopose import BODY_AXES, GeoPose
+from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import quaternion_from_matrix
-from reloc.localise.result import Inliers, LocalisedPose, LocaliseResult, PoseInMap
+from reloc.localise.result import Inliers, LocalisedPose, LocaliseResult, OnEarth, PoseInMap
 from reloc.wire.query import (
     Accuracy,
     CameraUsed,
@@ -73,27 +73,10 @@ _NO_POSE: dict[str, Any] = {
 }
 
 
-class OnEarth(Protocol):
-    """What every pose on Earth has; conventions as in `reloc.localise.result.LocalisedPose`."""
-
-    @property
-    def epsg(self) -> int: ...
-    @property
-    def utm(self) -> FloatArray: ...
-    @property
-    def cam_from_utm_xyzw(self) -> FloatArray: ...
-    @property
-    def geopose(self) -> GeoPose: ...
-    @property
-    def height_datum(self) -> str: ...
-    @property
-    def covariance(self) -> FloatArray: ...
-
-
 def place_fields(pose: OnEarth) -> dict[str, Any]:
-    """Position, orientation and covariance as members of a message."""
-    x, y, z, w = (float(q) for q in pose.geopose.quaternion_xyzw)
-    easting, northing, height = (float(v) for v in pose.utm)
+    """Position, orientation and how surely, as members of a message."""
+    x, y, z, w = pose.geopose.quaternion_xyzw
+    easting, northing, height = _floats(pose.utm)
     return {
         "position": Position(
             lat=pose.geopose.latitude_deg, lon=pose.geopose.longitude_deg, h=pose.geopose.height_m
@@ -105,39 +88,27 @@ def place_fields(pose: OnEarth) -> dict[str, Any]:
             easting=easting,
             northing=northing,
             height=height,
-            cam_from_utm_xyzw=tuple(float(q) for q in pose.cam_from_utm_xyzw),
+            cam_from_utm_xyzw=_floats(pose.cam_from_utm_xyzw),
         ),
-        "covariance": tuple(tuple(float(v) for v in row) for row in pose.covariance),
+        "covariance": tuple(_floats(row) for row in pose.covariance),
+        "accuracy": Accuracy(
+            horizontal_68_m=pose.horizontal_68_m,
+            vertical_68_m=pose.vertical_68_m,
+            orientation_68_deg=pose.orientation_68_deg,
+        ),
     }
 
 
 def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
     return {
         **place_fields(pose),
-        "accuracy": Accuracy(
-            horizontal_68_m=pose.horizontal_68_m,
-            vertical_68_m=pose.vertical_68_m,
-            orientation_68_deg=pose.orientation_68_deg,
-        ),
-        "camera": _camera_used(pose.camera, pose.camera_source),
+        "camera": CameraUsed(**asdict(pose.camera), source=pose.camera_source),
         "view_covariance": None
         if pose.view_covariance is None
         else tuple(_floats(row) for row in pose.view_covariance),
         "residual_rms_px": pose.residual_rms_px,
         "maps": pose.map_ids,
-        "lineage": tuple(
-            Lineage(
-                map_id=map_id,
-                method=str(entry["method"]),
-                generation=int(entry["generation"]),
-                parents=tuple(entry["parents"]),
-                steps=entry.get("steps"),
-                anchors=tuple(entry.get("anchors", ())),
-                drift_m=entry.get("drift_m"),
-                budget_m=entry.get("budget_m"),
-            )
-            for map_id, entry in zip(pose.map_ids, pose.lineage, strict=True)
-        ),
+        "lineage": tuple(Lineage(**entry) for entry in pose.lineage),
         "inlier_points": None if pose.inliers is None else _inlier_points(pose.inliers),
     }
 
@@ -151,24 +122,18 @@ def _in_map(pose: PoseInMap) -> InMapPose:
         cam_from_map_translation=_floats(pose.cam_from_map.translation),
         center=_floats(pose.cam_from_map.center),
         covariance=tuple(_floats(row) for row in pose.covariance),
-        camera=_camera_used(pose.camera, pose.camera_source),
+        camera=CameraUsed(**asdict(pose.camera), source=pose.camera_source),
         residual_rms_px=pose.residual_rms_px,
     )
 
 
 def _floats(values: FloatArray) -> Any:
-    return tuple(float(v) for v in values)
-
-
-def _camera_used(camera: Camera, source: Literal["request", "map", "exif", "estimated"]) -> CameraUsed:
-    return CameraUsed(
-        model=camera.model, width=camera.width, height=camera.height, params=camera.params, source=source
-    )
+    return tuple(values.tolist())
 
 
 def _inlier_points(inliers: Inliers) -> InlierPoints:
     return InlierPoints(
-        pixels=tuple((float(x), float(y)) for x, y in np.round(inliers.pixels, 2)),
-        utm=tuple((float(e), float(n), float(h)) for e, n, h in np.round(inliers.points_utm, 4)),
-        map_rows=tuple(int(row) for row in inliers.map_rows),
+        pixels=tuple(_floats(row) for row in np.round(inliers.pixels, 2)),
+        utm=tuple(_floats(row) for row in np.round(inliers.points_utm, 4)),
+        map_rows=tuple(inliers.map_rows.tolist()),
     )

@@ -5,7 +5,7 @@ One adjustment (`featuredb.adjust`) over the pixels of all photos, with the prio
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,29 +17,20 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import matrix_from_quaternion
+from reloc.answered_view import AnsweredView
 from reloc.localise.lens_prior import LensPriors, QueryLensPrior, opencv_by_lens, with_lens
 from reloc.localise.options import PoseOptions
 from reloc.localise.self_calibration import LensProblem, calibrate, measured_noise_px
 from reloc.wire.query import CameraRequest, LocaliseReply
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SharedLensOptions:
-    """When photos have a lens in common.
-
-    Attributes:
-        least_photos: that agree on a lens.
-        max_excess: by how much more a photo's pixels disagree with the common lens than with one of its own:
-            half a chi-square of eight degrees of freedom, 99.9 % of which is below. Photos of one lens had 10
-            at most, those of another camera 2,800 and more.
-        sigma_scale: errors of neighbouring pixels are not independent: the focal lengths of random groups of
-            3 to 14 photos of a simulated drone were off by 1.4 to 1.7 of the plain sigmas.
-    """
-
-    least_photos: int = 3
-    max_excess: float = 13.1
-    sigma_scale: float = 1.6
+_LEAST_PHOTOS = 3  # that agree on a lens
+# By how much more a photo's pixels may disagree with the common lens than with one of its own: half a
+# chi-square of eight degrees of freedom, 99.9 % of which is below. Photos of one lens had 10 at most, those
+# of another camera 2,800 and more.
+_MAX_EXCESS = 13.1
+# Errors of neighbouring pixels are not independent: the focal lengths of random groups of 3 to 14 photos of a
+# simulated drone were off by 1.4 to 1.7 of the plain sigmas.
+_SIGMA_SCALE = 1.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,14 +58,7 @@ class SharedLens:
 
     def as_request(self) -> CameraRequest:
         """As a query takes it."""
-        camera = self.camera
-        return CameraRequest(
-            model=camera.model,
-            width=camera.width,
-            height=camera.height,
-            params=camera.params,
-            sigmas=tuple(float(s) for s in self.sigmas),
-        )
+        return CameraRequest(**asdict(self.camera), sigmas=tuple(float(s) for s in self.sigmas))
 
 
 def views_of(replies: Sequence[LocaliseReply]) -> list[LensView | None]:
@@ -86,16 +70,14 @@ def views_of(replies: Sequence[LocaliseReply]) -> list[LensView | None]:
         if utm is None or lens is None or inliers is None or lens.source not in ("exif", "estimated"):
             views.append(None)
             continue
-        where = np.array([utm.easting, utm.northing, utm.height])
-        frame = frame or LocalFrame.from_utm(utm.easting, utm.northing, utm.height, utm.epsg)
-        center = frame.enu_from_utm(where, utm.epsg)
-        rotation = matrix_from_quaternion(utm.cam_from_utm_xyzw) @ frame.grid_from_enu(center, utm.epsg)
+        view = AnsweredView.of_reply(reply)
+        frame = frame or view.frame
         views.append(
             LensView(
                 pixels=np.array(inliers.pixels, dtype=np.float64).reshape(-1, 2),
                 points=frame.enu_from_utm(np.array(inliers.utm, dtype=np.float64).reshape(-1, 3), utm.epsg),
-                cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
-                camera=Camera(model=lens.model, width=lens.width, height=lens.height, params=lens.params),
+                cam_from_local=view.seen_in(frame).cam_from_local,
+                camera=view.camera,
             )
         )
     return views
@@ -127,31 +109,26 @@ def lenses_of_cameras(
     return lenses, asked_with
 
 
-def shared_lens(
-    views: Sequence[LensView],
-    priors: LensPriors | None = None,
-    pose: PoseOptions | None = None,
-    options: SharedLensOptions | None = None,
-) -> SharedLens | None:
+def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
     """The lens that most views agree on, without those that do not; None where too few are left.
 
     Args:
         views: of pictures of one size; any camera of OPENCV's or SIMPLE_RADIAL's model.
     """
-    priors, pose, options = priors or LensPriors(), pose or PoseOptions(), options or SharedLensOptions()
+    priors = LensPriors()
     agree = np.ones(len(views), dtype=np.bool_)
     excess = np.full(len(views), np.inf)
-    if len(views) < options.least_photos:
+    if len(views) < _LEAST_PHOTOS:
         return None
     first = views[0].camera
     # Where a photo's own lens lies among the priors does not matter: all of them outweigh these by far.
     focal_px = float(np.median([v.camera.focal_px for v in views]))
     prior = priors.around(first, focal_px, priors.unknown_focal_rel)
-    noise_px = 0.25 * pose.tolerance_rel * max(first.width, first.height)
+    noise_px = 0.25 * PoseOptions().tolerance_rel * max(first.width, first.height)
     noise = [measured_noise_px(v.pixels, v.points, v.cam_from_local, v.camera, noise_px) for v in views]
     problems = [_problem(view, prior, noise_px, own) for view, own in zip(views, noise, strict=True)]
     alone = np.array([_alone(p, v) for p, v in zip(problems, views, strict=True)])
-    while agree.sum() >= options.least_photos:
+    while agree.sum() >= _LEAST_PHOTOS:
         rows = [int(r) for r in np.flatnonzero(agree)]
         start = views[max(rows, key=lambda r: len(views[r].pixels))].camera
         block, covariance = _together(
@@ -161,10 +138,10 @@ def shared_lens(
         for r, found in zip(rows, block.cam_from_block, strict=True):
             excess[r] = problems[r].cost_of_pixels(found, camera) - alone[r]
         worst = max(rows, key=lambda r: excess[r])
-        if excess[worst] <= options.max_excess:
+        if excess[worst] <= _MAX_EXCESS:
             return SharedLens(
                 camera=camera,
-                sigmas=options.sigma_scale * np.sqrt(np.diag(covariance)),
+                sigmas=_SIGMA_SCALE * np.sqrt(np.diag(covariance)),
                 agree=agree,
             )
         agree[worst] = False

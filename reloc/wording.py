@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from featuredb.geo.geopose import GeoPose
 from featuredb.maps.lineage import lineage_text
-from reloc.localise.answer import error_radius
+from reloc.answered_view import geopose_of
+from reloc.localise.result import error_radius
 from reloc.wire.query import InMapPose, LocaliseReply
 
 # Steeper than this a photo shows no horizon, and people ask where its top points.
@@ -60,21 +60,8 @@ def describe(name: str, reply: LocaliseReply, database: str) -> str:
     )
 
 
-def angles(reply: LocaliseReply) -> GeoPose:
-    """The pose of a localised reply, which tells its angles; see docs/localisation.md."""
-    assert reply.position is not None
-    assert reply.quaternion is not None
-    q = reply.quaternion
-    return GeoPose(
-        latitude_deg=reply.position.lat,
-        longitude_deg=reply.position.lon,
-        height_m=reply.position.h,
-        quaternion_xyzw=(q.x, q.y, q.z, q.w),
-    )
-
-
 def _looks(reply: LocaliseReply) -> str:
-    pose = angles(reply)
+    pose = geopose_of(reply)
     heading, pitch, roll = pose.heading_pitch_roll_deg
     text = f"heading {heading:.2f} deg from true north, pitch {pitch:+.2f}, roll {roll:+.2f}"
     if abs(pitch) > _STEEP_DEG:

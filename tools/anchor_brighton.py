@@ -15,7 +15,6 @@
 import argparse
 import json
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from tools import scan_poses
 from tools.anchor_simworld import featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 from tools.real_photos import ask_poses, error_figures, ingest, table
 
 
@@ -37,8 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not args.poses.exists():
         scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
     frame, poses = read_poses(args.poses)
-    with tempfile.TemporaryDirectory() as scratch:
-        work = args.work or Path(scratch)
+    with work_folder(args.work) as work:
         database = work / "anchored"
         ingest(database, args.photos, args.held_out)
         shape = by_gps(Database.open(database), frame, args.poses)
@@ -103,13 +101,12 @@ def by_gps(database: Database, frame: LocalFrame, poses: Path) -> dict[str, floa
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
     parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
     parser.add_argument("--held-out", nargs="+", required=True, metavar="NAME")
     parser.add_argument("--work", type=Path, default=None, help="keep the database and the report there")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

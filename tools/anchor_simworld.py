@@ -16,7 +16,6 @@ import argparse
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,7 +29,7 @@ from featuredb.store import Database
 from reloc.client import Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 _ROOT = Path(__file__).resolve().parent.parent
@@ -38,8 +37,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    with tempfile.TemporaryDirectory() as scratch:
-        work = args.work or Path(scratch)
+    with work_folder(args.work) as work:
         inputs = args.inputs or work
         world = make_scan_world(
             inputs / f"scan-world-{args.size}-{args.seed}", args.seed, args.size, args.workers
@@ -141,13 +139,12 @@ def featuredb(*words: str, may_refuse: bool = False, refusals: Sequence[int] = (
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--size", choices=("short", "full"), default="short")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=0, help="processes that render photos; default: cores")
     parser.add_argument("--work", type=Path, default=None, help="keep world, databases and reports there")
     parser.add_argument("--inputs", type=Path, default=None, help="keep the world there, not in --work")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -1,8 +1,8 @@
 """What honest clients notice while others attack: answer times, failures and the server's memory.
 
-    python -m tools.attacks_benchmark DB PHOTOS [--points 200000] [--seconds 30] [--attack NAME ...]
+    python -m tools.attacks_benchmark DB PHOTOS [--seconds 30] [--attack NAME ...]
 
-DB has one real map of the PHOTOS, and is made larger by copies of it to so many points. A real server process
+DB has one real map of the PHOTOS, and is made larger by copies of it to 200,000 points. A real server process
 with keys (TLS, rules) and a gateway serve it. Three honest clients ask photos with and without a prior, one
 of them newly connected each time, quiet and under each attack of tools/attacks.py. A failed question counts
 as one that took the deadline.
@@ -30,6 +30,7 @@ from tools.attacks import ATTACKS, Target, attack
 from tools.figures import write_figures
 from tools.service_world import (
     ATTACKER,
+    DEADLINE_S,
     MemoryWatch,
     Service,
     enlarged,
@@ -37,11 +38,12 @@ from tools.service_world import (
     honest_clients,
     photos_of,
     running_service,
-    study_parser,
+    service_parser,
 )
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _CALM_S = 3.0  # between attacks
+_POINTS = 200_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,13 +67,13 @@ class Measured:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     database = Database.open(args.db)
-    map_ids = enlarged(database, args.points)
+    map_ids = enlarged(database, _POINTS)
     points = sum(m.points for m in database.snapshot().maps())
-    photos = photos_of(args.photos, 6, args.side)
+    photos = photos_of(args.photos, 6)
     measured: list[Measured] = []
     with (
         tempfile.TemporaryDirectory() as scratch,
-        running_service(args.db, Path(scratch), args.deadline) as service,
+        running_service(args.db, Path(scratch)) as service,
     ):
         expected = first_answers(service, photos)
         localised = sum(reply.status == "localised" for reply in expected)
@@ -113,18 +115,18 @@ def main(argv: Sequence[str] | None = None) -> int:
                 )
             )
             _say(measured[-1])
-    write_figures(args.json, figures(measured, points, args.deadline))
+    write_figures(args.json, figures(measured, points))
     return 0
 
 
-def figures(measured: Sequence[Measured], points: int, deadline_s: float) -> dict[str, object]:
+def figures(measured: Sequence[Measured], points: int) -> dict[str, object]:
     """Those of the quiet server, the worst of all attacks, and each."""
     quiet, attacked = measured[0], measured[1:]
     killed = [m for m in attacked if m.attack == "workers killed"]
     others = [m for m in attacked if m not in killed]
     return {
         "points": points,
-        "deadline_s": deadline_s,
+        "deadline_s": DEADLINE_S,
         "quiet_p99_s": quiet.p99_s,
         "quiet_mib": quiet.peak_mib,
         "worst_p99_s": max((m.p99_s for m in others), default=None),
@@ -170,12 +172,12 @@ def _web_client(service: Service, photos: Sequence[bytes]) -> Iterator[list[tupl
                     f"{service.gateway.endpoint}/localise",
                     files={"image": photos[number % len(photos)]},
                     data={"options": '{"exif_prior": true}'},
-                    timeout=service.deadline_s,
+                    timeout=DEADLINE_S,
                 )
                 ok = answer.status_code == 200
             except requests.RequestException:
                 ok = False
-            heard.append((time.monotonic() - start if ok else service.deadline_s, ok))
+            heard.append((time.monotonic() - start if ok else DEADLINE_S, ok))
 
     thread = threading.Thread(target=run)
     thread.start()
@@ -196,10 +198,8 @@ def _say(m: Measured) -> None:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--points", type=int, default=200_000)
+    parser = service_parser(__doc__)
     parser.add_argument("--seconds", type=float, default=30.0, help="for each attack")
-    parser.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="the server's")
     parser.add_argument("--attack", action="append", choices=sorted(ATTACKS), help="only this one")
     return parser.parse_args(argv)
 

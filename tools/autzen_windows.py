@@ -52,11 +52,12 @@ from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import MIN_CONFIRMATION_LOG_NFA
 from ingest.register.frame_registration import FramePrior
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.ortho_place import WINDOW_PX, Floats, OrthoOverScan, has_structure, measured_offset, place_of
 
 _STEPS = (225, 200)  # columns, rows between windows
 _HEIGHT_M = 1000.0
+_OFFSET_PX = (-7.0, -2.0)  # columns, rows
 _PRIOR_M, _PRIOR_DEG = 20.0, 5.0
 _KINDS = ("window", "mirrored", "elsewhere", "photo")
 _LIMIT_M, _WRONG_M = 1.5, 5.0
@@ -91,9 +92,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"scan: {len(cloud):,} points, {added.scan.height_datum} heights, EPSG:{added.scan.epsg}")
     place = place_of(args.ortho, frame, added.scan.epsg, cloud)
     measured = measured_offset(place)
-    offset = place.on_ground(np.array([args.offset]))[0] - place.on_ground(np.zeros((1, 2)))[0]
+    offset = place.on_ground(np.array([_OFFSET_PX]))[0] - place.on_ground(np.zeros((1, 2)))[0]
     apart = float(np.hypot(*(offset - measured)))
-    taken = f"columns {args.offset[0]:+g}, rows {args.offset[1]:+g}"
+    taken = f"columns {_OFFSET_PX[0]:+g}, rows {_OFFSET_PX[1]:+g}"
     print(f"offset taken: {taken}; the measured one is {apart:.2f} m from it")
     outcomes = []
     for kind, column, row, photo in _photos(place, args.photos):
@@ -281,18 +282,14 @@ def _summary(outcomes: Sequence[WindowOutcome], figures: Path | None) -> None:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = study_parser(__doc__)
     parser.add_argument("scan", type=Path)
     parser.add_argument("ortho", type=Path)
     parser.add_argument("--figure", type=Path, help="draw evidence against error")
     parser.add_argument(
         "--photos", type=Path, nargs="*", default=[], help="folders with photos of other places"
     )
-    parser.add_argument("--offset", nargs=2, type=float, default=(-7.0, -2.0), help="columns, rows")
     parser.add_argument("--seed", type=int, default=0)
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

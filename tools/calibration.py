@@ -20,8 +20,8 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.flight import received_positions
 from featuredb.simworld.world import World
 from ingest.register.gps import GpsOptions, place_by_gps
-from reloc.localise.answer import error_radius, placement_covariance
-from reloc.localise.result import LocalisedPose
+from reloc.localise.answer import placement_covariance
+from reloc.localise.result import LocalisedPose, error_radius
 
 # An answer, and the true cam_from_local in the frame of the answer.
 Pair = tuple[LocalisedPose, Rigid3]

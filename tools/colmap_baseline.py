@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pycolmap
 
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.made_maps import all_maps, copied, make
 
 _PICTURES = {".jpg", ".jpeg", ".png"}
@@ -118,11 +118,10 @@ def our_groups(folder: Path, work: Path, *, positions: bool) -> tuple[Grouped, i
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--no-positions", action="store_true")
     parser.add_argument("--work", type=Path, required=True, help="where COLMAP's result is kept")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -1,6 +1,6 @@
 """A folder of films by strangers: maps of what shows the place, placed by one frame, every frame tracked.
 
-    python -m tools.community_films --work DIR [--seed N] [--reuse]
+    python -m tools.community_films --work DIR [--seed N]
 
 1. Six simulated films without telemetry: three of one place (cuts, a title, black, a zoom, a logo, bars), one
    of another town, two of the place that are compressed badly, one of which shows the other town in between.
@@ -28,7 +28,7 @@ from featuredb.simworld.laser.scan_file import write_scan
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from tools.anchor_simworld import featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
 from tools.film_scripts import six_films
@@ -41,13 +41,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     inputs = (args.inputs or args.work) / f"community-{args.seed}"
     scripts = six_films(args.seed)
-    truth = write_films(inputs / "films", scripts, args.workers)
+    truth = write_films(inputs / "films", scripts, 0)
     write_truth(inputs / "truth.json", truth)
     work = args.work / f"run-{args.seed}"
-    made, seconds = work / "made", 0.0
-    if not (args.reuse and made.exists()):
-        shutil.rmtree(work, ignore_errors=True)
-        seconds = _ingest(made, inputs / "films", work)
+    shutil.rmtree(work, ignore_errors=True)
+    made = work / "made"
+    seconds = _ingest(made, inputs / "films", work)
     found = read_film_maps(made, work / "report", truth)
     say(found.as_text())
     figures: dict[str, Any] = found.figures(scripts) | {"ingest_s": seconds, "placed": 0}
@@ -112,15 +111,12 @@ def _tracked(database: Path, films: Path, work: Path, truth: FilmsTruth) -> list
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument(
         "--work", type=Path, required=True, help="databases, reports and tracks are kept there"
     )
     parser.add_argument("--inputs", type=Path, default=None, help="keep films and scan there, not in --work")
     parser.add_argument("--seed", type=int, default=1, help="of town, flights and picks")
-    parser.add_argument("--reuse", action="store_true", help="take the maps of the last run")
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -1,17 +1,28 @@
-"""How the programs here hand their figures to the scoreboard: one JSON object in a file."""
+"""What programs that measure something share: arguments, a folder to work in, figures for the scoreboard."""
 
 import argparse
 import json
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from featuredb.plain_json import plain
 
 
-def add_json_option(parser: argparse.ArgumentParser) -> None:
-    """The option that all programs have that measure something."""
+def study_parser(doc: str | None) -> argparse.ArgumentParser:
+    """The parser of a program; `doc`: of its module."""
+    parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
     parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the figures there")
+    return parser
+
+
+@contextmanager
+def work_folder(kept: Path | None) -> Iterator[Path]:
+    """The folder that is to be kept, or else one that goes with the block."""
+    with tempfile.TemporaryDirectory() as scratch:
+        yield kept or Path(scratch)
 
 
 def write_figures(path: Path | None, figures: Mapping[str, Any]) -> None:

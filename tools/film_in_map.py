@@ -7,7 +7,6 @@ track at the keyframes with the poses that the map itself has of them: the dista
 median distance from the map's cameras to their points, and the angle. Exit code 0 if a frame was followed.
 """
 
-import argparse
 import csv
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,10 +53,9 @@ class FilmInMap:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("film", type=Path)
     parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
-    add_json_option(parser)
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as scratch:
         made = film_in_map(args.film, args.work or Path(scratch))

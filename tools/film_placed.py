@@ -7,7 +7,6 @@ distances between track and telemetry, the radius is that of the track: of the h
 95 %, at the median frame.
 """
 
-import argparse
 import csv
 import sys
 import tempfile
@@ -23,7 +22,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.store import Database
 from featuredb.video.telemetry import telemetry_of_video
 from tools.anchor_simworld import featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 
 _WITHIN = float(chi2.ppf(0.95, 2))
 
@@ -51,10 +50,9 @@ class FilmPlaced:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("film", type=Path)
     parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
-    add_json_option(parser)
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as scratch:
         made = film_placed(args.film, args.work or Path(scratch))

@@ -34,14 +34,15 @@ from featuredb.render.levels import build_cloud
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 
+_EPSG = 32615  # UTM zone of the scan of `brighton`
 _SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    cloud = read_cloud(args.scan, args.epsg)
+    cloud = read_cloud(args.scan, _EPSG)
     options = FrameOptions(threads=2)
     names = args.photos or sorted(p.name for p in args.folder.iterdir() if p.suffix.lower() == ".jpg")
     accepted, apart, seconds = 0, [], []
@@ -156,13 +157,11 @@ def _apart(a: Rigid3, b: Rigid3) -> tuple[float, float]:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("scan", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--lens", required=True, metavar="MODEL:PARAMS", help="COLMAP's model and parameters")
-    parser.add_argument("--epsg", type=int, default=32615, help="UTM zone of the scan")
     parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

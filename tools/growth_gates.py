@@ -13,7 +13,6 @@ refuses right photos and no wrong ones costs photos and prevents nothing. The sa
 round; only the last counts.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,7 +33,7 @@ from ingest.growth.graph import map_graph
 from ingest.growth.place import component
 from ingest.growth.values import Refused
 from ingest.photos.photo import Photo
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 
 WRONG_M = 2.0  # a photo registered further off than this is wrong
 
@@ -193,9 +192,8 @@ def gate_rows(judgements: Iterable[Judgement]) -> list[tuple[str, str, int, int,
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("files", type=Path, nargs="+", metavar="gates.jsonl")
-    add_json_option(parser)
     args = parser.parse_args(argv)
     judgements = read_judgements(args.files)
     sys.stdout.write("step    gate                      asked refused  alone  right  wrong\n")

@@ -4,7 +4,7 @@
 
 1. Joint: all photos are reconstructed at once. The largest reconstruction is the reference.
 2. Portions: the photos, sorted by name, are cut into three, by turns (interleaved) or one after the other
-   (consecutive) or in a shuffled order. The first reconstruction of at least five photos is placed by GPS,
+   (consecutive). The first reconstruction of at least five photos is placed by GPS,
    or without GPS at a made-up place with a median viewing distance of 50 m. Photos of later portions are
    reconstructed among themselves and go through `ingest.growth.run.grow`, as photos of whoever keeps the
    database. What cannot be placed waits, is tried with the next portion, and once
@@ -48,11 +48,12 @@ from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.growth_common import log_to_stderr
 from tools.growth_gates import recorded
 
 _PORTIONS = 3
+_LEAST_FIRST = 5  # photos of the first map: three or four do not tell its lens from its heights
 _MADE_UP_FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0)
 _MADE_UP_DISTANCE_M = 50.0
 _EXTENT_M = 100.0  # of the camera centres of a set without GPS, when the two are compared
@@ -77,7 +78,6 @@ class State:
     making: MapMakingOptions
     work: Path
     database: Database
-    least_first: int
     waiting: list[int] = field(default_factory=list)
     centers: dict[str, FloatArray] = field(default_factory=dict)
     frame: LocalFrame | None = None
@@ -101,12 +101,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             making=making,
             work=args.work,
             database=Database.create(Path(scratch) / "portions"),
-            least_first=args.first_photos,
             joint={p.name: c for p, c in zip(joint.photos, joint.model.centers(), strict=True)},
             gates=args.gates,
         )
         started = time.process_time()
-        cut = portions(len(photos), args.cut, args.seed)
+        cut = portions(len(photos), args.cut)
         for number, rows in enumerate([*cut, []], start=1):
             state.waiting = sorted([*state.waiting, *rows])
             _take_in(state, f"portion {number}" if rows else "end")
@@ -116,15 +115,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return _judge(state, joint, args, joint_s, grown_s)
 
 
-def portions(count: int, cut: str, seed: int) -> list[list[int]]:
-    """Rows of the three portions: by turns, one after the other, or by turns of a shuffled order."""
+def portions(count: int, cut: str) -> list[list[int]]:
+    """Rows of the three portions: by turns, or one after the other."""
     rows = np.arange(count)
-    if cut == "shuffled":
-        rows = np.random.default_rng(seed).permutation(count)
     parts = [rows[i::_PORTIONS] for i in range(_PORTIONS)]
     if cut == "consecutive":
         parts = np.array_split(rows, _PORTIONS)
-    return [sorted(part.tolist()) for part in parts]
+    return [part.tolist() for part in parts]
 
 
 def _take_in(state: State, what: str) -> None:
@@ -145,7 +142,7 @@ def _take_in(state: State, what: str) -> None:
 
 def _first_map(state: State, what: str) -> None:
     for component in _reconstruct(state.photos, state.waiting, state.making, state.work):
-        if len(component.photos) < state.least_first:
+        if len(component.photos) < _LEAST_FIRST:
             break
         first = component.feature_map or _made_up(state, component)
         if first is not None:
@@ -303,23 +300,13 @@ def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: fl
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, required=True, help="folder of photos")
-    parser.add_argument("--cut", choices=("interleaved", "consecutive", "shuffled"), default="interleaved")
-    parser.add_argument("--seed", type=int, default=0, help="of the shuffled order")
+    parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
     parser.add_argument("--work", type=Path, required=True, help="work folder; features and matches are kept")
-    parser.add_argument(
-        "--first-photos",
-        type=int,
-        default=5,
-        help="least photos of the first map: three or four do not tell its lens from its heights",
-    )
     parser.add_argument("--adjust", action="store_true", help="adjust all maps together at the end")
     parser.add_argument("-v", "--verbose", action="store_true", help="one line a photo")
     parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -27,10 +27,11 @@ from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
-from reloc.localise.answer import error_radius, placement_covariance
+from reloc.localise.answer import placement_covariance
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
+from reloc.localise.result import error_radius
 from reloc.wire.query import CameraRequest
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.laser_baseline import colmap_given_the_lens
 from tools.laser_set import FRAME, LaserSet, read_laser_set, with_exif
 from tools.made_maps import all_maps, make
@@ -51,7 +52,7 @@ class Errors:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     with tempfile.TemporaryDirectory() as scratch:
-        figures = judged(read_laser_set(args.folder), (args.work or Path(scratch)) / args.folder.name)
+        figures = judged(read_laser_set(args.folder), Path(scratch) / args.folder.name)
     sys.stdout.write(args.folder.name + "\n" + text(figures) + "\n")
     write_figures(args.json, figures)
     return 0
@@ -190,10 +191,8 @@ def _median(values: Sequence[float]) -> float:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    parser.add_argument("--work", type=Path, default=None, help="keep databases there")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -1,6 +1,6 @@
 """Are the bounds of answers true when lenses are not known? Draws of lenses, positions and keypoints.
 
-    python -m tools.lens_draws --draws 300 [--sigma 0.02 0.5 3] [--workers 2] [--json FILE]
+    python -m tools.lens_draws --draws 300 [--json FILE]
 
 Each draw is a flight over a made-up town whose lens differs from what EXIF says of it: focal length by 2 %,
 principal point by 1 % of the longer side, two radial and two tangential terms. Keypoints have half a pixel of
@@ -51,9 +51,10 @@ from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
 from tools.calibration import pose_offset
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 
 _WIDTH, _HEIGHT, _FOCAL_PX = 1200, 900, 1000.0
+_SIGMAS_M = (0.02, 0.5, 3.0)  # of positions
 _KEYPOINT_PX = 0.5
 _SHOWN = 0.7  # of the points in view
 _QUERIES = 20
@@ -109,10 +110,9 @@ class LensDraw:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     figures: dict[str, float] = {}
-    for sigma in args.sigma:
-        with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
-            seeds = range(args.seed, args.seed + args.draws)
-            draws = list(pool.map(partial(drawn, sigma_m=sigma), seeds))
+    for sigma in _SIGMAS_M:
+        with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+            draws = list(pool.map(partial(drawn, sigma_m=sigma), range(args.draws)))
         found, text = judged(draws)
         sys.stdout.write(f"positions of {sigma:g} m\n{text}\n")
         sys.stdout.flush()
@@ -325,12 +325,8 @@ def _model_of(
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--draws", type=int, default=300)
-    parser.add_argument("--sigma", type=float, nargs="+", default=[0.02, 0.5, 3.0], help="of positions, m")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -36,7 +36,7 @@ from ingest.colmap.picture_shear import picture_shear
 from ingest.photos.photo import Photo
 from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.made_maps import all_maps, make, photo_names
 
 WIDTHS = tuple(field.name for field in fields(LensWidths))
@@ -221,10 +221,9 @@ def _database(folder: Path, work: Path) -> Path:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
     parser.add_argument("--work", type=Path, required=True, help="databases are kept there")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -8,7 +8,6 @@ and all its children (resident set) is sampled ten times a second, and the large
 process is asked for in the end.
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -23,18 +22,19 @@ import numpy as np
 from laspy.vlrs.known import WktCoordinateSystemVlr
 from pyproj import CRS
 
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 
 CHUNK = 500_000
 EPSG = 32632
 WEST, SOUTH = 560_000.0, 5_930_000.0
 SAMPLE_S = 0.1
+_PER_M2 = 20.0  # points per square metre
 
 
-def make_scan(path: Path, points: int, density: float, seed: int) -> None:
+def make_scan(path: Path, points: int) -> None:
     """Write a scan of a square, in strips from west to east."""
-    rng = np.random.default_rng(seed)
-    side = float(np.sqrt(points / density))
+    rng = np.random.default_rng(1)
+    side = float(np.sqrt(points / _PER_M2))
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales, header.offsets = np.full(3, 0.001), np.array([WEST, SOUTH, 0.0])
     header.vlrs.append(WktCoordinateSystemVlr(CRS.from_epsg(EPSG).to_wkt("WKT1_GDAL")))
@@ -122,18 +122,15 @@ def measure(command: list[str]) -> dict[str, float]:
 
 def main() -> int:
     """Make the scan unless it is there, add it to a fresh database, print what it took as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--points", type=int, default=5_000_000)
-    parser.add_argument("--density", type=float, default=20.0, help="points per square metre; default: 20")
-    parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folder", type=Path, required=True, help="for the scan and the database")
-    add_json_option(parser)
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
-    scan = args.folder / f"scan-{args.points}-{args.density:g}-{args.seed}.las"
+    scan = args.folder / f"scan-{args.points}.las"
     if not scan.is_file():
         part = scan.with_suffix(".part.las")
-        make_scan(part, args.points, args.density, args.seed)
+        make_scan(part, args.points)
         part.rename(scan)
     database = args.folder / "scans.db"
     shutil.rmtree(database, ignore_errors=True)

@@ -1,6 +1,6 @@
 """What is at a pixel: places of the simulated town's pixels against the truth, and the bounds.
 
-    python -m tools.locate_pixels [--work DIR] [--inputs DIR] [--database DB] [--json FILE]
+    python -m tools.locate_pixels [--work DIR] [--inputs DIR] [--json FILE]
 
 1. A world with a scan is made, its photos become a map that is placed on the scan (tools/anchor_simworld.py).
 2. Each held-out photo is localised; pixels at random, of what stands still, are located on the scan.
@@ -13,7 +13,6 @@ Exit code 0.
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,16 +32,18 @@ from featuredb.simworld.truth import TrueImage, Truth
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
+from reloc.answered_view import AnsweredView
 from reloc.localiser import Localiser
 from reloc.pixels.locate import PixelPlace, locate
 from reloc.pixels.surfaces import RaySurface, scan_surface
-from reloc.pixels.view import AnsweredView
 from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored, featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 from tools.worlds.scan_world import make_scan_world
 
+_SEED = 1
+_PIXELS, _DRAWS = 60, 16  # of each photo: pixels, and draws of a pose and a lens
 # In height, of one of two strips from their mean.
 _STRIPS_M = 0.5 * AirborneScanOptions().strip_shift_m / np.sqrt(2.0)
 
@@ -58,18 +59,13 @@ class Miss:
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    with tempfile.TemporaryDirectory() as scratch:
-        work = args.work or Path(scratch)
-        world = make_scan_world(
-            (args.inputs or work) / f"scan-world-short-{args.seed}", args.seed, "short", 0
-        )
-        path = args.database
-        if path is None:
-            featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
-            path = anchored(work, work / "mapped", world, other=False)[0]
+    with work_folder(args.work) as work:
+        world = make_scan_world((args.inputs or work) / f"scan-world-short-{_SEED}", _SEED, "short", 0)
+        featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
+        path = anchored(work, work / "mapped", world, other=False)[0]
         database = Database.open(path)
-        scene, truth = town_of(WorldOptions.short(args.seed)), world.world.truth
-        rng = np.random.default_rng(args.seed)
+        scene, truth = town_of(WorldOptions.short(_SEED)), world.world.truth
+        rng = np.random.default_rng(_SEED)
         localiser = Localiser.open(database)
         answered: list[Miss] = []
         drawn: list[Miss] = []
@@ -83,12 +79,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             assert surface is not None
             surface.common_m = _STRIPS_M
             target = _Target(scene, truth, photo, view)
-            pixels = target.pixels(rng, args.pixels)
+            pixels = target.pixels(rng, _PIXELS)
             found = _misses(target, pixels, locate(view, surface, pixels))
             answered += found
             refused += len(pixels) - len(found)
-            for _ in range(args.draws):
-                drawn += target.drawn(rng, surface, args.pixels // 5)
+            for _ in range(_DRAWS):
+                drawn += target.drawn(rng, surface, _PIXELS // 5)
     figures = _figures("answered", answered) | _figures("drawn", drawn)
     figures |= {"refused": refused, "located": len(answered), "draws": len(drawn)}
     write_figures(args.json, figures)
@@ -173,16 +169,9 @@ def _view(localiser: Localiser, data: bytes) -> AnsweredView | None:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--pixels", type=int, default=60, help="of each photo")
-    parser.add_argument("--draws", type=int, default=16, help="of a pose and a lens for each photo")
+    parser = study_parser(__doc__)
     parser.add_argument("--work", type=Path, default=None, help="keep databases there")
     parser.add_argument("--inputs", type=Path, default=None, help="keep the world there, not in --work")
-    parser.add_argument(
-        "--database", type=Path, default=None, help="of the world, placed on its scan already"
-    )
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

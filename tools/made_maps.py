@@ -1,8 +1,8 @@
 """What becomes of a folder of photos whose positions nobody knows: maps, and photos in them.
 
-    python -m tools.made_maps --photos FOLDER [--names A.JPG ...] [--strip] [--gcp FILE]
+    python -m tools.made_maps --photos FOLDER [--gcp FILE]
 
-The folder (with --strip: copies of it without any position) is ingested into a new database.
+The folder is ingested into a new database.
 Prints how many photos are in the largest map, in any map, and in how many, placed or not, and
 what the placement of the first leaves between positions and the map (of --gcp: ground control points, of
 which no other position is known). Exit code 0 if there is a map.
@@ -12,7 +12,6 @@ import argparse
 import io
 import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -23,7 +22,7 @@ from PIL import Image
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 _GPS_IFD = 34853
@@ -52,14 +51,9 @@ class Made:
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    with tempfile.TemporaryDirectory() as scratch:
-        work = args.work or Path(scratch)
-        names = args.names or photo_names(args.photos)
-        folder = args.photos
-        if args.strip or args.names:
-            folder = copied(args.photos, names, work / "photos", strip=args.strip)
+    with work_folder(args.work) as work:
         control = () if args.gcp is None else ("--gcp", str(args.gcp))
-        made = make(work / "db", "photos", folder, len(names), control)
+        made = make(work / "db", "photos", args.photos, len(photo_names(args.photos)), control)
     sys.stdout.write(f"{made}\n")
     write_figures(args.json, asdict(made))
     return 0 if made.maps else 1
@@ -145,13 +139,10 @@ def _picture_start(jpeg: bytes) -> int:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, metavar="FOLDER", required=True)
-    parser.add_argument("--names", nargs="+", default=[], metavar="NAME", help="default: all of the folder")
-    parser.add_argument("--strip", action="store_true", help="of JPEGs: without EXIF's GPS and XMP")
     parser.add_argument("--gcp", type=Path, default=None, metavar="FILE", help="control points of the photos")
-    parser.add_argument("--work", type=Path, default=None, help="keep database and copies there")
-    add_json_option(parser)
+    parser.add_argument("--work", type=Path, default=None, help="keep the database there")
     return parser.parse_args(argv)
 
 

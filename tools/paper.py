@@ -44,7 +44,7 @@ from tools.worlds.scan_world import make_scan_world
 _PARTS = ("descriptors", "film", "shares")
 _METHODS = ("SIFT", "SIFT upright", "KAZE upright", "ORB", "FREAK")
 _RATIO = 0.9  # of the table's matches; the curves are in the figure
-_FILM_SEED = 1
+_FILM_SEED, _FRAMES = 1, 1200
 _PLACED = "placed.json"  # what came of the film; who starts again goes on from there
 
 
@@ -108,8 +108,8 @@ def film(args: argparse.Namespace) -> tuple[list[Line], dict[str, Any]]:
     """A film that says nothing of its place, placed by one frame, tracked from end to end."""
     inputs = args.inputs or args.out
     world = make_scan_world(inputs / f"scan-world-short-{_FILM_SEED}", _FILM_SEED, "short", 0)
-    options = film_options("smooth", "short", _FILM_SEED, args.frames)
-    folder = write_film(inputs / f"film-short-{_FILM_SEED}-smooth-{args.frames}", options, 0)
+    options = film_options("smooth", "short", _FILM_SEED, _FRAMES)
+    folder = write_film(inputs / f"film-short-{_FILM_SEED}-smooth-{_FRAMES}", options, 0)
     truth = read_film_truth(folder)
     work = args.out / "film"
     if not (work / _PLACED).exists():
@@ -129,7 +129,7 @@ def film(args: argparse.Namespace) -> tuple[list[Line], dict[str, Any]]:
     frame_s = times.get("(B) one frame, median", float("nan"))
     projection_s = times.get("(C) structure projection, all frames", float("nan"))
     figures |= {"frame_s": frame_s, "projection_s": projection_s}
-    return film_lines(figures, args.frames), figures
+    return film_lines(figures, _FRAMES), figures
 
 
 def placed_film(film_file: Path, scan: Path, truth: FilmTruth, work: Path, seed: int) -> dict[str, Any]:
@@ -252,7 +252,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--inputs", type=Path, default=None, help="keep world and film there, not in --out")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="folder of the real sets")
     parser.add_argument("--only", nargs="+", choices=_PARTS, default=list(_PARTS))
-    parser.add_argument("--frames", type=int, default=1200)
     parser.add_argument("--seed", type=int, default=1, help="of the picks")
     return parser.parse_args(argv)
 

@@ -12,7 +12,6 @@ Then positions that have nothing to do with the photos: drawn at random within a
 photos, those of a flight shuffled, and those of another flight.
 """
 
-import argparse
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.own_frame import held_of
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.made_maps import all_maps, make, photo_names
 
 SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
@@ -117,15 +116,12 @@ _KINDS: dict[str, Callable[[Flight, np.random.Generator], FloatArray]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = study_parser(__doc__)
     parser.add_argument("--work", type=Path, required=True, help="maps are made there, and found again")
     parser.add_argument("--photos", type=Path, nargs="*", default=[], metavar="FOLDER")
     parser.add_argument("--draws", type=int, default=25, help="of each kind")
     parser.add_argument("--chance", type=int, default=1000, help="draws of random positions")
     parser.add_argument("--seed", type=int, default=1)
-    add_json_option(parser)
     args = parser.parse_args(argv)
     real = [real_flight(folder, args.work) for folder in args.photos]
     with threadpool_limits(1):  # matrices are small

@@ -1,6 +1,6 @@
 """How long one query takes, step by step.
 
-    uv run python tools/query_benchmark.py DB IMAGE... [--repeat 5]
+    uv run python tools/query_benchmark.py DB IMAGE...
 
 Each image with its own GPS as prior, decoded, localised and answered in this process, and then the same over
 Zenoh on loopback; medians over images and repeats. Transport is the client's wall time less the server's own.
@@ -23,10 +23,11 @@ from reloc.localiser import Localiser
 from reloc.service.handler import answer_query
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
-from reloc.service.threads import capped_process
+from reloc.service.workers.answering import capped_process
 from reloc.wire.query import LocaliseWireRequest, RequestOptions
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 
+_REPEAT, _THREADS = 5, 2
 _SUM_TOLERANCE_MS, _SUM_TOLERANCE_REL = 1.0, 0.02
 _WITH_PRIOR = LocaliseWireRequest(options=RequestOptions(exif_prior=True))
 
@@ -56,16 +57,16 @@ class Timed:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     database = Database.open(args.db)
-    with capped_process(args.threads):
+    with capped_process(_THREADS):
         localiser = Localiser.open(database)
-        direct = run_direct(localiser, args.images, args.repeat)
-        served = run_served(database, args.images, args.repeat, args.threads)
+        direct = run_direct(localiser, args.images)
+        served = run_served(database, args.images)
     write_figures(args.json, report_ours(direct, served))
     return 0
 
 
-def run_direct(localiser: Localiser, images: Sequence[Path], repeat: int) -> list[Timed]:
-    """Each image `repeat` times in this process, after one round that is not counted."""
+def run_direct(localiser: Localiser, images: Sequence[Path]) -> list[Timed]:
+    """Each image five times in this process, after one round that is not counted."""
 
     def ask(data: bytes) -> LocaliseReply:
         return answer_query(
@@ -77,20 +78,20 @@ def run_direct(localiser: Localiser, images: Sequence[Path], repeat: int) -> lis
             clock=StageClock(),
         )
 
-    return _rounds(ask, images, repeat)
+    return _rounds(ask, images)
 
 
-def run_served(database: Database, images: Sequence[Path], repeat: int, threads: int) -> list[Timed]:
+def run_served(database: Database, images: Sequence[Path]) -> list[Timed]:
     """The same over Zenoh."""
-    options = ServeOptions(listen=("tcp/127.0.0.1:0",), threads_per_worker=threads)
+    options = ServeOptions(listen=("tcp/127.0.0.1:0",), threads_per_worker=_THREADS)
     with start_server(database, options) as server, Client(server.endpoints[0]) as client:
-        return _rounds(lambda data: client.localise(data, exif_prior=True, timeout_s=60.0), images, repeat)
+        return _rounds(lambda data: client.localise(data, exif_prior=True, timeout_s=60.0), images)
 
 
-def _rounds(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path], repeat: int) -> list[Timed]:
+def _rounds(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list[Timed]:
     timed = []
     contents = [path.read_bytes() for path in images]
-    for number in range(repeat + 1):
+    for number in range(_REPEAT + 1):
         for data in contents:
             start = time.perf_counter()
             reply = ask(data)
@@ -130,12 +131,9 @@ def report_ours(direct: Sequence[Timed], served: Sequence[Timed]) -> dict[str, f
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("db")
     parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE")
-    parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--threads", type=int, default=2, help="of our query; default: 2")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -15,7 +15,6 @@ import json
 import resource
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,11 +28,11 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import PoseError, pose_difference
 from featuredb.store import Database
 from reloc.client import Client, LocaliseReply
-from reloc.localise.answer import error_radius
+from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 
 _ROOT = Path(__file__).resolve().parent.parent
 _EVERY = 5  # without --held-out, one photo in so many is held out
@@ -78,8 +77,7 @@ class HeldOutRow:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     held_out = tuple(args.held_out) or every_nth(args.photos)
-    with tempfile.TemporaryDirectory() as scratch:
-        work = args.work or Path(scratch)
+    with work_folder(args.work) as work:
         part = ingest(work / "part", args.photos, held_out)
         _tell(part, f"all but {len(held_out)} photos")
         whole = ingest(work / "whole", args.photos, ())
@@ -249,13 +247,12 @@ def _children_cpu_s() -> float:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
     parser.add_argument(
         "--held-out", nargs="+", default=[], metavar="NAME", help=f"default: every {_EVERY}th photo"
     )
     parser.add_argument("--work", type=Path, default=None, help="keep both databases and reports there")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -13,7 +13,6 @@
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from featuredb.video.folder import natural_key
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 from tools.growth_common import table
 from tools.real_photos import ingest, reference
 
@@ -39,14 +38,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         (p.name for p in args.photos.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png")),
         key=natural_key,
     )
-    with tempfile.TemporaryDirectory() as scratch:
-        work = args.work or Path(scratch)
+    with work_folder(args.work) as work:
         for name, left_out in (("part", names[1::2]), ("whole", [])):
             if not (work / name).exists():
                 ingest(work / name, args.photos, left_out, work / "cache")
         part, whole = reference(work / "part"), reference(work / "whole")
         moved, off_m = laid_on(whole, part)
-        frames = film_of(args.photos, names, args.seconds, work / "frames")
+        frames = film_of(args.photos, names, work / "frames")
         tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
     mapped = {image.name for image in part.images}
     rows, metres = [], []
@@ -91,24 +89,22 @@ def laid_on(whole: FeatureMap, part: FeatureMap) -> tuple[dict[str, Rigid3], flo
     )
 
 
-def film_of(photos: Path, names: Sequence[str], seconds: float, folder: Path) -> Path:
-    """A folder of links to the photos, with their times."""
+def film_of(photos: Path, names: Sequence[str], folder: Path) -> Path:
+    """A folder of links to the photos, a second from one to the next."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
         link = folder / name
         if not link.is_symlink():
             link.symlink_to((photos / name).resolve())
-    lines = [f"{seconds * i:.3f}" for i in range(len(names))]
+    lines = [f"{i:.3f}" for i in range(len(names))]
     (folder / "times.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, required=True)
-    parser.add_argument("--seconds", type=float, default=1.0, help="from photo to photo (1)")
     parser.add_argument("--work", type=Path, default=None, help="keep databases and cache there")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

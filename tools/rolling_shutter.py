@@ -10,7 +10,6 @@
 
 """
 
-import argparse
 import multiprocessing
 import subprocess
 import sys
@@ -34,11 +33,12 @@ from featuredb.simworld.camera.sensor import jpeg_bytes
 from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.worlds.film_world import FilmOptions, film_frame
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
 _PHOTOS, _SEEDS = 24, (1, 2)
+_READOUT_S = 0.03  # from the first row to the last
 _STYLES: tuple[FlightStyle, ...] = ("smooth", "jerky")
 _RECEIVER_M, _LATE_S, _RTK_M = 1.5, 0.3, 0.02
 _START = datetime(2025, 6, 21, 12, 40, 3, tzinfo=UTC)
@@ -46,18 +46,16 @@ _OUTSIDE = float(chi2.ppf(0.999, 3))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--inputs", type=Path, default=None, help="keep the pictures there, not in --work")
-    parser.add_argument("--readout-ms", type=float, default=30.0, help="from the first row to the last (30)")
-    add_json_option(parser)
     args = parser.parse_args(argv)
     figures = {"flights": 0, "active": 0, "outside": 0, "held_back": 0, "unnamed": 0}
     worst = 0.0
     for style in _STYLES:
         for seed in _SEEDS:
-            film = film_options(style, seed, 1e-3 * args.readout_ms)
-            pictures = drawn(film, (args.inputs or args.work) / f"rolling-{style}-{seed}-{args.readout_ms:g}")
+            film = film_options(style, seed)
+            pictures = drawn(film, (args.inputs or args.work) / f"rolling-{style}-{seed}-30")
             for receiver in ("plain", "rtk"):
                 name = f"{style}-{seed}-{receiver}"
                 photos = tagged(film, pictures, receiver == "rtk", args.work / name)
@@ -78,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def film_options(style: FlightStyle, seed: int, readout_s: float) -> FilmOptions:
+def film_options(style: FlightStyle, seed: int) -> FilmOptions:
     """A film with a frame a second."""
     return FilmOptions(
         world=WorldOptions.short(1),
@@ -88,7 +86,7 @@ def film_options(style: FlightStyle, seed: int, readout_s: float) -> FilmOptions
         width=960,
         height=540,
         samples=2,
-        readout_s=readout_s,
+        readout_s=_READOUT_S,
     )
 
 

@@ -11,7 +11,6 @@
 Believed is what gives a map whose place is known to 4 cm (a standard deviation per axis).
 """
 
-import argparse
 import re
 import sys
 from collections.abc import Sequence
@@ -30,9 +29,10 @@ from featuredb.simworld.truth import TrueImage, Truth
 from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database
 from tools.anchor_simworld import camera_errors, featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.made_maps import copied
 
+_SEED = 1
 _SIGMA_M, _OTHERWISE_M, _DATUM_M = 0.02, 5.0, 20.0
 _RADIUS_68 = float(np.sqrt(-2.0 * np.log(1.0 - 0.68)))
 _XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {words}/></rdf:RDF></x:xmpmeta>'
@@ -49,18 +49,16 @@ _POINTS, _MARK_PX = 9, 0.5
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--inputs", type=Path, default=None, help="keep the photos there, not in --work")
-    parser.add_argument("--seed", type=int, default=1)
-    add_json_option(parser)
     args = parser.parse_args(argv)
     flight = FlightOptions(lines=3, per_line=5, oblique=3, width=1024)
-    options = replace(WorldOptions.short(args.seed), flight=flight, queries=0, street=0, negatives_per_kind=0)
-    inputs = (args.inputs or args.work) / f"rtk-flight-{args.seed}"
+    options = replace(WorldOptions.short(_SEED), flight=flight, queries=0, street=0, negatives_per_kind=0)
+    inputs = (args.inputs or args.work) / f"rtk-flight-{_SEED}"
     whole = (inputs / "truth.json").is_file()
     world = open_world(inputs) if whole else write_world(inputs, options)
-    rng = np.random.default_rng((args.seed, 11))
+    rng = np.random.default_rng((_SEED, 11))
     images = world.truth.group("drone")
     places = np.array([image.cam_from_local.center for image in images])
     places = places + rng.normal(0.0, _SIGMA_M, places.shape)

@@ -42,14 +42,14 @@ _ROUNDS = ((0, 3), (0, 1, 2, 3, 4), tuple(range(7)))  # lens parameters that are
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     cv2.setNumThreads(1)
-    found = register(args.scan, args.photos, args.crs, args.focal_px)
+    found = register(args.scan, args.photos, args.crs)
     _print_accuracy(found)
     if args.poses:
         args.poses.write_text(json.dumps(found, indent=1) + "\n")
     return 0
 
 
-def register(scan_path: Path, folder: Path, crs: str | None, focal_px: float | None) -> dict[str, Any]:
+def register(scan_path: Path, folder: Path, crs: str | None) -> dict[str, Any]:
     """Poses of all photos of a folder that register, with the camera and the accuracy, JSON-able."""
     scan = read_scan(scan_path, crs)
     raster = nadir_raster(scan)
@@ -60,7 +60,7 @@ def register(scan_path: Path, folder: Path, crs: str | None, focal_px: float | N
         height, width = gray.shape
         if lens is None:
             # Any focal length will do for a start: over nearly flat ground the height takes it up.
-            lens = Lens(width, height, focal_px or 0.6 * width, width / 2 - 0.5, height / 2 - 0.5)
+            lens = Lens(width, height, 0.6 * width, width / 2 - 0.5, height / 2 - 0.5)
         if (width, height) != (lens.width, lens.height):
             raise SystemExit(
                 f"{path}: {width}x{height}, but one camera of {lens.width}x{lens.height} is assumed"
@@ -187,7 +187,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("scan", type=Path, metavar="SCAN", help="LAS or LAZ with colour")
     parser.add_argument("photos", type=Path, metavar="FOLDER", help="photos of one camera")
     parser.add_argument("--crs", default=None, help="of the scan, where the file names none")
-    parser.add_argument("--focal-px", type=float, default=None, help="start; default: 0.6 of the width")
     parser.add_argument("--poses", type=Path, default=None, metavar="FILE", help="write the poses as JSON")
     return parser.parse_args(argv)
 

@@ -35,7 +35,7 @@ from tools.service_world import (
     moved,
     photos_of,
     running_service,
-    study_parser,
+    service_parser,
 )
 
 _EVENT_S = 5.0  # between two of what happens beside the queries
@@ -80,9 +80,9 @@ class Events:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     database = Database.open(args.db)
-    photos = photos_of(args.photos, 4, args.side)
+    photos = photos_of(args.photos, 4)
     with tempfile.TemporaryDirectory() as scratch:
-        with running_service(args.db, Path(scratch), args.deadline) as service:
+        with running_service(args.db, Path(scratch)) as service:
             expected = first_answers(service, photos)
             events = Events(database, service, photos[0], seed=1)
             end = time.monotonic() + 60 * args.minutes
@@ -123,9 +123,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
+    parser = service_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="the server's")
     return parser.parse_args(argv)
 
 

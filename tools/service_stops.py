@@ -23,7 +23,7 @@ from reloc.client import Client
 from reloc.client.replies import TIMEOUT
 from tools.figures import write_figures
 from tools.serve_process import ServeProcess, children
-from tools.service_world import photos_of, study_parser
+from tools.service_world import photos_of, service_parser
 
 _CLIENTS = 4
 _STOP_S = 30.0  # ten for queries in hand, ten for live sessions, ten for the inbox
@@ -82,7 +82,7 @@ def stopped_under_load(database: Path, photo: bytes, after_s: float) -> Stopped:
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    (photo,) = photos_of(args.photos, 1, args.side)
+    (photo,) = photos_of(args.photos, 1)
     rng = random.Random(1)
     found = []
     for number in range(args.stops):
@@ -102,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
+    parser = service_parser(__doc__)
     parser.add_argument("--stops", type=int, default=200)
     return parser.parse_args(argv)
 

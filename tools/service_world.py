@@ -19,20 +19,20 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from reloc.authority.folder import Authority
 from reloc.client import Client, LocaliseReply
-from tools.figures import add_json_option
+from tools.figures import study_parser
 from tools.serve_process import CommandProcess, ServeProcess
 
 HONEST, ATTACKER, WEB = ("alice", "bob", "carol"), "mallory", "web"
 _SAME_M = 0.5  # two answers to one photo
+_SIDE_PX = 1024  # longer one of what is sent
+DEADLINE_S = 8.0  # of a query
 
 
-def study_parser(doc: str | None) -> argparse.ArgumentParser:
+def service_parser(doc: str | None) -> argparse.ArgumentParser:
     """What all of these studies are told; `doc`: of the program's module."""
-    parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
+    parser = study_parser(doc)
     parser.add_argument("db", type=Path)
     parser.add_argument("photos", type=Path, help="folder of the map's photos")
-    parser.add_argument("--side", type=int, default=1024, metavar="PX", help="longer one of what is sent")
-    add_json_option(parser)
     return parser
 
 
@@ -64,13 +64,13 @@ def moved(original: FeatureMap, number: int) -> FeatureMap:
     )
 
 
-def photos_of(folder: Path, count: int, side_px: int) -> list[bytes]:
+def photos_of(folder: Path, count: int) -> list[bytes]:
     """Photos as an app sends them: made smaller, with their EXIF."""
     found = []
     for path in sorted(folder.glob("*.JPG"))[:count]:
         with Image.open(path) as photo:
             exif = photo.info["exif"]
-            photo.thumbnail((side_px, side_px))
+            photo.thumbnail((_SIDE_PX, _SIDE_PX))
             out = io.BytesIO()
             photo.save(out, "JPEG", quality=90, exif=exif)
             found.append(out.getvalue())
@@ -89,28 +89,27 @@ class Service:
     """A server with keys, and a gateway before it.
 
     Attributes:
-        keys: folder of the authority. port: of the server. deadline_s: of a query.
+        keys: folder of the authority. port: of the server.
     """
 
     server: ServeProcess
     gateway: CommandProcess
     keys: Path
     port: int
-    deadline_s: float
 
     def config(self, client: str) -> Path:
         return self.keys / "clients" / f"{client}.json5"
 
 
 @contextmanager
-def running_service(database: Path, work: Path, deadline_s: float = 8.0) -> Iterator[Service]:
+def running_service(database: Path, work: Path) -> Iterator[Service]:
     """As `featuredb keys` ships it; both end by SIGTERM."""
     port, keys = free_port(), work / f"keys-{time.time_ns()}"
     authority = Authority.create(keys, port=port)
     for name in (*HONEST, ATTACKER, WEB):
         authority.add_client(name)
     with ExitStack() as stack:
-        server = ServeProcess(database, "--config", keys / "server.json5", "--deadline", deadline_s)
+        server = ServeProcess(database, "--config", keys / "server.json5", "--deadline", DEADLINE_S)
         stack.callback(server.stop)
         gateway = CommandProcess(
             "gateway",
@@ -119,10 +118,10 @@ def running_service(database: Path, work: Path, deadline_s: float = 8.0) -> Iter
             "--port",
             free_port(),
             "--timeout",
-            deadline_s,
+            DEADLINE_S,
         )
         stack.callback(gateway.stop)
-        yield Service(server=server, gateway=gateway, keys=keys, port=port, deadline_s=deadline_s)
+        yield Service(server=server, gateway=gateway, keys=keys, port=port)
 
 
 @dataclass(slots=True)
@@ -130,12 +129,11 @@ class Heard:
     """What honest clients were answered; threads share it.
 
     Attributes:
-        deadline_s: of a question. seconds: of each, failed ones as long as they may take. failures: codes.
+        seconds: of each question, failed ones as long as they may take. failures: codes.
         wrong: answers that are another place than the first one to the same question, or none where that had
             a place.
     """
 
-    deadline_s: float
     seconds: list[float] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     wrong: int = 0
@@ -150,7 +148,7 @@ class Heard:
 
     def failed(self, code: str) -> None:
         with self._lock:
-            self.seconds.append(self.deadline_s)
+            self.seconds.append(DEADLINE_S)
             self.failures.append(code)
 
     def p99_s(self) -> float:
@@ -183,14 +181,14 @@ def honest_clients(
 
     Every other question comes without a prior: it is looked for in all maps.
     """
-    heard, stop = Heard(service.deadline_s), threading.Event()
+    heard, stop = Heard(), threading.Event()
 
     def ask(client: Client, number: int) -> None:
         which = number % len(expected)
         start = time.monotonic()
         try:
             reply = client.localise(
-                photos[which % len(photos)], exif_prior=which < len(photos), timeout_s=service.deadline_s
+                photos[which % len(photos)], exif_prior=which < len(photos), timeout_s=DEADLINE_S
             )
         except ServiceError as error:
             heard.failed(error.code)

@@ -9,7 +9,6 @@
 
 """
 
-import argparse
 import re
 import subprocess
 import sys
@@ -25,18 +24,17 @@ from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution
 from tools.anchor_simworld import featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.made_maps import copied, photo_names
 
 _SHIFT_M = 50_000.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, metavar="FOLDER", required=True)
     parser.add_argument("--scan", type=Path, metavar="FILE", required=True)
     parser.add_argument("--work", type=Path, required=True)
-    add_json_option(parser)
     args = parser.parse_args(argv)
     names = photo_names(args.photos)
     right = copied(args.photos, names[::2], args.work / "right", strip=False)

@@ -1,6 +1,6 @@
 """How good are the answers on the simulated world, and do their reported uncertainties mean something?
 
-    uv run python tools/simulated_evaluation.py --out DIR [--size full] [--seed 1]
+    uv run python tools/simulated_evaluation.py --out DIR [--seed 1]
 
 Makes a world whose drone photos carry exact positions, ingests them (both are kept in DIR and reused), asks
 for every held-out photo and every negative, and compares with the truth:
@@ -39,7 +39,9 @@ from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
 from reloc.wire.query import LocaliseWireRequest
 from tools.calibration import RECEIVERS, Calibration, as_reported, over_placements
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
+
+_DRAWS = 300  # of placements
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     area = localiser.areas[0].area
     calibrations = {"as ingested": as_reported(answers)}
     for receiver in RECEIVERS:
-        calibrations[receiver.name] = over_placements(answers, area, world, receiver, args.draws, args.seed)
+        calibrations[receiver.name] = over_placements(answers, area, world, receiver, _DRAWS, args.seed)
     sys.stdout.write(f"{accuracy_table(asked)}\n\n{calibration_table(calibrations)}\n\n")
     coverage = {name: asdict(one.coverage) for name, one in calibrations.items()}
     write_figures(args.json, {"coverage": coverage} | flat_figures(asked))
@@ -80,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def prepare(args: argparse.Namespace) -> tuple[World, Database]:
     """The world and the database of its drone photos, made unless they are there."""
     start = time.monotonic()
-    world = make_world(args.out / "world", size=args.size, seed=args.seed, exact_gps=True)
+    world = make_world(args.out / "world", size="full", seed=args.seed, exact_gps=True)
     database = Database.create(args.out / "db")
     if not database.snapshot().maps():
         ingest_world(world, database, args.out / "report", exact_gps=True)
@@ -184,12 +186,9 @@ def calibration_table(calibrations: dict[str, Calibration]) -> str:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("simulated-evaluation"))
-    parser.add_argument("--size", choices=("short", "full"), default="full")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--draws", type=int, default=300, help="placements drawn; default: 300")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

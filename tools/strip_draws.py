@@ -9,7 +9,6 @@ strip of four some yaws are off by 180 degrees, as there. Each strip is placed w
 
 """
 
-import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,12 +24,13 @@ from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from tools.anchor_brighton import read_poses
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.position_draws import LEVELS, PARTS, SIGMAS, Flight, inside, squares
 
 _LEAST, _MOST_BEND = 5, 0.1  # photos of a real strip; its width over its length
 _EACH_DEG, _COMMON_DEG = np.array([1.3, 1.3, 1.8]), np.array([1.5, 1.5, 2.2])  # camera x and y, up
 _FLIPPED = 0.25
+_SEED = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,19 +43,15 @@ class CameraStrip:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = study_parser(__doc__)
     parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
     parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--draws", type=int, default=200, help="simulated strips")
-    parser.add_argument("--seed", type=int, default=1)
-    add_json_option(parser)
     args = parser.parse_args(argv)
     with threadpool_limits(1):
-        figures = measure("real", list(real_strips(args.poses, args.photos)), args.seed)
-        drawn = [simulated_strip(np.random.default_rng((args.seed, draw))) for draw in range(args.draws)]
-        figures |= measure("simulated", drawn, args.seed)
+        figures = measure("real", list(real_strips(args.poses, args.photos)), _SEED)
+        drawn = [simulated_strip(np.random.default_rng((_SEED, draw))) for draw in range(args.draws)]
+        figures |= measure("simulated", drawn, _SEED)
     write_figures(args.json, figures)
     return 0
 

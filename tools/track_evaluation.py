@@ -102,9 +102,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     database = anchored_map(args.out, args.size, args.seed, args.workers, inputs)
     results: dict[str, Tracked] = {}
     for name in args.films:
-        options = film_options(name, args.size, args.seed, args.frames, args.readout_ms)
-        rolling = f"-{args.readout_ms:g}ms" if args.readout_ms else ""
-        film = inputs / f"film-{args.size}-{args.seed}-{name}-{args.frames}{rolling}"
+        options = film_options(name, args.size, args.seed, args.frames)
+        film = inputs / f"film-{args.size}-{args.seed}-{name}-{args.frames}"
         folder = write_film(film, options, args.workers, _progress(name))
         truth = read_film_truth(folder)
         finder = finder_on(args.on, database, truth, args.seed)
@@ -163,7 +162,7 @@ def coarse_start(pose: Rigid3, seed: int) -> FramePrior:
     )
 
 
-def film_options(name: str, size: str, seed: int, frames: int, readout_ms: float = 0.0) -> FilmOptions:
+def film_options(name: str, size: str, seed: int, frames: int) -> FilmOptions:
     world = WorldOptions.short(seed) if size == "short" else WorldOptions(seed=seed)
     extent = (32.0, 26.0) if size == "short" else PathOptions().half_extent_m
     path = PathOptions(seed=seed, style="jerky" if name == "jerky" else "smooth", half_extent_m=extent)
@@ -173,7 +172,6 @@ def film_options(name: str, size: str, seed: int, frames: int, readout_ms: float
         path=path,
         frames=frames,
         cut=None if cut is None else (cut[0], cut[1]),
-        readout_s=1e-3 * readout_ms,
     )
 
 
@@ -292,9 +290,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=1200)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
-    parser.add_argument(
-        "--readout-ms", type=float, default=0.0, help="rolling shutter, from the first row to the last (0)"
-    )
     parser.add_argument("--inputs", type=Path, default=None, help="keep world and films there, not in --out")
     parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
     return parser.parse_args(argv)

@@ -1,6 +1,6 @@
 """A map without a place, placed on a scan by six picks in one photo: how often, and how right?
 
-    python -m tools.unplaced_brighton --photos FOLDER --scan SCAN.laz --poses poses.json [--draws 20]
+    python -m tools.unplaced_brighton --photos FOLDER --scan SCAN.laz --poses poses.json
 
 1. The photos but the held-out ones, without any position, become one map without a place.
 2. Each draw picks six points of the scan in one photo of the map, with the given error in pixels, and
@@ -15,7 +15,6 @@ import argparse
 import json
 import shutil
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from featuredb.store import Database
 from tools import scan_poses
 from tools.anchor_brighton import read_poses
 from tools.anchor_simworld import featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 from tools.made_maps import copied, make, photo_names
 from tools.picked import Scan, picks, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
@@ -36,6 +35,8 @@ from tools.real_photos import ask_poses, error_figures
 _HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
 _MADE = "made.json"  # what came of the photos; who starts again goes on from there
 _WRONG_M = 1.0
+_DRAWS, _SEED = 20, 1
+_SIGMA_PX = 3.0  # of a pick, each axis
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,20 +47,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     document = json.loads(args.poses.read_text(encoding="utf-8"))
     camera, epsg = camera_of(document), int(document["crs"].removeprefix("EPSG:"))
     scan = read_scan(args.scan, frame, epsg)
-    names = [name for name in photo_names(args.photos) if name not in args.held_out]
-    figures: dict[str, object] = {"photos": len(names), "draws": args.draws}
+    names = [name for name in photo_names(args.photos) if name not in _HELD_OUT]
+    figures: dict[str, object] = {"photos": len(names), "draws": _DRAWS}
     placed: list[dict[str, float]] = []
-    with tempfile.TemporaryDirectory() as scratch:
-        work = args.work or Path(scratch)
+    with work_folder(args.work) as work:
         if not (work / _MADE).exists():
             photos = copied(args.photos, names, work / "photos", strip=True)
-            copied(args.photos, args.held_out, work / "asked", strip=True)
+            copied(args.photos, _HELD_OUT, work / "asked", strip=True)
             made = make(work / "db", "photos", photos, len(names))
             featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
             write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
         figures |= json.loads((work / _MADE).read_text(encoding="utf-8"))
         (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
-        for number in range(args.draws):
+        for number in range(_DRAWS):
             done = work / f"draw-{number}.json"
             if not done.exists():
                 judgement = _draw(args, number, work, summary.map_id, scan, camera, frame, poses)
@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             one = json.loads(done.read_text(encoding="utf-8"))
             sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
             placed += [one] if one else []
-    figures |= summed(placed, args.draws)
+    figures |= summed(placed, _DRAWS)
     sys.stdout.write(f"{figures}\n")
     write_figures(args.json, figures)
     return 0
@@ -84,10 +84,10 @@ def _draw(
     poses: dict[str, Rigid3],
 ) -> dict[str, float] | None:
     """Place a copy of the map by the picks of one draw: errors of the held-out photos, or None: refused."""
-    rng = np.random.default_rng((args.seed, number))
+    rng = np.random.default_rng((_SEED, number))
     photos = work / "photos"
     image = str(rng.choice([name for name in photo_names(photos) if name in poses]))
-    drawn = picks(scan, camera, poses[image], rng, args.sigma_px)
+    drawn = picks(scan, camera, poses[image], rng, _SIGMA_PX)
     file = write_picks(work / f"picks-{number}.csv", image, *drawn)
     database = work / "placed"
     shutil.rmtree(database, ignore_errors=True)
@@ -97,7 +97,7 @@ def _draw(
     # 1: the map is not placed by them. 2: picks that leave the pose open, before anything is tried.
     if featuredb(*words, *out, may_refuse=True, refusals=(1, 2)) != 0:
         return None
-    return judged(database, work / "asked", args.held_out, frame, poses)
+    return judged(database, work / "asked", _HELD_OUT, frame, poses)
 
 
 def camera_of(document: dict[str, dict[str, object]]) -> Camera:
@@ -131,21 +131,16 @@ def summed(placed: Sequence[dict[str, float]], draws: int) -> dict[str, float]:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
     parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
-    parser.add_argument("--held-out", nargs="+", default=list(_HELD_OUT), metavar="NAME")
-    parser.add_argument("--draws", type=int, default=20)
-    parser.add_argument("--sigma-px", type=float, default=3.0, help="of a pick, each axis")
-    parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
         "--work",
         type=Path,
         default=None,
         help="keep databases and reports there; a run that was stopped goes on with the next draw",
     )
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -27,7 +27,7 @@ from featuredb.store import Database
 from tools import scan_poses
 from tools.anchor_brighton import read_poses
 from tools.anchor_simworld import featuredb
-from tools.figures import add_json_option, write_figures
+from tools.figures import study_parser, write_figures
 from tools.made_maps import copied, photo_names
 
 _STRANGE = 10
@@ -103,13 +103,12 @@ def _poses(feature_map: FeatureMap, frame: LocalFrame) -> dict[str, Rigid3]:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = study_parser(__doc__)
     parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
     parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
     parser.add_argument("--strange", type=Path, default=None, metavar="FOLDER", help="photos of elsewhere")
     parser.add_argument("--work", type=Path, required=True, help="copies and database are kept there")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

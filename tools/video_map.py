@@ -1,6 +1,6 @@
 """A map made of a film: keyframes, minutes, and how right its cameras are.
 
-    python -m tools.video_map --out DIR [--size short|full] [--frames 1200]
+    python -m tools.video_map --out DIR
 
 1. The film `smooth` of `tools.track_evaluation` (kept in DIR/film-smooth), a drone's telemetry beside it.
 2. `featuredb lidar add` of the town's scan; `featuredb ingest video`; `featuredb anchor --auto` of its map.
@@ -26,15 +26,15 @@ from tools.track_evaluation import film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from tools.worlds.scan_world import make_scan_world
 
+_SEED, _FRAMES = 1, 1200
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    world = make_scan_world(
-        args.out / f"{args.size}-{args.seed}" / "world", args.seed, args.size, args.workers
-    )
-    options = film_options("smooth", args.size, args.seed, args.frames)
-    folder = write_film(args.out / "film-smooth", options, args.workers)
+    world = make_scan_world(args.out / f"short-{_SEED}" / "world", _SEED, "short", 0)
+    options = film_options("smooth", "short", _SEED, _FRAMES)
+    folder = write_film(args.out / "film-smooth", options, 0)
     database = args.out / "film.db"
     shutil.rmtree(database, ignore_errors=True)
     featuredb("lidar", "add", str(database), str(world.scan))
@@ -78,10 +78,6 @@ def keyframe_errors(feature_map: FeatureMap, truth: FilmTruth) -> FloatArray:
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("video-map"))
-    parser.add_argument("--size", choices=("short", "full"), default="short")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--frames", type=int, default=1200)
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
     return parser.parse_args(argv)
 
 

@@ -19,7 +19,6 @@ from featuredb.geometry.rotation import quaternion_from_matrix, yaw_pitch_roll
 from reloc.bridge.robot_pose import FLU_FROM_FRD, NED_FROM_ENU, RobotPose
 
 MavMessage = Literal["odometry", "vision", "gps"]
-MAV_MESSAGES: tuple[MavMessage, ...] = ("odometry", "vision", "gps")
 
 _SEA_LEVEL = ("egm96", "egm2008", "navd88")  # MAVLink's altitudes are above mean sea level
 _GPS_EPOCH_S = 315_964_800  # of Unix time

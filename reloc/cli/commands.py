@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
+from reloc.wire.endpoints import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from featuredb.geometry.arrays import FloatArray
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     Ask = Callable[[bytes, CameraRequest | None, bool], LocaliseReply]
 
 _NOT_LOCALISED = 1  # exit code: everything worked, and the answer is no
-_DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
 def register(subparsers: Any) -> None:
@@ -34,7 +34,7 @@ def register(subparsers: Any) -> None:
         "--listen",
         action="append",
         metavar="ENDPOINT",
-        help=f"Zenoh endpoint, may be repeated; default {_DEFAULT_ENDPOINT} where no --config is given",
+        help=f"Zenoh endpoint, may be repeated; default {DEFAULT_ENDPOINT} where no --config is given",
     )
     serve.add_argument(
         "--connect",
@@ -83,9 +83,7 @@ def register(subparsers: Any) -> None:
         "query", help="ask a server where photos were taken", description="Ask a server over Zenoh."
     )
     query.add_argument("image", nargs="+", metavar="IMAGE", help="image file")
-    query.add_argument("--connect", default=_DEFAULT_ENDPOINT, metavar="ENDPOINT", help="Zenoh endpoint")
-    query.add_argument("--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect")
-    query.add_argument("--database", metavar="NAME", help="default: the only one that is served")
+    add_server_arguments(query)
     query.add_argument("--timeout", type=float, default=10.0, metavar="SECONDS", help="per image; default 10")
     query.add_argument(
         "--contribute",
@@ -111,6 +109,20 @@ def register(subparsers: Any) -> None:
     localise.add_argument("image", nargs="+", metavar="IMAGE", help="image file")
     _add_query_arguments(localise)
     localise.set_defaults(run=_localise)
+
+
+def add_server_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which server is asked, and for which database."""
+    parser.add_argument(
+        "--connect",
+        default=DEFAULT_ENDPOINT,
+        metavar="ENDPOINT",
+        help=f"Zenoh endpoint of the server; default {DEFAULT_ENDPOINT}",
+    )
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect"
+    )
+    parser.add_argument("--database", metavar="NAME", help="default: the only one that is served")
 
 
 def add_request_arguments(parser: argparse.ArgumentParser) -> None:
@@ -169,7 +181,7 @@ def _serve(args: argparse.Namespace) -> int:
     from reloc.service.serve import serve
     from reloc.service.server import Server
 
-    listen = tuple(args.listen or (() if args.config else (_DEFAULT_ENDPOINT,)))
+    listen = tuple(args.listen or (() if args.config else (DEFAULT_ENDPOINT,)))
     options = ServeOptions(
         listen=listen,
         connect=tuple(args.connect or ()),
@@ -232,12 +244,16 @@ def _query(args: argparse.Namespace) -> int:
 
 def _localise(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database
+    from reloc.answered_view import AnsweredView
     from reloc.overlay import map_points_in_view
 
     require_an_image(args.image)
     asker, ask = asking_here(args, lambda: open_database(args), inliers=args.overlay is not None)
     return _answer_all(
-        args, ask, asker.name, lambda reply: map_points_in_view(asker.localiser().areas, reply)
+        args,
+        ask,
+        asker.name,
+        lambda reply: map_points_in_view(asker.localiser().areas, AnsweredView.of_reply(reply)),
     )
 
 
@@ -309,17 +325,11 @@ def _answer_all(
                 target = _overlay_path(args.overlay, path, args.image)
                 write_overlay(target, data, reply, other_points(reply))
                 sys.stderr.write(f"wrote {target}\n")
-        except OSError as error:
-            sys.stderr.write(f"featuredb: {path}: {error.strerror or error}\n")
+        except (OSError, FeatureDbError) as error:
+            sys.stderr.write(f"featuredb: {path}: {getattr(error, 'strerror', None) or error}\n")
             codes.add(2)
-        except ServiceError as error:
-            sys.stderr.write(f"featuredb: {path}: {error}\n")
-            codes.add(2)
-            if error.code == "NO_SERVER":
+            if isinstance(error, ServiceError) and error.code == "NO_SERVER":
                 break
-        except FeatureDbError as error:
-            sys.stderr.write(f"featuredb: {path}: {error}\n")
-            codes.add(2)
     return max(codes)
 
 

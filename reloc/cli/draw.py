@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from featuredb.geometry.camera import Camera
     from featuredb.render.cloud import PointCloud
     from featuredb.store import Database
+    from reloc.answered_view import AnsweredView
     from reloc.pixels.layer import Layer
-    from reloc.pixels.view import AnsweredView
 
 _NO_POSE = 1  # exit code: everything worked, and there is no pose
 _REACH_M = 150.0  # beyond the track of a film, of the scan that is loaded
@@ -102,13 +102,12 @@ def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
     import numpy as np
 
     from featuredb.cli.common import open_database
-    from featuredb.geometry.camera import Camera
     from featuredb.video.frames import open_video
     from featuredb.video.writer import VideoWriter
+    from reloc.answered_view import AnsweredView, camera_of
     from reloc.cli.query_arguments import parse_camera
     from reloc.pixels.draw import draw_layer
     from reloc.pixels.layer import laid_on
-    from reloc.pixels.view import AnsweredView
     from reloc.tracking.trajectory.read import read_trajectory_csv
 
     asked = parse_camera(args.camera)
@@ -116,7 +115,7 @@ def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
         raise InvalidValueError(
             "draw: expected --camera, the lens of the film, which its track does not tell"
         )
-    lens = Camera(model=asked.model, width=asked.width, height=asked.height, params=asked.params)
+    lens = camera_of(asked)
     poses = {point.index: point.pose for point in read_trajectory_csv(args.track).points if point.pose}
     if not poses:
         sys.stderr.write(f"featuredb: {args.track}: no frame has a pose on Earth\n")

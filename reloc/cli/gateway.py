@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 from featuredb.extras import require
@@ -10,21 +9,14 @@ from featuredb.extras import require
 
 def register(subparsers: Any) -> None:
     """Add the subcommand to the parser of `featuredb`."""
+    from reloc.cli.commands import add_server_arguments
+
     gateway = subparsers.add_parser(
         "gateway",
         help="answer HTTP by asking a server over Zenoh",
         description="OSCP GeoPoseProtocol v2 and plain multipart over HTTP, answered by `featuredb serve`.",
     )
-    gateway.add_argument(
-        "--connect",
-        default="tcp/127.0.0.1:7447",
-        metavar="ENDPOINT",
-        help="Zenoh endpoint of the server; default tcp/127.0.0.1:7447",
-    )
-    gateway.add_argument(
-        "--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect"
-    )
-    gateway.add_argument("--database", metavar="NAME", help="default: the only one that is served")
+    add_server_arguments(gateway)
     gateway.add_argument("--host", default="127.0.0.1", help="address to listen on; default 127.0.0.1")
     gateway.add_argument(
         "--insecure",

@@ -10,12 +10,13 @@ if TYPE_CHECKING:
     from reloc.client.film import OnPose, StreamedFilm
     from reloc.wire.track import TrackPose
 
-_DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _SAID_EVERY_S = 1.0  # of the film's clock, for people
 
 
 def register(subparsers: Any) -> None:
     """Add `live` to the parser of `featuredb`."""
+    from reloc.cli.commands import add_server_arguments
+
     parser = subparsers.add_parser(
         "live",
         help="follow a camera or a film by a server, live",
@@ -27,11 +28,7 @@ def register(subparsers: Any) -> None:
         metavar="VIDEO",
         help="film, folder of pictures, camera (/dev/video0) or address (rtsp://...)",
     )
-    parser.add_argument("--connect", default=_DEFAULT_ENDPOINT, metavar="ENDPOINT", help="Zenoh endpoint")
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect"
-    )
-    parser.add_argument("--database", metavar="NAME", help="default: the only one that is served")
+    add_server_arguments(parser)
     parser.add_argument(
         "--out",
         action="append",
@@ -65,9 +62,10 @@ def run_live(args: argparse.Namespace) -> int:
     Raises:
         InvalidValueError, VideoError, ServiceError
     """
+    from featuredb.video.film import VideoOptions
     from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.client.client import Client
-    from reloc.client.film import StreamOptions, stream_film
+    from reloc.client.film import stream_film
     from reloc.tracking.trajectory.outputs import check_outputs, exit_code, write_outputs
 
     check_outputs(args.out)
@@ -78,9 +76,7 @@ def run_live(args: argparse.Namespace) -> int:
             args.video,
             camera=camera,
             prior=prior,
-            options=StreamOptions(
-                max_side_px=args.max_side, start_s=args.start, end_s=args.end, fps=args.fps
-            ),
+            options=VideoOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end, fps=args.fps),
             on_pose=_as_json if args.json else _teller(),
         )
     outputs = write_outputs(args.out, found.trajectory)

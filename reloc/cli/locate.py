@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from featuredb.geometry.arrays import FloatArray
     from featuredb.store import Database
+    from reloc.answered_view import AnsweredView
     from reloc.localiser import Localiser
     from reloc.pixels.boxes import MarkedPixel
     from reloc.pixels.locate import PixelPlace
     from reloc.pixels.surfaces import RaySurface
-    from reloc.pixels.view import AnsweredView
     from reloc.wire.query import LocaliseReply
 
 _NO_PLACE = 1  # exit code: everything worked, and a pixel or the photo has no place
@@ -130,8 +129,8 @@ def _boxes(args: argparse.Namespace) -> "list[MarkedPixel]":
     """The foot points of boxes; says on stderr where they may be those of a turned picture."""
     from featuredb.features.exif.read import read_exif
     from featuredb.features.image_header import read_header
+    from reloc.answered_view import AnsweredView
     from reloc.pixels.boxes import read_coco
-    from reloc.pixels.view import AnsweredView
 
     photo = Path(args.image)
     data = photo.read_bytes() if photo.is_file() else b""
@@ -174,7 +173,7 @@ def answered_view(
     args: argparse.Namespace, database: "Database"
 ) -> "tuple[AnsweredView | None, Localiser | None]":
     """The camera of the answer, and what has localised it here; no camera where there is no pose on Earth."""
-    from reloc.pixels.view import AnsweredView
+    from reloc.answered_view import AnsweredView
 
     if args.answer is not None:
         return AnsweredView.of_reply(_read_answer(args.answer, Path(args.image))), None
@@ -216,6 +215,7 @@ def _surface(
     from dataclasses import replace
 
     from reloc.localiser import Localiser
+    from reloc.overlay import map_points_in_view
     from reloc.pixels.surfaces import MapSurface, scan_surface
 
     scan = None if args.surface == "map" else scan_surface(database, view)
@@ -226,20 +226,9 @@ def _surface(
             f"--surface scan: expected a scan around the camera with heights of {view.height_datum}, as "
             "the answer's are, found none; `featuredb lidar list` shows what there is"
         )
-    return MapSurface(points=_map_points(view, localiser or Localiser.open(database)))
-
-
-def _map_points(view: "AnsweredView", localiser: "Localiser") -> "FloatArray":
-    import numpy as np
-
-    from reloc.localise.matching import visible_points
-
-    for indexed in localiser.areas_of(None if not view.map_ids else view.map_ids[:1]):
-        area = indexed.area
-        pose = view.cam_from_local @ view.frame.enu_from(area.frame)
-        rows = visible_points(area, area.searched_points(), view.camera, pose)
-        return view.frame.enu_from(area.frame).act(area.points[rows])
-    return np.empty((0, 3))
+    areas = (localiser or Localiser.open(database)).areas_of(view.map_ids[:1])
+    points_utm = map_points_in_view(areas, view)
+    return MapSurface(points=view.frame.enu_from_utm(points_utm, view.epsg))
 
 
 def _describe(place: "PixelPlace") -> str:

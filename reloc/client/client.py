@@ -14,7 +14,8 @@ from pydantic import BaseModel, ValidationError
 
 from featuredb.errors import InvalidValueError, ServiceError
 from reloc.client.live import LiveTrack
-from reloc.client.replies import NO_SERVER, TIMEOUT, read_message, service_error
+from reloc.client.replies import NO_SERVER, TIMEOUT, first_reply
+from reloc.wire.endpoints import DEFAULT_ENDPOINT
 from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, Keys
 from reloc.wire.query import (
     CameraRequest,
@@ -29,8 +30,6 @@ from reloc.wire.query import (
 from reloc.wire.server import Event, MapsReply, StatusReply
 
 _Message = TypeVar("_Message", bound=BaseModel)
-
-DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
 
 _TIMEOUT_S = 10.0  # Zenoh's own default
 # The server's deadline is this much earlier than the client's timeout, so that its word arrives in time.
@@ -62,7 +61,7 @@ class Client:
 
     def __init__(
         self,
-        connect: str = DEFAULT_CONNECT,
+        connect: str = DEFAULT_ENDPOINT,
         database: str | None = None,
         *,
         config_path: Path | None = None,
@@ -145,7 +144,6 @@ class Client:
             ServiceError: see the class.
             InvalidValueError: arguments that no server takes.
         """
-        data = image if isinstance(image, bytes) else Path(image).read_bytes()
         try:
             request = LocaliseWireRequest(
                 request_id=request_id,
@@ -161,6 +159,15 @@ class Client:
             )
         except ValidationError as error:
             raise InvalidValueError(f"localise: {explain(error)}") from error
+        data = image if isinstance(image, bytes) else Path(image).read_bytes()
+        return self.ask(data, request, timeout_s)
+
+    def ask(self, data: bytes, request: LocaliseWireRequest, timeout_s: float) -> LocaliseReply:
+        """`localise` of an image file's bytes, with its other arguments in one; they say no deadline.
+
+        Raises:
+            ServiceError: see the class.
+        """
         key = self._keys.localise(self.name)
         end, wait_s = time.perf_counter() + timeout_s, _FIRST_WAIT_S
         while True:
@@ -256,22 +263,20 @@ class Client:
         payload: bytes | None = None,
         attachment: bytes | None = None,
     ) -> _Message:
-        replies = self._session().get(
+        start = time.perf_counter()
+        found = first_reply(
+            self._session(),
             key,
+            model,
+            timeout_s,
             payload=payload,
             attachment=attachment,
-            timeout=timeout_s,
             # A photo is many fragments; dropping one of them under load would lose the query silently.
             congestion_control=zenoh.CongestionControl.BLOCK,
             express=True,
-            source_info=zenoh.SourceInfo(self._session().id, 0),  # one client among others
         )
-        start = time.perf_counter()
-        for reply in replies:
-            if reply.ok is not None:
-                return read_message(reply.ok.payload.to_bytes(), model)
-            if reply.err is not None:
-                raise service_error(reply.err.payload.to_bytes(), timeout_s)
+        if found is not None:
+            return found
         waited_s = time.perf_counter() - start
         if waited_s >= 0.9 * timeout_s:
             raise ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s from {key}")

@@ -22,28 +22,12 @@ from reloc.wire.track import TrackPose
 
 OnPose = Callable[[TrackPose, float | None], None]
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamOptions:
-    """How a film is streamed.
-
-    Attributes:
-        max_side_px: frames are made smaller before they are sent; a server tracks no larger ones by default.
-        jpeg_quality: of the frames.
-        start_s, end_s: the stretch of the film; None: all of it.
-        fps: frames per second of a folder of pictures without a file of times.
-        max_late_s: a frame of a file that is later than this against the film's clock is not sent: this
-            machine is too slow, and a live source would have gone on.
-        last_wait_s: how long the pose of the last frame is waited for.
-    """
-
-    max_side_px: int = 1280
-    jpeg_quality: int = 80
-    start_s: float | None = None
-    end_s: float | None = None
-    fps: float | None = None
-    max_late_s: float = 0.1
-    last_wait_s: float = 2.0
+SENT_SIDE_PX = 1280  # frames are made smaller before they are sent; a server tracks no larger ones by default
+_JPEG_QUALITY = 80
+# A frame of a file that is later than this against the film's clock is not sent: this machine is too slow,
+# and a live source would have gone on.
+_MAX_LATE_S = 0.1
+_LAST_WAIT_S = 2.0  # for the pose of the last frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -105,7 +89,7 @@ def stream_film(
     *,
     camera: CameraRequest | None = None,
     prior: PriorRequest | None = None,
-    options: StreamOptions | None = None,
+    options: VideoOptions | None = None,
     on_pose: OnPose | None = None,
 ) -> StreamedFilm:
     """Send the frames of a film when they are due, those of a camera as they come, and collect the poses.
@@ -115,20 +99,20 @@ def stream_film(
     Args:
         source: see `featuredb.video.frames.open_video`.
         camera: intrinsics of the film's frames, of any size; None: estimated.
-        prior: where the film begins.
+        prior: where the film begins. options: how it is read.
         on_pose: called with each pose, and the milliseconds from sending its frame.
 
     Raises:
         VideoError: the film cannot be read at all, or has no frames.
         ServiceError: no session could be opened.
     """
-    options = options or StreamOptions()
-    settings = VideoOptions(
-        max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s, fps=options.fps
-    )
+    options = options or VideoOptions(max_side_px=SENT_SIDE_PX)
     trouble: list[str] = []
     sent, last = 0, -1
-    with open_video(source, settings) as video, client.track(camera, prior) as live:
+    with (
+        open_video(source, options) as video,
+        client.track(camera, prior) as live,
+    ):
         answers, info = _Answers(live, on_pose), video.info
         begun: float | None = None
         try:
@@ -138,10 +122,10 @@ def stream_film(
                 due = now if info.live else begun + frame.time_s
                 answers.until(due)
                 last = frame.index
-                if time.perf_counter() - due <= options.max_late_s:
-                    live.send(_jpeg(frame.gray, options.jpeg_quality), frame.time_s, frame.index)
+                if time.perf_counter() - due <= _MAX_LATE_S:
+                    live.send(_jpeg(frame.gray), frame.time_s, frame.index)
                     sent += 1
-            _await_last(answers, last, options.last_wait_s)
+            _await_last(answers, last)
         except ServiceError as error:
             trouble.append(f"the session ended: {error}")
         refusals = tuple(f"frame {event.sequence}: {event.message}" for event in live.refusals)
@@ -165,15 +149,15 @@ def stream_film(
     )
 
 
-def _await_last(answers: _Answers, last: int, wait_s: float) -> None:
+def _await_last(answers: _Answers, last: int) -> None:
     """Poses of the frames that were sent last; the very last is never dropped by the server."""
-    end = time.perf_counter() + wait_s
+    end = time.perf_counter() + _LAST_WAIT_S
     while not answers.points or answers.points[-1].index < last:
         if not answers.take(end - time.perf_counter()) and time.perf_counter() >= end:
             return
 
 
-def _jpeg(gray: NDArray[np.uint8], quality: int) -> bytes:
-    done, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, quality])
+def _jpeg(gray: NDArray[np.uint8]) -> bytes:
+    done, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     assert done
     return bytes(data)

@@ -9,11 +9,10 @@ from contextlib import ExitStack
 from typing import Self
 
 import zenoh
-from pydantic import ValidationError
 from zenoh.handlers import Callback
 
 from featuredb.errors import ServiceError
-from reloc.client.replies import BAD_REPLY, NO_SERVER, TIMEOUT, read_message, service_error
+from reloc.client.replies import NO_SERVER, TIMEOUT, first_reply, read_message
 from reloc.wire.keys import Keys
 from reloc.wire.query import CameraRequest, PriorRequest, encode
 from reloc.wire.track import TrackEvent, TrackFrame, TrackOpened, TrackOpenRequest, TrackPose
@@ -183,17 +182,10 @@ class LiveTrack:
         return self._latency_ms.get(sequence)
 
     def _asked(self) -> TrackOpened:
-        replies = self._session.get(
-            self._key,
-            attachment=encode(self._request),
-            timeout=self._timeout_s,
-            source_info=zenoh.SourceInfo(self._session.id, 0),  # one client among others
-        )
-        for reply in replies:
-            if reply.ok is not None:
-                return read_message(reply.ok.payload.to_bytes(), TrackOpened)
-            if reply.err is not None:
-                raise service_error(reply.err.payload.to_bytes(), self._timeout_s)
+        attachment = encode(self._request)
+        opened = first_reply(self._session, self._key, TrackOpened, self._timeout_s, attachment=attachment)
+        if opened is not None:
+            return opened
         raise ServiceError(
             TIMEOUT, f"no server opened a live session within {self._timeout_s:g} s at {self._key}"
         )
@@ -229,11 +221,10 @@ class LiveTrack:
             self._changed.notify_all()
 
     def _on_event(self, sample: zenoh.Sample) -> None:
-        payload = sample.payload.to_bytes()
         try:
-            event = TrackEvent.model_validate_json(payload)
-        except ValidationError as error:
-            self._over(ServiceError(BAD_REPLY, f"expected a TrackEvent, found {payload[:200]!r}: {error}"))
+            event = read_message(sample.payload.to_bytes(), TrackEvent)
+        except ServiceError as error:
+            self._over(error)
             return
         self._heard = time.monotonic()
         if event.type == "ended":

@@ -33,12 +33,13 @@ from reloc.gateway.intake import Intake
 from reloc.gateway.link import Link
 from reloc.gateway.metrics import MEDIA_TYPE as METRICS_TYPE
 from reloc.gateway.metrics import GatewayMetrics
-from reloc.gateway.multipart import LocaliseForm, read_form
+from reloc.gateway.multipart import read_form
 from reloc.gateway.options import GatewayOptions
 from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
 from reloc.gateway.protocol import VERSION as GEOPOSE_VERSION
 from reloc.gateway.protocol import GeoPoseResp
-from reloc.wire.query import ErrorCode, LocaliseReply
+from reloc.service.logs import fields
+from reloc.wire.query import ErrorCode, LocaliseReply, LocaliseWireRequest
 from reloc.wire.server import MapsReply, StatusReply
 
 logger = logging.getLogger(__name__)
@@ -85,36 +86,17 @@ class Gateway:
     def geopose(self, body: bytes) -> tuple[GeoPoseResp, str, str]:
         """The answer, the datum of its height, the request id."""
         request = parse(body)
-        asked = question_of(request, self.options)
-        reply = self.link.ask(
-            lambda client: client.localise(
-                asked.image,
-                asked.prior,
-                asked.camera,
-                timeout_s=self.options.timeout_s,
-                request_id=asked.request_id,
-            )
-        )
+        image, asked = question_of(request, self.options)
+        reply = self.link.ask(lambda client: client.ask(image, asked, self.options.timeout_s))
         return *response_of(request, reply), reply.request_id
 
-    def localise(self, form: LocaliseForm) -> LocaliseReply:
+    def localise(self, image: bytes, asked: LocaliseWireRequest) -> LocaliseReply:
         """The server's reply as it is."""
         timeout_s = self.options.timeout_s
-        if form.options.deadline_ms is not None:
-            deadline_s = form.options.deadline_ms / 1e3
+        if asked.options.deadline_ms is not None:
+            deadline_s = asked.options.deadline_ms / 1e3
             timeout_s = min(timeout_s, deadline_s + min(deadline_s, _DEADLINE_MARGIN_S))
-        return self.link.ask(
-            lambda client: client.localise(
-                form.image,
-                form.prior,
-                form.camera,
-                timeout_s=timeout_s,
-                request_id=form.request_id,
-                inliers=form.options.inliers,
-                exif_prior=form.options.exif_prior,
-                maps=form.options.maps,
-            )
-        )
+        return self.link.ask(lambda client: client.ask(image, asked, timeout_s))
 
 
 def create_app(options: GatewayOptions) -> FastAPI:
@@ -175,8 +157,8 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
     @app.post(f"{prefix}/localise", **openapi.LOCALISE)
     async def localise(request: Request) -> Response:
         async with gateway.intake.admitted(request, "multipart/form-data") as bounded:
-            form = await read_form(bounded, gateway.options)
-            reply = await gateway.in_thread(lambda: gateway.localise(form))
+            image, asked = await read_form(bounded, gateway.options)
+            reply = await gateway.in_thread(lambda: gateway.localise(image, asked))
         return _json(reply)
 
     @app.get(f"{prefix}/maps", **openapi.MAPS)
@@ -296,17 +278,5 @@ class _Observed:
             path = scope["path"] if scope["path"] in self._paths else "other"
             seconds = time.perf_counter() - start
             self._metrics.observe(path, status, seconds)
-            logger.info(
-                "%s %s %s",
-                scope["method"],
-                path,
-                status,
-                extra={
-                    "fields": {
-                        "event": "http",
-                        "route": path,
-                        "status": status,
-                        "ms": round(seconds * 1e3, 1),
-                    }
-                },
-            )
+            said, ms = f"{scope['method']} {path} {status}", round(seconds * 1e3, 1)
+            logger.info(said, extra=fields("http", route=path, status=status, ms=ms))

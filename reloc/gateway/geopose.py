@@ -10,7 +10,6 @@ import binascii
 import io
 import math
 import re
-from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
@@ -54,16 +53,6 @@ class NotLocalisedError(GatewayError):
         self.geopose_id = geopose_id
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Question:
-    """What the server is asked: `reloc.client.Client.localise`'s arguments."""
-
-    image: bytes
-    prior: PriorRequest | None
-    camera: CameraRequest | None
-    request_id: str | None
-
-
 def parse(body: bytes) -> GeoPoseReq:
     """Read a request.
 
@@ -97,8 +86,8 @@ def check_version(accept: str) -> bool:
     return False
 
 
-def question_of(request: GeoPoseReq, options: GatewayOptions) -> Question:
-    """What to ask the server.
+def question_of(request: GeoPoseReq, options: GatewayOptions) -> tuple[bytes, LocaliseWireRequest]:
+    """What to ask the server: an image file, and what is said of it.
 
     Raises:
         GatewayError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE.
@@ -117,12 +106,13 @@ def question_of(request: GeoPoseReq, options: GatewayOptions) -> Question:
             "imageOrientation.mirrored: expected false; mirror the picture back, since no camera sees it so",
         )
     size = _size(picture)
-    return Question(
-        image=_image_file(_decoded(picture.imageBytes, options.max_image_bytes), picture, size),
+    image = _image_file(_decoded(picture.imageBytes, options.max_image_bytes), picture, size)
+    asked = LocaliseWireRequest(
         prior=_prior(request, picture, options),
         camera=_camera(picture, size),
         request_id=_wire_id(request.id),
     )
+    return image, asked
 
 
 def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp, str]:

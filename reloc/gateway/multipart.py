@@ -1,6 +1,5 @@
 """`POST /localise`: a form with an image file and JSON fields, as the wire has them."""
 
-from dataclasses import dataclass
 from typing import TypeVar
 
 from starlette.datastructures import UploadFile
@@ -25,19 +24,10 @@ _Field = TypeVar("_Field", CameraRequest, PriorRequest, RequestOptions)
 FIELDS = ("image", "camera", "prior", "options", "request_id")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LocaliseForm:
-    """What the form says."""
+async def read_form(request: Request, options: GatewayOptions) -> tuple[bytes, LocaliseWireRequest]:
+    """The image file, and what is said of it.
 
-    image: bytes
-    camera: CameraRequest | None
-    prior: PriorRequest | None
-    options: RequestOptions
-    request_id: str | None
-
-
-async def read_form(request: Request, options: GatewayOptions) -> LocaliseForm:
-    """Read the form; its file goes through a temporary file where it is larger than a megabyte.
+    The file goes through a temporary file where it is larger than a megabyte.
 
     Raises:
         GatewayError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE, and those of the body.
@@ -70,13 +60,13 @@ async def read_form(request: Request, options: GatewayOptions) -> LocaliseForm:
             ErrorCode.TOO_LARGE,
             f"image: expected at most {options.max_image_bytes} bytes, found {len(image)}",
         )
-    return LocaliseForm(
-        image=image,
+    said = LocaliseWireRequest(
         camera=_json("camera", CameraRequest, parts),
         prior=_json("prior", PriorRequest, parts),
         options=_json("options", RequestOptions, parts) or RequestOptions(),
         request_id=_request_id(parts),
     )
+    return image, said
 
 
 def _json(name: str, model: type[_Field], parts: dict[str, bytes]) -> _Field | None:

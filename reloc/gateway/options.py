@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from featuredb.errors import InvalidValueError
+from reloc.wire.endpoints import DEFAULT_ENDPOINT
 
 _PREFIX = re.compile(r"(/[A-Za-z0-9._~-]+)*")
 
@@ -34,7 +35,7 @@ class GatewayOptions:
         cors_origins: web pages of these origins may ask; "*" is all.
     """
 
-    connect: str = "tcp/127.0.0.1:7447"
+    connect: str = DEFAULT_ENDPOINT
     config_path: Path | None = None
     database: str | None = None
     host: str = "127.0.0.1"

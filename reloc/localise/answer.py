@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.arrays import FloatArray
@@ -65,9 +64,6 @@ def make_answer(
         cam_from_utm_xyzw=quaternion_from_matrix(pose.cam_from_local.rotation @ grid_from_local.T),
         geopose=geopose_from_camera(pose.cam_from_local, area.frame),
         height_datum=main.height_datum,
-        horizontal_68_m=error_radius(covariance[3:5, 3:5]),
-        vertical_68_m=error_radius(covariance[5:, 5:]),
-        orientation_68_deg=float(np.degrees(error_radius(covariance[:3, :3]))),
         map_ids=tuple(area.maps[i].map_id for i in order),
         lineage=tuple(_lineage(area.maps[i]) for i in order),
         residual_rms_px=uncertainty.residual_rms_px,
@@ -86,19 +82,6 @@ def _of_params(camera: Camera, joint: FloatArray) -> FloatArray | None:
     if camera.model == "OPENCV":
         by_lens[6:, 6:] = opencv_by_lens(lens_of(camera))
     return np.asarray(by_lens @ joint @ by_lens.T, dtype=np.float64)
-
-
-def error_radius(covariance: FloatArray, share: float = 0.68) -> float:
-    """Radius around a Gaussian's mean that holds a share of it, for covariances (d, d), d = 1, 2 or 3.
-
-    The squared distance is a weighted sum of chi-squares; a gamma distribution with its mean and variance
-    (Satterthwaite) is exact for d = 1 and for equal weights, and within 2 % in radius in between.
-    """
-    weights = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
-    mean, variance = float(weights.sum()), float(2.0 * (weights**2).sum())
-    if mean <= 0.0:
-        return 0.0
-    return float(np.sqrt(gammaincinv(mean**2 / variance, share) * variance / mean))
 
 
 def placement_covariance(area: Area, feature_map: FeatureMap, center: FloatArray) -> FloatArray:
@@ -176,10 +159,9 @@ def on_earth(
 def _lineage(feature_map: FeatureMap) -> dict[str, Any]:
     return {
         "map_id": feature_map.map_id,
-        "name": feature_map.name,
         "method": feature_map.placement.method,
-        "generation": feature_map.generation,
-        "parents": list(feature_map.parents),
+        "generation": int(feature_map.generation),
+        "parents": tuple(feature_map.parents),
     }
 
 

@@ -1,7 +1,7 @@
 """Absolute pose from 2D-3D matches: LO-RANSAC, focal length where unknown, refinement, covariance."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import poselib
@@ -14,9 +14,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.lens_prior import QueryLensPrior
 from reloc.localise.options import PoseOptions
+from reloc.localise.result import CameraSource
 from reloc.localise.self_calibration import calibrate, covariance_from_information, joint_jacobians
-
-CameraSource = Literal["request", "map", "exif", "estimated"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -5,6 +5,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincinv
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import GeoPose
@@ -25,6 +26,7 @@ Reason = Literal[
     "CONTRADICTS_PRIOR",
 ]
 REASONS: tuple[Reason, ...] = get_args(Reason)
+CameraSource = Literal["request", "map", "exif", "estimated"]
 PositionRole = Literal["agrees", "decided", "contradicted", "no_help"]
 
 
@@ -81,45 +83,65 @@ class Inliers:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LocalisedPose:
-    """A pose on Earth.
+class OnEarth:
+    """What every pose on Earth has.
+
+    Attributes:
+        epsg: UTM zone of `utm`, (3,) easting, northing, height of the camera centre, metres.
+        height_datum: datum of the heights, as the maps have it.
+        cam_from_utm_xyzw: (4,) rotation, grid axes (east, north, up) to camera axes.
+        geopose: the same as an OGC GeoPose.
+        covariance: (6, 6), axes true east-north-up at the camera: small rotation of the camera about those
+            axes (rad) before displacement of the camera centre (m). R_true = R(dtheta) R, C_true = C + dC.
+            Measurement noise scaled by the residuals, plus the map's own uncertainty.
+        horizontal_68_m, vertical_68_m, orientation_68_deg: radii that hold 68 % of the errors.
+    """
+
+    epsg: int
+    utm: FloatArray
+    height_datum: str
+    cam_from_utm_xyzw: FloatArray
+    geopose: GeoPose
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        for name, shape in (("covariance", (6, 6)), ("utm", (3,)), ("cam_from_utm_xyzw", (4,))):
+            object.__setattr__(self, name, frozen_array(f"OnEarth.{name}", getattr(self, name), shape))
+
+    @property
+    def horizontal_68_m(self) -> float:
+        return error_radius(self.covariance[3:5, 3:5])
+
+    @property
+    def vertical_68_m(self) -> float:
+        return error_radius(self.covariance[5:, 5:])
+
+    @property
+    def orientation_68_deg(self) -> float:
+        return float(np.degrees(error_radius(self.covariance[:3, :3])))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LocalisedPose(OnEarth):
+    """The pose of a photo on Earth.
 
     Attributes:
         frame: local ENU frame in which the pose was computed.
         cam_from_local: pose, `frame` to camera axes (x right, y down, z forward), metres.
-        covariance: (6, 6), axes true-north east-north-up at the camera: small rotation of the camera about
-            those axes (rad) before displacement of the camera centre (m). R_true = R(dtheta) R,
-            C_true = C + dC. Measurement noise scaled by the residuals, plus the map's own uncertainty.
         view_covariance: (6 + n, 6 + n) of the pose, as in `covariance`, and the camera's n parameters, for
             what pixels show: pose and lens err together, mostly so that the map's points stay where they are
             in the picture. None where the lens is exact: then it is `covariance`.
         camera: intrinsics used, full image size.
-        camera_source: request, map, exif or estimated.
-        epsg: UTM zone of `utm`.
-        utm: (3,) easting, northing, height of the camera centre, metres.
-        cam_from_utm_xyzw: rotation, grid axes (east, north, up) to camera axes.
-        geopose: the same as an OGC GeoPose.
-        height_datum: datum of the heights, as the maps have it.
-        horizontal_68_m, vertical_68_m, orientation_68_deg: radii that hold 68 % of the errors.
         map_ids: maps whose points are among the inliers, most inliers first.
-        lineage: for each of map_ids, what placed it: method, generation, parents; from a `Localiser`, which
-            knows the other maps, too, also steps, anchors, drift_m, budget_m (featuredb.maps.lineage).
+        lineage: for each of map_ids, what placed it: map_id, method, generation, parents; from a `Localiser`,
+            which knows the other maps, too, also steps, anchors, drift_m, budget_m (featuredb.maps.lineage).
         residual_rms_px: of the inliers, in full-size pixels.
     """
 
     frame: LocalFrame
     cam_from_local: Rigid3
-    covariance: FloatArray
     camera: Camera
-    camera_source: Literal["request", "map", "exif", "estimated"]
-    epsg: int
-    utm: FloatArray
-    cam_from_utm_xyzw: FloatArray
-    geopose: GeoPose
-    height_datum: str
-    horizontal_68_m: float
-    vertical_68_m: float
-    orientation_68_deg: float
+    camera_source: CameraSource
     map_ids: tuple[str, ...]
     lineage: tuple[dict[str, Any], ...]
     residual_rms_px: float
@@ -127,38 +149,41 @@ class LocalisedPose:
     view_covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        OnEarth.__post_init__(self)
         if self.view_covariance is not None:
             size = 6 + len(self.camera.params)
             joint = frozen_array("LocalisedPose.view_covariance", self.view_covariance, (size, size))
             object.__setattr__(self, "view_covariance", joint)
-        for name, shape in (("covariance", (6, 6)), ("utm", (3,)), ("cam_from_utm_xyzw", (4,))):
-            object.__setattr__(self, name, frozen_array(f"LocalisedPose.{name}", getattr(self, name), shape))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PoseInMap:
+class OwnPose:
     """A pose in the own frame of a map without a place; it says nothing of where on Earth that is.
 
     Attributes:
-        map_id: of the map.
-        frame: whether its unit is a metre, and whether its z is up.
+        map_id: of the map. frame: whether its unit is a metre, and whether its z is up.
         cam_from_map: pose, own frame to camera axes (x right, y down, z forward), units of the frame.
         covariance: (6, 6), axes of the own frame: small rotation of the camera about them (rad) before
             displacement of the camera centre (units of the frame).
-        camera, camera_source, residual_rms_px: as in LocalisedPose.
     """
 
     map_id: str
     frame: OwnFrame
     cam_from_map: Rigid3
     covariance: FloatArray
-    camera: Camera
-    camera_source: Literal["request", "map", "exif", "estimated"]
-    residual_rms_px: float
 
     def __post_init__(self) -> None:
-        covariance = frozen_array("PoseInMap.covariance", self.covariance, (6, 6))
+        covariance = frozen_array("OwnPose.covariance", self.covariance, (6, 6))
         object.__setattr__(self, "covariance", covariance)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseInMap(OwnPose):
+    """That of a photo; `camera`, `camera_source`, `residual_rms_px`: as in LocalisedPose."""
+
+    camera: Camera
+    camera_source: CameraSource
+    residual_rms_px: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -264,3 +289,16 @@ class LocaliseResult:
         if self.in_map is not None:
             return "localised_in_map"
         return "not_localised" if self.pose is None else "localised"
+
+
+def error_radius(covariance: FloatArray, share: float = 0.68) -> float:
+    """Radius around a Gaussian's mean that holds a share of it, for covariances (d, d), d = 1, 2 or 3.
+
+    The squared distance is a weighted sum of chi-squares; a gamma distribution with its mean and variance
+    (Satterthwaite) is exact for d = 1 and for equal weights, and within 2 % in radius in between.
+    """
+    weights = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
+    mean, variance = float(weights.sum()), float(2.0 * (weights**2).sum())
+    if mean <= 0.0:
+        return 0.0
+    return float(np.sqrt(gammaincinv(mean**2 / variance, share) * variance / mean))

@@ -34,13 +34,12 @@ from reloc.localise.matching import (
 )
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.pose import (
-    CameraSource,
     PoseHypothesis,
     estimate_pose,
     refine_pose,
     reprojection_errors,
 )
-from reloc.localise.result import Evidence, LocaliseRequest, Reason
+from reloc.localise.result import CameraSource, Evidence, LocaliseRequest, Reason
 
 _MORE_BY_REFINING = 2  # times RANSAC's inliers
 _FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement

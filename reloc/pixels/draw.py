@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
+from reloc.answered_view import AnsweredView
 from reloc.pixels.layer import Shape
 from reloc.pixels.surfaces import resampled
-from reloc.pixels.view import AnsweredView
 
 _DEPTH_PX = 1600  # longer side of the picture that decides what is hidden
 _COLOURS_RGB = ((255, 70, 50), (60, 200, 255), (255, 210, 40), (110, 230, 90), (230, 110, 255))

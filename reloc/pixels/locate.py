@@ -13,9 +13,9 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from reloc.localise.answer import error_radius
+from reloc.answered_view import AnsweredView
+from reloc.localise.result import error_radius
 from reloc.pixels.surfaces import Met, RaySurface
-from reloc.pixels.view import AnsweredView
 
 LocateReason = Literal["NO_SURFACE", "GRAZING", "OUTSIDE"]
 

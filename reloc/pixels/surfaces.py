@@ -1,7 +1,7 @@
 """What a ray of a photo may meet: the scan of the database, or the points of the map that answered."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
 from featuredb.store import Database
 from featuredb.store.scans import has_scans, list_scans
+from reloc.answered_view import AnsweredView
 from reloc.pixels.patch import Patch, fit_patch
-from reloc.pixels.view import AnsweredView
 
 REACH_M = 1000.0  # of the scan around the camera that is looked at
 _OVERVIEW_PX = 1000  # longer side of the picture in which a pixel's distance is looked up first
@@ -46,36 +46,12 @@ class Met:
     sigma_m: float
     spacing_m: float
     tolerance_m: float
-    around: "DepthAround"
-
-
-class DepthAround(Protocol):
-    """Looks up the distance at other pixels."""
-
-    def __call__(self, pixels: FloatArray) -> FloatArray: ...
-
-
-class RaySurface(Protocol):
-    """Something that rays can meet; `kind` is its name, `doubt` is said of each place on it."""
-
-    @property
-    def kind(self) -> str: ...
-
-    @property
-    def doubt(self) -> str: ...
-
-    def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
-        """Where the ray of a pixel (2,) meets it, or why it does not.
-
-        Args:
-            reach_px: how far around the pixel distances will be asked for.
-        """
-        ...
+    around: Callable[[FloatArray], FloatArray]
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class ScanSurface:
-    """A cloud in the frame of the view.
+    """A cloud in the frame of the view; `doubt` is said of each place on it.
 
     Attributes:
         common_m: one standard deviation of what neighbouring points are off by together (their strip, the
@@ -89,6 +65,11 @@ class ScanSurface:
     _overview: Rendering | None = field(default=None, repr=False)
 
     def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
+        """Where the ray of a pixel (2,) meets it, or why it does not.
+
+        Args:
+            reach_px: how far around the pixel distances will be asked for.
+        """
         rough = self._depth(view, pixel)
         if rough is None:
             return "the scan has no points there"
@@ -145,6 +126,7 @@ class MapSurface:
     doubt: str = ""
 
     def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
+        """As `ScanSurface.meet`."""
         pixels = view.camera.project(view.cam_from_local.act(self.points))
         apart = np.linalg.norm(pixels - pixel, axis=1)
         nearest = np.argsort(np.where(np.isfinite(apart), apart, np.inf), kind="stable")[:_NEAREST_POINTS]
@@ -165,14 +147,12 @@ class MapSurface:
             return "the map's points around lie on no surface"
         # Between points so far apart the surface may do what it does at them.
         sigma = float(np.hypot(patch.fitted_m, patch.scatter_m))
-        return Met(patch=patch, sigma_m=sigma, spacing_m=spacing, tolerance_m=tolerance, around=_Nowhere())
+        return Met(patch=patch, sigma_m=sigma, spacing_m=spacing, tolerance_m=tolerance, around=_nowhere)
 
 
-class _Nowhere:
+def _nowhere(pixels: FloatArray) -> FloatArray:
     """A map's few points show no edges."""
-
-    def __call__(self, pixels: FloatArray) -> FloatArray:
-        return np.full(len(pixels), np.nan)
+    return np.full(len(pixels), np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -202,6 +182,9 @@ class _Window:
         if apart[best] > max(within_px, 1.0 / self.scale):
             return None
         return float(self.depth[rows[best], columns[best]])
+
+
+RaySurface = ScanSurface | MapSurface
 
 
 def scan_surface(

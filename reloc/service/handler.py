@@ -17,10 +17,11 @@ from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.stage_clock import StageClock
+from reloc.answered_view import camera_of
 from reloc.localise.lens_prior import QueryLensPrior, known_within
 from reloc.localise.result import LocaliseRequest
+from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
-from reloc.service.source import LocaliserLike
 from reloc.wire.query import (
     CameraRequest,
     ErrorCode,
@@ -34,7 +35,7 @@ from reloc.wire.query import (
 def answer_query(
     data: bytes,
     wire_request: LocaliseWireRequest,
-    localiser: LocaliserLike,
+    localiser: Localiser,
     *,
     limits: DecodeLimits,
     request_id: str,
@@ -109,9 +110,7 @@ def _decode(data: bytes, limits: DecodeLimits) -> NDArray[np.uint8]:
 
 def _camera(camera: CameraRequest, width: int, height: int) -> Camera:
     try:
-        return Camera(
-            model=camera.model, width=camera.width, height=camera.height, params=camera.params
-        ).scaled_to(width, height)
+        return camera_of(camera).scaled_to(width, height)
     except InvalidValueError as error:
         raise RequestError(
             ErrorCode.BAD_REQUEST, f"camera: {error} (the image has {width}x{height})"

@@ -16,9 +16,9 @@ class JsonLinesFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        fields = getattr(record, "fields", None)
-        if isinstance(fields, dict):
-            line.update({name: value for name, value in fields.items() if name not in line})
+        more = getattr(record, "fields", None)
+        if isinstance(more, dict):
+            line.update({name: value for name, value in more.items() if name not in line})
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str)
@@ -33,3 +33,8 @@ def log_to(stream: TextIO) -> None:
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
         logger.propagate = False  # or each line comes a second time, in the program's own format
+
+
+def fields(event: str, **values: object) -> dict[str, object]:
+    """What a line has besides its message, as `extra` of a logger's method."""
+    return {"fields": {"event": event, **values}}

@@ -10,9 +10,8 @@ from featuredb.features.decode import DecodeLimits
 from reloc.service.contributions.inbox import InboxOptions
 from reloc.service.live.options import LiveOptions
 from reloc.service.workers.answering import WorkerLimits
+from reloc.wire.endpoints import DEFAULT_ENDPOINT
 from reloc.wire.keys import NAME_PATTERN
-
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

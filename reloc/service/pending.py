@@ -7,7 +7,8 @@ import uuid
 
 import zenoh
 
-from reloc.service.metrics import ServerMetrics
+from reloc.service.logs import fields
+from reloc.service.tally import Tally
 from reloc.wire.query import ErrorCode, ErrorReply, LocaliseReply, RequestError, encode
 
 logger = logging.getLogger(__name__)
@@ -35,8 +36,8 @@ class PendingQuery:
         "_answered",
         "_key",
         "_lock",
-        "_metrics",
         "_query",
+        "_tally",
         "asker",
         "deadline",
         "identity",
@@ -50,7 +51,7 @@ class PendingQuery:
         query: zenoh.Query,
         key: str,
         deadline_s: float,
-        metrics: ServerMetrics,
+        tally: Tally,
         *,
         identity: str | None,
     ) -> None:
@@ -58,7 +59,7 @@ class PendingQuery:
         self.asker = identity or session_of(query)
         self._query = query
         self._key = key
-        self._metrics = metrics
+        self._tally = tally
         self._lock = threading.Lock()
         self._answered = False
         self.received = time.perf_counter()
@@ -92,24 +93,21 @@ class PendingQuery:
                 return False
             self._answered = True
             latency_ms = (time.perf_counter() - self.received) * 1e3
-            self._metrics.answered(reply.reason, latency_ms)
+            kind = "localised" if reply.reason is None else "not_localised"
+            self._tally.add(kind, reply.reason or "", latency_ms)
             self._send(payload, error=False)
-        logger.info(
-            "query answered",
-            extra={
-                "fields": {
-                    "event": "answered",
-                    "request_id": self.request_id,
-                    "client": self.identity,
-                    "status": reply.status,
-                    "reason": reply.reason,
-                    "inliers": reply.inliers,
-                    "snapshot": reply.snapshot,
-                    "bytes": self.size,
-                    "latency_ms": round(latency_ms, 3),
-                }
-            },
+        told = fields(
+            "answered",
+            request_id=self.request_id,
+            client=self.identity,
+            status=reply.status,
+            reason=reply.reason,
+            inliers=reply.inliers,
+            snapshot=reply.snapshot,
+            bytes=self.size,
+            latency_ms=round(latency_ms, 3),
         )
+        logger.info("query answered", extra=told)
         return True
 
     def refuse(self, error: RequestError) -> bool:
@@ -120,23 +118,18 @@ class PendingQuery:
             if self._answered:
                 return False
             self._answered = True
-            self._metrics.failed(error.code)
+            self._tally.add("error", error.code)
             self._send(payload, error=True)
         level = logging.ERROR if error.code == ErrorCode.INTERNAL else logging.INFO
-        logger.log(
-            level,
-            "query refused",
-            extra={
-                "fields": {
-                    "event": "refused",
-                    "request_id": self.request_id,
-                    "client": self.identity,
-                    "code": error.code,
-                    "refusal": error.message,
-                    "bytes": self.size,
-                }
-            },
+        told = fields(
+            "refused",
+            request_id=self.request_id,
+            client=self.identity,
+            code=error.code,
+            refusal=error.message,
+            bytes=self.size,
         )
+        logger.log(level, "query refused", extra=told)
         return True
 
     def _send(self, payload: bytes, *, error: bool) -> None:
@@ -147,8 +140,5 @@ class PendingQuery:
                 else:
                     query.reply(self._key, payload, encoding=zenoh.Encoding.APPLICATION_JSON, express=True)
         except zenoh.ZError:  # the client went away, or asked with a selector that takes no such key
-            logger.warning(
-                "reply could not be sent",
-                exc_info=True,
-                extra={"fields": {"event": "reply_failed", "request_id": self.request_id}},
-            )
+            told = fields("reply_failed", request_id=self.request_id)
+            logger.warning("reply could not be sent", exc_info=True, extra=told)

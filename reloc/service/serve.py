@@ -9,10 +9,10 @@ from featuredb.store import Database
 from reloc.localise.options import LocaliseOptions
 from reloc.service.contributions.database_inbox import DatabaseInbox
 from reloc.service.contributions.inbox import Inbox
-from reloc.service.database_source import DatabaseSource
 from reloc.service.metrics import metrics_page
 from reloc.service.options import ServeOptions, wire_name_of
 from reloc.service.server import Server
+from reloc.service.source import DatabaseSource
 from reloc.wire.server import StatusReply
 
 _TURN_S = 1.0  # of waiting for a signal

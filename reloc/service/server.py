@@ -14,14 +14,14 @@ import zenoh
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.exposure import authenticates, check_exposure
 from reloc.service.live.follower import Follower
-from reloc.service.live.frames import FrameAnswerer
 from reloc.service.live.sessions import LiveSessions
-from reloc.service.metrics import ServerMetrics
+from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError, bind_free_port, open_server_session, server_config
-from reloc.service.source import AreaSource, ServedArea
+from reloc.service.source import DatabaseSource, ServedArea
+from reloc.service.tally import Tally
 from reloc.service.watcher import AreaWatcher
 from reloc.service.workers.pool import WorkerPool
 from reloc.service.workers.process import prepare_workers
@@ -30,8 +30,10 @@ from reloc.wire.query import MESSAGE_HEADROOM, WIRE_VERSION, ErrorCode, RequestE
 from reloc.wire.server import (
     Event,
     EventType,
+    Latency,
     Limits,
     MapsReply,
+    QueryCounts,
     QueueStatus,
     ReloadStatus,
     StatusReply,
@@ -54,7 +56,7 @@ class Server:
     def __init__(
         self,
         *,
-        source: AreaSource,
+        source: DatabaseSource,
         area: ServedArea,
         session: zenoh.Session,
         endpoints: tuple[str, ...],
@@ -72,7 +74,7 @@ class Server:
         self._keys = Keys(database=database)
         self._area = area
         self._started = time.perf_counter()
-        self._metrics = ServerMetrics()
+        self._tally = Tally()
         self._reloads = 0
         self._reload_error: str | None = None
         self._queue = QueryQueue(options.max_queue, options.max_queued_bytes)
@@ -90,7 +92,7 @@ class Server:
             session,
             self._keys,
             lambda: self._area,
-            self._follower,
+            lambda answerer: Follower(answerer, options, lambda: self._workers.published),
             options.live,
             self.server_id,
             authenticates=authenticates,
@@ -102,7 +104,7 @@ class Server:
 
     @classmethod
     def start(
-        cls, source: AreaSource, options: ServeOptions, database: str, inbox: Inbox | None = None
+        cls, source: DatabaseSource, options: ServeOptions, database: str, inbox: Inbox | None = None
     ) -> Self:
         """Load the area, then listen; when this returns, queries are answered.
 
@@ -197,7 +199,7 @@ class Server:
         self._watch.close()
         self._watcher.close(timeout_s=self._options.shutdown_grace_s)
         self._session.close()
-        self._log("stopped", queries=self._metrics.counts().model_dump())
+        self._log("stopped", queries=self._queries().model_dump())
 
     def status(self) -> StatusReply:
         """What `.../status` answers."""
@@ -217,8 +219,8 @@ class Server:
                 busy=self._workers.busy,
                 ready=self._workers.ready,
             ),
-            queries=self._metrics.counts(),
-            latency_ms=self._metrics.latency(),
+            queries=self._queries(),
+            latency_ms=Latency(**self._tally.latency(50, 90, 99)),
             reload=ReloadStatus(count=self._reloads, error=self._reload_error),
             limits=Limits(
                 max_payload_bytes=options.limits.max_bytes,
@@ -229,27 +231,25 @@ class Server:
             live=self._live.status(),
         )
 
-    def _follower(self, answerer: FrameAnswerer) -> Follower:
-        """A live session's, with the limits of a query."""
-        options = self._options
-        return Follower(
-            answerer,
-            limits=options.worker_limits,
-            frame_s=options.work_s,
-            max_bytes=options.live.limits.max_bytes,
-            files=lambda: self._workers.published,
+    def _queries(self) -> QueryCounts:
+        tally = self._tally
+        return QueryCounts(
+            received=tally.count("received"),
+            localised=tally.count("localised"),
+            not_localised=tally.by_code("not_localised"),
+            errors=tally.by_code("error"),
         )
 
     # Zenoh calls these in threads of its own; they must return at once.
 
     def _on_localise(self, query: zenoh.Query) -> None:
-        self._metrics.received()
+        self._tally.add("received")
         client = client_of(str(query.key_expr))
         item = PendingQuery(
             query,
             self._keys.localise(client),
             self._options.deadline_s,
-            self._metrics,
+            self._tally,
             identity=client if self._authenticates else None,
         )
         try:
@@ -337,13 +337,8 @@ class Server:
                 "event could not be published", exc_info=True, extra={"fields": event.model_dump()}
             )
 
-    def _log(self, event: str, **fields: object) -> None:
-        logger.info(
-            "%s %s",
-            self.database,
-            event,
-            extra={"fields": {"event": event, "database": self.database, **fields}},
-        )
+    def _log(self, event: str, **values: object) -> None:
+        logger.info("%s %s", self.database, event, extra=fields(event, database=self.database, **values))
 
 
 def _software_version() -> str:

@@ -8,8 +8,7 @@ from pathlib import Path
 import zenoh
 
 from featuredb.errors import FeatureDbError
-
-EXAMPLE_ENDPOINT = "tcp/127.0.0.1:7447"
+from reloc.wire.endpoints import DEFAULT_ENDPOINT
 
 
 class ServiceStartError(FeatureDbError):
@@ -52,7 +51,7 @@ def open_server_session(config: zenoh.Config, where: str) -> zenoh.Session:
     except zenoh.ZError as error:
         hint = "is another server running there? Choose another port with --listen tcp/HOST:PORT"
         if "in use" not in str(error):
-            hint = f"expected endpoints like {EXAMPLE_ENDPOINT}"
+            hint = f"expected endpoints like {DEFAULT_ENDPOINT}"
         raise ServiceStartError(f"cannot listen on {where}: {_first_sentence(error)}; {hint}") from error
 
 
@@ -70,7 +69,7 @@ def bind_free_port(endpoint: str) -> str:
             port = int(probe.getsockname()[1])
     except OSError as error:
         raise ServiceStartError(
-            f"cannot listen on {endpoint}: {error}; expected endpoints like {EXAMPLE_ENDPOINT}"
+            f"cannot listen on {endpoint}: {error}; expected endpoints like {DEFAULT_ENDPOINT}"
         ) from error
     return f"{match[1]}/{match[2]}:{port}{match[3] or ''}"
 

@@ -1,38 +1,14 @@
 """Where a server gets what it answers from: one immutable area at a time, newer ones when they appear."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from reloc.localise.candidates import IndexedArea
+from featuredb.geo.utm import geodetic_from_utm
+from featuredb.store import Database, MapSummary
 from reloc.localise.options import LocaliseOptions
-from reloc.localise.result import LocaliseRequest, LocaliseResult
-from reloc.wire.server import MapInfo
-
-
-class LocaliserLike(Protocol):
-    """Answers queries from one snapshot; safe to call from several threads."""
-
-    @property
-    def snapshot(self) -> int:
-        """Version of the database that it answers from."""
-        ...
-
-    @property
-    def options(self) -> LocaliseOptions:
-        """Settings by which it answers."""
-        ...
-
-    @property
-    def areas(self) -> tuple[IndexedArea, ...]:
-        """All areas, of whatever extractor; those whose maps did not change stay the same over reloads."""
-        ...
-
-    def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
-        """The pose of the image (h, w), or the reason why there is none."""
-        ...
+from reloc.localiser import Localiser
+from reloc.wire.server import BoundingBox, MapInfo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,7 +20,7 @@ class ServedArea:
         maps: the maps it answers from.
     """
 
-    localiser: LocaliserLike
+    localiser: Localiser
     maps: tuple[MapInfo, ...]
 
     @property
@@ -57,13 +33,59 @@ class ServedArea:
         return tuple(sorted({tile for info in self.maps for tile in info.tiles}))
 
 
-class AreaSource(Protocol):
-    """Loads areas; the server polls `version` and loads when it has changed."""
+class DatabaseSource:
+    """Loads areas of a database; the server polls `version` and loads when it has changed."""
+
+    def __init__(self, database: Database, options: LocaliseOptions | None = None) -> None:
+        self._database = database
+        self._options = options or LocaliseOptions()
+        self._previous: Localiser | None = None
 
     def version(self) -> int:
-        """The newest version that can be loaded; cheap."""
-        ...
+        """Number of the newest snapshot: one look at the table's log."""
+        return self._database.poll_version()
 
     def load(self) -> ServedArea:
-        """The newest area; may take seconds. Raises FeatureDbError when it cannot."""
-        ...
+        """Localiser and maps of one and the same snapshot.
+
+        Raises:
+            FeatureDbError: the store cannot be read, or maps do not fit together.
+        """
+        localiser = Localiser.open(self._database, self._options, previous=self._previous)
+        self._previous = localiser
+        snapshot = self._database.snapshot(localiser.snapshot)
+        active = [summary for summary in snapshot.maps() if summary.status == "active"]
+        return ServedArea(localiser=localiser, maps=tuple(map_info(summary) for summary in active))
+
+
+def map_info(summary: MapSummary) -> MapInfo:
+    """A map's summary as the wire says it."""
+    return MapInfo(
+        map_id=summary.map_id,
+        content_digest=summary.content_digest,
+        name=summary.name,
+        epsg=summary.epsg,
+        height_datum=summary.height_datum,
+        method=summary.method,
+        generation=summary.generation,
+        images=summary.images,
+        points=summary.points,
+        bounds=_bounds(summary),
+        tiles=tuple(f"{summary.epsg}-{tile}" for tile in summary.tiles),
+    )
+
+
+def _bounds(summary: MapSummary) -> BoundingBox | None:
+    """Degrees around the map's box: those of its corners, which grid lines curve off by centimetres."""
+    box = summary.box
+    if box is None:
+        return None
+    corners = [
+        (easting, northing, 0.0)
+        for easting in (box.min_easting, box.max_easting)
+        for northing in (box.min_northing, box.max_northing)
+    ]
+    lat_lon_h = geodetic_from_utm(np.array(corners), summary.epsg)
+    south, west = (float(v) for v in lat_lon_h[:, :2].min(axis=0))
+    north, east = (float(v) for v in lat_lon_h[:, :2].max(axis=0))
+    return BoundingBox(west=west, south=south, east=east, north=north)

@@ -4,7 +4,8 @@ import logging
 import threading
 from collections.abc import Callable
 
-from reloc.service.source import AreaSource, ServedArea
+from reloc.service.logs import fields
+from reloc.service.source import DatabaseSource, ServedArea
 
 logger = logging.getLogger(__name__)
 
@@ -16,7 +17,7 @@ class AreaWatcher:
 
     def __init__(
         self,
-        source: AreaSource,
+        source: DatabaseSource,
         *,
         served_version: int,
         poll_interval_s: float,
@@ -58,10 +59,8 @@ class AreaWatcher:
             self._served = area.snapshot
         except Exception as error:
             # A store may break in many ways; the area in service is whole and stays.
-            logger.exception(
-                "reload failed; the running snapshot stays in service",
-                extra={"fields": {"event": "reload_failed", "snapshot": version}},
-            )
+            told = fields("reload_failed", snapshot=version)
+            logger.exception("reload failed; the running snapshot stays in service", extra=told)
             self._on_failure(version, f"{type(error).__name__}: {error}")
             return False
         return True

@@ -11,8 +11,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.unplaced_map import OwnFrame
-from reloc.localise.pose import CameraSource
-from reloc.localise.result import LocaliseRequest
+from reloc.localise.result import CameraSource, LocaliseRequest
 from reloc.tracking.options import TrackOptions
 
 

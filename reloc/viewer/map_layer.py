@@ -10,9 +10,9 @@ from featuredb.export.shots import pose_covariance
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.lineage import MapLineage, describe_lineage
+from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import MapSummary
 from reloc.viewer.places import Spot
 from reloc.viewer.points import DrawnPoints
@@ -59,29 +59,28 @@ def describe_photos(feature_map: FeatureMap, frame: LocalFrame) -> list[dict[str
         pose = image.cam_from_local
         center = frame_from_map.act(pose.center)
         camera = feature_map.cameras[image.camera_id]
+        turn = frame_from_map.rotation @ pose.rotation.T
         utm = feature_map.frame.utm_from_enu(pose.center, feature_map.epsg)
         geopose = geopose_from_camera(pose, feature_map.frame)
         local_from_true = frame.true_enu_from_enu(center).T
-        time = image.capture_time
-        photos.append(
-            {
-                "id": image.image_id,
-                "name": image.name,
-                **drawn_pose(center, frame_from_map.rotation @ pose.rotation.T, camera),
-                **worded_place(geopose, utm, feature_map.epsg, feature_map.height_datum),
-                **worded_sigmas(pose_covariance(feature_map, image), local_from_true),
-                "camera": worded_camera(camera),
-                "time": None if time is None else time.isoformat(),
-                "owner": image.owner,
-                "licence": licence_of(image, feature_map),
-            }
-        )
+        where = worded_place(geopose, utm, feature_map.epsg, feature_map.height_datum)
+        where |= worded_sigmas(pose_covariance(feature_map, image), local_from_true)
+        photos.append(described_photo(image, feature_map, drawn_pose(center, turn, camera) | where))
     return photos
 
 
-def worded_camera(camera: Camera) -> str:
-    """A lens in a few words."""
-    return f"{camera.model} {camera.width}x{camera.height}, focal length {camera.focal_px:.0f} px"
+def described_photo(image: MapImage, of: AnyMap, where: dict[str, Any]) -> dict[str, Any]:
+    """A photo of a map, with what is drawn and said of its pose."""
+    camera, time = of.cameras[image.camera_id], image.capture_time
+    return {
+        "id": image.image_id,
+        "name": image.name,
+        **where,
+        "camera": f"{camera.model} {camera.width}x{camera.height}, focal length {camera.focal_px:.0f} px",
+        "time": None if time is None else time.isoformat(),
+        "owner": image.owner,
+        "licence": licence_of(image, of),
+    }
 
 
 def coverage(points: DrawnPoints) -> dict[str, Any]:

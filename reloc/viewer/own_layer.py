@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from featuredb.export.selection import licence_of
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import UnplacedSummary
-from reloc.viewer.map_layer import coverage, worded_camera
+from reloc.viewer.map_layer import coverage, described_photo
 from reloc.viewer.points import DrawnPoints, drawn_points, sampled
 from reloc.viewer.poses import drawn_pose
 
@@ -78,18 +77,7 @@ def _photos(unplaced: UnplacedMap) -> list[dict[str, Any]]:
     """The photos, poses in the own frame."""
     photos = []
     for image in unplaced.images:
-        pose, camera, time = image.cam_from_local, unplaced.cameras[image.camera_id], image.capture_time
-        photos.append(
-            {
-                "id": image.image_id,
-                "name": image.name,
-                **drawn_pose(pose.center, np.asarray(pose.rotation.T), camera),
-                "utm": None,
-                "ellipse": None,
-                "camera": worded_camera(camera),
-                "time": None if time is None else time.isoformat(),
-                "owner": image.owner,
-                "licence": licence_of(image, unplaced),
-            }
-        )
+        pose, camera = image.cam_from_local, unplaced.cameras[image.camera_id]
+        drawn = drawn_pose(pose.center, np.asarray(pose.rotation.T), camera)
+        photos.append(described_photo(image, unplaced, {**drawn, "utm": None, "ellipse": None}))
     return photos

@@ -16,7 +16,7 @@ def spot_of_trajectory(trajectory: Trajectory) -> Spot | None:
     pose = next((point.pose for point in trajectory.points if point.pose is not None), None)
     if pose is None:
         return None
-    easting, northing, height = (float(v) for v in pose.utm)
+    easting, northing, height = pose.utm.tolist()
     return Spot(easting=easting, northing=northing, height=height, epsg=pose.epsg)
 
 

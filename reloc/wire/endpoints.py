@@ -1,6 +1,8 @@
-"""Addresses of this machine alone."""
+"""Where servers listen, and which addresses are of this machine alone."""
 
 import ipaddress
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only
 
 
 def is_loopback(host: str) -> bool:

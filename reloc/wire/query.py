@@ -171,13 +171,18 @@ class Accuracy(Answer):
     orientation_68_deg: NotNegative
 
 
-class CameraUsed(Answer):
-    """Intrinsics that the pose was computed with, and where they came from."""
+class Intrinsics(Answer):
+    """Intrinsics by COLMAP's model names."""
 
     model: str
     width: Side
     height: Side
     params: tuple[float, ...]
+
+
+class CameraUsed(Intrinsics):
+    """Intrinsics that the pose was computed with, and where they came from."""
+
     source: Literal["request", "map", "exif", "estimated"]
 
 
@@ -335,15 +340,6 @@ class ErrorReply(Answer):
     code: str
     message: str
     request_id: str | None
-
-
-def parse_request(attachment: bytes | None) -> LocaliseWireRequest:
-    """Read the attachment of a localise query; none or an empty one means all defaults.
-
-    Raises:
-        RequestError: BAD_REQUEST with the field, what was expected and what was found.
-    """
-    return parse_attachment(LocaliseWireRequest, attachment)
 
 
 def parse_attachment(model: type[_Attached], attachment: bytes | None) -> _Attached:

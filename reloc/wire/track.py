@@ -11,12 +11,12 @@ from reloc.wire.query import (
     CameraRequest,
     Count,
     Covariance6,
+    Intrinsics,
     NotNegative,
     Position,
     PriorRequest,
     Quaternion,
     Request,
-    Side,
     UtmPose,
 )
 
@@ -79,15 +79,6 @@ class TrackFrame(Request):
 
     sequence: Sequence
     time_s: Annotated[float, Field(ge=-1e12, le=1e12)]
-
-
-class Intrinsics(Answer):
-    """Intrinsics by COLMAP's model names."""
-
-    model: str
-    width: Side
-    height: Side
-    params: tuple[float, ...]
 
 
 TrackStateText = Literal["tracking", "relocalised", "lost"]

@@ -1,19 +1,17 @@
 """The viewer's page in a real Chromium: what a person sees and clicks; nothing comes from elsewhere."""
 
-import io
 import os
 import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, sync_playwright
 
 from featuredb.store import Database
 from reloc.tracking.trajectory.read import read_trajectory_csv
@@ -23,11 +21,12 @@ from reloc.viewer.scene import ViewerSceneOptions, build_scene
 from reloc.viewer.static_page import write_static_page
 from tests.support.datasets import varied_database
 from tests.support.maps import random_map, random_unplaced_map
+from tests.support.seen_page import Seen, coloured, reddish
 from tests.support.viewer import MISSING, QUERY_POSE, ViewerWorld, make_world, running_viewer
 
 pytestmark = pytest.mark.slow
 
-BACKGROUND = np.array([243, 245, 247])
+
 CHROMIUM = shutil.which("chromium")
 
 
@@ -57,49 +56,6 @@ def browser() -> Iterator[Browser]:
         running.close()
 
 
-@dataclass
-class Seen:
-    """An open page, what it asked for, and what went wrong in it."""
-
-    page: Page
-    requests: list[str] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
-
-    def open(self, address: str) -> None:
-        self.page.goto(address)
-        self.page.evaluate("window.featuredb.then(() => true)")
-        self.frame()
-
-    def frame(self) -> None:
-        """Wait until what was asked to be drawn is on the screen."""
-        self.page.evaluate(
-            "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
-        )
-
-    def of_viewer(self, expression: str) -> object:
-        return self.page.evaluate(f"window.featuredb.then((viewer) => {expression})")
-
-    def pixels(self) -> np.ndarray:
-        """The view (h, w, 3), without the panels."""
-        self.frame()
-        shot = Image.open(io.BytesIO(self.page.locator("#stage").screenshot())).convert("RGB")
-        return np.asarray(shot).astype(int)
-
-    def only(self, *kinds: str) -> None:
-        """Show these kinds of things only."""
-        for box in self.page.locator("#kinds input").all():
-            box.set_checked(box.evaluate("(b) => b.parentElement.textContent.trim()") in kinds)
-
-    def click_photo(self, map_row: int, photo_row: int) -> None:
-        at = self.of_viewer(f"viewer.stage.project(viewer.place.maps[{map_row}].photos[{photo_row}].center)")
-        self.page.locator("#canvas").click(position={"x": at[0], "y": at[1]})
-
-    def panel(self) -> dict[str, str]:
-        """The table's rows of the panel."""
-        names = self.page.locator("#panel dt").all_inner_texts()
-        return dict(zip(names, self.page.locator("#panel dd").all_inner_texts(), strict=True))
-
-
 @pytest.fixture
 def seen(browser: Browser) -> Iterator[Seen]:
     page = browser.new_page(viewport={"width": 1280, "height": 720})
@@ -113,16 +69,6 @@ def seen(browser: Browser) -> Iterator[Seen]:
     yield watched
     page.close()
     assert watched.errors == []
-
-
-def coloured(pixels: np.ndarray) -> int:
-    """How many pixels are not the background."""
-    return int((np.abs(pixels - BACKGROUND).max(axis=2) > 12).sum())
-
-
-def reddish(pixels: np.ndarray) -> int:
-    """How many have the colour that the field's points have, (200, 60, 40)."""
-    return int((np.abs(pixels - [200, 60, 40]).max(axis=2) < 60).sum())
 
 
 def test_everything_comes_from_this_server(seen: Seen, url: str) -> None:

@@ -15,20 +15,17 @@ import ingest.growing as growing_module
 import ingest.growth.place.localised as localised_module
 from featuredb.cli.main import main
 from featuredb.errors import StoreError
-from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.features.features import Features
 from featuredb.store import Database
 from featuredb.store.candidates.owners import read_owners
-from featuredb.store.candidates.photos import contribute, list_candidates
+from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution
 from featuredb.store.verify import verify
 from ingest.growing import grow_candidates, watch_and_grow
 from ingest.growth.growth_report import GrowthReport
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
-from reloc.localise.result import LocaliseRequest
-from reloc.localiser import Localiser
-from tests.support.hill_photos import CAMERA, FRAME
+from tests.support.grown_maps import ask, copied, described, states
 from tests.support.hill_scan import write_hill_scan
 from tests.support.hill_walk import (
     NOW,
@@ -91,60 +88,33 @@ def grown(prepared: _Prepared) -> tuple[Path, GrowthReport]:
     return prepared[1:]
 
 
-def _copy(folder: Path, to: Path) -> Database:
-    shutil.copytree(folder, to / "db", dirs_exist_ok=True)
-    return Database.open(to / "db")
-
-
-def _states(database: Database) -> dict[str, str]:
-    return {c.candidate_id: c.state for c in list_candidates(database)}
-
-
-def _ask(database: Database, shot: Shot) -> float | None:
-    """Error in metres of the answer to a photo, None without one."""
-    result = Localiser.open(database).localise(
-        decode_gray(shot.data, INGEST_LIMITS), LocaliseRequest(camera=CAMERA)
-    )
-    if result.pose is None:
-        return None
-    center = FRAME.enu_from(result.pose.frame).act(result.pose.cam_from_local.center)
-    return float(np.linalg.norm(center - shot.cam_from_local.center))
-
-
 def test_photos_of_one_answer_where_others_show_the_same(database: Database, shots: list[Shot]) -> None:
     """The survey shows a part of what Anna's photos do, and of what Ben's do later: that part answers."""
     beyond = step_of(_EAST_M + 9.0, owners=("stranger",), each=1)[0]
-    asked_before = _ask(database, beyond)
+    asked_before = ask(database, beyond)
     anna = give(database, shots[:3])
     first = grow_candidates(database, growing())
     assert [(m.status, len(m.photos)) for m in first.maps] == [("active", 3)]
-    assert 0.3 < _described(database, first.promoted[0]) < 0.7
+    assert 0.3 < described(database, first.promoted[0]) < 0.7
 
     ben = give(database, shots[3:])
     second = grow_candidates(database, growing())
     assert len(second.promoted) == 1
-    assert 0.3 < _described(database, second.promoted[0]) < 1.0
-    assert _states(database) == dict.fromkeys([*anna, *ben], "used")
+    assert 0.3 < described(database, second.promoted[0]) < 1.0
+    assert states(database) == dict.fromkeys([*anna, *ben], "used")
     for map_id in (*first.promoted, *second.promoted):
         summary = database.snapshot().get(map_id)
         assert summary.status == "active"
         assert error_m(database, shots, map_id) < min(0.1, summary.drift_m + 0.05)
         assert summary.method == "map"
-    error = _ask(database, beyond)
+    error = ask(database, beyond)
     assert error is not None
     assert error < 0.2
     assert asked_before is None or error < asked_before + 0.05
 
 
-def _described(database: Database, map_id: str) -> float:
-    """Share of a map's points that answer."""
-    found = database.snapshot().load_map(map_id)
-    seen = found.observations
-    return len(np.unique(seen.point_index[seen.has_descriptor])) / len(found.points)
-
-
 def test_two_owners_at_once_are_promoted_in_one_run(grown: tuple[Path, GrowthReport], tmp_path: Path) -> None:
-    database, report = _copy(grown[0], tmp_path), grown[1]
+    database, report = copied(grown[0], tmp_path), grown[1]
     assert report.count("promoted") == 6
     assert report.rounds == 2
     entry = report.maps[0]
@@ -170,32 +140,32 @@ def test_two_owners_at_once_are_promoted_in_one_run(grown: tuple[Path, GrowthRep
 
 
 def test_beyond_the_budget_nothing_is_taken_and_photos_wait(given: Path, tmp_path: Path) -> None:
-    database = _copy(given, tmp_path)
+    database = copied(given, tmp_path)
     version = database.poll_version()
     report = grow_candidates(database, growing(budget_m=0.005))
     assert {p.reason_code for p in report.photos} == {"DRIFT_BUDGET"}
     assert {m.reason_code for m in report.maps} == {"DRIFT_BUDGET"}
     assert database.poll_version() == version
-    assert set(_states(database).values()) == {"waiting"}
+    assert set(states(database).values()) == {"waiting"}
     # With a larger budget, an anchor that came near for example, they go in.
     assert grow_candidates(database, growing()).count("promoted") == 6
 
 
 def test_a_map_that_was_retired_does_not_come_back(grown: tuple[Path, GrowthReport], tmp_path: Path) -> None:
-    database = _copy(grown[0], tmp_path)
+    database = copied(grown[0], tmp_path)
     map_id = grown[1].promoted[0]
     database.retire(map_id, "the photos are not ours")
-    assert set(_states(database).values()) == {"waiting"}
+    assert set(states(database).values()) == {"waiting"}
     report = grow_candidates(database, growing())
     assert {(p.outcome, p.reason_code) for p in report.photos} == {("refused", "RETIRED_MAP")}
-    assert set(_states(database).values()) == {"refused"}
+    assert set(states(database).values()) == {"refused"}
     assert database.snapshot().get(map_id).status == "retired"
 
 
 def test_a_run_that_dies_is_finished_by_the_next(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    database = _copy(given, tmp_path)
+    database = copied(given, tmp_path)
     version = database.poll_version()
 
     def dies(*args: object, **more: object) -> None:
@@ -206,7 +176,7 @@ def test_a_run_that_dies_is_finished_by_the_next(
         with pytest.raises(StoreError, match="power"):
             grow_candidates(database, growing())
     assert database.poll_version() == version
-    assert set(_states(database).values()) == {"waiting"}  # used by a map that is not there
+    assert set(states(database).values()) == {"waiting"}  # used by a map that is not there
     with monkeypatch.context() as patch:
         patch.setattr(Database, "set_status", dies)
         with pytest.raises(StoreError, match="power"):
@@ -214,7 +184,7 @@ def test_a_run_that_dies_is_finished_by_the_next(
     assert {m.status for m in database.snapshot().maps()} == {"active", "quarantined"}
     report = grow_candidates(database, growing())
     assert len(report.promoted) == 1
-    assert set(_states(database).values()) == {"used"}
+    assert set(states(database).values()) == {"used"}
 
 
 @pytest.mark.evaluation
@@ -223,12 +193,12 @@ def test_a_power_cut_leaves_what_was_seen(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At every write of a run what is left is what readers saw, or saw just before, and growth goes on."""
-    database = _copy(given, tmp_path)
+    database = copied(given, tmp_path)
     Path(database.url, "_work").rename(tmp_path / "work")
     options = replace(growing(), work=tmp_path / "work")
 
     def look(at: Database) -> object:
-        return {m.map_id: m.status for m in at.snapshot().maps()}, _states(at)
+        return {m.map_id: m.status for m in at.snapshot().maps()}, states(at)
 
     shown = [look(database)]
     left: list[tuple[int, State]] = []
@@ -256,7 +226,7 @@ def test_a_power_cut_leaves_what_was_seen(
         if (reached := shown.index(look(found))) not in gone_on:
             gone_on.add(reached)
             grow_candidates(found, options)
-            assert set(_states(found).values()) == {"used"}
+            assert set(states(found).values()) == {"used"}
             assert {m.status for m in found.snapshot().maps()} == {"active"}
         shutil.rmtree(place)
     assert gone_on == set(range(len(shown)))
@@ -281,10 +251,10 @@ def test_photos_of_elsewhere_wait_broken_ones_and_copies_are_refused(
     assert fates[ids[2]][1] in ("TOO_FEW_MATCHES", "TOO_FEW_INLIERS")
     assert fates[ids[1]][0] == "refused"
     assert fates[ids[3]][0] == "refused"
-    assert _states(database)[ids[0]] == "waiting"
+    assert states(database)[ids[0]] == "waiting"
     later = grow_candidates(database, growing(give_up_days=30), now=NOW + timedelta(days=31))
     assert {p.reason_code for p in later.photos} == {"GAVE_UP"}
-    assert "waiting" not in _states(database).values()
+    assert "waiting" not in states(database).values()
 
 
 def test_a_photo_is_not_looked_for_twice_in_the_same_maps(
@@ -327,7 +297,7 @@ def _jpeg(picture: np.ndarray) -> bytes:
 def test_a_worker_grows_when_photos_arrive_and_survives_errors(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    database = _copy(given, tmp_path)
+    database = copied(given, tmp_path)
     stop, reports, calls = threading.Event(), [], []
     real = growing_module.grow_candidates
 
@@ -353,7 +323,7 @@ def test_a_worker_grows_when_photos_arrive_and_survives_errors(
 
 
 def test_trusted_owners_and_commands(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _copy(given, tmp_path)
+    copied(given, tmp_path)
     url, report = str(tmp_path / "db"), tmp_path / "report.json"
     photo = tmp_path / "known.jpg"
     photo.write_bytes(step_of(WEST_M, owners=("x",), each=1)[0].data)
@@ -400,7 +370,7 @@ def test_a_scan_in_store_has_its_say(given: Path, tmp_path: Path, up_m: float, o
     pytest.importorskip("laspy")
     from featuredb.lidar.add import AddOptions, add_scan
 
-    database = _copy(given, tmp_path)
+    database = copied(given, tmp_path)
     anchor = next(iter(database.snapshot().maps()))
     datum = database.snapshot().load_map(anchor.map_id).height_datum
     if other_datum:

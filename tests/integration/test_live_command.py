@@ -13,7 +13,7 @@ from featuredb.errors import VideoError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.video.writer import VideoWriter
 from reloc.client import Client
-from reloc.client.film import StreamOptions, stream_film
+from reloc.client.film import stream_film
 from reloc.service.server import Server
 from reloc.tracking.pose_message import point_of_message, pose_message
 from reloc.wire.track import TrackPose
@@ -114,7 +114,7 @@ def test_a_film_that_cannot_be_read_opens_no_session(server: Server, tmp_path: P
     before = server.status().live
     (tmp_path / "broken.mp4").write_bytes(b"no film")
     with Client(server.endpoints[0]) as client, pytest.raises(VideoError):
-        stream_film(client, tmp_path / "broken.mp4", options=StreamOptions())
+        stream_film(client, tmp_path / "broken.mp4")
     after = server.status().live
     assert before is not None
     assert after is not None

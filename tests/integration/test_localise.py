@@ -1,35 +1,28 @@
 """Photos of a rendered field, localised in maps whose truth is known: errors in metres, and refusals."""
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from featuredb.errors import ImageError, IncompatibleExtractorError, InvalidValueError, MapNotFoundError
+from featuredb.errors import ImageError, IncompatibleExtractorError, InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.index import descriptor_index
-from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.lens_uncertainty import LensUncertainty
-from featuredb.store import Database
 from reloc.localise import search
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise
-from reloc.localise.options import CandidateOptions, LocaliseOptions
+from reloc.localise.options import LocaliseOptions
 from reloc.localise.pose import PoseHypothesis
-from reloc.localise.result import LocaliseRequest, LocaliseResult
-from reloc.localiser import Localiser
+from reloc.localise.result import LocaliseRequest
 from tests.support import planar_map as field
-from tests.support.planar_map import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, field_texture, render, view
+from tests.support.field_queries import KNOWN, POSE, indexed, moved, pose_errors
+from tests.support.planar_map import CAMERA, EPSG, field_texture, render, view
 
 UNSURE = LensUncertainty(
     focal_rel=0.003,
@@ -39,8 +32,6 @@ UNSURE = LensUncertainty(
     tangential=(1e-5, 1e-5),
     dilution=50.0,
 )
-KNOWN = LocaliseRequest(camera=CAMERA)
-POSE = view(5.0, -6.0, 40.0, 8.0, 33.0)
 
 
 @pytest.fixture(scope="module")
@@ -61,33 +52,6 @@ def texture() -> NDArray[np.uint8]:
 @pytest.fixture(scope="module")
 def photo(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return render(texture, POSE, seed=99)
-
-
-def indexed(*maps: FeatureMap) -> IndexedArea:
-    made = build_area(maps)
-    return IndexedArea(area=made, index=build_index(made.descriptors))
-
-
-def moved(feature_map: FeatureMap, map_id: str, east_m: float, sigma_m: float = 0.01) -> FeatureMap:
-    """The same content, placed elsewhere, with that uncertainty."""
-    frame = LocalFrame.from_utm(EASTING + east_m, NORTHING, HEIGHT, EPSG)
-    points = feature_map.points
-    local = feature_map.points_local()
-    return replace(
-        feature_map,
-        map_id=map_id,
-        frame=frame,
-        points=replace(points, utm=frame.utm_from_enu(local, EPSG)),
-        placement=replace(feature_map.placement, covariance=np.diag([1e-10] * 4 + [sigma_m**2] * 3)),
-    )
-
-
-def pose_errors(result: LocaliseResult, truth: Rigid3) -> tuple[float, float]:
-    """Metres and degrees, in the frame that the map was made in."""
-    assert result.pose is not None, (result.reason, result.detail)
-    frame = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
-    found = result.pose.cam_from_local @ result.pose.frame.enu_from(frame)
-    return float(np.linalg.norm(found.center - truth.center)), found.angle_to_deg(truth)
 
 
 @pytest.mark.parametrize(
@@ -401,118 +365,3 @@ def test_the_timings_add_up_and_the_inliers_reproject(area: IndexedArea, photo: 
     assert len(gap) == result.inliers
     assert np.median(gap) < 0.5
     assert gap.max() < 3.0
-
-
-def test_threads_share_the_areas(area: IndexedArea, texture: NDArray[np.uint8]) -> None:
-    photos = [render(texture, view(e, -5.0, 42.0, 10.0, 20.0 * e), seed=e) for e in range(6)]
-    requests = [KNOWN if i % 2 else LocaliseRequest() for i in range(6)]
-    serial = [localise(p, r, [area]) for p, r in zip(photos, requests, strict=True)]
-    with ThreadPoolExecutor(3) as pool:
-        parallel = list(pool.map(lambda p, r: localise(p, r, [area]), photos, requests))
-    for one, other in zip(serial, parallel, strict=True):
-        assert one.pose is not None
-        assert other.pose is not None
-        np.testing.assert_array_equal(one.pose.cam_from_local.matrix(), other.pose.cam_from_local.matrix())
-        np.testing.assert_array_equal(one.pose.covariance, other.pose.covariance)
-
-
-def test_a_database_serves_its_active_maps_only(
-    tmp_path: Path, field_map: FeatureMap, photo: NDArray[np.uint8]
-) -> None:
-    """Retired and quarantined maps answer nothing; unchanged areas are taken over; map_ids restrict."""
-    database = Database.create(str(tmp_path / "db"))
-    far = moved(field_map, "far", 3000.0)
-    elsewhere = replace(moved(field.planar_map(5), "elsewhere", -3000.0), status="active")
-    for feature_map in (field_map, elsewhere, moved(far, "held", 6000.0).with_status("quarantined")):
-        database.commit_map(feature_map)
-    first = Localiser.open(database)
-    assert sorted(m.map_id for a in first.areas for m in a.area.maps) == ["elsewhere", "field"]
-    result = first.localise(photo, KNOWN)
-    assert pose_errors(result, POSE)[0] < 0.05
-    assert result.snapshot == first.snapshot
-    assert first.localise(photo, replace(KNOWN, map_ids=("elsewhere",))).pose is None
-    only = first.localise(photo, replace(KNOWN, map_ids=("field",)))
-    assert only.pose is not None
-    assert only.pose.map_ids == ("field",)
-    for wrong in ("nowhere", "held"):
-        with pytest.raises(MapNotFoundError, match=wrong):
-            first.localise(photo, replace(KNOWN, map_ids=(wrong,)))
-
-    database.commit_map(far)
-    second = Localiser.open(database, previous=first)
-    kept = {id(a) for a in first.areas}
-    assert sum(id(a) in kept for a in second.areas) == 2
-    assert len(second.areas) == 3
-    assert second.localise(photo, KNOWN).reason == "AMBIGUOUS"
-    assert first.localise(photo, KNOWN).reason is None  # a snapshot stays as it was
-
-    database.retire("field", "moved away")
-    third = Localiser.open(database, previous=second)
-    assert sorted(m.map_id for a in third.areas for m in a.area.maps) == ["elsewhere", "far"]
-    assert third.localise(photo, KNOWN).pose is not None
-    upright = LocaliseOptions(extractor=ExtractorOptions(upright=True))
-    with pytest.raises(IncompatibleExtractorError, match="start the server"):
-        Localiser.open(database, upright, previous=third).localise(photo, KNOWN)
-
-
-def test_naming_maps_of_an_area_builds_nothing_and_leaves_the_others_out(
-    tmp_path: Path, field_map: FeatureMap, photo: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also with voting over an index of many lists, and for the lenses that maps lend."""
-    database = Database.create(tmp_path / "db")
-    beside = moved(field_map, "beside", 100.0)
-    loose = moved(field_map, "loose", 9000.0).with_status("quarantined")
-    by_gps = replace(loose, placement=replace(loose.placement, method="gps"))
-    for feature_map in (field_map, replace(beside, camera_keys=("its own",)), by_gps):
-        database.commit_map(feature_map)
-    monkeypatch.setattr(descriptor_index, "_EXHAUSTIVE_LIMIT", 1000)
-    options = LocaliseOptions(candidates=CandidateOptions(single_cluster_points=1))
-    localiser = Localiser.open(database, options)
-    (both,) = localiser.areas
-    assert localiser.localise(photo, KNOWN).reason == "AMBIGUOUS"
-    assert localiser.localise(photo, replace(KNOWN, map_ids=("loose",))).pose is not None
-
-    def built(*_: object) -> None:
-        raise AssertionError("something was built for a query")
-
-    monkeypatch.setattr("reloc.localiser.build_area", built)
-    monkeypatch.setattr("reloc.localiser.build_index", built)
-    for named, east_m in (("field", 0.0), ("beside", 100.0), ("loose", 9000.0)):
-        pose = localiser.localise(photo, replace(KNOWN, map_ids=(named,))).pose
-        assert pose is not None
-        assert pose.map_ids == (named,)
-        assert pose.utm[0] == pytest.approx(EASTING + east_m + POSE.center[0], abs=0.1)
-    (one,) = localiser.areas_of(("field",))
-    assert both.area.camera_for_key("its own") is not None
-    assert one.area.camera_for_key("its own") is None
-    assert set(one.area.point_map[one.area.searched_points()]) == {0}
-
-
-def test_a_map_in_quarantine_that_positions_placed_answers_where_it_is_named(
-    tmp_path: Path, field_map: FeatureMap, photo: NDArray[np.uint8]
-) -> None:
-    by_gps = replace(field_map.placement, method="gps")
-    database = Database.create(tmp_path / "db")
-    database.commit_map(replace(field_map, placement=by_gps, status="quarantined"))
-    localiser = Localiser.open(database)
-    assert localiser.localise(photo, KNOWN).reason == "NO_COVERAGE"
-    named = localiser.localise(photo, replace(KNOWN, map_ids=("field",)))
-    assert named.pose is not None
-    assert [entry["map_id"] for entry in named.pose.lineage] == ["field"]
-
-
-def test_a_map_in_quarantine_that_maps_placed_answers_nobody(
-    tmp_path: Path, field_map: FeatureMap, photo: NDArray[np.uint8]
-) -> None:
-    database = Database.create(tmp_path / "db")
-    database.commit_map(field_map)
-    grown = replace(
-        field.planar_map(map_id="grown"),
-        placement=replace(field_map.placement, method="map"),
-        parents=("field",),
-        generation=1,
-        status="quarantined",
-    )
-    database.commit_map(grown)
-    with pytest.raises(MapNotFoundError, match="grown"):
-        Localiser.open(database).localise(photo, replace(KNOWN, map_ids=("grown",)))

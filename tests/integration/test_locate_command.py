@@ -20,7 +20,7 @@ from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from featuredb.video.frames import open_video
 from featuredb.video.writer import VideoWriter
-from reloc.pixels.view import AnsweredView
+from reloc.answered_view import AnsweredView
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPoint
 from reloc.wire.query import LocaliseReply

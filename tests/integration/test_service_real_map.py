@@ -21,8 +21,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.store import Database
 from featuredb.store.candidates.photos import list_candidates
+from reloc.answered_view import AnsweredView
 from reloc.client import CameraRequest, Client, PriorRequest
-from reloc.overlay import project_utm
 from reloc.service.options import ServeOptions
 from reloc.service.serve import serve
 from reloc.wire.query import LocaliseReply
@@ -215,7 +215,7 @@ def test_overlay_projects_the_inliers_onto_their_keypoints(server, database, pho
     reply = LocaliseReply.model_validate_json(json.dumps(reply_json))
     assert run("localise", str(database), *common, str(targets[1])) == 0
     keypoints = np.array(reply.inlier_points.pixels)
-    projected = project_utm(reply, np.array(reply.inlier_points.utm))
+    projected = AnsweredView.of_reply(reply).project_utm(np.array(reply.inlier_points.utm))
     residual = np.linalg.norm(keypoints - projected, axis=1)
     assert len(residual) == reply.inliers
     # The drawing's own projection agrees with the pose estimator's residual.

@@ -14,7 +14,7 @@ from reloc.wire.query import (
     LocaliseReply,
     LocaliseWireRequest,
     RequestError,
-    parse_request,
+    parse_attachment,
 )
 from reloc.wire.server import MapsReply, StatusReply
 from schemas import load_schema
@@ -236,7 +236,7 @@ BAD_REQUESTS = [
 @pytest.mark.parametrize("request_json", GOOD_REQUESTS)
 def test_schema_and_server_take_the_same_requests(request_json):
     validator("localise_request").validate(request_json)
-    parsed = parse_request(json.dumps(request_json).encode())
+    parsed = parse_attachment(LocaliseWireRequest, json.dumps(request_json).encode())
     validator("localise_request").validate(json.loads(parsed.model_dump_json()))
 
 
@@ -244,5 +244,5 @@ def test_schema_and_server_take_the_same_requests(request_json):
 def test_schema_and_server_refuse_the_same_requests(request_json):
     assert not validator("localise_request").is_valid(request_json)
     with pytest.raises(RequestError) as caught:
-        parse_request(json.dumps(request_json).encode())
+        parse_attachment(LocaliseWireRequest, json.dumps(request_json).encode())
     assert caught.value.code == "BAD_REQUEST"

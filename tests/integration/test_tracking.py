@@ -1,7 +1,5 @@
 """A film over the test hills, tracked by the map of a survey; the truth is known."""
 
-import csv
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +12,9 @@ import reloc.tracking.trajectory.files as trajectory_files_module
 from featuredb.cli.main import main
 from featuredb.errors import InvalidValueError, VideoError
 from featuredb.geo.geopose import geopose_from_camera
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.store import Database
 from featuredb.video.film import Video, VideoFrame
-from featuredb.video.frames import open_video
 from featuredb.video.writer import VideoWriter
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.result import LocaliseRequest
@@ -30,19 +26,10 @@ from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.values import EarthPose, TrajectoryPoint
 from tests.support.hill_photos import CAMERA, FRAME, _render
-from tests.support.hill_walk import WEST_M, anchored_database
+from tests.support.hill_walk import anchored_database
 from tests.support.made_once import made_once
-from tests.support.planar_map import field_texture, view
-
-_OPTIONS = TrackOptions(keyframe_every=4, answer_after=4, lost_answer_after=6, catch_up=6, min_matches=20)
-_FRAMES, _CUT = 44, range(20, 24)
-
-
-def pose_at(frame: int) -> Rigid3:
-    """Half a metre and a degree a frame."""
-    return view(
-        WEST_M - 9.0 + 0.4 * frame, -3.0 + 0.1 * frame, 46.0, tilt_deg=8.0, heading_deg=10.0 + 0.7 * frame
-    )
+from tests.support.planar_map import field_texture
+from tests.support.tracked_film import CUT, FRAMES, OPTIONS, pose_at, tracked
 
 
 @pytest.fixture(scope="module")
@@ -58,14 +45,7 @@ def areas(anchored: Path) -> tuple[IndexedArea, ...]:
 @pytest.fixture(scope="module")
 def film() -> list[np.ndarray]:
     texture, other = field_texture(1), field_texture(9)
-    return [_render(other if i in _CUT else texture, pose_at(i), i) for i in range(_FRAMES)]
-
-
-def tracked(
-    areas: tuple[IndexedArea, ...], film: list[np.ndarray], options: TrackOptions = _OPTIONS
-) -> list[TrackedFrame]:
-    with Tracker(MapFinder(areas), CAMERA, options) as tracker:
-        return [tracker.track(gray, i / 30.0) for i, gray in enumerate(film)]
+    return [_render(other if i in CUT else texture, pose_at(i), i) for i in range(FRAMES)]
 
 
 @pytest.fixture(scope="module")
@@ -83,32 +63,32 @@ def test_every_pose_is_right_and_what_is_lost_is_said(
             assert frame.detail
             continue
         true = pose_at(frame.index)
-        assert frame.index not in _CUT
+        assert frame.index not in CUT
         off = frame.cam_from_local.center - area_from_hills.act(true.center)
         assert np.linalg.norm(off) < 0.3, frame.index
         assert (frame.cam_from_local @ area_from_hills).angle_to_deg(true) < 0.3
         assert frame.covariance is not None
-        assert frame.inliers >= _OPTIONS.min_landmarks
+        assert frame.inliers >= OPTIONS.min_landmarks
     states = [frame.state for frame in track]
     # The first answer comes six frames after the first frame, and again six after the first after the cut.
     assert states[:7] == ["lost"] * 6 + ["relocalised"]
     assert states[7:20] == ["tracking"] * 13
     assert states[20:24] == ["lost"] * 4
     found = states.index("relocalised", 20)
-    assert found <= 24 + 2 * (_OPTIONS.lost_answer_after + 1)
-    assert states[found + 1 :] == ["tracking"] * (_FRAMES - found - 1)
+    assert found <= 24 + 2 * (OPTIONS.lost_answer_after + 1)
+    assert states[found + 1 :] == ["tracking"] * (FRAMES - found - 1)
 
 
 def test_a_cut_to_a_look_alike_is_a_loss(areas: tuple[IndexedArea, ...], film: list[np.ndarray]) -> None:
     """A fifth of the picture stays as it was: its landmarks agree with a pose, and are too few to believe."""
     alike = [frame.copy() for frame in film[:24]]
-    for i in _CUT:
+    for i in CUT:
         width = alike[i].shape[1] // 5
         alike[i][:, :width] = _render(field_texture(1), pose_at(i), i)[:, :width]
     track = tracked(areas, alike)
     assert [frame.state for frame in track[7:]] == ["tracking"] * 13 + ["lost"] * 4
     assert "should be in view" in track[20].detail
-    without = tracked(areas, alike, replace(_OPTIONS, least_kept=0.0))
+    without = tracked(areas, alike, replace(OPTIONS, least_kept=0.0))
     assert without[20].state == "tracking"
 
 
@@ -152,7 +132,7 @@ def test_frames_between_a_localised_one_and_its_answer_have_poses_in_the_end(
 ) -> None:
     area_from_hills = areas[0].area.frame.enu_from(FRAME)
     late: dict[int, TrackedFrame] = {}
-    with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
+    with Tracker(MapFinder(areas), CAMERA, OPTIONS) as tracker:
         for i, gray in enumerate(film[:12]):
             tracker.track(gray, i / 30.0)
             late |= {frame.index: frame for frame in tracker.late}
@@ -170,15 +150,15 @@ def test_frames_before_a_localised_one_are_followed_backwards_to_the_cut(
     """Of four frames of elsewhere and twelve of the map the first and the seventh are looked for."""
     area_from_hills = areas[0].area.frame.enu_from(FRAME)
     late: dict[int, TrackedFrame] = {}
-    with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
-        for i, gray in enumerate(film[_CUT.start : _CUT.start + 16]):
+    with Tracker(MapFinder(areas), CAMERA, OPTIONS) as tracker:
+        for i, gray in enumerate(film[CUT.start : CUT.start + 16]):
             tracker.track(gray, i / 30.0)
             late |= {frame.index: frame for frame in tracker.late}
-    assert sorted(late) == list(range(len(_CUT), 12))
+    assert sorted(late) == list(range(len(CUT), 12))
     assert [late[i].state for i in sorted(late)] == ["relocalised", *["tracking"] * 7]
     for i, frame in late.items():
         assert frame.cam_from_local is not None
-        off = frame.cam_from_local.center - area_from_hills.act(pose_at(_CUT.start + i).center)
+        off = frame.cam_from_local.center - area_from_hills.act(pose_at(CUT.start + i).center)
         assert np.linalg.norm(off) < 0.3
 
 
@@ -186,14 +166,14 @@ def test_a_film_that_ends_before_the_answer_has_its_poses(
     areas: tuple[IndexedArea, ...], film: list[np.ndarray]
 ) -> None:
     for count in (1, 4):
-        with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
+        with Tracker(MapFinder(areas), CAMERA, OPTIONS) as tracker:
             now = [tracker.track(gray, i / 30.0).state for i, gray in enumerate(film[:count])]
             late = tracker.finish()
             assert not tracker.finish()
         assert now == ["lost"] * count
         assert [frame.state for frame in late] == ["relocalised", *["tracking"] * (count - 1)]
         assert [frame.index for frame in late] == list(range(count))
-    with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
+    with Tracker(MapFinder(areas), CAMERA, OPTIONS) as tracker:
         for i, gray in enumerate(film[:9]):
             tracker.track(gray, i / 30.0)
         assert not tracker.finish()
@@ -203,12 +183,12 @@ def test_a_found_track_catches_up_a_few_frames_at_a_time(
     areas: tuple[IndexedArea, ...], film: list[np.ndarray]
 ) -> None:
     """No frame waits for all of them, and the poses are those of one that does."""
-    slowly = replace(_OPTIONS, catch_up=3)
+    slowly = replace(OPTIONS, catch_up=3)
     at_once: dict[int, TrackedFrame] = {}
     late: dict[int, TrackedFrame] = {}
     with (
         Tracker(MapFinder(areas), CAMERA, slowly) as slow,
-        Tracker(MapFinder(areas), CAMERA, _OPTIONS) as fast,
+        Tracker(MapFinder(areas), CAMERA, OPTIONS) as fast,
     ):
         for i, gray in enumerate(film[:12]):
             now, then = slow.track(gray, i / 30.0), fast.track(gray, i / 30.0)
@@ -252,7 +232,7 @@ def test_an_answer_is_waited_for_a_little_at_each_frame(
     waits: list[float],
 ) -> None:
     """And not in one gap at the frame at which it is due."""
-    options = replace(_OPTIONS, keyframe_every=10, answer_after=10, few_landmarks=few, live=live)
+    options = replace(OPTIONS, keyframe_every=10, answer_after=10, few_landmarks=few, live=live)
     said: list[float] = []
     monkeypatch.setattr("reloc.tracking.tracker.wait", lambda _, timeout: said.append(timeout))
     with Tracker(MapFinder(areas), CAMERA, options) as tracker:
@@ -270,7 +250,7 @@ def test_searches_in_vain_do_not_count_against_the_track_that_is_found(
     """Three keyframes in a row without the map are a loss, whatever was looked for before."""
     monkeypatch.setattr(MapGround, "match", lambda *_: Unmatched(reason="TOO_FEW_MATCHES", detail="nothing"))
     other = _render(field_texture(9), pose_at(0), 0)
-    track = tracked(areas, [other] * 18 + film[:16], replace(_OPTIONS, catch_up=3))
+    track = tracked(areas, [other] * 18 + film[:16], replace(OPTIONS, catch_up=3))
     # Searches at 0, 6 and 12 are in vain; that of 18 is answered at 24, and caught up with at 26.
     assert [frame.state for frame in track[:27]] == ["lost"] * 26 + ["relocalised"]
     assert [frame.state for frame in track[27:]] == ["tracking"] * 7
@@ -282,7 +262,7 @@ def test_pictures_that_come_slowly_are_each_looked_for(
     """Flow does not bridge them; each is found before the next but one comes."""
     rows = list(range(0, 20, 5))
     found: dict[int, TrackedFrame] = {}
-    with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
+    with Tracker(MapFinder(areas), CAMERA, OPTIONS) as tracker:
         for i, row in enumerate(rows):
             now = tracker.track(film[row], 2.0 * i)
             found |= {frame.index: frame for frame in (*tracker.late, now) if frame.cam_from_local}
@@ -316,7 +296,7 @@ def test_where_the_film_begins_says_nothing_after_a_loss(
         return real(self, gray, request, options)
 
     monkeypatch.setattr(MapFinder, "find", noted)
-    with Tracker(MapFinder(areas), CAMERA, _OPTIONS, LocaliseRequest(prior=prior)) as tracker:
+    with Tracker(MapFinder(areas), CAMERA, OPTIONS, LocaliseRequest(prior=prior)) as tracker:
         for i, gray in enumerate(film[:32]):
             tracker.track(gray, i / 30.0)
     assert asked[0] is prior
@@ -407,91 +387,3 @@ def folder(anchored: Path, film: list[np.ndarray], tmp_path_factory: pytest.Temp
         for gray in film:
             writer.write(gray)
     return folder
-
-
-_LENS = f"{CAMERA.model},{CAMERA.width},{CAMERA.height},{','.join(map(str, CAMERA.params))}"
-
-
-def test_the_command_tracks_a_film(
-    anchored: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files = [tmp_path / f"out/track.{kind}" for kind in ("csv", "tum", "geojson", "kml", "json", "srt")]
-    outs = [text for file in files for text in ("--out", str(file))]
-    overlay = tmp_path / "overlay.mp4"
-    drawn_to = ["--overlay", str(overlay)]
-    code = main(
-        ["track", str(anchored), str(folder / "film.mp4"), *outs, "--camera", _LENS, "--json", *drawn_to]
-    )
-    summary = json.loads(capsys.readouterr().out)
-    assert code == 0
-    assert summary["frames"] == _FRAMES
-    assert summary["written"] == [*map(str, files), str(overlay)]
-    rows = list(csv.DictReader(files[0].read_text().splitlines()))
-    assert len(rows) == _FRAMES
-    states = [row["state"] for row in rows]
-    # The default settings have a keyframe every twelfth frame: the film of elsewhere is lost, what is between
-    # a localised frame and its answer is not.
-    assert states[:20] == ["relocalised", *["tracking"] * 19]
-    assert states[20:24] == ["lost"] * 4
-    assert summary["lost"] == states.count("lost")
-    for row in rows:
-        if row["state"] == "lost":
-            assert row["detail"]
-            continue
-        utm = [float(row[name]) for name in ("easting", "northing", "height")]
-        true = FRAME.utm_from_enu(pose_at(int(row["frame"])).center, int(row["epsg"]))
-        assert np.linalg.norm(np.array(utm) - true) < 0.3, row["frame"]
-    with open_video(overlay) as drawn:
-        assert sum(1 for _ in drawn) == _FRAMES
-
-
-def test_a_film_of_elsewhere_gives_a_table_of_reasons(
-    anchored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = field_texture(9)
-    with VideoWriter(tmp_path / "film.mp4", width=CAMERA.width, height=CAMERA.height, fps=30.0) as writer:
-        for i in range(10):
-            writer.write(_render(other, pose_at(i), i))
-    out = ["--out", str(tmp_path / "t.csv"), "--out", str(tmp_path / "t.kml")]
-    assert main(["track", str(anchored), str(tmp_path / "film.mp4"), *out]) == 1
-    said = capsys.readouterr().out
-    assert "10 frames, 0 tracked, 0 relocalised, 10 lost" in said
-    assert {row["state"] for row in csv.DictReader((tmp_path / "t.csv").read_text().splitlines())} == {"lost"}
-    assert not (tmp_path / "t.kml").exists()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (["--out", "t.txt"], "expected a name that ends in .csv"),
-        (["--out", "t.csv", "--camera", "PINHOLE,640"], "--camera: expected MODEL,WIDTH,HEIGHT"),
-        (["--out", "t.csv", "--camera", "PINHOLE,640,640,600,600,320,320"], "differ in aspect ratio"),
-        (["--out", "t.csv", "--prior", "north"], "--prior: expected LAT,LON,SIGMA_M"),
-        (["--out", "t.csv", "--start", "60"], "no frames"),
-        (["--out", "t.csv", "--map", "nobody"], "nobody"),
-    ],
-)
-def test_bad_requests_say_what_is_wrong_and_write_nothing(
-    change: list[str],
-    message: str,
-    anchored: Path,
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    overlay = ["--overlay", "o.mp4"]
-    assert main(["track", str(anchored), str(folder / "film.mp4"), *change, *overlay]) not in (0, 1)
-    assert message in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_broken_film_says_so_and_writes_nothing(
-    anchored: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    broken = tmp_path / "broken.mp4"
-    broken.write_bytes((folder / "film.mp4").read_bytes()[:2000])
-    assert main(["track", str(anchored), str(broken), "--out", str(tmp_path / "t.csv")]) == 2
-    assert "broken.mp4" in capsys.readouterr().err
-    assert [f.name for f in tmp_path.iterdir()] == ["broken.mp4"]

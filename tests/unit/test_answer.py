@@ -10,10 +10,10 @@ from featuredb.geometry.rotation import matrix_from_quaternion, so3_log
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
-from reloc.localise.answer import error_radius, make_answer
+from reloc.localise.answer import make_answer
 from reloc.localise.lens_prior import lens_of, with_lens
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
-from reloc.localise.result import LocalisedPose
+from reloc.localise.result import LocalisedPose, error_radius
 from tests.support.scenes import EPSG, box_points, looking_at, random_descriptors, ring, scene_map
 
 POSE = looking_at(np.array([38.0, 22.0, 33.0]), np.array([0.0, 0.0, 3.0]))

@@ -1,9 +1,7 @@
 """Placement by GPS: known similarities, honest covariance, and every gate."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,37 +11,19 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation, so3_exp
-from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from ingest.own_frame import held_of
-from ingest.placed_models import placement_evidence
-from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.register.gps import GpsPlacement, place_by_gps
 from ingest.register.position_noise import Held
-
-_OPTIONS = GpsOptions()
-_TRUE = Sim3(scale=8.5, rotation=so3_exp([0.3, -0.2, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
-
-
-def _flight(count: int, seed: int = 0) -> FloatArray:
-    """Positions in the local frame: a block of some 100 m by 80 m, heights varying by metres."""
-    rng = np.random.default_rng(seed)
-    return np.column_stack(
-        [rng.uniform(-50, 50, count), rng.uniform(-40, 40, count), rng.normal(50, 3, count)]
-    )
-
-
-def _place(
-    positions: FloatArray, noise: FloatArray, sigmas: FloatArray, options: GpsOptions = _OPTIONS
-) -> GpsPlacement:
-    return place_by_gps(_TRUE.inverse().act(positions), positions + noise, sigmas, options)
+from tests.support.gps_flights import OPTIONS, TRUE, flight, place
 
 
 def test_exact_positions_give_the_exact_similarity() -> None:
-    positions = _flight(12)
-    placed = _place(positions, np.zeros((12, 3)), np.full((12, 3), 2.0))
+    positions = flight(12)
+    placed = place(positions, np.zeros((12, 3)), np.full((12, 3), 2.0))
     assert placed.reason is None
     assert placed.local_from_sfm is not None
-    error = (placed.local_from_sfm @ _TRUE.inverse()).log()
+    error = (placed.local_from_sfm @ TRUE.inverse()).log()
     assert np.abs(error).max() < 1e-8
     assert placed.residual_rms_m < 1e-8
 
@@ -51,16 +31,16 @@ def test_exact_positions_give_the_exact_similarity() -> None:
 def test_sigmas_weigh_the_positions() -> None:
     """Heights that are poor by tens of metres must not tilt the map: the answer is weighted least squares."""
     rng = np.random.default_rng(3)
-    positions, sigmas = _flight(40), np.tile([0.5, 0.5, 10.0], (40, 1))
+    positions, sigmas = flight(40), np.tile([0.5, 0.5, 10.0], (40, 1))
     noise = rng.normal(0, 1, (40, 3)) * sigmas
-    placed = _place(positions, noise, sigmas)
+    placed = place(positions, noise, sigmas)
     assert placed.local_from_sfm is not None
-    shift = placed.local_from_sfm.act(_TRUE.inverse().act(positions)) - positions
+    shift = placed.local_from_sfm.act(TRUE.inverse().act(positions)) - positions
     assert np.abs(shift[:, :2].mean(axis=0)).max() < 3.5 * 0.5 / np.sqrt(40)
     # The unweighted fit lets the poor heights into the horizontal: it must be the worse one.
-    plain = similarity_closed_form(_TRUE.inverse().act(positions), positions + noise)
+    plain = similarity_closed_form(TRUE.inverse().act(positions), positions + noise)
     assert plain is not None
-    plain_shift = plain.act(_TRUE.inverse().act(positions)) - positions
+    plain_shift = plain.act(TRUE.inverse().act(positions)) - positions
     assert (shift[:, :2] ** 2).sum() < (plain_shift[:, :2] ** 2).sum()
 
 
@@ -69,10 +49,10 @@ def _scores(noise: Callable[[np.random.Generator], FloatArray], draws: int, coun
     scores = []
     for draw in range(draws):
         rng = np.random.default_rng((draw, count))
-        placed = _place(_flight(count, seed=draw), noise(rng), np.tile([4.0, 4.0, 10.0], (count, 1)))
+        placed = place(flight(count, seed=draw), noise(rng), np.tile([4.0, 4.0, 10.0], (count, 1)))
         assert placed.local_from_sfm is not None
         assert placed.covariance is not None
-        error = (_TRUE @ placed.local_from_sfm.inverse()).log()
+        error = (TRUE @ placed.local_from_sfm.inverse()).log()
         scores.append(float(error @ np.linalg.solve(placed.covariance, error)))
     return np.array(scores)
 
@@ -103,11 +83,11 @@ def test_shared_error_shows_in_the_covariance_not_in_the_residuals() -> None:
     rng = np.random.default_rng(7)
     sigmas = np.tile([3.0, 3.0, 6.0], (20, 1))
     bias = np.array([2.5, -1.5, 5.0])
-    placed = _place(_flight(20), bias + rng.normal(0, 0.1, (20, 3)), sigmas)
+    placed = place(flight(20), bias + rng.normal(0, 0.1, (20, 3)), sigmas)
     assert placed.local_from_sfm is not None
     assert placed.covariance is not None
     assert placed.residual_rms_m < 0.3
-    error = (_TRUE @ placed.local_from_sfm.inverse()).log()
+    error = (TRUE @ placed.local_from_sfm.inverse()).log()
     np.testing.assert_allclose(error[4:], -bias, atol=0.3)
     np.testing.assert_allclose(np.sqrt(np.diag(placed.covariance)[4:]), [3.0, 3.0, 6.0], rtol=0.05)
     # Scale and rotation are as good as the small noise: 0.1 m of noise over 100 m of flight.
@@ -117,19 +97,19 @@ def test_shared_error_shows_in_the_covariance_not_in_the_residuals() -> None:
 
 def test_outliers_are_found_and_left_out() -> None:
     rng = np.random.default_rng(9)
-    positions, sigmas = _flight(20), np.full((20, 3), 1.0)
+    positions, sigmas = flight(20), np.full((20, 3), 1.0)
     noise = rng.normal(0, 0.5, (20, 3))
     noise[[4, 11, 17]] += np.array([[40.0, 0, 0], [0, -60.0, 10], [0, 0, 30.0]])
-    placed = _place(positions, noise, sigmas)
+    placed = place(positions, noise, sigmas)
     assert placed.reason is None
     assert np.flatnonzero(~placed.inliers).tolist() == [4, 11, 17]
     assert placed.local_from_sfm is not None
-    shift = placed.local_from_sfm.act(_TRUE.inverse().act(positions)) - positions
+    shift = placed.local_from_sfm.act(TRUE.inverse().act(positions)) - positions
     assert np.abs(shift).max() < 1.0
 
 
 def test_two_photos_are_too_few() -> None:
-    placed = _place(_flight(2), np.zeros((2, 3)), np.ones((2, 3)))
+    placed = place(flight(2), np.zeros((2, 3)), np.ones((2, 3)))
     assert placed.reason == "TOO_FEW"
     assert placed.local_from_sfm is None
     assert "2 registered photos" in placed.message
@@ -140,7 +120,7 @@ def test_a_line_of_photos_does_not_answer(across_m: float, reason: str | None) -
     """Little or nothing tells the turn about the line."""
     rng = np.random.default_rng(1)
     positions = np.outer(np.linspace(-60, 60, 12), [0.8, 0.6, 0.0]) + rng.normal(0, 1, (12, 3)) * across_m
-    placed = _place(positions, rng.normal(0, 0.5, (12, 3)), np.full((12, 3), 1.0))
+    placed = place(positions, rng.normal(0, 0.5, (12, 3)), np.full((12, 3), 1.0))
     assert placed.reason == reason
     assert "along a line" in (placed.provisional if reason is None else placed.message)
     assert placed.covariance is not None
@@ -163,37 +143,37 @@ def test_a_line_of_photos_that_are_held_level_has_a_place(seed: int) -> None:
         across /= np.linalg.norm(across)
         roll = so3_exp([0.0, 0.0, rng.normal(0, np.radians(2.0))])
         local = roll @ np.stack([across, np.cross(view, across), view])
-        held.append(Rigid3(rotation=nearest_rotation(local @ _TRUE.rotation), translation=np.zeros(3)))
+        held.append(Rigid3(rotation=nearest_rotation(local @ TRUE.rotation), translation=np.zeros(3)))
     noise, sigmas = rng.normal(0, 0.5, (12, 3)), np.tile([4.0, 4.0, 10.0], (12, 1))
     placed = place_by_gps(
-        _TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, held=held_of(held)
+        TRUE.inverse().act(positions), positions + noise, sigmas, OPTIONS, held=held_of(held)
     )
     assert placed.reason is None
     assert "no camera angles" in placed.provisional  # nothing has measured that they are level
     assert placed.local_from_sfm is not None
     assert placed.covariance is not None
-    error = (_TRUE @ placed.local_from_sfm.inverse()).log()
+    error = (TRUE @ placed.local_from_sfm.inverse()).log()
     assert np.degrees(np.abs(error[1:4]).max()) < 5.0
     assert float(error @ np.linalg.solve(placed.covariance, error)) < chi2.ppf(0.999, 7)
 
 
 def test_pictures_that_are_stored_upside_down_do_not_turn_a_flight_over() -> None:
     rng = np.random.default_rng(3)
-    positions = _flight(20)
+    positions = flight(20)
     held = []
     for heading in rng.uniform(0, 2 * np.pi, 20):
         across = np.array([np.sin(heading), -np.cos(heading), 0.0])
         view = np.array([0.5 * np.cos(heading), 0.5 * np.sin(heading), -np.sqrt(0.75)])
         local = np.stack([across, np.cross(view, across), view])
-        held.append(Rigid3(rotation=nearest_rotation(local @ _TRUE.rotation), translation=np.zeros(3)))
+        held.append(Rigid3(rotation=nearest_rotation(local @ TRUE.rotation), translation=np.zeros(3)))
     level = held_of(held)
     assert level is not None
     level = replace(level, down=-level.down)
     noise, sigmas = rng.normal(0, 1.0, (20, 3)), np.tile([4.0, 4.0, 10.0], (20, 1))
-    placed = place_by_gps(_TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, held=level)
+    placed = place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas, OPTIONS, held=level)
     assert placed.reason is None
     assert placed.local_from_sfm is not None
-    assert np.degrees(np.abs((_TRUE @ placed.local_from_sfm.inverse()).log()[1:4]).max()) < 5.0
+    assert np.degrees(np.abs((TRUE @ placed.local_from_sfm.inverse()).log()[1:4]).max()) < 5.0
 
 
 def _told(
@@ -213,7 +193,7 @@ def _told(
     told: list[CameraAngles | None] = []
     for k in range(len(local)):
         cam = so3_exp(rng.normal(0, np.radians(1.3), 3)) @ cam_from_enu(yaw_deg, pitch_deg, 0.0)
-        held.append(Rigid3(rotation=nearest_rotation(cam @ _TRUE.rotation), translation=np.zeros(3)))
+        held.append(Rigid3(rotation=nearest_rotation(cam @ TRUE.rotation), translation=np.zeros(3)))
         told.append(
             CameraAngles(
                 yaw_deg=yaw_deg + (180.0 if k < flips * len(local) else 0.0),
@@ -233,12 +213,12 @@ def _strip(count: int = 12) -> FloatArray:
 def _placed_by(positions: FloatArray, held: Held | None) -> GpsPlacement:
     noise = np.random.default_rng(3).normal(0, 0.5, positions.shape)
     sigmas = np.tile([4.0, 4.0, 10.0], (len(positions), 1))
-    return place_by_gps(_TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, held=held)
+    return place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas, OPTIONS, held=held)
 
 
 def _turn_deg(placed: GpsPlacement) -> float:
     assert placed.local_from_sfm is not None
-    return float(np.degrees(np.linalg.norm((_TRUE @ placed.local_from_sfm.inverse()).log()[1:4])))
+    return float(np.degrees(np.linalg.norm((TRUE @ placed.local_from_sfm.inverse()).log()[1:4])))
 
 
 @pytest.mark.parametrize("yaw_deg", [30.0, 143.0, 250.0])
@@ -259,7 +239,7 @@ def test_a_strip_whose_photos_look_across_waits_without_angles() -> None:
     assert placed.figures["turn_sigma_deg"] > 10.0
 
 
-@pytest.mark.parametrize("positions", [_strip(), _flight(20)], ids=["strip", "block"])
+@pytest.mark.parametrize("positions", [_strip(), flight(20)], ids=["strip", "block"])
 def test_yaws_off_by_180_degrees_in_all_photos_are_said_and_drag_nothing(positions: FloatArray) -> None:
     held, told = _told(positions, flips=1.0)
     placed = _placed_by(positions, held_of(held, told))
@@ -271,7 +251,7 @@ def test_yaws_off_by_180_degrees_in_all_photos_are_said_and_drag_nothing(positio
 
 
 def test_tilts_off_by_180_degrees_turn_no_flight_over() -> None:
-    positions = _flight(20)
+    positions = flight(20)
     held, told = _told(positions, off_deg=180.0)
     placed = _placed_by(positions, held_of(held, told))
     assert placed.reason is None
@@ -280,7 +260,7 @@ def test_tilts_off_by_180_degrees_turn_no_flight_over() -> None:
 
 
 def test_a_third_of_yaws_off_by_180_degrees_drags_nothing() -> None:
-    positions = _flight(20)
+    positions = flight(20)
     held, told = _told(positions, flips=0.34)
     placed = _placed_by(positions, held_of(held, told))
     assert placed.message == "placed by GPS"
@@ -289,7 +269,7 @@ def test_a_third_of_yaws_off_by_180_degrees_drags_nothing() -> None:
 
 def test_a_compass_tells_the_heading_of_a_small_flight() -> None:
     """Photos within four metres, positions noisy by half a metre; they look at the horizon."""
-    positions = _flight(12) * 0.04
+    positions = flight(12) * 0.04
     held, told = _told(positions, pitch_deg=-5.0)
     compass = [
         CameraAngles(yaw_deg=one.yaw_deg, pitch_deg=None, sigma_yaw_deg=5.0, sigma_tilt_deg=180.0)
@@ -313,7 +293,7 @@ def test_positions_that_are_late_say_by_how_much() -> None:
     speed = np.gradient(positions, times, axis=0)
     late = positions - 2.0 * speed + rng.normal(0, 0.3, positions.shape)
     sigmas = np.tile([4.0, 4.0, 10.0], (len(plan), 1))
-    placed = place_by_gps(_TRUE.inverse().act(positions), late, sigmas, _OPTIONS, times)
+    placed = place_by_gps(TRUE.inverse().act(positions), late, sigmas, OPTIONS, times)
     assert placed.reason is None
     assert placed.figures["lag_s"] == pytest.approx(2.0, abs=0.3)
 
@@ -321,110 +301,6 @@ def test_positions_that_are_late_say_by_how_much() -> None:
 def test_a_wide_strip_is_no_line() -> None:
     rng = np.random.default_rng(1)
     positions = np.outer(np.linspace(-60, 60, 12), [0.8, 0.6, 0.0]) + rng.normal(0, 6, (12, 3))
-    placed = _place(positions, rng.normal(0, 0.5, (12, 3)), np.full((12, 3), 1.0))
+    placed = place(positions, rng.normal(0, 0.5, (12, 3)), np.full((12, 3), 1.0))
     assert placed.reason is None
     assert placed.provisional == ""
-
-
-def test_positions_at_one_place_are_refused() -> None:
-    placed = place_by_gps(_flight(6), np.zeros((6, 3)), np.ones((6, 3)), _OPTIONS)
-    assert placed.reason == "DEGENERATE_LINE"
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_positions_of_other_photos_are_refused(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    positions = _flight(25)
-    placed = place_by_gps(
-        _TRUE.inverse().act(positions),
-        positions[rng.permutation(25)],
-        np.tile([4.0, 4.0, 10.0], (25, 1)),
-        _OPTIONS,
-    )
-    assert placed.reason == "RESIDUALS"
-    assert "other photos" in placed.message
-
-
-def test_positions_drawn_by_chance_let_no_map_answer() -> None:
-    for seed in range(20):
-        rng = np.random.default_rng((seed, 5))
-        count = int(rng.integers(3, 9))
-        drawn = np.column_stack([rng.uniform(-500, 500, (count, 2)), rng.uniform(0, 100, count)])
-        placed = place_by_gps(
-            _TRUE.inverse().act(_flight(count, seed)), drawn, np.tile([4.0, 4.0, 10.0], (count, 1)), _OPTIONS
-        )
-        assert placed.reason is not None or placed.provisional
-
-
-def test_three_positions_are_too_few_to_answer_by() -> None:
-    """They always agree with some similarity; nothing is left to check it by."""
-    positions = np.array([[0.0, 0, 0], [60, 0, 0], [0, 55, 0]])
-    noise = np.random.default_rng(4).normal(0, 1, (3, 3))
-    placed = _place(positions, noise, np.full((3, 3), 2.0))
-    assert placed.reason is None
-    assert "too few" in placed.provisional
-
-
-def test_a_flight_that_is_smaller_than_its_noise_is_refused() -> None:
-    positions = _flight(12) * 0.1
-    noise = np.random.default_rng(4).normal(0, 1, (12, 3)) * 3.0
-    assert _place(positions, noise, np.full((12, 3), 3.0)).reason is not None
-
-
-def test_positions_without_heights_place_a_map() -> None:
-    rng = np.random.default_rng(6)
-    positions = _flight(20) + np.column_stack([np.zeros((20, 2)), np.linspace(-20, 20, 20)])
-    noisy = positions + rng.normal(0, 1, (20, 3))
-    noisy[:, 2] = 0.0
-    sigmas = np.tile([2.0, 2.0, np.inf], (20, 1))
-    placed = place_by_gps(_TRUE.inverse().act(positions), noisy, sigmas, _OPTIONS)
-    assert placed.reason is None
-    assert placed.local_from_sfm is not None
-    assert placed.covariance is not None
-    error = (_TRUE @ placed.local_from_sfm.inverse()).log()
-    assert abs(error[0]) < 0.1
-    assert np.sqrt(placed.covariance[6, 6]) > 1000.0  # nobody knows the height
-    evidence = placement_evidence(placed, [SimpleNamespace(name=f"{k}.jpg") for k in range(20)])
-    json.dumps(evidence, allow_nan=False)  # a map keeps it
-    assert evidence["residuals_enu_m"]["0.jpg"][2] is None
-
-
-def test_a_refusal_without_heights_names_none() -> None:
-    rng = np.random.default_rng(1)
-    positions = _flight(25)
-    sigmas = np.tile([4.0, 4.0, np.inf], (25, 1))
-    centers = _TRUE.inverse().act(positions)
-    placed = place_by_gps(centers, positions[rng.permutation(25)] * [9.0, 9.0, 0.0], sigmas, _OPTIONS)
-    assert placed.reason == "RESIDUALS"
-    assert "in height" not in placed.message
-    assert placed.figures["rms_vertical_m"] is None
-
-
-def test_many_positions_are_thinned_and_all_are_judged() -> None:
-    rng = np.random.default_rng(10)
-    positions = _flight(900)
-    noise = rng.normal(0, 1, (900, 3))
-    noise[[3, 700, 701]] += 200.0
-    placed = _place(positions, noise, np.full((900, 3), 2.0))
-    assert placed.reason is None
-    assert not placed.inliers[[3, 700, 701]].any()
-    assert placed.inliers.sum() >= 890
-
-
-def test_the_same_input_gives_the_same_answer() -> None:
-    positions = _flight(60)
-    noise = np.random.default_rng(8).normal(0, 1, (60, 3))
-    a, b = (_place(positions, noise, np.ones((60, 3))) for _ in range(2))
-    assert a.local_from_sfm is not None
-    assert b.local_from_sfm is not None
-    np.testing.assert_array_equal(a.local_from_sfm.matrix(), b.local_from_sfm.matrix())
-
-
-def test_a_steady_height_hides_no_bias_behind_an_unsteady_position() -> None:
-    """Heights off by 5 m and steady to 0.1 m beside positions with all their error in the noise."""
-    rng = np.random.default_rng(3)
-    sigmas = np.tile([1.5, 1.5, 5.0], (40, 1))
-    noise = rng.normal(0, 1, (40, 3)) * [1.5, 1.5, 0.1] + [0.0, 0.0, 5.0]
-    placed = _place(_flight(40), noise, sigmas)
-    assert placed.covariance is not None
-    assert np.sqrt(placed.covariance[6, 6]) == pytest.approx(5.0, rel=0.03)

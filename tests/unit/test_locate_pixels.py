@@ -14,11 +14,11 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
+from reloc.answered_view import AnsweredView
 from reloc.pixels.boxes import geojson, read_coco
 from reloc.pixels.locate import locate
 from reloc.pixels.patch import fit_patch
 from reloc.pixels.surfaces import MapSurface, ScanSurface, resampled, window_camera
-from reloc.pixels.view import AnsweredView
 from tests.support.scanned_map import EPSG, FRAME
 
 LENS = Camera(

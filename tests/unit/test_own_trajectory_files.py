@@ -15,6 +15,7 @@ from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.maps.unplaced_map import OwnFrame
 from featuredb.store import Database
 from ingest.track.finders import FilmGround, finder_for
+from reloc.localise.result import OwnPose
 from reloc.tracking.film_overlay import _words
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
@@ -22,7 +23,7 @@ from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.trajectory.files import CSV_COLUMNS, write_trajectory
 from reloc.tracking.trajectory.outputs import check_outputs_in_map, exit_code, write_outputs
 from reloc.tracking.trajectory.read import read_trajectory_csv
-from reloc.tracking.trajectory.values import OwnPose, Trajectory, TrajectoryPoint, point_of
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 from tests.support.maps import random_unplaced_map
 from tests.support.planar_map import view
 

@@ -13,13 +13,13 @@ from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from reloc.localise.result import REASONS
 from reloc.reply import reply_from_result
-from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
 from reloc.service.queueing import QueryQueue
 from reloc.service.session import bind_free_port
-from reloc.service.threads import capped_process
+from reloc.service.tally import Tally
+from reloc.service.workers.answering import capped_process
 from reloc.wire.keys import Keys
-from reloc.wire.query import ContributionReply, RequestError, encode, parse_request
+from reloc.wire.query import ContributionReply, LocaliseWireRequest, RequestError, encode, parse_attachment
 from reloc.wording import ADVICE, describe
 from tests.support.service import localised, not_localised
 
@@ -94,14 +94,13 @@ def test_stages_sum_to_the_total_and_to_the_wall_time():
 
 
 def test_percentiles_of_the_latency():
-    metrics = ServerMetrics()
+    tally = Tally()
+    assert tally.latency(50) == {"count": 0, "p50": None, "max": None}
     for ms in range(1, 101):
-        metrics.answered(None if ms % 2 else "AMBIGUOUS", float(ms))
-    latency = metrics.latency()
-    assert (latency.count, latency.p50, latency.max) == (100, 50.5, 100.0)
-    assert latency.p90 == pytest.approx(90.1)
-    counts = metrics.counts()
-    assert (counts.localised, counts.not_localised) == (50, {"AMBIGUOUS": 50})
+        tally.add("not_localised", "TOO_FEW_MATCHES" if ms % 2 else "AMBIGUOUS", float(ms))
+    assert tally.latency(50, 90) == {"count": 100, "p50": 50.5, "p90": 90.1, "max": 100.0}
+    assert list(tally.by_code("not_localised").items()) == [("AMBIGUOUS", 50), ("TOO_FEW_MATCHES", 50)]
+    assert (tally.count("not_localised"), tally.count("error")) == (100, 0)
 
 
 def test_threads_are_capped_within_the_block_and_restored_after_it():
@@ -150,8 +149,10 @@ def test_a_reply_keeps_every_digit_of_the_pose():
 
 
 def test_no_attachment_means_all_defaults():
-    request = parse_request(None)
-    assert request == parse_request(b"") == parse_request(b"{}")
+    request = parse_attachment(LocaliseWireRequest, None)
+    assert (
+        request == parse_attachment(LocaliseWireRequest, b"") == parse_attachment(LocaliseWireRequest, b"{}")
+    )
     assert request.prior is None
     assert not request.options.inliers
 

@@ -18,7 +18,7 @@ _ANSWER = {
 
 
 class DatabaseInbox:
-    """See `reloc.service.contributions.inbox.InboxStore`."""
+    """Where contributions go; the methods may take seconds."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

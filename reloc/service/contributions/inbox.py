@@ -11,10 +11,11 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from featuredb.store.candidates.photos import InboxCounts
 from featuredb.store.candidates.states import Contribution
+from reloc.service.contributions.database_inbox import DatabaseInbox
+from reloc.service.logs import fields
 from reloc.wire.query import ContributionReason
 from reloc.wire.server import ContributionStatus
 
@@ -56,18 +57,6 @@ class InboxRefusal:
     detail: str
 
 
-class InboxStore(Protocol):
-    """Where contributions go; the methods may take seconds and raise FeatureDbError."""
-
-    def write(self, contributions: list[Contribution]) -> None:
-        """Store them all."""
-        ...
-
-    def counts(self) -> InboxCounts:
-        """How much is stored."""
-        ...
-
-
 class Ticket:
     """A place in the queue; either `submit` or `cancel` must be called, once."""
 
@@ -90,7 +79,7 @@ class Ticket:
 class Inbox:
     """Takes photos from the workers; they share it."""
 
-    def __init__(self, store: InboxStore, options: InboxOptions | None = None) -> None:
+    def __init__(self, store: DatabaseInbox, options: InboxOptions | None = None) -> None:
         self._store = store
         self._options = options or InboxOptions()
         self._changed = threading.Condition()
@@ -121,10 +110,7 @@ class Inbox:
         self._thread.join(timeout_s)
         with self._changed:
             if self._queue:
-                logger.error(
-                    "contributions lost: the server stopped before the store took them",
-                    extra={"fields": {"event": "contributions_lost", "count": len(self._queue)}},
-                )
+                _lost(len(self._queue), "the server stopped before the store took them")
 
     def reserve(self, owner: str, size: int) -> Ticket | InboxRefusal:
         """A place for a photo of `size` bytes, or why there is none. Returns at once."""
@@ -241,9 +227,7 @@ class Inbox:
                 self._store.write(contributions)
             except Exception as error:
                 # A store may break in many ways; the thread must live on, or photos would be lost for ever.
-                logger.warning(
-                    "inbox: a write failed", exc_info=True, extra={"fields": {"event": "inbox_failed"}}
-                )
+                logger.warning("inbox: a write failed", exc_info=True, extra=fields("inbox_failed"))
                 with self._changed:
                     self._error = f"{type(error).__name__}: {error}"
                 if pause_s is None or self._stop.wait(pause_s):
@@ -252,10 +236,7 @@ class Inbox:
                 with self._changed:
                     self._error = None
                 return True
-        logger.error(
-            "contributions lost: the store does not take them",
-            extra={"fields": {"event": "contributions_lost", "count": len(contributions)}},
-        )
+        _lost(len(contributions), "the store does not take them")
         return False
 
     def _refresh_if_old(self) -> None:
@@ -272,9 +253,7 @@ class Inbox:
             counts, error = self._store.counts(), None
         except Exception as failure:  # as for a write
             counts, error = None, f"{type(failure).__name__}: {failure}"
-            logger.warning(
-                "inbox: cannot be counted", exc_info=True, extra={"fields": {"event": "inbox_failed"}}
-            )
+            logger.warning("inbox: cannot be counted", exc_info=True, extra=fields("inbox_failed"))
         with self._changed:
             self._counts = counts or self._counts
             self._error = error
@@ -287,5 +266,9 @@ def _made(make: Callable[[], Contribution]) -> Contribution | None:
     try:
         return make()
     except Exception:
-        logger.exception("contribution lost", extra={"fields": {"event": "contributions_lost", "count": 1}})
+        logger.exception("contribution lost", extra=fields("contributions_lost", count=1))
         return None
+
+
+def _lost(count: int, why: str) -> None:
+    logger.error("contributions lost: %s", why, extra=fields("contributions_lost", count=count))

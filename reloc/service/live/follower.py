@@ -8,7 +8,8 @@ from typing import Self
 from featuredb.stage_clock import StageClock
 from reloc.service.live.frames import FrameAnswerer, FrameAsk
 from reloc.service.live.latest import Arrival
-from reloc.service.workers.answering import WorkerLimits
+from reloc.service.logs import fields
+from reloc.service.options import ServeOptions
 from reloc.service.workers.area_files import LocaliserFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
 from reloc.wire.query import ErrorCode, RequestError, parse_attachment
@@ -43,19 +44,17 @@ class Follower:
     def __init__(
         self,
         answerer: FrameAnswerer,
-        *,
-        limits: WorkerLimits,
-        frame_s: float,
-        max_bytes: int,
+        options: ServeOptions,
         files: Callable[[], LocaliserFiles],
     ) -> None:
         """
         Args:
-            limits: of one frame. frame_s: the longest that the process is at one. max_bytes: of one.
+            options: of the server; a frame has the limits of a query.
             files: the area in service, which may be another one from frame to frame.
         """
-        self._answerer, self._limits = answerer, limits
-        self._frame_s, self._max_bytes, self._files = frame_s, max_bytes, files
+        self._answerer, self._files = answerer, files
+        self._limits, self._frame_s = options.worker_limits, options.work_s
+        self._max_bytes = options.live.limits.max_bytes
         self._process: WorkerProcess | None = None
         self._last: TrackFrame | None = None  # whose header was in order
         self._last_time_s: float | None = None  # of the last frame that was tracked
@@ -108,7 +107,7 @@ class Follower:
         except (WorkerEndedError, WorkerDefectError) as error:
             self._close()
             self._check_not_stopped(error)
-            logger.exception("a frame failed", extra={"fields": {"event": "frame_failed"}})
+            logger.exception("a frame failed", extra=fields("frame_failed"))
             code, why = self._failure(error)
             raise FrameError(code, why, header.sequence) from error
         self._last_time_s = header.time_s

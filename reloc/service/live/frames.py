@@ -12,10 +12,11 @@ from featuredb.features.decode import decode_gray
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from featuredb.video.film import fitted_size
+from reloc.answered_view import camera_of
 from reloc.localise.result import LocaliseRequest
+from reloc.localiser import Localiser
 from reloc.service.handler import geo_prior
 from reloc.service.live.options import LiveOptions
-from reloc.service.source import LocaliserLike
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.pose_message import pose_message
 from reloc.tracking.tracker import Tracker
@@ -54,11 +55,11 @@ class FrameAnswerer:
         self._camera = None if request.camera is None else _camera(request.camera)
         prior = None if request.prior is None else geo_prior(request.prior)
         self._request = LocaliseRequest(prior=prior)
-        self._localiser: LocaliserLike | None = None
+        self._localiser: Localiser | None = None
         self._tracker: Tracker | None = None
         self._size: tuple[int, int] | None = None
 
-    def answer(self, ask: FrameAsk, data: bytes, localiser: LocaliserLike) -> TrackPose:
+    def answer(self, ask: FrameAsk, data: bytes, localiser: Localiser) -> TrackPose:
         """The pose of a frame, or that the track is lost.
 
         Raises:
@@ -107,7 +108,7 @@ class FrameAnswerer:
             )
         return gray
 
-    def _tracker_for(self, gray: NDArray[np.uint8], localiser: LocaliserLike) -> Tracker:
+    def _tracker_for(self, gray: NDArray[np.uint8], localiser: Localiser) -> Tracker:
         """The session's tracker, over the maps in service: it begins with the first frame and its size.
 
         Maps that are all of another extractor answer nothing, as none.
@@ -148,6 +149,6 @@ def _smaller(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
 
 def _camera(camera: CameraRequest) -> Camera:
     try:
-        return Camera(model=camera.model, width=camera.width, height=camera.height, params=camera.params)
+        return camera_of(camera)
     except InvalidValueError as error:
         raise RequestError(ErrorCode.BAD_REQUEST, f"camera: {error}") from error

@@ -11,7 +11,8 @@ from pydantic import BaseModel
 
 from reloc.service.live.follower import Follower, FollowerStoppedError, FrameError
 from reloc.service.live.latest import Arrival, LatestFrame
-from reloc.service.live.metrics import LiveMetrics
+from reloc.service.logs import fields
+from reloc.service.tally import Tally
 from reloc.wire.track import EndReason, TrackEvent
 
 logger = logging.getLogger(__name__)
@@ -42,7 +43,7 @@ class LiveSession:
         *,
         idle_timeout_s: float,
         publish: Callable[[str, BaseModel], None],
-        metrics: LiveMetrics,
+        tally: Tally,
         on_end: Callable[[], None],
     ) -> None:
         """
@@ -54,7 +55,7 @@ class LiveSession:
         self._follower = follower
         self._idle_timeout_s = idle_timeout_s
         self._publish = publish
-        self._metrics = metrics
+        self._tally = tally
         self._on_end = on_end
         self._inbox = LatestFrame()
         self._reason: EndReason | None = None
@@ -67,7 +68,9 @@ class LiveSession:
 
     def offer(self, arrival: Arrival) -> None:
         """Leave a frame for the thread; the one that waits, if any, is dropped for it."""
-        self._metrics.frame_received(dropped=not self._inbox.put(arrival))
+        self._tally.add("frame received")
+        if not self._inbox.put(arrival):
+            self._tally.add("frame dropped")
 
     def end(self, reason: EndReason) -> None:
         """Take no more frames; the first reason counts. Returns at once.
@@ -96,9 +99,7 @@ class LiveSession:
         except FollowerStoppedError:
             pass
         except Exception:
-            logger.exception(
-                "live session failed", extra={"fields": {"event": "internal", "session": self.name}}
-            )
+            logger.exception("live session failed", extra=fields("internal", session=self.name))
             self.end(EndReason.INTERNAL)
         self._on_end()
         self._say_ended()
@@ -117,12 +118,13 @@ class LiveSession:
         try:
             pose = self._follower.answer(arrival)
         except FrameError as error:
-            self._metrics.frame_refused(error.code)
+            self._tally.add("frame refused", error.code)
             self._states["refused"] += 1
             self._event("refused", error.code, error.message, error.sequence)
             return False
         self._states[pose.state] += 1
-        self._metrics.frame_answered(pose.state, (time.perf_counter() - arrival.received) * 1e3)
+        latency_ms = (time.perf_counter() - arrival.received) * 1e3
+        self._tally.add("frame answered", pose.state, latency_ms)
         self._publish("poses", pose)
         return True
 
@@ -130,18 +132,9 @@ class LiveSession:
         reason = self._reason or EndReason.INTERNAL
         text = _END_TEXT.get(reason, f"no usable frame for {self._idle_timeout_s:g} s")
         self._event("ended", reason, text, None)
-        self._metrics.ended(reason)
-        logger.info(
-            "live session ended",
-            extra={
-                "fields": {
-                    "event": "live_ended",
-                    "session": self.name,
-                    "reason": reason,
-                    "frames": dict(self._states),
-                }
-            },
-        )
+        self._tally.add("ended", reason)
+        said = {"session": self.name, "reason": reason, "frames": dict(self._states)}
+        logger.info("live session ended", extra=fields("live_ended", **said))
 
     def _event(self, kind: str, code: str, message: str, sequence: int | None) -> None:
         fields = {"type": kind, "session": self.name, "code": code, "message": message}

@@ -17,11 +17,12 @@ from featuredb.errors import IncompatibleExtractorError
 from reloc.service.live.follower import Follower
 from reloc.service.live.frames import FrameAnswerer
 from reloc.service.live.latest import Arrival
-from reloc.service.live.metrics import LiveMetrics
 from reloc.service.live.options import LiveOptions
 from reloc.service.live.session import LiveSession
+from reloc.service.logs import fields
 from reloc.service.pending import session_of
 from reloc.service.source import ServedArea
+from reloc.service.tally import Tally
 from reloc.tracking.map_ground import usable_areas
 from reloc.wire.keys import NAME_PATTERN, Keys
 from reloc.wire.query import (
@@ -34,6 +35,8 @@ from reloc.wire.query import (
 )
 from reloc.wire.track import (
     EndReason,
+    LiveFrameCounts,
+    LiveLatency,
     LiveStatus,
     TrackLimits,
     TrackOpened,
@@ -70,7 +73,7 @@ class LiveSessions:
         """
         self._session, self._keys, self._area, self._follower = session, keys, area, follower
         self._options, self._server_id, self._authenticates = options, server_id, authenticates
-        self._metrics = LiveMetrics()
+        self._tally = Tally()
         self._lock = threading.Lock()
         self._open: dict[str, LiveSession] = {}  # by key
         self._frames: dict[str, zenoh.Subscriber[None]] = {}
@@ -105,7 +108,21 @@ class LiveSessions:
 
     def status(self) -> LiveStatus:
         """Counts since the start."""
-        return self._metrics.status(open_now=len(self._open), capacity=self._options.max_sessions)
+        tally = self._tally
+        return LiveStatus(
+            open=len(self._open),
+            capacity=self._options.max_sessions,
+            opened=tally.count("opened"),
+            refused=tally.by_code("refused"),
+            ended=tally.by_code("ended"),
+            frames=LiveFrameCounts(
+                received=tally.count("frame received"),
+                answered=tally.by_code("frame answered"),
+                refused=tally.by_code("frame refused"),
+                dropped=tally.count("frame dropped"),
+            ),
+            latency_ms=LiveLatency(**tally.latency(50, 95)),
+        )
 
     # Zenoh calls these in threads of its own; they must return at once.
 
@@ -119,19 +136,20 @@ class LiveSessions:
                 self._refuse(query, client, name, error)
                 return
             except Exception:
-                logger.exception("live session not opened", extra={"fields": {"event": "internal"}})
+                logger.exception("live session not opened", extra=fields("internal"))
                 text = "the server failed to open the session; its log says why"
                 self._refuse(query, client, name, RequestError(ErrorCode.INTERNAL, text))
                 return
             query.reply(self._keys.track(client, name), reply, encoding=_JSON)
-        _log("live session opened", "live_opened", client, name)
+        logger.info("live session opened", extra=fields("live_opened", client=client, session=name))
 
     def _refuse(self, query: zenoh.Query, client: str, name: str, error: RequestError) -> None:
-        self._metrics.open_refused(error.code)
+        self._tally.add("refused", error.code)
         refusal = ErrorReply(code=error.code, message=error.message, request_id=None)
         query.reply_err(encode(refusal), encoding=_JSON)
-        refused = {"code": error.code, "refusal": error.message}
-        _log("live session refused", "live_refused", client[:80], name[:80], **refused)
+        asked = {"client": client[:80], "session": name[:80]}
+        said = {"code": error.code, "refusal": error.message}
+        logger.info("live session refused", extra=fields("live_refused", **asked, **said))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         """A client's token has come or gone."""
@@ -169,7 +187,7 @@ class LiveSessions:
                 self._follower(answerer),
                 idle_timeout_s=self._options.idle_timeout_s,
                 publish=lambda leaf, message: self._publish(f"{key}/{leaf}", message),
-                metrics=self._metrics,
+                tally=self._tally,
                 on_end=lambda: self._forget(key),
             )
 
@@ -182,7 +200,7 @@ class LiveSessions:
             session.start()
             undo.pop_all()
             self._frames[key], self._open[key] = frames, session
-        self._metrics.opened()
+        self._tally.add("opened")
         limits = self._options.limits
         return TrackOpened(
             session=name,
@@ -273,7 +291,3 @@ def _check_comparable(area: ServedArea) -> None:
         usable_areas(localiser.areas, localiser.options.extractor.fingerprint)
     except IncompatibleExtractorError as error:
         raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
-
-
-def _log(message: str, event: str, client: str, session: str, **fields: object) -> None:
-    logger.info(message, extra={"fields": {"event": event, "client": client, "session": session, **fields}})

@@ -6,6 +6,8 @@ import resource
 import signal
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
@@ -14,12 +16,12 @@ from typing import Any, Protocol
 
 import cv2
 from pydantic import BaseModel
+from threadpoolctl import threadpool_limits
 
 from featuredb.features.decode import DecodeLimits
 from featuredb.stage_clock import StageClock
+from reloc.localiser import Localiser
 from reloc.service.handler import answer_query
-from reloc.service.source import LocaliserLike
-from reloc.service.threads import capped_process
 from reloc.service.workers.area_files import MappedAreas
 from reloc.wire.query import (
     ErrorCode,
@@ -53,7 +55,7 @@ class WorkerLimits:
 class Answerer(Protocol):
     """What answers in the process: it is sent there, as it is, when the process starts."""
 
-    def answer(self, ask: Any, data: bytes, localiser: LocaliserLike) -> BaseModel:
+    def answer(self, ask: Any, data: bytes, localiser: Localiser) -> BaseModel:
         """The answer to a message with an image file. Raises RequestError: why there is none."""
         ...
 
@@ -83,7 +85,7 @@ class QueryAnswerer:
 
     decode: DecodeLimits
 
-    def answer(self, ask: Ask, data: bytes, localiser: LocaliserLike) -> LocaliseReply:
+    def answer(self, ask: Ask, data: bytes, localiser: Localiser) -> LocaliseReply:
         """As `answer_query`."""
         return answer_query(
             data,
@@ -93,6 +95,18 @@ class QueryAnswerer:
             request_id=ask.request_id,
             clock=StageClock(),
         )
+
+
+@contextmanager
+def capped_process(count: int) -> Iterator[None]:
+    """Within the block OpenCV and BLAS use at most `count` threads, in all threads of the process."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(count)
+    try:
+        with threadpool_limits(limits=count):
+            yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 class _Stop:
@@ -112,7 +126,7 @@ class _Stop:
 def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer) -> None:
     """Until the other end is closed: answers to `OpenFiles` (empty) and what the answerer is asked."""
     stop, areas = _Stop(), MappedAreas()
-    localiser: LocaliserLike | None = None
+    localiser: Localiser | None = None
     unlimited = resource.getrlimit(resource.RLIMIT_AS)
     with capped_process(limits.threads):
         while not stop.wanted:
@@ -140,10 +154,10 @@ def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer)
             stop.busy = False
 
 
-def _opened(connection: Connection, message: OpenFiles, areas: MappedAreas) -> LocaliserLike:
+def _opened(connection: Connection, message: OpenFiles, areas: MappedAreas) -> Localiser:
     """Raises SystemExit, and says why, where a file cannot be mapped."""
     try:
-        localiser: LocaliserLike = areas.localiser(message.keys, lambda: recv_handle(connection))
+        localiser: Localiser = areas.localiser(message.keys, lambda: recv_handle(connection))
     except OSError as error:
         if isinstance(error, ConnectionError):
             raise
@@ -168,7 +182,7 @@ def _set_limit(which: int, wanted: int) -> None:
     resource.setrlimit(which, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
 
 
-def _answer(answerer: Answerer, ask: object, data: bytes, localiser: LocaliserLike) -> bytes:
+def _answer(answerer: Answerer, ask: object, data: bytes, localiser: Localiser) -> bytes:
     try:
         return REPLY + encode(answerer.answer(ask, data, localiser))
     except RequestError as error:

@@ -16,8 +16,7 @@ from typing import IO, Any
 
 from featuredb.errors import StoreError
 from reloc.localise.candidates import IndexedArea
-from reloc.localiser import OnDemand
-from reloc.service.source import LocaliserLike
+from reloc.localiser import Localiser, OnDemand
 
 _ALIGNMENT = 64
 _LENGTH_BYTES = 8
@@ -50,7 +49,7 @@ class AreaFiles:
         self._keys = itertools.count()
         self._written: weakref.WeakKeyDictionary[object, AreaFile] = weakref.WeakKeyDictionary()
 
-    def of(self, localiser: LocaliserLike) -> LocaliserFiles:
+    def of(self, localiser: Localiser) -> LocaliserFiles:
         """The files of a localiser.
 
         Raises:
@@ -64,7 +63,7 @@ class AreaFiles:
                 "need as much room as in memory; free it, or set TMPDIR to another folder"
             ) from error
 
-    def _files(self, localiser: LocaliserLike) -> LocaliserFiles:
+    def _files(self, localiser: Localiser) -> LocaliserFiles:
         parts: list[AreaFile] = []
 
         def key_of(part: object) -> int:

@@ -11,6 +11,7 @@ from featuredb.stage_clock import StageClock
 from featuredb.store.candidates.states import ANONYMOUS, candidate_id_of
 from reloc.service.contributions.database_inbox import contribution_of
 from reloc.service.contributions.inbox import Inbox, InboxRefusal
+from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
@@ -25,7 +26,7 @@ from reloc.wire.query import (
     LocaliseReply,
     LocaliseWireRequest,
     RequestError,
-    parse_request,
+    parse_attachment,
 )
 
 logger = logging.getLogger(__name__)
@@ -151,7 +152,7 @@ class WorkerPool:
                 if process is not None:
                     self._gone(process)
                 process = None
-                logger.exception("a worker does not come up", extra={"fields": {"event": "worker_failed"}})
+                logger.exception("a worker does not come up", extra=fields("worker_failed"))
                 with self._changed:
                     self._failed[threading.current_thread().name] = str(error)
                     self._changed.notify_all()
@@ -181,10 +182,8 @@ class WorkerPool:
             item.refuse(_ended_error(error, self._limits, item))
         except Exception as error:
             trace = {"trace": str(error)} if isinstance(error, WorkerDefectError) else {}
-            logger.exception(
-                "query failed",
-                extra={"fields": {"event": "internal", "request_id": item.request_id, **trace}},
-            )
+            told = fields("internal", request_id=item.request_id, **trace)
+            logger.exception("query failed", extra=told)
             item.refuse(
                 RequestError(
                     ErrorCode.INTERNAL,
@@ -195,7 +194,7 @@ class WorkerPool:
     def _localise(self, item: PendingQuery, process: WorkerProcess) -> None:
         clock = StageClock(start=item.received)
         clock.lap("queue")
-        request = parse_request(item.attachment())
+        request = parse_attachment(LocaliseWireRequest, item.attachment())
         item.request_id = request.request_id or item.request_id
         if request.contribute and self._inbox is None:
             raise RequestError(

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.rotation import quaternion_from_matrix
-from reloc.tracking.trajectory.values import OwnPose, Trajectory
+from reloc.localise.result import OwnPose
+from reloc.tracking.trajectory.values import Trajectory
 
 _AXES = ("rx", "ry", "rz", "x", "y", "z")
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]

@@ -10,52 +10,18 @@ from datetime import datetime
 from itertools import groupby
 
 from featuredb.errors import InvalidValueError
-from featuredb.geo.geopose import GeoPose, geopose_from_camera
-from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rotation import quaternion_from_matrix
-from featuredb.maps.unplaced_map import OwnFrame
+from reloc.localise.result import OnEarth, OwnPose
 from reloc.tracking.ground import StandingInMap
 from reloc.tracking.tracked_frame import TrackedFrame, TrackState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EarthPose:
-    """Where the camera was; conventions as in `reloc.localise.result.LocalisedPose`.
-
-    Attributes:
-        epsg: UTM zone of `utm`, (3,) easting, northing, height of the camera centre, metres.
-        height_datum: datum of all heights.
-        cam_from_utm_xyzw: (4,) rotation, grid axes (east, north, up) to camera axes.
-        geopose: the same as an OGC GeoPose.
-        covariance: (6, 6), true east-north-up at the camera: rotation (rad) before displacement (m), of the
-            frame's own measurement and of the map's placement.
-        map_id: of the map, or the scan, whose points most landmarks are.
-    """
-
-    epsg: int
-    utm: FloatArray
-    height_datum: str
-    cam_from_utm_xyzw: FloatArray
-    geopose: GeoPose
-    covariance: FloatArray
-    map_id: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OwnPose:
-    """Where the camera was in the own frame of a map without a place.
-
-    Attributes:
-        map_id: of the map. frame: whether its unit is a metre, and whether its z is up.
-        cam_from_map: own frame to camera axes (x right, y down, z forward), units of the frame.
-        covariance: (6, 6), axes of the own frame: rotation (rad) before displacement (units of the frame).
-    """
+class EarthPose(OnEarth):
+    """Where the camera was; `map_id`: of the map, or the scan, whose points most landmarks are."""
 
     map_id: str
-    frame: OwnFrame
-    cam_from_map: Rigid3
-    covariance: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

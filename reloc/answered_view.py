@@ -7,13 +7,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from featuredb.errors import InvalidValueError
+from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
 from reloc.localise.jacobians import pixel_jacobians
-from reloc.wire.query import LocaliseReply
+from reloc.wire.query import CameraRequest, Intrinsics, LocaliseReply
+from reloc.wire.track import TrackPose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,7 +62,7 @@ class AnsweredView:
             (utm.easting, utm.northing, utm.height),
             utm.epsg,
             utm.cam_from_utm_xyzw,
-            camera=Camera(model=used.model, width=used.width, height=used.height, params=used.params),
+            camera=camera_of(used),
             covariance=np.array(covariance if reply.view_covariance is None else reply.view_covariance),
             height_datum=reply.height_datum or "unknown",
             map_ids=reply.maps,
@@ -96,6 +98,14 @@ class AnsweredView:
         """The same camera with its pose in another frame nearby; the covariance keeps its axes."""
         return replace(self, frame=frame, cam_from_local=self.cam_from_local @ self.frame.enu_from(frame))
 
+    def project_utm(self, points_utm: FloatArray) -> FloatArray:
+        """Pixels (n, 2) of points (n, 3), easting, northing, height in the zone; NaN behind the camera.
+
+        Through the local frame, because UTM itself is not metric.
+        """
+        points = self.frame.enu_from_utm(points_utm, self.epsg)
+        return self.camera.project(self.cam_from_local.act(points))
+
     def rays(self, pixels: FloatArray) -> FloatArray:
         """(n, 3) in `frame`, of depth 1 along the optical axis; NaN where the lens sees nothing."""
         xy = self.camera.unproject(pixels)
@@ -117,11 +127,27 @@ class AnsweredView:
         for sign in (-1.0, 1.0):
             moved = params.copy()
             moved[k] += sign * step
-            camera = Camera(
-                model=self.camera.model,
-                width=self.camera.width,
-                height=self.camera.height,
-                params=tuple(moved),
-            )
-            ends.append(camera.project(in_camera)[0])
+            ends.append(replace(self.camera, params=tuple(moved)).project(in_camera)[0])
         return np.asarray((ends[1] - ends[0]) / (2.0 * step))
+
+
+def geopose_of(message: LocaliseReply | TrackPose) -> GeoPose:
+    """The pose of an answer that has one on Earth, which tells its angles; see docs/localisation.md."""
+    assert message.position is not None
+    assert message.quaternion is not None
+    q = message.quaternion
+    return GeoPose(
+        latitude_deg=message.position.lat,
+        longitude_deg=message.position.lon,
+        height_m=message.position.h,
+        quaternion_xyzw=(q.x, q.y, q.z, q.w),
+    )
+
+
+def camera_of(lens: CameraRequest | Intrinsics) -> Camera:
+    """The camera that a message speaks of.
+
+    Raises:
+        InvalidValueError: it is none.
+    """
+    return Camera(model=lens.model, width=lens.width, height=lens.height, params=lens.params)

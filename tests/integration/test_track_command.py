@@ -1,0 +1,126 @@
+"""`featuredb track`: films tracked by maps, and what is said of those that cannot be."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.cli.main import main
+from featuredb.video.frames import open_video
+from featuredb.video.writer import VideoWriter
+from tests.support.hill_photos import CAMERA, FRAME, _render
+from tests.support.hill_walk import anchored_database
+from tests.support.made_once import made_once
+from tests.support.planar_map import field_texture
+from tests.support.tracked_film import CUT, FRAMES, pose_at
+
+
+@pytest.fixture(scope="module")
+def anchored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once("anchored-hills", anchored_database, tmp_path_factory) / "db"
+
+
+@pytest.fixture(scope="module")
+def film() -> list[np.ndarray]:
+    texture, other = field_texture(1), field_texture(9)
+    return [_render(other if i in CUT else texture, pose_at(i), i) for i in range(FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def folder(anchored: Path, film: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The database, and the film as an mp4."""
+    folder = tmp_path_factory.mktemp("film")
+    with VideoWriter(folder / "film.mp4", width=CAMERA.width, height=CAMERA.height, fps=30.0) as writer:
+        for gray in film:
+            writer.write(gray)
+    return folder
+
+
+_LENS = f"{CAMERA.model},{CAMERA.width},{CAMERA.height},{','.join(map(str, CAMERA.params))}"
+
+
+def test_the_command_tracks_a_film(
+    anchored: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / f"out/track.{kind}" for kind in ("csv", "tum", "geojson", "kml", "json", "srt")]
+    outs = [text for file in files for text in ("--out", str(file))]
+    overlay = tmp_path / "overlay.mp4"
+    drawn_to = ["--overlay", str(overlay)]
+    code = main(
+        ["track", str(anchored), str(folder / "film.mp4"), *outs, "--camera", _LENS, "--json", *drawn_to]
+    )
+    summary = json.loads(capsys.readouterr().out)
+    assert code == 0
+    assert summary["frames"] == FRAMES
+    assert summary["written"] == [*map(str, files), str(overlay)]
+    rows = list(csv.DictReader(files[0].read_text().splitlines()))
+    assert len(rows) == FRAMES
+    states = [row["state"] for row in rows]
+    # The default settings have a keyframe every twelfth frame: the film of elsewhere is lost, what is between
+    # a localised frame and its answer is not.
+    assert states[:20] == ["relocalised", *["tracking"] * 19]
+    assert states[20:24] == ["lost"] * 4
+    assert summary["lost"] == states.count("lost")
+    for row in rows:
+        if row["state"] == "lost":
+            assert row["detail"]
+            continue
+        utm = [float(row[name]) for name in ("easting", "northing", "height")]
+        true = FRAME.utm_from_enu(pose_at(int(row["frame"])).center, int(row["epsg"]))
+        assert np.linalg.norm(np.array(utm) - true) < 0.3, row["frame"]
+    with open_video(overlay) as drawn:
+        assert sum(1 for _ in drawn) == FRAMES
+
+
+def test_a_film_of_elsewhere_gives_a_table_of_reasons(
+    anchored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = field_texture(9)
+    with VideoWriter(tmp_path / "film.mp4", width=CAMERA.width, height=CAMERA.height, fps=30.0) as writer:
+        for i in range(10):
+            writer.write(_render(other, pose_at(i), i))
+    out = ["--out", str(tmp_path / "t.csv"), "--out", str(tmp_path / "t.kml")]
+    assert main(["track", str(anchored), str(tmp_path / "film.mp4"), *out]) == 1
+    said = capsys.readouterr().out
+    assert "10 frames, 0 tracked, 0 relocalised, 10 lost" in said
+    assert {row["state"] for row in csv.DictReader((tmp_path / "t.csv").read_text().splitlines())} == {"lost"}
+    assert not (tmp_path / "t.kml").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--out", "t.txt"], "expected a name that ends in .csv"),
+        (["--out", "t.csv", "--camera", "PINHOLE,640"], "--camera: expected MODEL,WIDTH,HEIGHT"),
+        (["--out", "t.csv", "--camera", "PINHOLE,640,640,600,600,320,320"], "differ in aspect ratio"),
+        (["--out", "t.csv", "--prior", "north"], "--prior: expected LAT,LON,SIGMA_M"),
+        (["--out", "t.csv", "--start", "60"], "no frames"),
+        (["--out", "t.csv", "--map", "nobody"], "nobody"),
+    ],
+)
+def test_bad_requests_say_what_is_wrong_and_write_nothing(
+    change: list[str],
+    message: str,
+    anchored: Path,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    overlay = ["--overlay", "o.mp4"]
+    assert main(["track", str(anchored), str(folder / "film.mp4"), *change, *overlay]) not in (0, 1)
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_broken_film_says_so_and_writes_nothing(
+    anchored: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes((folder / "film.mp4").read_bytes()[:2000])
+    assert main(["track", str(anchored), str(broken), "--out", str(tmp_path / "t.csv")]) == 2
+    assert "broken.mp4" in capsys.readouterr().err
+    assert [f.name for f in tmp_path.iterdir()] == ["broken.mp4"]
