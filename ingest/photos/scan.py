@@ -196,7 +196,9 @@ def _examine_all(
         if file.reason_code:
             continue
         old = known.get(file.name)
-        if old and (old.size, old.mtime_ns) == (file.size, file.mtime_ns):
+        same = old is not None and (old.size, old.mtime_ns) == (file.size, file.mtime_ns)
+        # What was not supported may be now, by another version or a package that is installed since.
+        if old is not None and same and old.reason_code != "unsupported":
             results[file.name] = old
         else:
             todo.append(file)

@@ -81,6 +81,11 @@ def test_without_the_extra_the_refusal_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "IMG_1.HEIC").write_bytes(_as_heic(photo(size=(640, 480))))
-    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    cache = tmp_path.parent / f"{tmp_path.name}.json"
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pillow_heif", None)
+        scanned = scan_folder(tmp_path, cache_file=cache)
     with pytest.raises(IngestError, match=r"1 unsupported; IMG_1.HEIC: .* pip install 'featuredb\[heic\]'"):
-        require_usable(scan_folder(tmp_path), tmp_path)
+        require_usable(scanned, tmp_path)
+    # Once it is installed, what was refused is not refused from memory.
+    assert [p.status for p in scan_folder(tmp_path, cache_file=cache).photos] == ["ok"]
