@@ -21,6 +21,8 @@ from featuredb.extras import require
 
 STILL_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1", b"avif"})
 SEQUENCE_BRANDS = frozenset({b"hevc", b"hevx", b"msf1", b"avis"})
+_PICTURES = (b"hvc1", b"av01", b"grid")  # cameras' kinds; a library may decode others, of any size
+_BLOCK = 64  # pixels of HEVC's largest block: encoders fill the last one, and cut that off again
 _MAX_META = 4 << 20  # bytes of the box that describes all; a phone's has some 20 kB
 # (quarter turns against the clock, then the axis of a mirror or None) as an orientation of EXIF.
 _ORIENTATIONS: dict[tuple[int, int | None], int] = {
@@ -255,6 +257,10 @@ def _geometry(meta: _Meta) -> tuple[int, int, int]:
     """Width, height, and EXIF's orientation."""
     if meta.primary is None or meta.primary not in meta.types:
         raise ImageError("the HEIF file has no primary picture; export a JPEG", "unsupported")
+    if (kind := meta.types[meta.primary]) not in _PICTURES:
+        raise ImageError(
+            f"a HEIF picture of the kind {kind!r} is not supported; export a JPEG", "unsupported"
+        )
     size: tuple[int, int] | None = None
     turns, mirror = 0, None
     for index in meta.used.get(meta.primary, []):
@@ -267,7 +273,10 @@ def _geometry(meta: _Meta) -> tuple[int, int, int]:
             size = body.number(4), body.number(4)
         elif kind == b"clap" and b"av01" not in meta.types.values():  # libheif cuts, OpenCV does not
             width, per_width, height, per_height = (body.number(4) for _ in range(4))
+            coded = size
             size = round(width / max(per_width, 1)), round(height / max(per_height, 1))
+            if coded is None or any(not 0 <= a - b < _BLOCK for a, b in zip(coded, size, strict=True)):
+                raise ImageError("a HEIF picture that is cut by a box is not supported", "unsupported")
         elif kind == b"irot":
             turns += (body.number(1) & 3) * (1 if mirror is None else -1)
         elif kind == b"imir":

@@ -153,6 +153,12 @@ def test_boxes_that_lie_cost_nothing() -> None:
     data = _encode(_scene())
     assert _refusal(data.replace(b"ftypheic", b"ftyphevc")).code == "unsupported"  # a sequence
     assert _refusal(data.replace(b"ispe", b"free")).code == "broken"
+    laid_over = data.replace(b"\0\0hvc1\0", b"\0\0iovl\0", 1)
+    assert "b'iovl' is not supported" in str(_refusal(laid_over))
+    cut = _encode(_scene((201, 143)))
+    at = cut.index(b"clap") + 4
+    small = cut[:at] + struct.pack(">II", 70, 1) + cut[at + 8 :]  # decoded whole, whatever is cut from it
+    assert _refusal(small).code == "unsupported"
     at = data.index(b"iloc")
     assert (
         _refusal(data[: at + 8] + b"\0\0\xff\xff" + data[at + 12 :]).code == "broken"
