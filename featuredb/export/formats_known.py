@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from html import escape
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,6 +90,9 @@ class ExportedMaps:
             f"{self.out}: {self.format}, {done.maps} maps, {done.images} images, {done.points} points, "
             f"{done.observations} observations, {done.bytes / 1e6:.1f} MB, of version {self.version}\n"
         )
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.as_text())}</pre>"
 
 
 def export_maps(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
+from featuredb.features.heif import heic_pixels
 from featuredb.features.image_header import ImageHeader, read_header
 
 # libjpeg fills what a scan does not cover with coefficients 0, which is this grey.
@@ -137,7 +138,7 @@ def _check(data: bytes, limits: DecodeLimits) -> ImageHeader:
 def _decode(data: bytes | Path, limits: DecodeLimits, flags: int) -> NDArray[np.uint8]:
     content = read_image_bytes(data, limits)
     header = _check(content, limits)
-    pixels = _imdecode(content, flags)
+    pixels = _heic(content, header, flags) if header.format == "HEIC" else _imdecode(content, flags)
     if pixels is None:
         raise ImageError(f"the {header.format} of {header.width}x{header.height} cannot be decoded", "broken")
     if pixels.shape[:2] != (header.height, header.width):
@@ -151,6 +152,13 @@ def _decode(data: bytes | Path, limits: DecodeLimits, flags: int) -> NDArray[np.
             "the JPEG's end marker comes before its last pixels; copy the file again", "truncated"
         )
     return pixels
+
+
+def _heic(content: bytes, header: ImageHeader, flags: int) -> NDArray[np.uint8]:
+    rgb = heic_pixels(content, (header.width, header.height), header.orientation or 1)
+    if flags != cv2.IMREAD_GRAYSCALE:
+        return rgb
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def _imdecode(content: bytes, flags: int) -> NDArray[np.uint8] | None:

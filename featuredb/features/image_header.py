@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
+from featuredb.features.heif import SEQUENCE_BRANDS, STILL_BRANDS, read_heif
 
 IMAGE_ERROR_CODES = (
     "unreadable",  # the file could not be opened or is not a regular file
@@ -36,8 +37,9 @@ class ImageHeader:
     """Format and size of an image as stored.
 
     Attributes:
-        format: JPEG, PNG, WEBP, TIFF or BMP.
+        format: JPEG, PNG, WEBP, TIFF, BMP, HEIC or AVIF.
         width, height: pixels as stored, before EXIF orientation.
+        orientation: 1..8 where the format says it in place of EXIF, or None.
         exif: (start, stop) of the TIFF stream with the EXIF in the file's bytes, or None.
         xmp: (start, stop) of the XMP packet, or None.
         scans: passes over the picture that decoding takes; more than one in progressive JPEGs.
@@ -51,6 +53,7 @@ class ImageHeader:
     xmp: tuple[int, int] | None = None
     scans: int = 1
     end: int = 0
+    orientation: int | None = None
 
 
 def check_signature(head: bytes) -> None:
@@ -67,6 +70,7 @@ def check_signature(head: bytes) -> None:
         or (head[:4] == b"RIFF" and head[8:12] == b"WEBP")
         or head[:4] in (b"II*\0", b"MM\0*")
         or _is_bmp(head)
+        or (head[4:8] == b"ftyp" and head[8:12] in STILL_BRANDS)
     ):
         raise _refusal(head)
 
@@ -84,6 +88,17 @@ def read_header(data: bytes) -> ImageHeader:
         return _png(data)
     if data[:4] == b"RIFF":
         return _webp(data)
+    if data[4:8] == b"ftyp":
+        heif = read_heif(data)
+        return ImageHeader(
+            format="AVIF" if heif.avif else "HEIC",
+            width=heif.width,
+            height=heif.height,
+            exif=heif.exif,
+            xmp=heif.xmp,
+            end=heif.end,
+            orientation=heif.orientation,
+        )
     return _bmp(data) if _is_bmp(data) else _tiff(data)
 
 
@@ -94,17 +109,10 @@ def _is_bmp(head: bytes) -> bool:
 
 def _refusal(data: bytes) -> ImageError:
     brand = data[8:12] if data[4:8] == b"ftyp" else b""
-    if brand in (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"):
-        return ImageError(
-            "HEIC is not supported; convert to JPEG first (for example `heif-convert`, or on an iPhone "
-            "Settings > Camera > Formats > Most Compatible)",
-            "unsupported",
-        )
+    if brand in SEQUENCE_BRANDS:
+        return ImageError("a sequence of HEIF pictures is not supported; export one", "unsupported")
     if brand:
-        return ImageError(
-            f"an MP4/AVIF container of brand {brand!r} is not a photo that is taken; export a JPEG",
-            "unsupported",
-        )
+        return ImageError(f"a film (MP4, brand {brand!r}) is not a photo", "unsupported")
     known = {
         b"GIF8": "GIF",
         b"\0\0\0\x0c": "JPEG 2000",
@@ -121,7 +129,7 @@ def _refusal(data: bytes) -> ImageError:
     if _PNG_SIGNATURE.startswith(data) or (len(data) < 12 and data[:4] == b"RIFF"):
         return ImageError(f"the file ends after {len(data)} bytes, within its header", "truncated")
     return ImageError(
-        f"expected a JPEG, PNG, WebP, TIFF or BMP file, found bytes that begin with {data[:8]!r}",
+        f"expected a JPEG, HEIC, AVIF, PNG, WebP, TIFF or BMP file, found bytes that begin with {data[:8]!r}",
         "not_an_image",
     )
 

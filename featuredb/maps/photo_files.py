@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 from featuredb.file_digest import file_sha256
 from featuredb.maps.feature_map import MapImage
 
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+_SUFFIXES = (".jpg", ".jpeg", ".heic", ".heif", ".avif", ".png", ".tif", ".tiff")
 
 
 class PhotoFolder:

@@ -25,7 +25,7 @@ from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb, pro
 from featuredb.features.exif.read import ExifInfo, read_exif
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
 
-_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".heic", ".heif", ".avif", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 _CSV_NAME, _TXT_NAME = "timestamps.csv", "times.txt"
 _MAX_BYTES = 1 << 30  # of one picture: an uncompressed TIFF of the most pixels has 400 MB
 

@@ -194,7 +194,9 @@ def _examine_all(
         if file.reason_code:
             continue
         old = known.get(file.name)
-        if old and (old.size, old.mtime_ns) == (file.size, file.mtime_ns):
+        same = old is not None and (old.size, old.mtime_ns) == (file.size, file.mtime_ns)
+        # What was not supported may be now, by another version or a package that is installed since.
+        if old is not None and same and old.reason_code != "unsupported":
             results[file.name] = old
         else:
             todo.append(file)
@@ -365,8 +367,8 @@ def require_photos(folder: Path) -> None:
     found = [file for file in walk(folder) if not file.reason_code]
     if not any(_begins_as_photo(file.path) for file in found):
         raise IngestError(
-            f"{folder}: expected photos (JPEG, PNG, WebP, TIFF, BMP) in it or in folders in it, found none "
-            f"among {len(found)} files; check the path"
+            f"{folder}: expected photos (JPEG, HEIC, AVIF, PNG, WebP, TIFF, BMP) in it or in folders in it, "
+            f"found none among {len(found)} files; check the path"
         )
 
 
@@ -388,8 +390,9 @@ def require_usable(result: ScanResult, folder: Path, least: int = 1) -> tuple[Ph
     usable = result.usable
     if len(usable) < least:
         reasons = ", ".join(f"{count} {code}" for code, count in sorted(result.skipped.items())) or "no files"
+        told = next((f"; {p.name}: {p.reason}" for p in result.photos if p.reason_code == "unsupported"), "")
         raise IngestError(
             f"{folder}: expected at least {least} usable photos, found {len(usable)} of "
-            f"{len(result.photos)} files (skipped: {reasons})"
+            f"{len(result.photos)} files (skipped: {reasons}{told})"
         )
     return usable

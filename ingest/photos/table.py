@@ -5,7 +5,7 @@ Columns (all optional but the first two, of which one must be there):
 | column  | meaning |
 |---|---|
 | path    | of the file, from the table's folder |
-| id      | instead of a path: a file of that name, with or without .jpg, .jpeg, .png, in the table's folder |
+| id      | instead of a path: a file of that name, with or without .jpg, .jpeg, .png, .heic, in its folder |
 | lat, lon | WGS84 degrees |
 | height  | metres, counted as the maps' heights are |
 | accuracy, accuracy_height | standard deviations per horizontal axis and of the height, metres |
@@ -54,7 +54,7 @@ _ALIASES = {
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "license": "licence"},
     **{"alt": "height", "altitude": "height", "elevation": "height"},
 }
-_PHOTO_SUFFIXES = ("", ".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
+_PHOTO_SUFFIXES = ("", ".jpg", ".jpeg", ".png", ".heic", ".JPG", ".JPEG", ".PNG", ".HEIC")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

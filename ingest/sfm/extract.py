@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
-from featuredb.features.decode import INGEST_LIMITS, decode_gray
+from featuredb.features.decode import INGEST_LIMITS, decode_gray, decode_rgb
 from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
 from ingest.executor import Executor, Lost, Progress, no_progress
@@ -165,8 +165,8 @@ def _colours(data: bytes, features: Features) -> NDArray[np.uint8]:
     """RGB (n, 3) under the keypoints, from the photo at a quarter of its size."""
     flags = cv2.IMREAD_REDUCED_COLOR_4 | cv2.IMREAD_IGNORE_ORIENTATION
     bgr = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if bgr is None:
-        return np.full((len(features), 3), 128, np.uint8)  # colour is for display only
+    if bgr is None:  # OpenCV has no HEIC
+        bgr = decode_rgb(data, INGEST_LIMITS)[::_COLOUR_SHRINK, ::_COLOUR_SHRINK, ::-1]
     columns = np.clip((features.xy[:, 0] / _COLOUR_SHRINK).astype(int), 0, bgr.shape[1] - 1)
     rows = np.clip((features.xy[:, 1] / _COLOUR_SHRINK).astype(int), 0, bgr.shape[0] - 1)
     return np.asarray(bgr[rows, columns, ::-1], dtype=np.uint8)

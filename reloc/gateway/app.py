@@ -35,6 +35,7 @@ from reloc.gateway.metrics import MEDIA_TYPE as METRICS_TYPE
 from reloc.gateway.metrics import GatewayMetrics
 from reloc.gateway.multipart import read_form
 from reloc.gateway.options import GatewayOptions
+from reloc.gateway.phone import add_phone_page
 from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
 from reloc.gateway.protocol import VERSION as GEOPOSE_VERSION
 from reloc.gateway.protocol import GeoPoseResp
@@ -187,7 +188,10 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
         text = gateway.metrics.text(gateway.intake.in_flight, gateway.link.sessions, status)
         return Response(text, media_type=METRICS_TYPE)
 
-    return frozenset(f"{prefix}/{leaf}" for leaf in ("geopose", "localise", "maps", "health", "metrics"))
+    add_phone_page(app, prefix)
+    return frozenset(
+        f"{prefix}/{leaf}" for leaf in ("geopose", "localise", "maps", "health", "metrics", "phone")
+    )
 
 
 def _add_failures(app: FastAPI) -> None:

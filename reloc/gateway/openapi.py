@@ -153,7 +153,7 @@ LOCALISE: dict[str, Any] = {
                             "image": {
                                 "type": "string",
                                 "format": "binary",
-                                "description": "JPEG, PNG, WebP, TIFF, BMP",
+                                "description": "JPEG, HEIC, AVIF, PNG, WebP, TIFF, BMP",
                             },
                             "camera": {"$ref": _REF.format(model="CameraRequest")},
                             "prior": {"$ref": _REF.format(model="PriorRequest")},

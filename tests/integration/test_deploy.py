@@ -24,7 +24,7 @@ def test_the_image_takes_in_the_packages_and_no_secrets() -> None:
 
 def test_a_worker_that_grows_asks_the_scans() -> None:
     (extras,) = re.findall(r"/src\[([a-z,]+)\]", (_ROOT / "deploy/Containerfile").read_text())
-    assert set(extras.split(",")) == {"http", "lidar"}
+    assert set(extras.split(",")) == {"heic", "http", "lidar"}
 
 
 def test_keys_are_for_clients_outside_and_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,10 @@
 """Every command line of the documentation is run, or at least read by its own program; none is left out."""
 
+import json
+import os
 import shutil
 import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,6 +60,7 @@ _FIRST = "README.md"
 _FEATURES = 1500  # of a photo
 _LANGUAGES = {"sh", "python", "sql", "json", "text"}
 
+_NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 _TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in pages()}
 _BLOCKS = [block for page, text in _TEXTS.items() for block in blocks(page, text)]
 _COMMANDS = [command for block in _BLOCKS if block.language == "sh" for command in commands(block)]
@@ -133,6 +137,31 @@ def test_the_commands_of_the_readme_run(after_readme: Path) -> None:
 @pytest.mark.parametrize("page", [page for page in _TEXTS if page != _FIRST and what_runs(page)])
 def test_the_commands_of_a_page_run(after_readme: Path, tmp_path: Path, page: str) -> None:
     run_page(page, Path(shutil.copytree(after_readme, tmp_path / "here")))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", _NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(after_readme: Path, tmp_path: Path, notebook: Path) -> None:
+    here = Path(shutil.copytree(after_readme, tmp_path / "here"))
+    shutil.copy(notebook, here)
+    programs = Path(sys.executable).parent
+    done = subprocess.run(
+        [programs / "jupyter-execute", "--timeout=600", notebook.name],
+        cwd=here,
+        env={**os.environ, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("notebook", _NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_stored_without_what_it_gave(notebook: Path) -> None:
+    cells = [c for c in json.loads(notebook.read_text("utf-8"))["cells"] if c["cell_type"] == "code"]
+    assert cells
+    assert [c["outputs"] for c in cells if c["outputs"] or c["execution_count"] is not None] == []
 
 
 @pytest.mark.parametrize("command", [*_COMMANDS, *_PROSE], ids=str)

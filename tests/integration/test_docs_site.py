@@ -1,19 +1,25 @@
 """The documentation's site builds without a warning, shows what the Markdown says, and needs no network."""
 
+import inspect
 import os
+import re
 import subprocess
 import sys
+import typing
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 from markdown_it import MarkdownIt
 
+import featuredb
 from tools.site_pages import PAGES, ROOT
 
+_REFERENCE = "reference/python.md"  # of docstrings, not of Markdown alone
 _SOURCES = {page: ROOT / source for source, page in PAGES.items()} | {
     path.relative_to(ROOT / "docs").as_posix(): path for path in (ROOT / "docs").rglob("*.md")
 }
+del _SOURCES[_REFERENCE]
 _COUNTED = ("table", "tr", "li", "pre", "img", "h1", "h2", "h3")
 
 
@@ -76,6 +82,38 @@ def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
     assert len(pages) > len(_SOURCES)  # and the page for what is not found
     assert [source for page in pages for source in page.loaded] == []
     assert (site / "search" / "search_index.json").is_file()
+
+
+def _members(owner: type) -> dict[str, object]:
+    """Public methods and properties of a class by their full names."""
+    of_methods = (property, classmethod, staticmethod)
+    return {
+        f"{owner.__module__}.{owner.__qualname__}.{name}": value
+        for name, value in vars(owner).items()
+        if not name.startswith("_") and (inspect.isfunction(value) or isinstance(value, of_methods))
+    }
+
+
+def test_the_reference_has_every_public_name_and_what_its_methods_give(site: Path) -> None:
+    assert dir(featuredb) == sorted(featuredb.__all__)
+    names: dict[str, object] = {"featuredb.open": featuredb.open}
+    classes = {v for v in (getattr(featuredb, n) for n in featuredb.__all__) if inspect.isclass(v)}
+    for value in _members(featuredb.FeatureDatabase).values():
+        given = typing.get_type_hints(value.fget if isinstance(value, property) else value)["return"]
+        if given.__module__ != "builtins":
+            classes.add(given)
+    assert len(classes) > 8  # found, and not only named
+    for owner in classes:
+        names |= {f"{owner.__module__}.{owner.__qualname__}": owner} | _members(owner)
+    page = (site / html_of(_REFERENCE)).read_text(encoding="utf-8")
+    shown = set(re.findall(r'id="([\w.]+)"', page))
+    assert sorted(names.keys() - shown) == []
+    # A dataclass without a docstring is given its signature.
+    bare = [
+        name for name, v in names.items() if not v.__doc__ or v.__doc__.startswith(f"{name.split('.')[-1]}(")
+    ]
+    assert bare == []
+    assert "featuredb.__version__</code>" in page
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,9 @@ LIMITS = DecodeLimits(max_bytes=4 << 20, max_pixels=4_000_000, min_side_px=64)
 CASES_PER_KIND = 60
 
 
+pytest.importorskip("pillow_heif").register_heif_opener()
+
+
 def _seed_files() -> dict[str, bytes]:
     coarse = np.random.default_rng(3).integers(0, 256, (6, 8, 3), dtype=np.uint8)
     image = Image.fromarray(coarse).resize((128, 96), Image.Resampling.BICUBIC)
@@ -39,6 +42,8 @@ def _seed_files() -> dict[str, bytes]:
         ("WEBP", {"quality": 85}),
         ("TIFF", {"compression": "tiff_lzw"}),
         ("BMP", {}),
+        ("AVIF", {"quality": 85}),
+        ("HEIF", {"quality": 85}),
     ):
         buffer = io.BytesIO()
         image.save(buffer, kind, exif=exif, **options)

@@ -136,6 +136,7 @@ def test_export_writes_what_the_command_does(url: Path, tmp_path: Path) -> None:
     db = featuredb.open(url)
     done = db.export(tmp_path / "points.ply", "ply")
     assert done.written.maps == 1
+    assert "points.ply: ply, 1 maps" in done._repr_html_()
     assert (tmp_path / "points.ply").exists()
     with pytest.raises(ExportError, match="expected one of dataset"):
         db.export(tmp_path / "x", "shapefile")

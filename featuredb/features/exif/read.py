@@ -116,22 +116,23 @@ def read_exif(data: bytes, header: ImageHeader | None = None) -> ExifInfo:
             return ExifInfo(warnings=(f"no metadata: {error}",))
     tiff = data[slice(*header.exif)] if header.exif else b""
     xmp = data[slice(*header.xmp)] if header.xmp else b""
-    return parse_exif(tiff, xmp, header.width, header.height)
+    return parse_exif(tiff, xmp, header.width, header.height, header.orientation)
 
 
-def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
+def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: int | None = None) -> ExifInfo:
     """Metadata from the TIFF stream of EXIF and the XMP packet (either may be empty).
 
     Args:
         tiff: from the byte order mark on, without the prefix "Exif".
         xmp: XML text.
         width, height: of the stored image, pixels; the focal length is given for these.
+        orientation: said by the format, which EXIF then only repeats.
     """
     main, exif, gps, warnings = _directories(tiff)
     values = _xmp_values(xmp)
     position = finer_position(gps_position(gps, warnings), values)
     altitude, reference = gps_altitude(gps, warnings) if position else (None, "unknown")
-    orientation = _orientation(main, warnings)
+    orientation = orientation or _orientation(main, warnings)
     sigma_h, sigma_v, source = gps_sigmas(gps, values, warnings)
     return ExifInfo(
         width=width,
