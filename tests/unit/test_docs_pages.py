@@ -71,3 +71,16 @@ def reasons_in(tree: ast.Module) -> Iterator[str]:
 
 def strings_of(node: ast.AST) -> list[str]:
     return [node.value] if isinstance(node, ast.Constant) and isinstance(node.value, str) else []
+
+
+def test_the_lines_that_decide_are_where_the_architecture_says() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    rows = text.partition("## The lines that decide\n")[2].partition("\n## ")[0].splitlines()[2:]
+    cells = [row.split("|")[2] for row in rows if row]
+    assert len(cells) > 10
+    for cell in cells:
+        paths = [name for name in re.findall(r"`([\w/.]+)`", cell) if "/" in name]
+        names = [name for name in re.findall(r"`(\w+)`", cell) if name not in ("maps",)]
+        code = "".join((ROOT / path).read_text(encoding="utf-8") for path in paths if path.endswith(".py"))
+        assert all((ROOT / path).exists() for path in paths), cell
+        assert [name for name in names if not re.search(rf"\b{name}\b", code)] == [], cell
