@@ -128,7 +128,7 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=None,
         metavar="N",
-        help="points seen by at least N photos carry descriptors; default: see the README",
+        help="points seen by at least N photos carry descriptors; default: 3",
     )
     group.add_argument(
         "--height-datum",
