@@ -84,3 +84,12 @@ def test_the_lines_that_decide_are_where_the_architecture_says() -> None:
         code = "".join((ROOT / path).read_text(encoding="utf-8") for path in paths if path.endswith(".py"))
         assert all((ROOT / path).exists() for path in paths), cell
         assert [name for name in names if not re.search(rf"\b{name}\b", code)] == [], cell
+
+
+def test_pages_that_the_code_names_are_there() -> None:
+    for folder in ("featuredb", "ingest", "reloc", "schemas", "tools", "deploy"):
+        for path in (
+            p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".js", ".json", ".yaml", ".service")
+        ):
+            named = re.findall(r"\bdocs/[\w/-]+\.md\b", path.read_text(encoding="utf-8"))
+            assert [name for name in named if not (ROOT / name).is_file()] == [], path
