@@ -30,7 +30,7 @@ class OutlierOptions:
     neighbours: int = 8
     fewest: int = 4
     # A ratio of neighbours and no distance: scans are denser near the scanner and where strips overlap, and a
-    # distance that is odd in one place is usual in another. docs/lidar.md has the distributions.
+    # distance that is odd in one place is usual in another. docs/measurements/lidar.md has the distributions.
     ratio: float = 5.0
     reach_spacings: float = 12.0
     shortest_reach_m: float = 1.0

@@ -8,7 +8,7 @@ is chosen, so a heap of old gains finds the greatest one without computing the o
 A point that is not chosen loses its descriptors and stays as geometry. Answers read described points only,
 so the index, its memory and a query's time shrink as if the point were gone; what stays serves what works on
 tracks (placing a map on a scan, adjusting its lens, exports) and leaves the numbers of all points as they
-were. `keep_points=False` removes it altogether (docs/growth.md has the bytes of both).
+were. `keep_points=False` removes it altogether (docs/measurements/growth.md has the bytes of both).
 """
 
 import heapq

@@ -11,7 +11,7 @@ class ThinOptions:
 
     Attributes:
         cover: K, described points that each image keeps seeing. From 400 on the simulated town gains hardly
-            any answer within its limits (docs/growth.md).
+            any answer within its limits (docs/measurements/growth.md).
         max_views: described observations that a chosen point keeps, those that differ most in direction and
             distance. More only repeat what the mean descriptor says already.
         keep_points: points that are not chosen stay without descriptors.

@@ -124,7 +124,7 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         "--min-track-length",
         type=int,
         metavar="N",
-        help="points seen by at least N photos carry descriptors; default: see the README",
+        help="points seen by at least N photos carry descriptors; default: 3",
     )
     group.add_argument(
         "--height-datum",

@@ -1,6 +1,6 @@
 """Gates of growth: each compares one figure with its limit and says so. Pure functions.
 
-docs/growth.md shows the distributions behind the limits, and the commands that print them.
+docs/measurements/growth.md shows the distributions behind the limits, and the commands that print them.
 """
 
 from collections.abc import Iterable

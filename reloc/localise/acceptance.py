@@ -193,7 +193,7 @@ def confidence(evidence: Evidence, rival_inliers: int) -> float:
     """Probability in [0, 1] that an accepted pose is right.
 
     Logistic in the evidence, fitted on right and wrong poses of a simulated
-    town and of real photos (docs/localisation.md), right and wrong ones weighing the same.
+    town and of real photos (docs/measurements/localisation.md), right and wrong ones weighing the same.
     """
     rivalry = rival_inliers / max(evidence.inliers, 1)
     score = _CONFIDENCE_BASE + _CONFIDENCE_PER_LOG * np.log1p(max(evidence.log_nfa, 0.0))

@@ -32,7 +32,6 @@ from tests.support.remembered import remembered
 
 _REAL_DATA = "needs photos or scans that are not in the repository"
 _BY_HAND = "needs a person's clicks; tools/paper.py runs the same with picks, tests/browser the page"
-_STUDY = "a study of its own world: many minutes, or hours"
 # Commands of blocks that are not run, by their beginning, and why. Their programs read their arguments.
 NOT_RUN = {
     "featuredb ingest video film.db": _BY_HAND,
@@ -53,10 +52,10 @@ NOT_RUN = {
 PYTHON_NOT_RUN = {
     "docs/wire.md": "tests/integration/test_service_docs.py runs it",
     "docs/gateway.md": "tests/integration/test_gateway_docs.py runs it",
-    "docs/store.md": "fragments, with names for maps and photos of the reader's own",
+    "docs/measurements/store.md": "fragments, with names for maps and photos of the reader's own",
 }
 # The page that makes the database; the others begin with what it leaves.
-_FIRST = "README.md"
+_FIRST = "docs/quickstart.md"
 _FEATURES = 1500  # of a photo
 _LANGUAGES = {"sh", "python", "sql", "json", "text"}
 
@@ -106,7 +105,7 @@ def run_page(page: str, folder: Path) -> None:
 def in_short() -> Iterator[None]:
     """Commands start no workers, which take long, and what the same photo gave before is not sought anew.
 
-    README.md and docs/anchoring.md register the same frames on the same scan, with and without a person.
+    docs/anchoring.md and the tutorials register the same frames on the same scan.
     A map of few features is adjusted and compared sooner; how good it is, the demo says.
     """
     with pytest.MonkeyPatch.context() as patch:
@@ -118,8 +117,8 @@ def in_short() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def after_readme(in_short: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the simulated town, after all that the README shows."""
+def after_first(in_short: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the simulated town, after all that the first page shows."""
     folder = make_folder(tmp_path_factory.mktemp("documentation"))
     run_page(_FIRST, folder)
     go_on(folder)
@@ -128,15 +127,15 @@ def after_readme(in_short: None, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # it makes the town and its maps: three minutes on two free cores
-def test_the_commands_of_the_readme_run(after_readme: Path) -> None:
-    made = ("report/report.html", "overlay.png", "track.csv", "track.kml", "drawn.mp4", "colmap/sparse")
-    assert [name for name in made if not (after_readme / name).exists()] == []
+def test_the_commands_of_the_first_page_run(after_first: Path) -> None:
+    made = ("report/report.html", "overlay.png", "track.csv", "colmap/sparse", "opensfm/tracks.csv")
+    assert [name for name in made if not (after_first / name).exists()] == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in _TEXTS if page != _FIRST and what_runs(page)])
-def test_the_commands_of_a_page_run(after_readme: Path, tmp_path: Path, page: str) -> None:
-    run_page(page, Path(shutil.copytree(after_readme, tmp_path / "here")))
+def test_the_commands_of_a_page_run(after_first: Path, tmp_path: Path, page: str) -> None:
+    run_page(page, Path(shutil.copytree(after_first, tmp_path / "here")))
 
 
 @pytest.mark.slow

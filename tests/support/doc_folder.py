@@ -7,9 +7,10 @@
     film.mp4, film.srt        a film of another flight, and its telemetry
     gcp_list.txt              ground control points, marked in the photos of the park
 
-The README is run first, and leaves what the other pages begin with: my.db with MAP, of the photos of the
-park, and what it exports. `go_on` adds what comes from elsewhere: OTHER_MAP of another flight, in quarantine,
-and colmap and opensfm, MAP as models of those programs that do not say how surely they lie there.
+The quick start is run first, and leaves what the other pages begin with: my.db with MAP, of the photos of the
+park. `go_on` adds what comes from elsewhere: the scan in my.db, OTHER_MAP of another flight, in quarantine,
+track.csv of the film, and colmap and opensfm, MAP as models of those programs that do not say how surely they
+lie there.
 """
 
 import csv
@@ -97,21 +98,23 @@ def make_folder(folder: Path) -> Path:
 
 
 def go_on(folder: Path) -> None:
-    """Add what other pages than the README have from elsewhere."""
+    """Add what other pages than the first one have from elsewhere."""
     with inside(folder):
-        assert main(["rollback", "my.db", "1"]) == 0  # before it was anchored
-        assert main(["ingest", "photos", "my.db", "home/photos/walk", "--quiet"]) == 0
+        _run("lidar add my.db scan.laz --quiet")
+        _run("ingest photos my.db home/photos/walk --quiet")
         values = placeholders(Path("my.db"))
         database = Database.open("my.db")
         database.set_status([values["OTHER_MAP"]], "quarantined", "nobody has confirmed it")
-        shutil.copytree(f"town-colmap/{values['MAP']}", "colmap")
-        Path("colmap/georeference.json").unlink()
-        assert main(["export", "my.db", "exported", "--format", "opensfm", "--maps", values["MAP"]]) == 0
-        shutil.move(f"exported/{values['MAP']}", "opensfm")
-        Path("exported").rmdir()
-        Path("opensfm/georeference.json").unlink()
-        for path in ("town", "town-colmap", "other.db", "third.db"):
-            shutil.rmtree(path)
+        _run(f"track my.db film.mp4 --map {values['MAP']} --end 1 --out track.csv")
+        for program in ("colmap", "opensfm"):
+            _run(f"export my.db exported --format {program} --maps {values['MAP']}")
+            shutil.move(f"exported/{values['MAP']}", program)
+            Path(program, "georeference.json").unlink()
+            shutil.rmtree("exported")
+
+
+def _run(arguments: str) -> None:
+    assert main(arguments.split()) == 0, arguments
 
 
 @contextmanager

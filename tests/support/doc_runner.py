@@ -20,7 +20,7 @@ from tests.support.doc_folder import placeholders
 # Commands that serve until they are stopped, and how they show that they do: the port on which they answer,
 # what they write, or None where they show nothing.
 _SERVING: dict[tuple[str, ...], int | str | None] = {
-    ("featuredb", "serve"): 7447,
+    ("featuredb", "serve"): '"event": "serving"',  # it listens before it answers
     ("featuredb", "gateway"): 8080,
     ("featuredb", "view"): "http://127.0.0.1:",
     ("featuredb", "grow", "--watch"): None,
@@ -28,6 +28,7 @@ _SERVING: dict[tuple[str, ...], int | str | None] = {
     ("dask", "scheduler"): 8786,
     ("dask", "worker"): "Registered to:",
 }
+_PORTS = {("featuredb", "serve"): 7447, ("featuredb", "gateway"): 8080, ("dask", "scheduler"): 8786}
 _READY_S, _STOPPED_S, _SHELL_S = 60.0, 30.0, 120.0
 
 
@@ -43,8 +44,7 @@ def serves(command: Command) -> bool:
 def ports(commands: list[Command]) -> list[int]:
     """Ports that the commands listen on."""
     kinds = [_kind(command) for command in commands]
-    signs = [_SERVING[kind] for kind in kinds if kind is not None]
-    return [sign for sign in signs if isinstance(sign, int)]
+    return [_PORTS[kind] for kind in kinds if kind in _PORTS]
 
 
 def is_free(port: int) -> bool:

@@ -96,7 +96,6 @@ SPEED: tuple[Row, ...] = (
         figures=same("points_per_cpu_second"),
         text="{peak_tree_mib:.0f} MiB at the peak, {cpu_seconds:.0f} s of a core",
         limits=(Limit(figure="peak_tree_mib", most=2048),),
-        readme=True,
         minutes=15,
     ),
 )

@@ -196,7 +196,6 @@ REAL: tuple[Row, ...] = (
             Limit(figure="foreign_accepted", most=0),
         ),
         needs=("autzen", "brighton/images", "lewis/images"),
-        readme=True,
         minutes=40,
     ),
     Row(
@@ -224,7 +223,6 @@ REAL: tuple[Row, ...] = (
         ),
         needs=("brighton/images", "brighton/model.laz"),
         resumes=True,
-        readme=True,
         minutes=40,
     ),
     Row(
@@ -322,7 +320,6 @@ REAL: tuple[Row, ...] = (
         text="{ours_of_colmap_largest} of {colmap_largest} ({share:.0%}), in {times:.1f} times COLMAP's time",
         limits=(Limit(figure="share", least=0.9), Limit(figure="placed", most=0)),
         needs=("reichstag/images",),
-        readme=True,
         minutes=15,
     ),
     Row(

@@ -107,7 +107,6 @@ SIMULATED: tuple[Row, ...] = (
             Limit(figure="scan_cameras_m", most=0.10),
             Limit(figure="scan_queries_largest_m", most=0.5),
         ),
-        readme=True,
         minutes=4,
     ),
     Row(
@@ -268,7 +267,6 @@ SIMULATED: tuple[Row, ...] = (
             Limit(figure="lost", most=12),
         ),
         resumes=True,
-        readme=True,
         minutes=25,
     ),
     *(_films(seed) for seed in (1, 2)),

@@ -122,7 +122,7 @@ def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator
 
 
 def _searched(sources: tuple[RenderSource, ...]) -> tuple[RenderSource, ...]:
-    """Shaded relief gives points nothing to match and has few edges (docs/descriptors.md): where the scan has
+    """Shaded relief has nothing to match and few edges (docs/measurements/descriptors.md): where the scan has
     more to show, poses are compared with it, but not searched.
     """
     telling = tuple(source for source in sources if source != "shaded")

@@ -10,7 +10,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from ingest.register.frame_registration import FrameReason
 
-# Where the line is, by right and wrong registrations of the simulated town (docs/registration.md).
+# Where the line is, by right and wrong registrations of the simulated town:
+# docs/measurements/registration.md.
 MIN_COVER = 0.03  # smallest share of a render that shows the scan
 MIN_INLIERS = 20  # fewer independent inliers are never believed
 # Smallest share of the parts of the photo where the scan should be seen that hold inliers.

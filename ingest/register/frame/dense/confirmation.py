@@ -39,7 +39,7 @@ from ingest.register.frame_registration import RenderSource
 _OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not
 
 
-# Where the line between confirmed and not is; docs/registration.md shows the distributions behind it.
+# Where the line between confirmed and not is; docs/measurements/registration.md shows the distributions.
 _SIDE_PX = 480  # longer side of the view on which pieces are compared, where the scan is dense enough
 _SEARCH_PX = 16  # radius of the window in which a piece is searched
 _NEAR_PX = 3.0  # a piece agrees with the pose when its best place is this near
@@ -59,7 +59,7 @@ _MIN_CELLS = 4  # of 16 parts of the photo, how many must hold a piece that agre
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConfirmOptions:
-    """Where the line between confirmed and not is; docs/registration.md shows the distributions behind it.
+    """Where the line between confirmed and not is; docs/measurements/registration.md shows the distributions.
 
     Attributes:
         finest_spacing: a pixel is at least this share of the mean distance between scan points.

@@ -7,7 +7,7 @@ modulo 180 degrees. Those channels share a large constant part, "there is textur
 correlation. The channels here are the Fourier series of the same function of direction without its constant
 term: strength times cosine and sine of twice and four times the gradient's angle. Four channels do the work
 of eight, they average to zero, and on aerial photos against laser intensity they found the right place far
-more often (docs/registration.md).
+more often (docs/measurements/registration.md).
 """
 
 from dataclasses import dataclass
