@@ -17,8 +17,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from ingest.own_frame import held_of
 from ingest.placed_models import placement_evidence
+from ingest.positions.position_noise import Held
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
-from ingest.register.position_noise import Held
 
 _OPTIONS = GpsOptions()
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.3, -0.2, 2.0]), translation=np.array([4.0, -7.0, 50.0]))

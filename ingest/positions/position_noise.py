@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.register.variance_components import MixedModel, ModelAxis, prior_mean
+from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean
 
 _TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
 _ROUNDS = 12  # of weights and components; most settle in five
