@@ -16,7 +16,8 @@ def center_priors(
 
     What a receiver states is the size of its whole error, most of which a flight's positions share: a
     barometer that is off by 10 m still tells that all photos were taken at one height. What they share moves
-    a map, the rest shapes it.
+    a map, the rest shapes it. No position counts less than it states: where they seem noisier, the map may be
+    bent instead, and those that are far off lose to the adjustment's robust loss.
 
     Args:
         photo_of: (n,) photos of the positions, in their order in time.
@@ -25,7 +26,7 @@ def center_priors(
     """
     fit = fit_noisy(start, centers, positions, sigmas)
     stated = np.array([stated_sigma(sigmas[:, :2]), stated_sigma(sigmas[:, 2:])])
-    share = (np.hypot(fit.noise.white, fit.noise.drift) / stated)[[0, 0, 1]]
+    share = np.minimum(np.hypot(fit.noise.white, fit.noise.drift) / stated, 1.0)[[0, 0, 1]]
     move = fit.local_from_sfm.inverse()
     axes = move.scale * move.rotation * share
     return CenterPriors(
