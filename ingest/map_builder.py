@@ -28,9 +28,11 @@ from ingest.colmap.precision import (
     upper_triangle,
 )
 from ingest.own_frame import own_frame_of
-from ingest.photos.photo import Photo, center_priors
+from ingest.photos.photo import Photo, answered_positions
+from ingest.positions.center_priors import center_priors
 from ingest.sfm.extract import PhotoFeatures
 
+_LEAST_POSITIONS = 3  # tell a similarity
 _MOST_PHOTOS = 1000  # whose normal equations are inverted densely
 
 
@@ -76,7 +78,7 @@ def build_map(
         photos, features: of the model's registered photos, in the order of `model.rows`; features are read
             once, photo by photo.
     """
-    positions = center_priors(photos, frame) if placement.method == "gps" else None
+    positions = _positions(model, placement, photos, frame) if placement.method == "gps" else None
     parts = _parts(model, placement.local_from_sfm, photos, features, identity, options, positions)
     if parts is None:
         return None
@@ -166,6 +168,17 @@ def _parts(
             "provenance": provenance,
         },
     )
+
+
+def _positions(
+    model: Model, placement: Placement, photos: Sequence[Photo], frame: LocalFrame
+) -> CenterPriors | None:
+    """Measured centres of the placed model; None where they do not tell a similarity."""
+    rows, positions, sigmas = answered_positions(photos, frame)
+    if len(rows) < _LEAST_POSITIONS:
+        return None
+    placed = placement.local_from_sfm.act(model.centers()[rows])
+    return center_priors(rows, placed, positions, sigmas, Sim3.identity())
 
 
 def _errors(

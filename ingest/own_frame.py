@@ -13,7 +13,7 @@ from featuredb.geometry.rotation import rotation_to_up
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NOMINAL_DISTANCE, OwnFrame
 from ingest.colmap.bridge import Model
-from ingest.register.position_noise import Held
+from ingest.positions.position_noise import Held
 
 # What gives a map without a place its place; for people.
 WAYS_TO_A_PLACE = (

@@ -25,12 +25,14 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap.bridge import SfmPhoto, quiet, whole_model_of
 from ingest.colmap.precision import linearise, shared_variance_px2
+from ingest.positions.center_priors import center_priors
 
 # COLMAP's own gates of mapping: 4 px at keypoints good to half a pixel, 1.5 degrees, 15 observations.
 _MAX_ERROR_OVER_SCALE = 8.0
 _MIN_ANGLE_DEG = 1.5
 _FOCAL_OVER_SIDE, _MAX_DISTORTION = (0.1, 10.0), 1.0  # COLMAP's own for bogus lenses
 _MIN_OBSERVATIONS = 15
+_ROUNDS = 2  # of noise of positions and adjustment: how far positions are off follows from the shape
 _LEAST_PX2 = 1e-6  # of a variance: exact observations
 _FUNCTION_TOLERANCE = 1e-6  # relative; what is left is below micrometres
 
@@ -49,7 +51,8 @@ class AdjustOptions:
             (`ingest.colmap.precision.shared_variance_px2`) count as one against these priors and positions: a
             lens model's faults are common to whole photos too. On `brighton`, from above, EXIF's focal length
             of 2311 px comes to 2602 with 1, 2357 with 10, 2322 with 50, where its scan says 2296.
-        use_positions: GPS positions take part, robustly, each with its own sigma.
+        use_positions: GPS positions take part, robustly, as noisy as they are among themselves
+            (`ingest.positions.center_priors`).
         max_iterations: of Ceres.
         threads: one gives the same numbers in every run.
     """
@@ -173,29 +176,30 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
     block = model.block(model.pixels(keypoints))
     if options.whole_lens and options.refine_focal:
         block = whole_lens(block)
-    centers = _center_priors(block, image_ids, known.photos) if options.use_positions else None
     lenses = [
         lens_prior_of(camera, known.focal_px.get(camera_id), options)
         for camera, camera_id in zip(block.cameras, camera_ids, strict=True)
     ]
-    terms = Terms(
-        keypoint_px=loss_scale_px,
-        dilution=options.dilution * block_variance_px2(block) / loss_scale_px**2,
-        lenses=tuple(lenses) if options.refine_focal else (None,) * len(lenses),
-        centers=centers,
-        held_photos=() if centers is not None else (0,),
-    )
-    problem = Problem(block, terms, options.threads)
-    problem.solve(options.max_iterations, _FUNCTION_TOLERANCE)
-    adjusted = problem.block()
-    for camera_id, lens in zip(camera_ids, adjusted.cameras, strict=True):
+    for _ in range(_ROUNDS if options.use_positions else 1):
+        centers = _center_priors(block, image_ids, known.photos) if options.use_positions else None
+        terms = Terms(
+            keypoint_px=loss_scale_px,
+            dilution=options.dilution * block_variance_px2(block) / loss_scale_px**2,
+            lenses=tuple(lenses) if options.refine_focal else (None,) * len(lenses),
+            centers=centers,
+            held_photos=() if centers is not None else (0,),
+        )
+        problem = Problem(block, terms, options.threads)
+        problem.solve(options.max_iterations, _FUNCTION_TOLERANCE)
+        block = problem.block()
+    for camera_id, lens in zip(camera_ids, block.cameras, strict=True):
         camera = reconstruction.camera(camera_id)
         camera.model = pycolmap.CameraModelId.__members__[lens.model]
         camera.params = list(lens.params)
-    for image_id, pose in zip(image_ids, adjusted.cam_from_block, strict=True):
+    for image_id, pose in zip(image_ids, block.cam_from_block, strict=True):
         frame = reconstruction.frame(reconstruction.image(image_id).frame_id)
         frame.rig_from_world = pycolmap.Rigid3d(pose.matrix()[:3])
-    for point_id, xyz in zip(point_ids, adjusted.xyz, strict=True):
+    for point_id, xyz in zip(point_ids, block.xyz, strict=True):
         reconstruction.point3D(point_id).xyz = xyz
     reconstruction.update_point_3d_errors()
 
@@ -243,21 +247,18 @@ def _center_priors(block: Block, image_ids: list[int], photos: tuple[SfmPhoto, .
         return None
     measured = np.array([photos[image_ids[k] - 1].prior_position for k in told])
     covariance = np.array([photos[image_ids[k] - 1].prior_covariance for k in told])
+    sigmas = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     centers = block.centers()[told]
     ransac = pycolmap.RANSACOptions()
-    ransac.max_error = 3.0 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max()))
+    ransac.max_error = 3.0 * float(np.linalg.norm(sigmas, axis=1).max())
     ransac.random_seed = 0
     found = pycolmap.estimate_sim3d_robust(centers, measured, ransac)
     if found is None:
         return None
     fit = found["tgt_from_src"]
     turn = Rigid3.from_matrix(np.column_stack([fit.rotation.matrix(), fit.translation])).rotation
-    move = Sim3(scale=float(fit.scale), rotation=turn, translation=fit.translation).inverse()
-    return CenterPriors(
-        photo_of=np.array(told, dtype=np.int64),
-        xyz=move.act(measured),
-        covariance=move.scale**2 * move.rotation @ covariance @ move.rotation.T,
-    )
+    start = Sim3(scale=float(fit.scale), rotation=turn, translation=fit.translation)
+    return center_priors(np.array(told, dtype=np.int64), centers, measured, sigmas, start)
 
 
 def _triangulated_anew(reconstruction: Any, database: Path, folder: Path) -> Any:

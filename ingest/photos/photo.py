@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from featuredb.adjust.terms import CenterPriors
 from featuredb.features.exif.gps import AltitudeReference
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -181,16 +181,11 @@ def capture_seconds(photos: Sequence[Photo]) -> FloatArray | None:
     return np.array([(time - times[0]).total_seconds() for time in times])
 
 
-def center_priors(photos: Sequence[Photo], frame: LocalFrame) -> CenterPriors | None:
-    """Measured centres for an adjustment in the frame: of positions that somebody answers for.
-
-    Returns:
-        None where fewer than three photos have one: they do not tell a similarity.
-    """
+def answered_positions(
+    photos: Sequence[Photo], frame: LocalFrame
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Photos (n,) whose positions somebody answers for, with these (n, 3) and their sigmas (n, 3)."""
     xyz, sigmas = gps_priors(photos, frame)
     hints = np.array([photo.gps_is_hint for photo in photos], dtype=np.bool_)
     rows = np.flatnonzero(np.isfinite(sigmas).all(axis=1) & ~hints)
-    if len(rows) < 3:
-        return None
-    covariance = np.array([np.diag(sigma**2) for sigma in sigmas[rows]])
-    return CenterPriors(photo_of=rows, xyz=xyz[rows], covariance=covariance)
+    return rows, xyz[rows], sigmas[rows]

@@ -1,6 +1,6 @@
 """Placement by positions of any quality: the similarity, how wide it is, and whether it may be by chance.
 
-How noisy the positions are is estimated with the similarity (`ingest.register.position_noise`). What noise
+How noisy the positions are is estimated with the similarity (`ingest.positions.position_noise`). What noise
 leaves of the stated sigmas is taken for a bias that all positions share. Two tests, each by a rate of error:
 
 - chance: how often would positions that have nothing to do with the reconstruction fit as well? It follows
@@ -22,8 +22,8 @@ from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGM
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.register.position_noise import ANGLES_WRONG, Held, NoisyFit, fit_noisy, stated_sigma
-from ingest.register.variance_components import NOISE_SHARE
+from ingest.positions.position_noise import ANGLES_WRONG, Held, NoisyFit, fit_noisy, stated_sigma
+from ingest.positions.variance_components import NOISE_SHARE
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 

@@ -13,7 +13,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model, without_impossible
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.photos.photo import Photo, center_priors, local_frame_of, photo_cameras
+from ingest.photos.photo import Photo, answered_positions, local_frame_of, photo_cameras
 from ingest.reconstruction import MapMakingOptions
 from ingest.sfm.mapper import SfmOptions, SfmTask, SfmView, disjoint, mapping_settings
 from tests.support.planar_map import CAMERA
@@ -85,12 +85,10 @@ def test_measured_centres_are_those_that_somebody_answers_for() -> None:
     photos = [_PHOTO, replace(tagged[0], gps_is_hint=True), *tagged[1:4], _at(48.99, 8.41, None)]
     frame = local_frame_of(tagged)
     assert frame is not None
-    found = center_priors(photos, frame)
-    assert found is not None
-    assert found.photo_of.tolist() == [2, 3, 4]  # no position, a hint and one without height say nothing
-    np.testing.assert_allclose(found.covariance[0], np.diag([9.0, 9.0, 25.0]))
-    np.testing.assert_allclose(np.diff(found.xyz[:, 2]), 1.0, atol=1e-2)
-    assert center_priors(photos[:4], frame) is None
+    rows, positions, sigmas = answered_positions(photos, frame)
+    assert rows.tolist() == [2, 3, 4]  # no position, a hint and one without height say nothing
+    np.testing.assert_allclose(sigmas, np.tile([3.0, 3.0, 5.0], (3, 1)))
+    np.testing.assert_allclose(np.diff(positions[:, 2]), 1.0, atol=1e-2)
 
 
 def _model(rows: list[int]) -> Model:

@@ -139,7 +139,9 @@ SIMULATED: tuple[Row, ...] = (
             f"orientation {{orientation_68_{sigma}:.0%}} and {{orientation_95_{sigma}:.1%}} "
             "inside 68 and 95 % bounds"
             for sigma in _SIGMAS
-        ),
+        )
+        + "; of {level:.0f} level flights cameras are off in height by {bent_m:.3f} m, nine of ten by at "
+        "most {bent_90_m:.3f} m",
         limits=tuple(
             limit
             for sigma in _SIGMAS

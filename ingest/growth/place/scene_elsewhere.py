@@ -24,7 +24,7 @@ from featuredb.store import MapSummary, Snapshot
 from ingest.growth.map_images import features_and_points
 from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.values import LEAST_PHOTOS, Edge
-from ingest.register.variance_components import NOISE_SPREAD
+from ingest.positions.variance_components import NOISE_SPREAD
 from ingest.workspace import read_array, write_arrays
 
 logger = logging.getLogger(__name__)

@@ -1,11 +1,13 @@
 """How noisy positions are, estimated together with the similarity that carries a reconstruction to them.
 
-    position_i = S center_i + bias + drift(t_i) + noise_i
+    position_i = S (center_i + shape_i) + bias + drift(t_i) + noise_i
 
 For the horizontal axes and the vertical each: noise is independent, drift is a line and a random walk along
 the time of the flight, the bias is shared by the flight and cannot be told from the similarity's
-translation. What positions say of themselves is a prior of these components of variance (`MixedModel`).
-Positions far out are found with weights of Student's t (Lange, Little, Taylor 1989) and then left out.
+translation. The reconstruction is bent, too, by what is left of its lens' error: without a shape of its own,
+survey-grade positions would seem to drift. What positions say of themselves is a prior of these components
+of variance (`MixedModel`). Positions far out are found with weights of Student's t (Lange, Little, Taylor
+1989) and then left out.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +19,7 @@ from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.register.variance_components import MixedModel, ModelAxis, prior_mean
+from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean
 
 _TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
 _ROUNDS = 12  # of weights and components; most settle in five
@@ -32,6 +34,7 @@ _LAG_SHARE = 0.5  # of a stated sigma that may be a lag
 ANGLES_WRONG = 4.0  # standard deviations
 _MOST_LAG_S = 1.0  # standard deviation of a lag
 _STEADY_S = 20.0
+_SHAPE = 1e-3  # of the centres' distance from their middle: 0.9e-3 on entry-P10, 0.7e-3 on fountain-P11
 _MOST_POSITIONS = 400  # more are thinned out evenly in time
 _TURNS = 8.0  # local maxima of the likelihood over turns: each is a chance of its own
 _INSIDE = 0.999  # of honest positions
@@ -129,6 +132,7 @@ class _Data:
         walk: (n, n) covariance of a walk of unit variance at its end.
         stated: (2,) median sigma, horizontal and vertical.
         speed: (n, 3) metres of the reconstruction a second; 0 where it is not known.
+        shape_m: standard deviation of a centre's coordinate by the reconstruction's own shape.
         lag_sigma_s: of the time between a photo and its position.
         held: how the photos are held, or None.
     """
@@ -139,6 +143,7 @@ class _Data:
     walk: FloatArray
     stated: FloatArray
     speed: FloatArray
+    shape_m: float
     lag_sigma_s: float
     held: Held | None
 
@@ -213,6 +218,7 @@ def fit_noisy(
         walk=_walk(order),
         stated=stated,
         speed=speed,
+        shape_m=_SHAPE * start.scale * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()),
         lag_sigma_s=min(_LAG_SHARE * stated[0] / usual, _MOST_LAG_S) if usual > 0 else _MOST_LAG_S,
         held=held,
     )
@@ -318,13 +324,13 @@ def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: Floa
 
 def _at(data: _Data, state: _State, weights: FloatArray) -> MixedModel:
     axes = _axes(data, state.residual(data), state.jacobian(data), weights)
-    return MixedModel(axes, *state.known(data))
+    return MixedModel(axes, *state.known(data), data.shape_m**2)
 
 
 def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: FloatArray) -> FloatArray:
     """The walk (n, 3) that is most likely for residuals (n, 3), with a constant taken off each axis."""
     result = np.zeros_like(residual)
-    white, drift = np.exp(2.0 * theta[:2]), np.exp(2.0 * theta[2:])
+    white, drift = data.shape_m**2 + np.exp(2.0 * theta[:2]), np.exp(2.0 * theta[2:])
     for group, axes in enumerate(_AXES):
         for axis in axes.tolist():
             known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
@@ -340,7 +346,8 @@ def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: Float
 def _squared(data: _Data, state: _State, weights: FloatArray, theta: FloatArray) -> FloatArray:
     """(n, 2) squared residuals over the noise, horizontal and vertical, less the walk; 0 where not known."""
     residual = state.residual(data)
-    return _relative(data, residual - _walked(data, residual, weights, theta)) / np.exp(2.0 * theta[:2])
+    noise = data.shape_m**2 + np.exp(2.0 * theta[:2])
+    return _relative(data, residual - _walked(data, residual, weights, theta)) / noise
 
 
 def _relative(data: _Data, residual: FloatArray) -> FloatArray:

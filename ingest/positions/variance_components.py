@@ -42,11 +42,13 @@ class MixedModel:
     Attributes:
         axes: east, north, up.
         known: (m, p) whitened Jacobian, off: (m,) residuals, of what is known beside them.
+        least: variance of an observation that is no component's.
     """
 
     axes: list[ModelAxis]
     known: FloatArray
     off: FloatArray
+    least: float = 0.0
 
     def cost(self, theta: FloatArray, stated: FloatArray | None) -> float:
         """Minus twice the logarithm of the restricted likelihood, with the prior where `stated` is given."""
@@ -97,7 +99,8 @@ class MixedModel:
         matrix, right = self.known.T @ self.known, self.known.T @ self.off
         squared, logs = float(self.off @ self.off), 0.0
         for axis in self.axes:
-            variance = np.exp(2.0 * theta[axis.group]) + np.exp(2.0 * theta[2 + axis.group]) * axis.walk
+            variance = self.least + np.exp(2.0 * theta[axis.group])
+            variance = variance + np.exp(2.0 * theta[2 + axis.group]) * axis.walk
             scaled = axis.jacobian / variance[:, None]
             matrix = matrix + axis.jacobian.T @ scaled
             right = right + scaled.T @ axis.residual
@@ -115,7 +118,7 @@ class MixedModel:
         slope = np.zeros(4)
         for axis in self.axes:
             white, drift = np.exp(2.0 * theta[axis.group]), np.exp(2.0 * theta[2 + axis.group]) * axis.walk
-            variance = white + drift
+            variance = self.least + white + drift
             left = (axis.residual - axis.jacobian @ step) ** 2
             left += ((axis.jacobian @ covariance) * axis.jacobian).sum(axis=1)
             by_variance = 2.0 * (1.0 / variance - left / variance**2)

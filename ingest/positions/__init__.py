@@ -1,0 +1,1 @@
+"""How noisy measured camera positions are, and what they say in an adjustment."""
