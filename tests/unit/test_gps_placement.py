@@ -13,8 +13,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation, so3_exp
 from featuredb.geometry.similarity import similarity_closed_form
 from ingest.own_frame import held_of
-from ingest.register.gps import GpsPlacement, place_by_gps
 from ingest.positions.position_noise import Held
+from ingest.register.gps import GpsPlacement, place_by_gps
 from tests.support.gps_flights import OPTIONS, TRUE, flight, place
 
 
