@@ -23,7 +23,7 @@ STILL_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1", b"avif"})
 SEQUENCE_BRANDS = frozenset({b"hevc", b"hevx", b"msf1", b"avis"})
 _PICTURES = (b"hvc1", b"av01", b"grid")  # cameras' kinds; a library may decode others, of any size
 _BLOCK = 64  # pixels of HEVC's largest block: encoders fill the last one, and cut that off again
-_MAX_META = 4 << 20  # bytes of the box that describes all; a phone's has some 20 kB
+_MAX_META = 1 << 20  # bytes of the box that describes all; a phone's has some 20 kB
 # (quarter turns against the clock, then the axis of a mirror or None) as an orientation of EXIF.
 _ORIENTATIONS: dict[tuple[int, int | None], int] = {
     **{(0, None): 1, (1, None): 8, (2, None): 3, (3, None): 6},
@@ -152,6 +152,8 @@ def heic_pixels(data: bytes, header_size: tuple[int, int], orientation: int) -> 
         no_memory = isinstance(error, MemoryError) or "Memory allocation" in str(error)
         code = "too_large" if no_memory else "broken"
         raise ImageError(f"the HEIC cannot be decoded: {str(error)[:200]}", code) from error
+    if pixels.dtype == np.uint16:  # grey of 10 and 12 bits, whatever `convert_hdr_to_8bit` says
+        pixels = (pixels >> 8).astype(np.uint8)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[:, :, None], 3, axis=2)
     return np.ascontiguousarray(_unturned(pixels[:, :, :3], orientation))
@@ -230,6 +232,8 @@ def _read_extents(body: _Reader, meta: _Meta) -> None:
     version, sizes = body.version(), body.number(2)
     offset_size, length_size, base_size = sizes >> 12, sizes >> 8 & 15, sizes >> 4 & 15
     index_size = sizes & 15 if version else 0
+    if not {offset_size, length_size, base_size, index_size} <= {0, 4, 8}:  # ISO/IEC 14496-12, 8.11.3
+        raise _broken("its table of places has numbers of no size that there is")
     if not length_size or not (offset_size or base_size):
         raise _broken("its items have no length")  # nor would reading them ever end
     for _ in range(body.number(2 if version < 2 else 4)):

@@ -9,7 +9,8 @@ import pyarrow as pa
 
 from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
 from featuredb.store.changes import Change
-from featuredb.store.delta import Commit, Table
+from featuredb.store.delta import Table
+from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, Row, map_rows_table, rows_of
 from featuredb.store.tables import FORMAT_VERSION, MAPS, SPECS
 

@@ -23,8 +23,9 @@ from featuredb.store.commits import (
     new_write_id,
     read_rows,
 )
-from featuredb.store.delta import Commit, Table
+from featuredb.store.delta import Table
 from featuredb.store.durable.copies import check_restored
+from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import Snapshot

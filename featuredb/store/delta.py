@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 from urllib.parse import unquote
@@ -34,7 +34,7 @@ from featuredb.errors import ConflictError, StoreError
 from featuredb.store.durable.ages import old_files, old_scratch_folders, remove_files
 from featuredb.store.durable.filesystem import table_files
 from featuredb.store.durable.local import Sight, commit_locally, create_locally
-from featuredb.store.durable.log import acknowledge, check_end
+from featuredb.store.durable.log import Commit, acknowledge, check_end, read_commit
 from featuredb.store.durable.making import (
     check_format,
     create_table,
@@ -61,16 +61,6 @@ class DataFile:
     partition: dict[str, Any]
     min_write_id: str | None
     max_write_id: str | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Commit:
-    """One entry of a table's log, timestamp in UTC."""
-
-    version: int
-    timestamp: datetime
-    operation: str
-    metadata: dict[str, str]
 
 
 class Table:
@@ -206,18 +196,14 @@ class Table:
         ]
 
     def commits(self, limit: int | None = None) -> list[Commit]:
-        """The log, newest first; each entry is one small file to read."""
+        """The log up to this version, newest first; each entry is one small file to read.
+
+        Not by deltalake's `history`: where others have committed since the table was opened, it lists their
+        entries, too, and numbers the newest of them with this table's version.
+        """
+        versions = range(self.version, -1, -1)[:limit]
         with _as_store_error(f"cannot read the log of {self._url}"):
-            entries = self._delta.history(limit)
-        return [
-            Commit(
-                version=entry["version"],
-                timestamp=datetime.fromtimestamp(entry["timestamp"] / 1000.0, tz=UTC),
-                operation=str(entry.get("operation", "")),
-                metadata={k: str(v) for k, v in entry.items() if k.startswith("featuredb.")},
-            )
-            for entry in entries
-        ]
+            return [read_commit(self.storage, version) for version in versions]
 
     def append(self, rows: pa.Table | pa.RecordBatchReader) -> None:
         """Append child rows, of a table or as a stream; concurrent appends rebase and all land.

@@ -180,7 +180,7 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
         lens_prior_of(camera, known.focal_px.get(camera_id), options)
         for camera, camera_id in zip(block.cameras, camera_ids, strict=True)
     ]
-    for _ in range(_ROUNDS if options.use_positions else 1):
+    for _ in range(_ROUNDS):
         centers = _center_priors(block, image_ids, known.photos) if options.use_positions else None
         terms = Terms(
             keypoint_px=loss_scale_px,
@@ -192,6 +192,8 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
         problem = Problem(block, terms, options.threads)
         problem.solve(options.max_iterations, _FUNCTION_TOLERANCE)
         block = problem.block()
+        if centers is None:
+            break
     for camera_id, lens in zip(camera_ids, block.cameras, strict=True):
         camera = reconstruction.camera(camera_id)
         camera.model = pycolmap.CameraModelId.__members__[lens.model]

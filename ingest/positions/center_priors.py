@@ -20,7 +20,7 @@ def center_priors(
     bent instead, and those that are far off lose to the adjustment's robust loss.
 
     Args:
-        photo_of: (n,) photos of the positions, in their order in time.
+        photo_of: (n,) photos of the positions, in the order of their names, which is taken for that in time.
         centers: (n, 3) as reconstructed. positions, sigmas: (n, 3) metres.
         start: takes centres to positions, within the range where it is linear.
     """

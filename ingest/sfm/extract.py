@@ -147,6 +147,7 @@ def _extract_one(task: ExtractTask) -> str:
     try:
         data = task.photo.read_bytes()
         features = extract(decode_gray(data, INGEST_LIMITS), task.options)
+        rgb = _colours(data, features)
     except (ImageError, OSError) as error:
         return str(error)
     write_arrays(
@@ -155,7 +156,7 @@ def _extract_one(task: ExtractTask) -> str:
         | {
             "size": np.array([features.width, features.height]),
             "fingerprint": np.array(features.fingerprint),
-            "rgb": _colours(data, features),
+            "rgb": rgb,
         },
     )
     return ""

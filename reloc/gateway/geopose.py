@@ -178,7 +178,7 @@ def _size(picture: CameraReading) -> tuple[int, int] | None:
 def _image_file(data: bytes, picture: CameraReading, size: tuple[int, int] | None) -> bytes:
     """The picture as a file. Clients call files RGBA32, too, so the bytes decide and not `imageFormat`."""
     channels = _CHANNELS.get(picture.imageFormat.upper())
-    if channels is None or data.startswith(_FILE_BEGINNINGS):
+    if channels is None or data.startswith(_FILE_BEGINNINGS) or data[4:8] == b"ftyp":
         return data
     if size is None or len(data) != size[0] * size[1] * channels:
         raise GatewayError(

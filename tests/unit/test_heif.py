@@ -108,6 +108,12 @@ def test_what_phones_write() -> None:
         assert np.abs(decode_rgb(data).astype(float) - plain).mean() < 5
     grey = decode_rgb(_encode(_scene().convert("L")))
     assert np.abs(grey[:, :, 1].astype(float) - np.asarray(_scene().convert("L"))).mean() < 4
+    deep_grey = io.BytesIO()
+    levels = np.asarray(_scene().convert("L"))
+    pillow_heif.from_bytes("I;16", SIZE, (levels.astype(np.uint16) * 257).tobytes()).save(deep_grey)
+    for found in (decode_gray(deep_grey.getvalue()), decode_rgb(deep_grey.getvalue())[:, :, 2]):
+        assert found.dtype == np.uint8
+        assert np.abs(found.astype(float) - levels).mean() < 4
     tiled = decode_rgb(_encode(_scene((600, 440)), tile_size=256))
     assert np.abs(tiled.astype(float) - np.asarray(_scene((600, 440)))).mean() < 4
     odd = decode_rgb(_encode(_scene((201, 143))))  # cut to its size by the box clap
@@ -163,6 +169,8 @@ def test_boxes_that_lie_cost_nothing() -> None:
     assert (
         _refusal(data[: at + 8] + b"\0\0\xff\xff" + data[at + 12 :]).code == "broken"
     )  # items without length
+    # A number of one byte, which no standard has, would make a table of millions of places of a small file.
+    assert "numbers of no size" in str(_refusal(data[: at + 8] + b"\x41" + data[at + 9 :]))
     huge = data[:28] + struct.pack(">I", 1 << 30) + data[32:]
     assert _refusal(huge).code == "broken"  # a description of a gigabyte
 

@@ -110,6 +110,32 @@ def list_entries(files: fs.FileSystem) -> dict[int, datetime]:
     return dict(sorted(_numbered(files, LOG, _ENTRY)))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Commit:
+    """One entry of a table's log, timestamp in UTC."""
+
+    version: int
+    timestamp: datetime
+    operation: str
+    metadata: dict[str, str]
+
+
+def read_commit(files: fs.FileSystem, version: int) -> Commit:
+    """What a log entry says of itself.
+
+    Raises:
+        StoreError: it is missing, empty or torn.
+    """
+    told = [action["commitInfo"] for action in whole_entry(files, version)[1] if "commitInfo" in action]
+    info = told[0] if told else {}
+    return Commit(
+        version=version,
+        timestamp=datetime.fromtimestamp(info.get("timestamp", 0) / 1000.0, tz=UTC),
+        operation=str(info.get("operation", "")),
+        metadata={k: str(v) for k, v in info.items() if k.startswith("featuredb.")},
+    )
+
+
 def whole_entry(files: fs.FileSystem, version: int) -> tuple[bytes, list[Action]]:
     """A table's log entry as it is written, and its actions.
 

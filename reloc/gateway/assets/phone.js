@@ -3,6 +3,7 @@
 const $ = (id) => document.getElementById(id);
 const POSITION_MS = 5000; // a fix that takes longer is not waited for
 const LEAST_SIGMA_M = 10; // phones between houses are off by tens of metres and claim three
+const MOST_SIGMA_M = 1e6; // of the wire
 
 async function startCamera() {
   try {
@@ -40,6 +41,7 @@ async function snap() {
     $("pose").hidden = true;
     return say("Point the camera at what the map shows.");
   }
+  $("ask").disabled = true; // until the answer is there
   draw($("camera"), $("camera").videoWidth, $("camera").videoHeight);
   const photo = await new Promise((done) => $("shot").toBlob(done, "image/jpeg", 0.92));
   return ask(photo, await prior());
@@ -66,7 +68,7 @@ async function prior() {
     navigator.geolocation.getCurrentPosition(done, () => done(null), options));
   if (found === null) return null;
   const { latitude, longitude, accuracy } = found.coords;
-  return { lat: latitude, lon: longitude, sigma_m: Math.max(LEAST_SIGMA_M, accuracy) };
+  return { lat: latitude, lon: longitude, sigma_m: Math.min(MOST_SIGMA_M, Math.max(LEAST_SIGMA_M, accuracy)) };
 }
 
 async function ask(photo, place) {
