@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from featuredb.adjust.terms import CenterPriors
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.positions.position_noise import fit_noisy, stated_sigma
+from ingest.positions.position_noise import fit_noisy
+from ingest.positions.variance_components import stated_sigma
 
 
 def center_priors(

@@ -3,11 +3,11 @@
     position_i = S (center_i + shape_i) + bias + drift(t_i) + noise_i
 
 For the horizontal axes and the vertical each: noise is independent, drift is a line and a random walk along
-the time of the flight, the bias is shared by the flight and cannot be told from the similarity's
-translation. The reconstruction is bent, too, by what is left of its lens' error: without a shape of its own,
-survey-grade positions would seem to drift. What positions say of themselves is a prior of these components
-of variance (`MixedModel`). Positions far out are found with weights of Student's t (Lange, Little, Taylor
-1989) and then left out.
+the time of the flight, the bias that a flight shares cannot be told from the similarity's translation. What
+is left of the lens' error bends the reconstruction: without that shape, survey-grade positions would seem to
+drift (the map's own covariances have it). What positions say of themselves is a prior of these components of
+variance (`MixedModel`). Positions far out are found with weights of Student's t (Lange, Little, Taylor 1989)
+and then left out.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean
+from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean, stated_sigma
 
 _TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
 _ROUNDS = 12  # of weights and components; most settle in five
@@ -282,12 +282,6 @@ def _speeds(centers: FloatArray, times_s: FloatArray) -> FloatArray:
     return speed
 
 
-def stated_sigma(sigmas: FloatArray) -> float:
-    """The median of those that are known, metres; one where none is."""
-    known = sigmas[np.isfinite(sigmas)]
-    return float(np.median(known)) if len(known) else 1.0
-
-
 def _walk(times_s: FloatArray) -> FloatArray:
     """Covariance (n, n) of a drift that is nothing at the first time and of unit variance at the last."""
     since = times_s - times_s.min()
@@ -346,8 +340,8 @@ def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: Float
 def _squared(data: _Data, state: _State, weights: FloatArray, theta: FloatArray) -> FloatArray:
     """(n, 2) squared residuals over the noise, horizontal and vertical, less the walk; 0 where not known."""
     residual = state.residual(data)
-    noise = data.shape_m**2 + np.exp(2.0 * theta[:2])
-    return _relative(data, residual - _walked(data, residual, weights, theta)) / noise
+    own = residual - _walked(data, residual, weights, theta)
+    return _relative(data, own) / (data.shape_m**2 + np.exp(2.0 * theta[:2]))
 
 
 def _relative(data: _Data, residual: FloatArray) -> FloatArray:

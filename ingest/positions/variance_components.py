@@ -4,7 +4,7 @@ Estimated by restricted maximum likelihood (Patterson, Thompson 1971) under a pr
 (importance sampling around the modes), so that few observations give wide answers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -42,7 +42,8 @@ class MixedModel:
     Attributes:
         axes: east, north, up.
         known: (m, p) whitened Jacobian, off: (m,) residuals, of what is known beside them.
-        least: variance of an observation that is no component's.
+        least: variance of an observation that is no component's, and that whoever reads a covariance has counted
+            already.
     """
 
     axes: list[ModelAxis]
@@ -66,8 +67,8 @@ class MixedModel:
     def solution(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Step (7,) and its covariance; what nothing tells is as wide as it can be."""
         matrix, right, _, _ = self._normal(theta)
-        covariance = np.linalg.inv(matrix)
-        return np.asarray(covariance @ right), np.asarray(covariance)
+        step = np.linalg.solve(matrix, right)
+        return step, np.asarray(np.linalg.inv(replace(self, least=0.0)._normal(theta)[0]))
 
     def modes(self, start: FloatArray, stated: FloatArray) -> list[FloatArray]:
         """The most likely components, best first: from those at hand, and as if all were drift or noise."""
@@ -145,3 +146,9 @@ class MixedModel:
 def prior_mean(stated: FloatArray) -> FloatArray:
     """Logarithms (4,) of the components by `stated` sigmas, horizontal and vertical (2,)."""
     return np.asarray(np.log(np.concatenate([NOISE_SHARE * stated, _DRIFT_SHARE * stated])))
+
+
+def stated_sigma(sigmas: FloatArray) -> float:
+    """The median of those that are known, metres; one where none is."""
+    known = sigmas[np.isfinite(sigmas)]
+    return float(np.median(known)) if len(known) else 1.0

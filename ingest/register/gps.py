@@ -22,8 +22,8 @@ from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGM
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.positions.position_noise import ANGLES_WRONG, Held, NoisyFit, fit_noisy, stated_sigma
-from ingest.positions.variance_components import NOISE_SHARE
+from ingest.positions.position_noise import ANGLES_WRONG, Held, NoisyFit, fit_noisy
+from ingest.positions.variance_components import NOISE_SHARE, stated_sigma
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
