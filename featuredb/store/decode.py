@@ -143,7 +143,7 @@ def _gathered(
     parts = list(batches)
     table = pa.Table.from_batches(parts) if parts else SPECS[name].schema.empty_table()
     index: NDArray[np.int64] = table[index_column].to_numpy()
-    if not np.array_equal(np.sort(index), np.arange(count)):
+    if len(table) != count or not np.array_equal(np.sort(index), np.arange(count)):
         raise StoreError(
             f"{name}: expected {count} rows, {index_column} being each of 0 to {count - 1}, found "
             f"{len(table)} of which {len(np.unique(index))} are different"

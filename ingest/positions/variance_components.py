@@ -42,8 +42,7 @@ class MixedModel:
     Attributes:
         axes: east, north, up.
         known: (m, p) whitened Jacobian, off: (m,) residuals, of what is known beside them.
-        least: variance of an observation that is no component's, and that whoever reads a covariance has counted
-            already.
+        least: variance of an observation that is no component's; covariances leave it to whoever reads them.
     """
 
     axes: list[ModelAxis]

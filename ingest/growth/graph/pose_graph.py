@@ -248,7 +248,7 @@ def solve_pose_graph(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> 
     """The most likely places of all maps; edges that contradict the rest are named and left out.
 
     Raises:
-        InvalidValueError: map ids repeat, or an edge names an unknown map.
+        InvalidValueError: map ids repeat, an edge names an unknown map, or its covariance is not finite.
     """
     ids = [node.map_id for node in nodes]
     if len(set(ids)) != len(ids):
@@ -256,6 +256,9 @@ def solve_pose_graph(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> 
     unknown = {m for e in edges for m in (e.a, e.b)} - set(ids)
     if unknown:
         raise InvalidValueError(f"pose graph: edges name unknown maps {sorted(unknown)}")
+    broken = [f"{e.a} and {e.b}" for e in edges if not np.isfinite(e.covariance).all()]
+    if broken:
+        raise InvalidValueError(f"pose graph: covariances are not finite between {', '.join(broken)}")
     left_out: list[EdgeFit] = []
     remaining = list(edges)
     anchored_first = _anchored(nodes, remaining)
