@@ -66,8 +66,10 @@ class MixedModel:
     def solution(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Step (7,) and its covariance; what nothing tells is as wide as it can be."""
         matrix, right, _, _ = self._normal(theta)
-        step = np.linalg.solve(matrix, right)
-        return step, np.asarray(np.linalg.inv(replace(self, least=0.0)._normal(theta)[0]))
+        return (
+            np.asarray(np.linalg.solve(matrix, right)),
+            np.asarray(np.linalg.inv(replace(self, least=0.0)._normal(theta)[0])),
+        )
 
     def modes(self, start: FloatArray, stated: FloatArray) -> list[FloatArray]:
         """The most likely components, best first: from those at hand, and as if all were drift or noise."""

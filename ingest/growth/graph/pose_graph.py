@@ -62,8 +62,7 @@ class GraphEdge:
     Attributes:
         b_from_a: carries what map a says to where map b says it; graph's frame.
         covariance: (7, 7) of its left perturbation.
-        shared: (7, 3) the part of it that all edges have in common: what they are off for one sigma of three
-            errors that no edge has alone.
+        shared: (7, 3) the part that all edges have in common, for one sigma of three errors.
     """
 
     a: str
@@ -253,12 +252,10 @@ def solve_pose_graph(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> 
     ids = [node.map_id for node in nodes]
     if len(set(ids)) != len(ids):
         raise InvalidValueError(f"pose graph: map ids repeat: {ids}")
-    unknown = {m for e in edges for m in (e.a, e.b)} - set(ids)
-    if unknown:
+    if unknown := {m for e in edges for m in (e.a, e.b)} - set(ids):
         raise InvalidValueError(f"pose graph: edges name unknown maps {sorted(unknown)}")
-    broken = [f"{e.a} and {e.b}" for e in edges if not np.isfinite(e.covariance).all()]
-    if broken:
-        raise InvalidValueError(f"pose graph: covariances are not finite between {', '.join(broken)}")
+    if broken := [str(e) for e in edges if not np.isfinite(e.covariance).all()]:
+        raise InvalidValueError(f"pose graph: covariances that are not finite: {broken}")
     left_out: list[EdgeFit] = []
     remaining = list(edges)
     anchored_first = _anchored(nodes, remaining)
