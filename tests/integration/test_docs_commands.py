@@ -140,8 +140,8 @@ def test_the_commands_of_a_page_run(after_first: Path, tmp_path: Path, page: str
 
 @pytest.mark.slow
 @pytest.mark.parametrize("notebook", _NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(after_readme: Path, tmp_path: Path, notebook: Path) -> None:
-    here = Path(shutil.copytree(after_readme, tmp_path / "here"))
+def test_a_notebook_runs(after_first: Path, tmp_path: Path, notebook: Path) -> None:
+    here = Path(shutil.copytree(after_first, tmp_path / "here"))
     shutil.copy(notebook, here)
     programs = Path(sys.executable).parent
     done = subprocess.run(
