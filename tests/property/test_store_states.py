@@ -182,7 +182,7 @@ class StoreMachine(RuleBasedStateMachine):
             restore(self.target, place)
         if killed:
             StoreMachine.kills += 1
-            if (Path(place.url) / LIST).exists() or not Path(place.url).exists():
+            if (Path(place.url) / LIST).exists() or not (Path(place.url) / MAPS).exists():  # not done
                 restore(self.target, place)
         shutil.rmtree(self.database.url)
         self.database = Database.open(place.url)
