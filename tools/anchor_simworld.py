@@ -124,6 +124,8 @@ def featuredb(*words: str, may_refuse: bool = False, refusals: Sequence[int] = (
     """Run a command of featuredb and show what it says; `refusals` are answers where it may refuse."""
     sys.stdout.write(f"$ featuredb {' '.join(words)}\n")
     sys.stdout.flush()
+    if words[0] == "ingest":  # it makes a database, but no folders around it
+        Path(words[2]).parent.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
         [sys.executable, "-m", "featuredb.cli", *words],
         cwd=_ROOT,
