@@ -261,6 +261,6 @@ def test_some_steps() -> None:
 @pytest.mark.evaluation
 @pytest.mark.timeout(7200)
 def test_two_thousand_steps() -> None:
-    run(80, 26)
+    run(95, 26)
     assert StoreMachine.steps >= 2000
     assert StoreMachine.kills > 200
