@@ -254,7 +254,7 @@ def run(examples: int, steps: int) -> None:
 
 
 def test_some_steps() -> None:
-    run(3, 10)
+    run(6, 12)
     assert StoreMachine.kills > 0
 
 
