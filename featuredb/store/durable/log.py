@@ -124,13 +124,17 @@ def read_commit(files: fs.FileSystem, version: int) -> Commit:
     """What a log entry says of itself.
 
     Raises:
-        StoreError: it is missing, empty or torn.
+        StoreError: it is missing, empty or torn, or says nothing.
     """
     told = [action["commitInfo"] for action in whole_entry(files, version)[1] if "commitInfo" in action]
-    info = told[0] if told else {}
+    if not told or "timestamp" not in told[0]:
+        raise StoreError(
+            f"log entry {entry_name(version)}: it does not say when it was made; run `featuredb verify`"
+        )
+    info = told[0]
     return Commit(
         version=version,
-        timestamp=datetime.fromtimestamp(info.get("timestamp", 0) / 1000.0, tz=UTC),
+        timestamp=datetime.fromtimestamp(info["timestamp"] / 1000.0, tz=UTC),
         operation=str(info.get("operation", "")),
         metadata={k: str(v) for k, v in info.items() if k.startswith("featuredb.")},
     )
