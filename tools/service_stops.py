@@ -15,7 +15,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from featuredb.errors import ServiceError
@@ -27,17 +27,20 @@ from tools.service_world import photos_of, service_parser
 
 _CLIENTS = 4
 _STOP_S = 30.0  # ten for queries in hand, ten for live sessions, ten for the inbox
+_LOG_LINES = 200  # a trace of every thread has some hundred
 _LATEST_S = 2.0  # the last moment of the signal, after the first question
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stopped:
-    """One stop. `codes`: what clients heard, "" for an answer. left: processes that outlived it."""
+    """One stop. `codes`: what clients heard, "" for an answer. left: processes that outlived it.
+    log: the last lines that the server wrote."""
 
     seconds: float
     exit_code: int | None
     codes: tuple[str, ...]
     left: int
+    log: tuple[str, ...]
 
     @property
     def clean(self) -> bool:
@@ -77,7 +80,9 @@ def stopped_under_load(database: Path, photo: bytes, after_s: float) -> Stopped:
     end = time.monotonic() + 5.0
     while (left := sum(Path(f"/proc/{pid}").exists() for pid in tree)) and time.monotonic() < end:
         time.sleep(0.05)
-    return Stopped(seconds=seconds, exit_code=code, codes=tuple(codes), left=left)
+    return Stopped(
+        seconds=seconds, exit_code=code, codes=tuple(codes), left=left, log=tuple(server.errors[-_LOG_LINES:])
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -88,7 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for number in range(args.stops):
         found.append(stopped_under_load(args.db, photo, rng.uniform(0.0, _LATEST_S)))
         if not found[-1].clean:
-            sys.stdout.write(f"stop {number}: {found[-1]}\n")
+            sys.stdout.write(f"stop {number}: {replace(found[-1], log=())}\n{''.join(found[-1].log)}")
+            sys.stdout.flush()
     codes = Counter(code or "answered" for one in found for code in one.codes)
     figures = {
         "stops": len(found),
