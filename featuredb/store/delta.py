@@ -1,4 +1,4 @@
-"""One Delta table, typed: the only module that calls deltalake.
+"""One Delta table, typed: what the store needs of deltalake.
 
 What deltalake 1.6 does, and tests/integration/test_delta_behaviour.py pins:
 - An append rebases onto whatever was committed meanwhile. Right for child rows, which nobody else names.

@@ -1,4 +1,4 @@
-"""The only place that knows pycolmap's database and reconstruction.
+"""Photos to pycolmap's database, and its reconstructions to arrays.
 
 In come photos as values, out go reconstructions as plain arrays.
 """

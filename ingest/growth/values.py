@@ -24,6 +24,7 @@ from reloc.localise.result import LocaliseResult
 FeaturesOf = Callable[[int], PhotoFeatures]
 """Features of the photo of a row; called when they are needed, so that not all are in memory."""
 
+DRIFT_BUDGET_M = 0.5  # what a survey's points are usually wanted for
 LEAST_PHOTOS = 3  # of a reconstruction, of a map without a place, and of those by which two maps overlap
 # Points in common that connect two maps; an existing map with fewer would not hold a new one alone. An
 # accepted pose has 15 inliers, and an overlap is measured by 60.
@@ -145,13 +146,13 @@ class GrowthOptions:
     """How a database grows.
 
     Attributes:
-        drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken: what
-            a survey's points are usually wanted for. Photos beyond it wait for an anchor.
+        drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken;
+            its photos wait for an anchor.
         trusted: identities that the operator vouches for: their photos need nobody else, as his own.
         threads: photos that are localised at a time.
     """
 
-    drift_budget_m: float = 0.5
+    drift_budget_m: float = DRIFT_BUDGET_M
     trusted: tuple[str, ...] = ()
     threads: int = 1
 

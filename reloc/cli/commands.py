@@ -55,9 +55,15 @@ def register(subparsers: Any) -> None:
         help="start even where machines that nobody has authenticated can reach the server",
     )
     serve.add_argument("--name", default="", help="database name on the wire; default: the folder's name")
-    serve.add_argument("--workers", type=int, default=2, help="queries localised at a time; default 2")
-    serve.add_argument("--max-queue", type=int, default=32, help="queries that may wait; default 32")
-    serve.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="per query; default 8")
+    serve.add_argument("--workers", type=int, help="queries localised at a time; default 2")
+    serve.add_argument("--max-queue", type=int, help="queries that may wait; default 32")
+    serve.add_argument(
+        "--deadline",
+        type=float,
+        dest="deadline_s",
+        metavar="SECONDS",
+        help="per query; default 8",
+    )
     serve.add_argument(
         "--contributions",
         choices=("on", "off"),
@@ -65,12 +71,16 @@ def register(subparsers: Any) -> None:
         help="take photos that clients contribute, with credit and licence, into a bounded inbox; default on",
     )
     serve.add_argument(
-        "--live-sessions", type=int, default=2, metavar="N", help="streams followed at a time; default 2"
+        "--live-sessions",
+        type=int,
+        dest="max_sessions",
+        metavar="N",
+        help="streams followed at a time; default 2",
     )
     serve.add_argument(
         "--live-idle",
         type=float,
-        default=5.0,
+        dest="idle_timeout_s",
         metavar="SECONDS",
         help="a live session without a usable frame for so long ends; default 5",
     )
@@ -181,6 +191,9 @@ def _serve(args: argparse.Namespace) -> int:
     from reloc.service.serve import serve
     from reloc.service.server import Server
 
+    def given(*names: str) -> dict[str, Any]:
+        return {name: value for name in names if (value := getattr(args, name, None)) is not None}
+
     listen = tuple(args.listen or (() if args.config else (DEFAULT_ENDPOINT,)))
     options = ServeOptions(
         listen=listen,
@@ -189,11 +202,9 @@ def _serve(args: argparse.Namespace) -> int:
         insecure=args.insecure,
         name=args.name,
         metrics_port=args.metrics_port,
-        workers=args.workers,
-        max_queue=args.max_queue,
-        deadline_s=args.deadline,
         contributions=args.contributions == "on",
-        live=LiveOptions(max_sessions=args.live_sessions, idle_timeout_s=args.live_idle),
+        live=LiveOptions(**given("max_sessions", "idle_timeout_s")),
+        **given("workers", "max_queue", "deadline_s"),
     )
     database = open_database(args)
     log_to(sys.stderr)

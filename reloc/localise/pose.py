@@ -12,7 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.localise.jacobians import pixel_jacobians
-from reloc.localise.lens_prior import QueryLensPrior
+from reloc.localise.lens_prior import LensPriors, QueryLensPrior
 from reloc.localise.options import PoseOptions
 from reloc.localise.result import CameraSource
 from reloc.localise.self_calibration import calibrate, covariance_from_information, joint_jacobians
@@ -60,7 +60,10 @@ def estimate_pose(
     if len(pixels) < options.min_matches:
         return None
     tolerance_px = options.tolerance_rel * max(camera.width, camera.height)
-    tries = [_ransac(pixels, points, guess, tolerance_px, options) for guess in _guesses(camera, source)]
+    tries = [
+        _ransac(pixels, points, guess, tolerance_px, options)
+        for guess in _guesses(camera, source, options.lens)
+    ]
     if source in ("exif", "estimated"):
         tries.append(_ransac_focal(pixels, points, camera, tolerance_px, options))
     found = [
@@ -76,13 +79,14 @@ def estimate_pose(
     return max(found, key=lambda pose: pose.count, default=None)
 
 
-def _guesses(camera: Camera, source: CameraSource) -> list[Camera]:
+def _guesses(camera: Camera, source: CameraSource, lens: LensPriors) -> list[Camera]:
     """Lenses that are tried as if they were known.
 
     The focal length of a minimal sample is arbitrary where the scene is flat and seen from above; there any
     focal length fits, and the refinement goes on from the guess.
     """
-    factors = {"exif": (1.0, 0.87, 1.15), "estimated": (1.0, 0.5, 0.7, 1.4, 2.0)}
+    wide = 1.0 + lens.exif_focal_rel
+    factors = {"exif": (1.0, 1.0 / wide, wide), "estimated": (1.0, 0.5, 0.7, 1.4, 2.0)}
     return [
         camera if f == 1.0 else camera.with_focal(f * camera.focal_px) for f in factors.get(source, (1.0,))
     ]

@@ -19,7 +19,7 @@ from ingest.growth.place.localised import in_frame, with_lens
 from ingest.growth.place.placement import MapsPlacement, parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
 from ingest.growth.place.similarity_fit import find_correspondences
-from ingest.growth.values import LEAST_PHOTOS, FeaturesOf, LocalisedPhoto, Refused
+from ingest.growth.values import DRIFT_BUDGET_M, LEAST_PHOTOS, FeaturesOf, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
 from ingest.sfm.links import connected_parts, keep_photos
@@ -59,7 +59,7 @@ def grow_component(
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     identity: MapIdentity,
-    max_bound_m: float = 0.5,
+    max_bound_m: float = DRIFT_BUDGET_M,
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
 
