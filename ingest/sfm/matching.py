@@ -20,6 +20,9 @@ from ingest.sfm.pairs import Pair
 from ingest.workspace import Workspace, read_array, read_arrays, write_arrays
 
 _DESCRIPTOR_LENGTH = 512.0  # of 8-bit RootSIFT
+# The box holds 99.0 % of the verified matches of `seneca`, and takes 42 % of the time.
+_OUTSIDE = (0.05, 0.95)  # of the first matches, along each axis: some are wrong
+_MARGIN = 0.15  # of the longer side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +35,8 @@ class MatchOptions:
         max_angle_rad: no match between descriptors further apart (COLMAP's 0.7).
         max_error_px: of the two-view geometry, at `error_reference_side_px`, growing with the image.
         error_reference_side_px: keypoints are located on images of about this size.
+        first_features: strongest features of each photo, which are matched first.
+        least_first: a pair with fewer matches among them is not matched further.
         min_inliers: pairs with fewer verified matches do not count. Pairs of `brighton` and `lewis` had
             none at all; repeated structure gives more, and two good photos hundreds.
         overlays: what is a watermark, and what is a copy.
@@ -42,6 +47,8 @@ class MatchOptions:
     max_angle_rad: float = 0.7
     max_error_px: float = 2.0
     error_reference_side_px: int = 1600
+    first_features: int = 3000
+    least_first: int = 6
     min_inliers: int = 20
     overlays: OverlayOptions = field(default_factory=OverlayOptions)
     seed: int = 0
@@ -166,6 +173,30 @@ def match_pairs(
     )
 
 
+def pair_matches(a: Features, b: Features, options: MatchOptions) -> NDArray[np.uint32]:
+    """Mutual matches of two photos, strongest features first: rows (m, 2) of a and b.
+
+    The strongest tell whether two photos show the same at all, for a sixteenth of the time, and where in each
+    photo the other's part of the scene is; only there the rest is matched.
+    """
+    count = options.first_features
+    if max(len(a), len(b)) <= count:
+        return mutual_matches(a.descriptors, b.descriptors, options)
+    first = mutual_matches(a.descriptors[:count], b.descriptors[:count], options)
+    if len(first) < options.least_first:
+        return first[:0]
+    in_a, in_b = _around(a, first[:, 0]), _around(b, first[:, 1])
+    found = mutual_matches(a.descriptors[in_a], b.descriptors[in_b], options)
+    return np.stack([in_a[found[:, 0]], in_b[found[:, 1]]], axis=1).astype(np.uint32)
+
+
+def _around(photo: Features, rows: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Rows of the features in the box that the middle of these spans, made larger on each side."""
+    low, high = np.quantile(photo.xy[rows], _OUTSIDE, axis=0)
+    margin = _MARGIN * max(photo.width, photo.height)
+    return np.flatnonzero(((photo.xy >= low - margin) & (photo.xy <= high + margin)).all(axis=1))
+
+
 def mutual_matches(
     descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], options: MatchOptions
 ) -> NDArray[np.uint32]:
@@ -213,7 +244,7 @@ def _match_pair(task: MatchTask, a: Features, other: PhotoView, target: Path) ->
         return _outcome(target)
     b = read_features(other.features).features
     options, sizes = task.options, ((a.width, a.height), (b.width, b.height))
-    matches = mutual_matches(a.descriptors, b.descriptors, options)
+    matches = pair_matches(a, b, options)
     matches = without_overlay(a.xy, b.xy, *sizes, matches, options.overlays)
     side = max(a.width, a.height, b.width, b.height)
     view = verify_pair(
