@@ -8,7 +8,6 @@ commit. Each is a process of its own, the one after the other.
 """
 
 import argparse
-import os
 import resource
 import subprocess
 import sys
@@ -60,15 +59,18 @@ class Cost:
     def ratio(self) -> float:
         return self.ours_s / self.colmap_s
 
+    def figures(self) -> dict[str, float]:
+        found = asdict(self)
+        del found["folder"]
+        return found | {"ratio": self.ratio}
+
 
 def main(argv: Sequence[str] | None = None) -> int:
-    costs = [measured(folder) for folder in _arguments(argv).folders]
     args = _arguments(argv)
-    figures = {
-        "sets": [asdict(cost) | {"ratio": cost.ratio} for cost in costs],
-        "worst_ratio": max(cost.ratio for cost in costs),
-        "fewer": max(cost.colmap_photos - cost.ours_photos for cost in costs),
-    }
+    costs = [measured(folder) for folder in args.folders]
+    figures = {f"{cost.folder}_{name}": value for cost in costs for name, value in cost.figures().items()}
+    figures["worst_ratio"] = max(cost.ratio for cost in costs)
+    figures["fewer"] = max(cost.colmap_photos - cost.ours_photos for cost in costs)
     write_figures(args.json, figures)
     return 0
 
@@ -101,9 +103,7 @@ def measured(folder: Path) -> Cost:
 def _processor_s(*argv: str) -> tuple[float, str]:
     """Of a Python process and all that it started; and what it printed."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(
-        [sys.executable, *argv], stdout=subprocess.PIPE, text=True, check=False, env={**os.environ}
-    )
+    done = subprocess.run([sys.executable, *argv], stdout=subprocess.PIPE, text=True, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         raise SystemExit(f"exit code {done.returncode}: {' '.join(argv[:4])}")

@@ -29,6 +29,20 @@ SPEED: tuple[Row, ...] = (
         minutes=2,
     ),
     Row(
+        name="ingest-time",
+        group="speed",
+        form="full",
+        claim="ingest of `brighton` and `seneca` against COLMAP's own pipeline, processor time of one run",
+        commands=(("tools.ingest_benchmark", BRIGHTON, "{data}/seneca/images", *OUT),),
+        figures=same("brighton_ours_s", "brighton_colmap_s", "seneca_ours_s", "seneca_colmap_s"),
+        text="{brighton_ratio:.2f} and {seneca_ratio:.2f} times COLMAP's time; {brighton_ours_photos:.0f} "
+        "and {seneca_ours_photos:.0f} photos in a map, COLMAP {brighton_colmap_photos:.0f} and "
+        "{seneca_colmap_photos:.0f}",
+        limits=(Limit(figure="worst_ratio", most=0.5), Limit(figure="fewer", most=0)),
+        needs=("brighton/images", "seneca/images"),
+        minutes=15,
+    ),
+    Row(
         name="service-attacks",
         group="speed",
         form="full",
