@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
+from featuredb.geometry.error_radius import error_radius
 from featuredb.maps.lineage import lineage_text
 from reloc.answered_view import geopose_of
-from reloc.localise.result import error_radius
 from reloc.wire.query import InMapPose, LocaliseReply
 
 # Steeper than this a photo shows no horizon, and people ask where its top points.

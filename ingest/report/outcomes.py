@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from featuredb.geo.utm import meridian_convergence_deg, utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from ingest.photos.photo import Photo, shared_key
 from ingest.placed_models import Component
@@ -67,20 +66,13 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         height_datum=made.height_datum,
         scale=made.placement.local_from_sfm.scale,
         residual_rms_m=made.placement.residual_rms_m,
-        radius_m=_radius_m(made),
+        place=PlaceBounds.of(made.placement.covariance),
         plan=_plan(component, made),
     )
 
 
 def _map_of(component: Component) -> AnyMap | None:
     return component.feature_map if component.unplaced is None else component.unplaced
-
-
-def _radius_m(feature_map: FeatureMap) -> float:
-    """Horizontal, of 95 %: the longer half axis of the ellipse at the median camera, metres."""
-    at = point_jacobian(np.array([image.cam_from_local.center for image in feature_map.images]))[:, :2]
-    spread = at @ feature_map.placement.covariance @ at.transpose(0, 2, 1)
-    return float(np.median(np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(spread)[:, -1])))
 
 
 def photo_outcomes(
