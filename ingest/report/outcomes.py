@@ -17,6 +17,11 @@ from ingest.placed_models import Component
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage
 from ingest.report.values import CameraOutcome, MapOutcome, PhotoOutcome, PlanView
 
+_NO_POSE = (
+    "it has matches, but they fit no reconstruction of three photos or more: most are with photos that are "
+    "left out, too, or on points that no other two see. Photos between it and the map's help"
+)
+
 
 def map_outcome(component: Component, created: Mapping[str, bool], options: MapMakingOptions) -> MapOutcome:
     """A component for the report.
@@ -106,7 +111,7 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
     elif photo.status == "ok" and not result.matches_per_photo.get(photo.name):
         code, reason = "no_matches", "no other photo shows the same place"
     elif photo.status == "ok":
-        code, reason = "no_pose", "its matches fit no reconstruction of at least three photos"
+        code, reason = "no_pose", _NO_POSE
     skipped = photo.status == "skipped" or code in ("unreadable", "copy")
     return _outcome(
         photo, result, status="skipped" if skipped else "not_registered", code=code, reason=reason
