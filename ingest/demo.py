@@ -84,8 +84,10 @@ def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> l
 
     start = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
+    _tell(say, start, "drawing the town and its photos ...")
     world = make_world(out / "world", size=size, seed=seed, exact_gps=exact_gps)
     _tell(say, start, f"simulated town: {len(world.images('drone'))} drone photos in {world.folder}")
+    _tell(say, start, "making a map of them; each stage is told when it is done ...")
     database = Database.create(out / "db")
     report = ingest_world(world, database, out / "report", exact_gps=exact_gps)
     made = next((m for m in report.maps if m.status != "refused"), None)
@@ -98,6 +100,7 @@ def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> l
         start,
         f"map: {made.photos} photos, {made.points} points; {out / 'report' / 'report.html'}",
     )
+    _tell(say, start, "serving the map, and asking it where other photos were taken ...")
     with (
         start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
         Client(server.endpoints[0]) as client,
@@ -125,10 +128,10 @@ def make_world(folder: Path, *, size: str, seed: int, exact_gps: bool) -> "World
 def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gps: bool) -> "IngestReport":
     """Ingest the drone photos and write the report."""
     from featuredb.features.extractor import ExtractorOptions
+    from ingest.api.ingesting import ingest
     from ingest.map_builder import MapOptions
-    from ingest.pipeline import IngestOptions, ingest_photos
+    from ingest.pipeline import IngestOptions
     from ingest.reconstruction import MapMakingOptions
-    from ingest.report.page import write_report
     from ingest.report.plots import plan_png
 
     options = IngestOptions(
@@ -138,8 +141,7 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
             extractor=ExtractorOptions(max_features=3000), maps=MapOptions(height_datum="ellipsoidal")
         ),
     )
-    report = ingest_photos(database, world.folder / "drone", options)
-    write_report(report_folder, report)
+    report = ingest(database, world.folder / "drone", options, report=report_folder)
     for outcome in report.maps[:1]:
         if outcome.plan is not None:
             (report_folder / "plan.png").write_bytes(plan_png(outcome.plan))

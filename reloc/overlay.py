@@ -26,6 +26,7 @@ _RESIDUAL_BGR = (40, 40, 240)
 _OTHER_BGR = (240, 160, 40)
 _MAX_OTHER = 4000  # more dots hide the photo
 _SAME_POINT_M = 0.001
+_LEGEND = "green: keypoints that agree; red: how far their map points are off; blue: other map points"
 _MAX_SIDE_PX = 1600  # of the picture; larger ones only take longer to open
 
 
@@ -124,5 +125,8 @@ def _caption(image: NDArray[np.uint8], reply: LocaliseReply) -> None:
         f"H {reply.utm.height:.2f}  {reply.inliers} inliers"
     )
     height = image.shape[0]
-    image[max(0, height - 26) :] //= 4  # a dark band, so that the text reads on any photo
-    cv2.putText(image, text, (8, height - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    image[max(0, height - 46) :] //= 4  # a dark band, so that the text reads on any photo
+    for up, line in ((28, text), (8, _LEGEND)):
+        cv2.putText(
+            image, line, (8, height - up), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
+        )

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
+from featuredb.geometry.error_radius import error_radius
 from featuredb.maps.lineage import lineage_text
 from reloc.answered_view import geopose_of
-from reloc.localise.result import error_radius
 from reloc.wire.query import InMapPose, LocaliseReply
 
 # Steeper than this a photo shows no horizon, and people ask where its top points.
@@ -17,9 +17,9 @@ ADVICE = {
     "NO_COVERAGE": "no map lies near the prior (or the database is empty): check the prior, "
     "or ingest photos of the place",
     "TOO_FEW_FEATURES": "the photo shows too little texture: take a sharper, lighter or wider one",
-    "TOO_FEW_MATCHES": "the maps know little of what it shows: try a photo from a more similar viewpoint, "
+    "TOO_FEW_MATCHES": "it may show another place; if not, a photo from a more similar viewpoint, "
     "a prior (--prior), or add photos of the place to the database",
-    "TOO_FEW_INLIERS": "the matches do not agree on one pose: give a prior (--prior) or the camera "
+    "TOO_FEW_INLIERS": "it may show another place; if not, give a prior (--prior) or the camera "
     "(--camera), or take another photo",
     "AMBIGUOUS": "another place, or a look-alike, explains it about as well: give a prior (--prior)",
     "CONTRADICTS_PRIOR": "the photo fits a place far from the prior: check the prior or widen its sigma",
@@ -51,12 +51,18 @@ def describe(name: str, reply: LocaliseReply, database: str) -> str:
         f"{accuracy.vertical_68_m:.3f} m vertically, {accuracy.orientation_68_deg:.3f} deg\n"
         f"{_radii_95(reply)}"
         f"{_own_position(reply)}"
-        f"  evidence  {reply.inliers} inliers from {reply.matches} matches, residual "
-        f"{reply.residual_rms_px or 0.0:.2f} px, camera from {reply.camera.source}, "
-        f"maps {', '.join(reply.maps)}\n"
+        f"  evidence  {_evidence(reply)}, residual {reply.residual_rms_px or 0.0:.2f} px, "
+        f"camera from {reply.camera.source}, maps {', '.join(reply.maps)}\n"
         f"{_lineage(reply)}"
         f"{_contribution(reply)}"
         f"  time      {total:.0f} ms, snapshot {reply.snapshot}\n"
+    )
+
+
+def _evidence(reply: LocaliseReply) -> str:
+    """Inliers may be more than matches: the pose finds some that nothing else tells from their like."""
+    return (
+        f"{reply.inliers} inliers ({reply.matches} matches led to the pose, which was then used to find more)"
     )
 
 
@@ -64,7 +70,9 @@ def _looks(reply: LocaliseReply) -> str:
     pose = geopose_of(reply)
     heading, pitch, roll = pose.heading_pitch_roll_deg
     text = f"heading {heading:.2f} deg from true north, pitch {pitch:+.2f}, roll {roll:+.2f}"
-    if abs(pitch) > _STEEP_DEG:
+    if abs(pitch) <= _STEEP_DEG:
+        text += f" (the horizon's right end is {'higher' if roll > 0 else 'lower'})"
+    else:
         up = pose.true_enu_from_body[:, 2]
         text += f"; the photo's top points to {math.degrees(math.atan2(up[0], up[1])) % 360.0:.2f}"
     return text
@@ -81,7 +89,7 @@ def _own_position(reply: LocaliseReply) -> str:
     own = reply.exif_prior
     if own is None:
         return ""
-    away = "" if own.distance_m is None else f", {_metres(own.distance_m)} away"
+    away = "" if own.distance_m is None else f", {_metres(own.distance_m)} away horizontally"
     said = {
         "agrees": f"the photo's EXIF position{away}, agrees; the answer is the same without it",
         "decided": f"the photo's EXIF position{away}, decided; --no-exif-prior leaves it out",
@@ -106,8 +114,8 @@ def _in_map(name: str, reply: LocaliseReply, pose: InMapPose, database: str) -> 
         f"confidence {reply.confidence:.3f}\n"
         f"  in map    x {x:.3f}  y {y:.3f}  z {z:.3f} {unit}; "
         f"z is {'up' if pose.upright else 'not known to be up'}\n"
-        f"  evidence  {reply.inliers} inliers from {reply.matches} matches, residual "
-        f"{pose.residual_rms_px:.2f} px, camera from {pose.camera.source}\n"
+        f"  evidence  {_evidence(reply)}, residual {pose.residual_rms_px:.2f} px, "
+        f"camera from {pose.camera.source}\n"
         f"  to place the map: featuredb maps says how\n"
         f"  time      {reply.timings_ms.get('total', 0.0):.0f} ms, snapshot {reply.snapshot}\n"
     )

@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from featuredb.features.exif.read import read_exif
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from featuredb.index.area import Area
@@ -21,7 +22,7 @@ from featuredb.simworld.flight import received_positions
 from featuredb.simworld.world import World
 from ingest.register.gps import GpsOptions, place_by_gps
 from reloc.localise.answer import placement_covariance
-from reloc.localise.result import LocalisedPose, error_radius
+from reloc.localise.result import LocalisedPose
 
 # An answer, and the true cam_from_local in the frame of the answer.
 Pair = tuple[LocalisedPose, Rigid3]

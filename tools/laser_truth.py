@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
@@ -29,7 +30,6 @@ from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from reloc.localise.answer import placement_covariance
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
-from reloc.localise.result import error_radius
 from reloc.wire.query import CameraRequest
 from tools.figures import study_parser, write_figures
 from tools.laser_baseline import colmap_given_the_lens

@@ -107,7 +107,7 @@ def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | No
         SystemExit: there is a database already, or the command failed.
     """
     if database.exists():
-        raise SystemExit(f"{database} is there already; a cold start needs an empty place")
+        raise SystemExit(f"{database} is there already; a map is made from nothing there")
     report = database.with_name(f"{database.name}-report")
     command = [sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)]
     command += ["--quiet", "--report", str(report), *(f"--exclude={name}" for name in exclude)]

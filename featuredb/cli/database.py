@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from featuredb.store.sql import SqlResult
 
 _DEFAULTS = VacuumOptions()
+_BOUNDS = (
+    "place_95_m, tilt_95_deg, heading_95_deg: 95 of 100 maps lie no further off horizontally, and are tilted "
+    "and turned about the vertical by no more\n"
+)
 
 
 def register(subparsers: Any) -> None:
@@ -97,18 +101,24 @@ def maps_table(maps: Sequence["MapSummary"]) -> str:
     """Maps with a place, and why some are in quarantine."""
     header = (
         "map", "name", "status", "method", "gen", "drift_m", "epsg", "images", "points", "residual_m",
-        "committed",
+        "place_95_m", "tilt_95_deg", "heading_95_deg", "committed",
     )  # fmt: skip
     rows = [
         (
             m.map_id, m.name, m.status, m.method, m.generation,
             None if m.drift_m is None else round(m.drift_m, 3), m.epsg, m.images, m.points,
-            round(m.residual_rms_m, 3), m.created_at,
+            round(m.residual_rms_m, 3), round(m.bounds.horizontal_m, 2), round(m.bounds.tilt_deg, 2),
+            round(m.bounds.heading_deg, 2), m.created_at,
         )
         for m in maps
     ]  # fmt: skip
-    return format_table(header, rows) + "".join(
-        f"{m.map_id}: {m.status_reason}\n" for m in maps if m.status == "quarantined" and m.status_reason
+    words = _BOUNDS if maps else ""
+    return (
+        format_table(header, rows)
+        + words
+        + "".join(
+            f"{m.map_id}: {m.status_reason}\n" for m in maps if m.status == "quarantined" and m.status_reason
+        )
     )
 
 

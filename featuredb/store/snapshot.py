@@ -5,12 +5,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from datetime import datetime
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
 
 from featuredb.errors import MapNotFoundError, StoreError, UnplacedMapError
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
+from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, UnplacedStatus
 from featuredb.store.changes import RETIRED
 from featuredb.store.decode import decode_map, decode_no_place, has_place
@@ -77,6 +79,7 @@ class MapSummary(_Summary):
         residual_rms_m: of the placement, metres.
         drift_m, budget_m: of a map that other maps placed: 95 % bound of its position against its anchors,
             and what growth allowed, metres; None where the placement does not say.
+        bounds: what holds 95 % of the errors of the placement.
     """
 
     status: MapStatus
@@ -88,6 +91,7 @@ class MapSummary(_Summary):
     generation: int
     parents: tuple[str, ...]
     residual_rms_m: float
+    bounds: PlaceBounds
     drift_m: float | None = None
     budget_m: float | None = None
 
@@ -287,5 +291,6 @@ def _summary(row: Row) -> MapSummary:
         parents=tuple(row["parents"]),
         drift_m=drift_m,
         budget_m=budget_m,
+        bounds=PlaceBounds.of(np.reshape(row["placement_covariance"], (7, 7))),
         **{name: row[name] for name in (*_AS_STORED, *_PLACED_AS_STORED)},
     )

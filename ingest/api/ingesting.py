@@ -162,9 +162,9 @@ def summary(report: IngestReport) -> str:
             lines.append(
                 f"map {outcome.map_id} ({outcome.name}): {outcome.status.replace('_', ' ')}, "
                 f"{outcome.photos} photos, {outcome.points} points, EPSG:{outcome.epsg}, "
-                f"{'control' if outcome.control else 'GPS'} residual {outcome.residual_rms_m or 0.0:.2f} m, "
-                f"place known to {outcome.radius_m or 0.0:.2f} m (95 %)"
+                f"{'control' if outcome.control else 'GPS'} residual {outcome.residual_rms_m or 0.0:.2f} m"
             )
+            lines.extend(f"  {words}" for words in outcome.place_words)
         if outcome.control is not None and outcome.control.control.marks:
             lines.extend(f"note: {text}" for text in outcome.control.file.notes)
             lines.append(residual_table(outcome.control.placement, outcome.control.control).rstrip("\n"))

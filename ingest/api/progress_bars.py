@@ -21,7 +21,7 @@ from ingest.executor import Progress as ProgressCallback
 _TITLES = {
     "scan": "Reading files",
     "extract": "Extracting features",
-    "match": "Matching pairs",
+    "match": "Matching each photo with others",
     "reconstruct": "Reconstructing",
     "build": "Building maps",
 }
@@ -64,12 +64,16 @@ def _drawn(bars: Progress) -> ProgressCallback:
 
 def _logged() -> ProgressCallback:
     """A finished stage is one line: files and pipes want no redrawing."""
-    start = time.monotonic()
+    before = time.monotonic()  # when the stage before ended
     told: set[str] = set()
 
     def log(stage: str, done: int, total: int) -> None:
+        nonlocal before
         if done >= total and stage not in told:
             told.add(stage)
-            sys.stderr.write(f"{_TITLES.get(stage, stage)}: {total} ({time.monotonic() - start:.1f} s)\n")
+            now = time.monotonic()
+            sys.stderr.write(f"{_TITLES.get(stage, stage)}: {total} ({now - before:.1f} s)\n")
+            sys.stderr.flush()
+            before = now
 
     return log

@@ -6,17 +6,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from featuredb.geo.utm import meridian_convergence_deg, utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from ingest.photos.photo import Photo, shared_key
 from ingest.placed_models import Component
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage
 from ingest.report.values import CameraOutcome, MapOutcome, PhotoOutcome, PlanView
+
+_NO_POSE = (
+    "it has matches, but they fit no reconstruction of three photos or more: most are with photos that are "
+    "left out, too, or on points that no other two see. Photos between it and the map's help"
+)
 
 
 def map_outcome(component: Component, created: Mapping[str, bool], options: MapMakingOptions) -> MapOutcome:
@@ -67,20 +71,13 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         height_datum=made.height_datum,
         scale=made.placement.local_from_sfm.scale,
         residual_rms_m=made.placement.residual_rms_m,
-        radius_m=_radius_m(made),
+        place=PlaceBounds.of(made.placement.covariance),
         plan=_plan(component, made),
     )
 
 
 def _map_of(component: Component) -> AnyMap | None:
     return component.feature_map if component.unplaced is None else component.unplaced
-
-
-def _radius_m(feature_map: FeatureMap) -> float:
-    """Horizontal, of 95 %: the longer half axis of the ellipse at the median camera, metres."""
-    at = point_jacobian(np.array([image.cam_from_local.center for image in feature_map.images]))[:, :2]
-    spread = at @ feature_map.placement.covariance @ at.transpose(0, 2, 1)
-    return float(np.median(np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(spread)[:, -1])))
 
 
 def photo_outcomes(
@@ -114,7 +111,7 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
     elif photo.status == "ok" and not result.matches_per_photo.get(photo.name):
         code, reason = "no_matches", "no other photo shows the same place"
     elif photo.status == "ok":
-        code, reason = "no_pose", "its matches fit no reconstruction of at least three photos"
+        code, reason = "no_pose", _NO_POSE
     skipped = photo.status == "skipped" or code in ("unreadable", "copy")
     return _outcome(
         photo, result, status="skipped" if skipped else "not_registered", code=code, reason=reason

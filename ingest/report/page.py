@@ -7,6 +7,7 @@ from pathlib import Path
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
 from ingest.register.control.report import control_html
 from ingest.report.films import films_html
+from ingest.report.gps_figures import figure_rows
 from ingest.report.plots import histograms_png, plan_png
 from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, report_json
 from ingest.workspace import atomic_file, write_json
@@ -83,7 +84,7 @@ def _map(outcome: MapOutcome) -> str:
         ("points", f"{outcome.points:,}"),
         ("observations", f"{outcome.observations:,}, {outcome.descriptors:,} with descriptors"),
         (f"residual to {method}", number(outcome.residual_rms_m, "{:.2f} m root mean square")),
-        ("place known to", number(outcome.radius_m, "{:.2f} m horizontally (95 %)")),
+        *(words.split(": ", 1) for words in outcome.place_words),
         ("scale", number(outcome.scale, "{:.4g} m per unit of the reconstruction")),
         ("coordinates", f"EPSG:{outcome.epsg}, heights: {outcome.height_datum}" if outcome.epsg else "none"),
         ("map id", outcome.map_id or "none"),
@@ -103,9 +104,21 @@ def _map(outcome: MapOutcome) -> str:
         + pictures
         + control
         + _cameras(outcome)
-        + folded("Gates and their figures", outcome.gates)
+        + _gates(outcome)
         + "</section>"
     )
+
+
+def _gates(outcome: MapOutcome) -> str:
+    """What the placement rests on; that by GPS with a line about each figure."""
+    if outcome.control is not None:
+        return folded("Gates and their figures", outcome.gates)
+    rows = figure_rows(outcome.gates)
+    if not rows:
+        return ""
+    head = ("figure", "value", "what it says")
+    title = "<summary>Figures of the placement by GPS</summary>"
+    return f"<details>{title}{table(head, rows)}</details>"
 
 
 def _cameras(outcome: MapOutcome) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.plain_json import plain
 from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
 from ingest.register.control.maps import ControlledPlacement
@@ -24,6 +25,10 @@ SCHEMA_ID = "featuredb/ingest/report/1"
 FOCAL_CHANGE_TO_WARN = 0.08
 
 _TRACK_BINS = (2, 3, 4, 5, 6, 8, 10, 15, 20, 50)
+_BETTER = (
+    "better by: a scan (featuredb lidar add, then anchor) or control points (--gcp); somewhat by more photos "
+    "over a larger area, or photos that tell their gimbal's angles"
+)
 _PERCENTILES = (50, 90, 99)
 _DRAWN = ("errors_px", "track_lengths", "plan", "control")  # what the page shows of a map
 
@@ -142,7 +147,7 @@ class MapOutcome:
         gates: figures of every gate, JSON-able.
         scale: metres per unit of the reconstruction.
         residual_rms_m: of the GPS positions that were used.
-        radius_m: horizontal, in which the true place of its cameras lies with 95 %, by the covariance.
+        place: what holds 95 % of the errors of its placement; None where it has none.
         picture_shear: `ingest.colmap.picture_shear.PictureShear.size`; 0 where it was not measured.
         descriptors: observations with descriptors.
         errors_px: (n,) mean reprojection error of each point; track_lengths: (n,) photos that see it.
@@ -163,7 +168,7 @@ class MapOutcome:
     height_datum: str = ""
     scale: float | None = None
     residual_rms_m: float | None = None
-    radius_m: float | None = None
+    place: PlaceBounds | None = None
     picture_shear: float = 0.0
     gates: Mapping[str, Any] = field(default_factory=dict)
     cameras: tuple[CameraOutcome, ...] = ()
@@ -171,6 +176,19 @@ class MapOutcome:
     track_lengths: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     plan: PlanView | None = None
     control: ControlledPlacement | None = None
+
+    @property
+    def place_words(self) -> tuple[str, ...]:
+        """What its place is worth, and what helps, a sentence each; nothing where it has no place."""
+        if self.place is None:
+            return ()
+        if self.control is not None:
+            return self.place.words()
+        angles = self.gates.get("angles", {})
+        level = "what they say of their angles" if angles.get("told") else "level"
+        off_deg = angles.get("tilt_off_deg")
+        off = () if off_deg is None else (f"tilt: its photos are {off_deg:.1f} degrees off {level} (median)",)
+        return (*self.place.words(), *off, _BETTER)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -277,6 +295,7 @@ def _map_json(outcome: MapOutcome) -> dict[str, Any]:
     edges = [*_TRACK_BINS, 1 << 30]
     counts: list[int] = np.histogram(tracks, bins=edges)[0].tolist() if len(tracks) else []
     return {name: getattr(outcome, name) for name in MapOutcome.__slots__ if name not in _DRAWN} | {
+        "place": outcome.place and asdict(outcome.place),
         "warnings": outcome.warnings,
         "cameras": [asdict(camera) for camera in outcome.cameras],
         "reprojection_px": {f"p{p}": float(np.percentile(errors, p)) for p in _PERCENTILES if len(errors)},

@@ -1,6 +1,7 @@
 """Subcommands `serve`, `query`, `live` and `localise`; what they need is imported when they run."""
 
 import argparse
+import logging
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     # A photo's bytes, its lens where it is known, and whether it is asked for the first time of two.
     Ask = Callable[[bytes, CameraRequest | None, bool], LocaliseReply]
 
+logger = logging.getLogger(__name__)
 _NOT_LOCALISED = 1  # exit code: everything worked, and the answer is no
 
 
@@ -182,11 +184,17 @@ def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _serve(args: argparse.Namespace) -> int:
+    from featuredb.cli.common import open_database
+    from reloc.service.logs import fields, log_to
+
+    database = open_database(args)
+    log_to(sys.stderr)
+    logger.info(  # before the imports, which take seconds, too
+        'loads the maps of %s; wait for "serving" before you ask', database.name, extra=fields("loading")
+    )
     import cv2
 
-    from featuredb.cli.common import open_database
     from reloc.service.live.options import LiveOptions
-    from reloc.service.logs import log_to
     from reloc.service.options import ServeOptions
     from reloc.service.serve import serve
     from reloc.service.server import Server
@@ -206,8 +214,6 @@ def _serve(args: argparse.Namespace) -> int:
         live=LiveOptions(**given("max_sessions", "idle_timeout_s")),
         **given("workers", "max_queue", "deadline_s"),
     )
-    database = open_database(args)
-    log_to(sys.stderr)
     # Its decoders tell stderr about each hostile file; the refusal in our log says it once.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
@@ -327,6 +333,8 @@ def _answer_all(
             sys.stdout.flush()
             if reply.status == "not_localised":
                 codes.add(_NOT_LOCALISED)
+                if args.overlay is not None:
+                    sys.stderr.write(f"featuredb: {path}: no overlay, as it was not localised\n")
             elif reply.in_map is not None:
                 if args.overlay is not None:
                     sys.stderr.write(f"featuredb: {path}: no overlay of a map without a place\n")

@@ -5,13 +5,13 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.unplaced_map import OwnFrame
@@ -289,16 +289,3 @@ class LocaliseResult:
         if self.in_map is not None:
             return "localised_in_map"
         return "not_localised" if self.pose is None else "localised"
-
-
-def error_radius(covariance: FloatArray, share: float = 0.68) -> float:
-    """Radius around a Gaussian's mean that holds a share of it, for covariances (d, d), d = 1, 2 or 3.
-
-    The squared distance is a weighted sum of chi-squares; a gamma distribution with its mean and variance
-    (Satterthwaite) is exact for d = 1 and for equal weights, and within 2 % in radius in between.
-    """
-    weights = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
-    mean, variance = float(weights.sum()), float(2.0 * (weights**2).sum())
-    if mean <= 0.0:
-        return 0.0
-    return float(np.sqrt(gammaincinv(mean**2 / variance, share) * variance / mean))

@@ -13,8 +13,8 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.error_radius import error_radius
 from reloc.answered_view import AnsweredView
-from reloc.localise.result import error_radius
 from reloc.pixels.surfaces import Met, RaySurface
 
 LocateReason = Literal["NO_SURFACE", "GRAZING", "OUTSIDE"]

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from featuredb.errors import InvalidValueError
 
 _ADDRESS = re.compile(r"(http://\S+); stop with")
-_START_S = 120.0  # a cold start imports everything and loads the map
+_START_S = 120.0  # the first time it imports everything and loads the map
 _STOP_S = 10.0
 _TOLD_CHARACTERS = 500
 

@@ -52,7 +52,11 @@ def test_maps_and_history(db: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert code == 0
     lines = out.splitlines()
     assert lines[0].split()[:4] == ["map", "name", "status", "method"]
-    assert [line.split()[0] for line in lines[2:]] == ["map-1", "map-2", "map-3"]
+    assert [line.split()[0] for line in lines[2:-1]] == ["map-1", "map-2", "map-3"]
+    bounds = Database.open(db).snapshot().get("map-1").bounds
+    column = lines[0].split().index("tilt_95_deg") - len(lines[0].split())
+    assert lines[2].split()[column - 1] == str(round(bounds.tilt_deg, 2))  # "committed" has two words
+    assert lines[-1].startswith("place_95_m, tilt_95_deg, heading_95_deg: 95 of 100 maps")
     code, out, _ = run(capsys, "maps", db, "--json", "--as-of", "0")
     assert json.loads(out)["maps"] == []
     code, out, _ = run(capsys, "history", db)
@@ -62,10 +66,10 @@ def test_maps_and_history(db: str, capsys: pytest.CaptureFixture[str]) -> None:
 def test_retire_and_rollback(db: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, "retire", db, "map-1", "--reason", "wrong street")
     assert (code, out) == (0, "retired: map-1, map-2\n")
-    assert len(run(capsys, "maps", db)[1].splitlines()) == 3
-    assert len(run(capsys, "maps", db, "--all")[1].splitlines()) == 5
+    assert len(run(capsys, "maps", db)[1].splitlines()) == 4
+    assert len(run(capsys, "maps", db, "--all")[1].splitlines()) == 6
     assert run(capsys, "rollback", db, "1")[:2] == (0, "version 3\n")
-    assert len(run(capsys, "maps", db)[1].splitlines()) == 5
+    assert len(run(capsys, "maps", db)[1].splitlines()) == 6
 
 
 def test_sql_formats(db: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -43,6 +43,8 @@ NOT_RUN = {
     "featuredb demo": "tests/integration/test_demo.py runs it",
     "tools/check.py": "it runs these tests",
     "pip install": "installs; the extra is looked up",
+    "uv sync": "installs; these tests run in what it makes",
+    "source": "these tests run in what it activates",
     "tools/scan_poses.py": _REAL_DATA,
     "tools/descriptor_study.py": _REAL_DATA,
     "tools/frame_real_photos.py": _REAL_DATA,

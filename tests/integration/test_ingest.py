@@ -131,7 +131,8 @@ def test_a_wrong_position_is_named_and_left_out(work: Path, tmp_path: Path) -> N
     assert report.maps[0].residual_rms_m is not None
     assert report.maps[0].residual_rms_m < 0.1
     # Nothing tells how much of a stated sigma all positions share: 95 % of two axes are 2.45 sigmas.
-    assert report.maps[0].radius_m == pytest.approx(2.45 * 0.02, rel=0.3)
+    assert report.maps[0].place is not None
+    assert report.maps[0].place.horizontal_m == pytest.approx(2.45 * 0.02, rel=0.3)
 
 
 def test_positions_that_agree_on_another_place_keep_their_photos_out(work: Path, tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ import pytest
 from PIL import Image
 
 from featuredb.errors import InvalidValueError
+from featuredb.maps.place_bounds import PlaceBounds
+from ingest.api.ingesting import summary
 from ingest.plot_parts import nice_length, residual_exaggeration
 from ingest.report.page import write_report
 from ingest.report.plots import histograms_png, plan_png
@@ -197,6 +199,27 @@ def test_a_report_of_nothing_can_be_written(tmp_path: Path) -> None:
         )
     )
     jsonschema.validate(document, SCHEMA)
+
+
+def test_terminal_and_page_say_what_a_place_is_worth(tmp_path: Path) -> None:
+    bounds = PlaceBounds(horizontal_m=9.19, vertical_m=18.7, tilt_deg=4.43, heading_deg=2.84)
+    angles = {"told": False, "tilt_off_deg": 3.91, "tilt_contradicts": False}
+    gates = {"turn_sigma_deg": 1.92, "noise_m": [1.7, 3.3], "angles": angles, "options": {"wrong": 0.001}}
+    of_gps = replace(report().maps[0], place=bounds, gates=gates)
+    text = summary(report(maps=(of_gps,)))
+    page = write_report(tmp_path, report(maps=(of_gps,)))[1].read_text(encoding="utf-8")
+    for words in ("9.19 m horizontally", "tilted by 4.4 degrees", "3.9 degrees off level", "a scan"):
+        assert words in text
+        assert words in page
+    rows = re.findall(r"<tr><td[^>]*>(\w+)</td><td[^>]*>([^<]+)</td><td[^>]*>[^<]{20,}</td></tr>", page)
+    assert rows == [
+        ("noise_m", "1.7, 3.3"),
+        ("turn_sigma_deg", "1.92"),
+        ("told", "no"),
+        ("tilt_off_deg", "3.91"),
+        ("tilt_contradicts", "no"),
+    ]
+    jsonschema.validate(report_json(report(maps=(of_gps,))), SCHEMA)
 
 
 @pytest.mark.parametrize("k", [1, 2, 60])

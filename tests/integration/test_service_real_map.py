@@ -224,6 +224,7 @@ def test_overlay_projects_the_inliers_onto_their_keypoints(server, database, pho
     photo = cv2.imread(str(photos / "a.png"))
     query, here = (cv2.imread(str(t)) for t in targets)
     assert query.shape == here.shape == photo.shape
+    assert query[-44:-30].mean() < 0.6 * photo[-44:-30].mean(), "a legend stands there"
     green = (query[:, :, 1].astype(int) - query[:, :, 0] > 60).sum()
     blue = [(p[:, :, 0].astype(int) - p[:, :, 2] > 60).sum() for p in (query, here)]
     assert green > 1000
@@ -232,9 +233,12 @@ def test_overlay_projects_the_inliers_onto_their_keypoints(server, database, pho
 
 
 def test_several_overlays_get_names_of_their_own(database, photos, tmp_path, capsys):
-    images = [str(photos / name) for name in HELD_OUT]
+    blank = tmp_path / "blank.jpg"
+    Image.new("RGB", (640, 480), "grey").save(blank)
+    images = [str(photos / name) for name in HELD_OUT] + [str(blank)]
     run("localise", str(database), *images, "--camera", CAMERA_TEXT, "--overlay", str(tmp_path / "o.png"))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["o-a.png", "o-b.png"]
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["o-a.png", "o-b.png"]
+    assert f"{blank}: no overlay, as it was not localised" in capsys.readouterr().err
 
 
 def test_priors_select_and_contradict(server, photos, capsys):
@@ -326,7 +330,8 @@ def test_hot_reload_commit_retire_and_a_clean_end(tmp_path, field, photos):
         assert client.localise(image, camera=CAMERA_REQUEST).reason == "NO_COVERAGE"
     assert process.stop(signal.SIGTERM) == 0
     log = process.log()
-    assert [line["event"] for line in log if line.get("event") in ("serving", "stopped")] == [
+    assert [line["event"] for line in log if line.get("event") in ("loading", "serving", "stopped")] == [
+        "loading",
         "serving",
         "stopped",
     ]

@@ -5,6 +5,7 @@ import pyproj
 import pytest
 
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_log
 from featuredb.geometry.sim3 import Sim3
@@ -13,7 +14,7 @@ from featuredb.maps.feature_map import FeatureMap
 from reloc.localise.answer import make_answer
 from reloc.localise.lens_prior import lens_of, with_lens
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
-from reloc.localise.result import LocalisedPose, error_radius
+from reloc.localise.result import LocalisedPose
 from tests.support.scenes import EPSG, box_points, looking_at, random_descriptors, ring, scene_map
 
 POSE = looking_at(np.array([38.0, 22.0, 33.0]), np.array([0.0, 0.0, 3.0]))

@@ -15,6 +15,7 @@ from featuredb.geometry.similarity import similarity_closed_form
 from ingest.own_frame import held_of
 from ingest.positions.position_noise import Held
 from ingest.register.gps import GpsPlacement, place_by_gps
+from ingest.report.gps_figures import FIGURES
 from tests.support.gps_flights import OPTIONS, TRUE, flight, place
 
 
@@ -229,6 +230,8 @@ def test_a_strip_with_the_cameras_angles_answers(yaw_deg: float) -> None:
     assert (placed.reason, placed.provisional, placed.message) == (None, "", "placed by GPS")
     assert placed.figures["turn_sigma_deg"] < 3.0
     assert _turn_deg(placed) < 3.0
+    figures = placed.figures.keys() | placed.figures["angles"].keys()
+    assert figures - FIGURES.keys() == {"options", "angles"}  # the report explains each
 
 
 def test_a_strip_whose_photos_look_across_waits_without_angles() -> None:

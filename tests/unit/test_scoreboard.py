@@ -78,7 +78,9 @@ def test_the_page_tells_what_holds_what_failed_and_what_was_not_run() -> None:
     assert "| 0.25 m in 1 s | m <= 0.3 | yes | quick | a, 2026-01-02 | 1.0 |" in page(
         [row()], {"tiny": result("a", 0.25)}
     )
-    assert "| 0.35 m in 1 s | m <= 0.3 | **no** |" in page([row()], {"tiny": result("a", 0.35)})
+    assert "| 0.35 m in 1 s | m <= 0.3 | **no**: m <= 0.3 (it is 0.35) |" in page(
+        [row()], {"tiny": result("a", 0.35)}
+    )
     assert "FAILED: exit code 3: a/b" in page([row()], {"tiny": result("a", 0.0, "exit code 3: a|b")})
     assert "| not run | m <= 0.3 | - |" in page([row()], {})
     with pytest.raises(SystemExit, match="found no such pair"):

@@ -32,6 +32,10 @@ def test_the_angles_are_those_of_a_gimbal(reply: LocaliseReply, angles: tuple[fl
     assert [float(v) for v in said.groups()] == pytest.approx(angles, abs=0.006)
     top = re.search(r"top points to ([.0-9]+)", text)
     assert (top is not None) == (angles[1] < -60.0)
+    if top is None:  # two points of the horizon, 10 degrees to the right of the heading and to its left
+        aside = np.radians(angles[0] + np.array([10.0, -10.0]))
+        right, left = np.column_stack([np.sin(aside), np.cos(aside), 0.0 * aside]) @ cam_from_enu(*angles).T
+        assert ("right end is higher" in text) == (right[1] / right[2] < left[1] / left[2])
     if top is not None:
         assert float(top.group(1)) == pytest.approx(angles[0], abs=0.006)
 
@@ -60,12 +64,24 @@ def test_the_radius_of_95_per_cent_is_that_of_the_covariance(reply: LocaliseRepl
 def test_the_answer_says_what_the_photos_own_position_did(reply: LocaliseReply) -> None:
     assert "prior" not in describe("a.jpg", reply, "db")
     for role, distance_m, words in (
-        ("agrees", 3.25, "EXIF position, 3.2 m away, agrees"),
-        ("decided", 12.0, "12.0 m away, decided; --no-exif-prior leaves it out"),
-        ("contradicted", 312_400.0, "312.4 km away, is not what the photo shows"),
+        ("agrees", 3.25, "EXIF position, 3.2 m away horizontally, agrees"),
+        ("decided", 12.0, "12.0 m away horizontally, decided; --no-exif-prior leaves it out"),
+        ("contradicted", 312_400.0, "312.4 km away horizontally, is not what the photo shows"),
     ):
         own = OwnPositionUse(role=role, distance_m=distance_m)
         assert words in describe("a.jpg", reply.model_copy(update={"exif_prior": own}), "db")
     lost = reply_from_result(not_localised(3), request_id="r", timings_ms={"total": 12.0})
     helpless = lost.model_copy(update={"exif_prior": OwnPositionUse(role="no_help", distance_m=None)})
     assert "EXIF position was tried, and did not help" in describe("a.jpg", helpless, "db")
+
+
+def test_more_inliers_than_matches_explain_themselves(reply: LocaliseReply) -> None:
+    text = describe("a.jpg", reply.model_copy(update={"inliers": 428, "matches": 212}), "db")
+    assert "428 inliers (212 matches led to the pose, which was then used to find more), residual" in text
+
+
+@pytest.mark.parametrize("reason", ["TOO_FEW_MATCHES", "TOO_FEW_INLIERS"])
+def test_the_first_thought_about_a_photo_that_fits_nothing_is_another_place(reason: str) -> None:
+    lost = reply_from_result(not_localised(3), request_id="r", timings_ms={"total": 12.0})
+    text = describe("a.jpg", lost.model_copy(update={"reason": reason}), "db")
+    assert "  try: it may show another place; if not, " in text

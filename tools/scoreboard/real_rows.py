@@ -121,8 +121,7 @@ REAL: tuple[Row, ...] = (
         name="brighton-held-out",
         group="real",
         form="quick",
-        claim="`brighton`: 14 of 18 photos become a map from a cold start; the 4 others over Zenoh, "
-        "against a map of all 18",
+        claim="`brighton`: 14 of 18 photos become a map; the 4 others over Zenoh, against a map of all 18",
         commands=(("tools.real_photos", "--photos", BRIGHTON, "--held-out", *HELD_OUT, *OUT),),
         text="{registered} of {usable} in {ingest_s:.0f} s; " + ANSWERS,
         limits=(

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from tools.scoreboard.results import ROOT, Result
-from tools.scoreboard.row import Row
+from tools.scoreboard.row import Figures, Row
 
 PAGE = ROOT / "docs" / "measurements.md"
 README = ROOT / "README.md"
@@ -47,7 +47,7 @@ def readme_table(rows: Sequence[Row], results: Mapping[str, Result]) -> str:
     lines = ["| what | figure | holds |", "|---|---|---|"]
     for row in shown[:MOST_IN_README]:
         figures = results[row.name].figures
-        lines.append(f"| {row.claim} | {row.words(figures)} | {_yes(row.holds(figures))} |")
+        lines.append(f"| {row.claim} | {row.words(figures)} | {_yes(row, figures)} |")
     return "\n".join(lines)
 
 
@@ -72,13 +72,15 @@ def _line(row: Row, result: Result | None) -> str:
         failure = result.failure.replace("|", "/").replace("`", "'").replace("<", "(").replace(">", ")")
         cells = [f"FAILED: {failure}", limits, "no", row.form, f"{result.commit}, {result.date}", "-"]
     else:
-        cells = [row.words(result.figures), limits, _yes(row.holds(result.figures)), row.form]
+        cells = [row.words(result.figures), limits, _yes(row, result.figures), row.form]
         cells += [f"{result.commit}, {result.date}", f"{result.seconds / 60:.1f}"]
     return f"| {row.name} | {row.claim} | {' | '.join(cells)} |"
 
 
-def _yes(holds: bool) -> str:
-    return "yes" if holds else "**no**"
+def _yes(row: Row, figures: Figures) -> str:
+    """Whether it holds; if not, which limit is missed and by what figure."""
+    missed = row.missed(figures)
+    return f"**no**: {missed}" if missed else "yes"
 
 
 def _quoted(word: str) -> str:

@@ -87,6 +87,14 @@ class Row:
         """Whether all limits hold."""
         return all(limit.holds(figures) for limit in self.limits)
 
+    def missed(self, figures: Figures) -> str:
+        """The limits that do not hold, each with its figure; "" where all do."""
+        found = [(limit, figures.get(limit.figure)) for limit in self.limits if not limit.holds(figures)]
+        return ", ".join(
+            f"{limit} (it is {value:.3g})" if isinstance(value, float | int) else f"{limit} (not measured)"
+            for limit, value in found
+        )
+
     def words(self, figures: Figures) -> str:
         """The figures in words; what is missing shows as a dash."""
         return string.Formatter().vformat(self.text, (), _Dashes(figures))
