@@ -1,0 +1,125 @@
+"""Subcommand `serve`; what it needs is imported when it runs."""
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+from reloc.wire.endpoints import DEFAULT_ENDPOINT
+
+logger = logging.getLogger(__name__)
+
+
+def register(subparsers: Any) -> None:
+    """Add the subcommand to the parser of `featuredb`."""
+    from featuredb.cli.common import add_database_argument
+
+    serve = subparsers.add_parser(
+        "serve", help="answer queries over Zenoh", description="Answer queries over Zenoh until stopped."
+    )
+    add_database_argument(serve)
+    serve.add_argument(
+        "--listen",
+        action="append",
+        metavar="ENDPOINT",
+        help=f"Zenoh endpoint, may be repeated; default {DEFAULT_ENDPOINT} where no --config is given",
+    )
+    serve.add_argument(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of a router that clients connect to, may be repeated; with --config the server "
+        "then listens only where --listen says so",
+    )
+    serve.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="Zenoh configuration (JSON5), such as `featuredb keys` makes",
+    )
+    serve.add_argument(
+        "--insecure",
+        action="store_true",
+        help="start even where machines that nobody has authenticated can reach the server",
+    )
+    serve.add_argument("--name", default="", help="database name on the wire; default: the folder's name")
+    serve.add_argument("--workers", type=int, help="queries localised at a time; default 2")
+    serve.add_argument("--max-queue", type=int, help="queries that may wait; default 32")
+    serve.add_argument(
+        "--deadline",
+        type=float,
+        dest="deadline_s",
+        metavar="SECONDS",
+        help="per query; default 8",
+    )
+    serve.add_argument(
+        "--contributions",
+        choices=("on", "off"),
+        default="on",
+        help="take photos that clients contribute, with credit and licence, into a bounded inbox; default on",
+    )
+    serve.add_argument(
+        "--live-sessions",
+        type=int,
+        dest="max_sessions",
+        metavar="N",
+        help="streams followed at a time; default 2",
+    )
+    serve.add_argument(
+        "--live-idle",
+        type=float,
+        dest="idle_timeout_s",
+        metavar="SECONDS",
+        help="a live session without a usable frame for so long ends; default 5",
+    )
+    serve.add_argument(
+        "--metrics-port", type=int, metavar="PORT", help="serve http://127.0.0.1:PORT/metrics for Prometheus"
+    )
+    serve.set_defaults(run=_serve)
+
+
+def _serve(args: argparse.Namespace) -> int:
+    from featuredb.cli.common import open_database
+    from reloc.service.logs import fields, log_to
+
+    database = open_database(args)
+    log_to(sys.stderr)
+    logger.info(  # before the imports, which take seconds, too
+        'loads the maps of %s; wait for "serving" before you ask', database.name, extra=fields("loading")
+    )
+    import cv2
+
+    from reloc.service.live.options import LiveOptions
+    from reloc.service.options import ServeOptions
+    from reloc.service.serve import serve
+    from reloc.service.server import Server
+
+    def given(*names: str) -> dict[str, Any]:
+        return {name: value for name in names if (value := getattr(args, name, None)) is not None}
+
+    listen = tuple(args.listen or (() if args.config else (DEFAULT_ENDPOINT,)))
+    options = ServeOptions(
+        listen=listen,
+        connect=tuple(args.connect or ()),
+        config_path=args.config,
+        insecure=args.insecure,
+        name=args.name,
+        metrics_port=args.metrics_port,
+        contributions=args.contributions == "on",
+        live=LiveOptions(**given("max_sessions", "idle_timeout_s")),
+        **given("workers", "max_queue", "deadline_s"),
+    )
+    # Its decoders tell stderr about each hostile file; the refusal in our log says it once.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+    def announce(server: Server) -> None:
+        where = ", ".join(server.endpoints) or str(args.config)
+        sys.stdout.write(
+            f"serving {server.database!r} (snapshot {server.status().snapshot}, {server.status().maps} maps) "
+            f"on {where}; stop with Ctrl-C\n"
+        )
+        sys.stdout.flush()
+
+    serve(database, options, on_ready=announce)
+    return 0
