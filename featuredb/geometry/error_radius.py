@@ -1,4 +1,4 @@
-"""The radius that holds a share of a Gaussian's errors; without SciPy, which takes a third of a second to import."""
+"""The radius that holds a share of a Gaussian's errors; without SciPy, whose import takes as long as a command."""
 
 import math
 from statistics import NormalDist
