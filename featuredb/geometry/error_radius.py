@@ -1,4 +1,4 @@
-"""The radius that holds a share of a Gaussian's errors; without SciPy, whose import takes as long as a command."""
+"""The radius that holds a share of a Gaussian's errors; without SciPy, whose import takes time."""
 
 import math
 from statistics import NormalDist
