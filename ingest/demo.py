@@ -84,7 +84,7 @@ def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> l
 
     start = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    _tell(say, start, "drawing the town and its photos ...")
+    _tell(say, start, "drawing the town and its photos, a minute or two ...")
     world = make_world(out / "world", size=size, seed=seed, exact_gps=exact_gps)
     _tell(say, start, f"simulated town: {len(world.images('drone'))} drone photos in {world.folder}")
     _tell(say, start, "making a map of them; each stage is told when it is done ...")

@@ -85,9 +85,8 @@ def _serve(args: argparse.Namespace) -> int:
 
     database = open_database(args)
     log_to(sys.stderr)
-    logger.info(  # before the imports, which take seconds, too
-        'loads the maps of %s; wait for "serving" before you ask', database.name, extra=fields("loading")
-    )
+    # Before the imports, which take seconds, too.
+    logger.info('loads %s; wait for "serving" before you ask', database.name, extra=fields("loading"))
     import cv2
 
     from reloc.service.live.options import LiveOptions
