@@ -74,7 +74,7 @@ def test_rows_of_known_queries_without_sense(database: Database, column: str, va
     at = rows.column_names.index(column)
     pq.write_table(rows.set_column(at, column, pa.array([value], rows[column].type)), path)
     assert outcome(database, truth) == "found"
-    with pytest.raises(StoreError, match="damaged.*featuredb verify"):
+    with pytest.raises(StoreError, match=r"damaged.*featuredb verify"):
         list_canaries(database)
 
 
