@@ -175,6 +175,7 @@ def _serve(args: argparse.Namespace) -> int:
     import cv2
 
     from featuredb.cli.common import open_database
+    from featuredb.stop_signals import end_process
     from reloc.service.live.options import LiveOptions
     from reloc.service.logs import log_to
     from reloc.service.options import ServeOptions
@@ -209,7 +210,7 @@ def _serve(args: argparse.Namespace) -> int:
         sys.stdout.flush()
 
     serve(database, options, on_ready=announce)
-    return 0
+    end_process(0)
 
 
 def _query(args: argparse.Namespace) -> int:
