@@ -209,7 +209,7 @@ def _rows(table: Table) -> list[Row]:
         found = table.dataset().to_table(_LIGHT, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"cannot read the table canaries ({error}); run `featuredb verify`") from error
-    return rows_of(found, "created_at")
+    return rows_of(found, CANARIES, "created_at")
 
 
 def _same(there: Row, wanted: Row) -> Row:
@@ -241,24 +241,30 @@ def _pose_columns(pose: KnownPose | None) -> Row:
 
 
 def _canary(row: Row) -> Canary:
-    pose = None
-    if row["expected"] == "localised":
-        pose = KnownPose(
-            epsg=row["epsg"],
-            utm=np.array([row["easting"], row["northing"], row["height"]]),
-            height_datum=row["height_datum"],
-            cam_from_utm_xyzw=np.array(row["cam_from_utm_xyzw"]),
-            tolerance_m=row["tolerance_m"],
-            tolerance_deg=row["tolerance_deg"],
+    try:
+        return Canary(
+            canary_id=row["canary_id"],
+            name=row["name"],
+            created_at=row["created_at"],
+            sha256=row["sha256"],
+            request=json.loads(row["request"]),
+            pose=_pose(row) if row["expected"] == "localised" else None,
+            origin=row["origin"],
+            snapshot=row["snapshot"],
+            note=row["note"],
         )
-    return Canary(
-        canary_id=row["canary_id"],
-        name=row["name"],
-        created_at=row["created_at"],
-        sha256=row["sha256"],
-        request=json.loads(row["request"]),
-        pose=pose,
-        origin=row["origin"],
-        snapshot=row["snapshot"],
-        note=row["note"],
+    except (TypeError, ValueError) as error:
+        raise StoreError(
+            f"canary {row['name']}: its row is damaged ({error}); run `featuredb verify`"
+        ) from error
+
+
+def _pose(row: Row) -> KnownPose:
+    return KnownPose(
+        epsg=row["epsg"],
+        utm=np.array([row["easting"], row["northing"], row["height"]]),
+        height_datum=row["height_datum"],
+        cam_from_utm_xyzw=np.array(row["cam_from_utm_xyzw"]),
+        tolerance_m=row["tolerance_m"],
+        tolerance_deg=row["tolerance_deg"],
     )

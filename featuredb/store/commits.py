@@ -107,7 +107,7 @@ def read_rows(maps: Table) -> list[Row]:
         for field in SPECS[MAPS].schema:  # those that an older format does not have
             if field.name not in table.column_names:
                 table = table.append_column(field.name, pa.nulls(len(table), field.type))
-        return rows_of(table, "created_at")
+        return rows_of(table, MAPS, "created_at")
     except FileNotFoundError as error:
         raise SnapshotNotFoundError(
             f"version {maps.version} is gone, vacuum removed its files ({error}); choose a newer one"

@@ -9,8 +9,8 @@ What deltalake 1.6 does, and tests/integration/test_delta_behaviour.py pins:
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import uuid
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -32,7 +32,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError
 
 from featuredb.errors import ConflictError, StoreError
 from featuredb.store.durable.ages import old_files, old_scratch_folders, remove_files
-from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.filesystem import store_errors, table_files
 from featuredb.store.durable.local import Sight, commit_locally, create_locally
 from featuredb.store.durable.log import Commit, acknowledge, check_end, read_commit
 from featuredb.store.durable.making import (
@@ -48,6 +48,7 @@ from featuredb.store.tables import FORMAT_VERSION, TableSpec
 
 T = TypeVar("T")
 
+COMMIT_ID = "featuredb.commit_id"  # in the entries of compare-and-swaps
 _HEX = re.compile(r"[0-9a-f]{1,64}")
 
 
@@ -75,7 +76,8 @@ class Table:
     @classmethod
     def exists(cls, url: str, storage_options: dict[str, str] | None) -> bool:
         """Whether there is a Delta table of any kind."""
-        return bool(DeltaTable.is_deltatable(url, storage_options=storage_options))
+        with store_errors(f"cannot reach {url}"):
+            return bool(DeltaTable.is_deltatable(url, storage_options=storage_options))
 
     @classmethod
     def create(cls, url: str, spec: TableSpec, storage_options: dict[str, str] | None) -> None:
@@ -161,7 +163,7 @@ class Table:
         Raises:
             StoreError: the store cannot be reached.
         """
-        with _as_store_error(f"cannot read the log of {self._url}"):
+        with store_errors(f"cannot read the log of {self._url}"):
             self._delta.update_incremental()
             check_end(self._url, self.storage, self.version)
 
@@ -170,14 +172,14 @@ class Table:
         filesystem = self.storage
         if "://" in self._url:
             filesystem = None  # deltalake's, which knows the files' sizes
-        with _as_store_error(f"cannot read {self._url}"):
+        with store_errors(f"cannot read {self._url}"):
             return self._delta.to_pyarrow_dataset(
                 file_pruning_predicate=list(pruning) or None, filesystem=filesystem
             )
 
     def count(self, column: str, value: str) -> int:
         """The rows with a value in a column of which the log has statistics."""
-        with _as_store_error(f"cannot read {self._url}"):
+        with store_errors(f"cannot read {self._url}"):
             return int(self.dataset([(column, "=", value)]).count_rows(filter=ds.field(column) == value))
 
     def files(self) -> list[DataFile]:
@@ -202,7 +204,7 @@ class Table:
         entries, too, and numbers the newest of them with this table's version.
         """
         versions = range(self.version, -1, -1)[:limit]
-        with _as_store_error(f"cannot read the log of {self._url}"):
+        with store_errors(f"cannot read the log of {self._url}"):
             return [read_commit(self.storage, version) for version in versions]
 
     def append(self, rows: pa.Table | pa.RecordBatchReader) -> None:
@@ -231,12 +233,18 @@ class Table:
 
         Raises:
             StaleVersionError: the table has moved on; nothing was committed.
+            StoreError: the store failed; an object store that does not answer may have taken the entry.
         """
-        expected = self.version + 1
-        properties = CommitProperties(max_commit_retries=0, custom_metadata=metadata)
-        found, _ = self._commit(
-            "write", lambda delta: self._write(delta, rows, mode, properties, schema_mode), "files"
-        )
+        expected, mine = self.version + 1, uuid.uuid4().hex
+        properties = CommitProperties(max_commit_retries=0, custom_metadata={**metadata, COMMIT_ID: mine})
+        try:
+            found, _ = self._commit(
+                "write", lambda delta: self._write(delta, rows, mode, properties, schema_mode), "files"
+            )
+        except StoreError:
+            if not self._has_taken(expected, mine):
+                raise
+            found = expected
         if found != expected:
             raise StoreError(f"{self._url}: expected version {expected}, found {found}")
         return expected
@@ -296,7 +304,7 @@ class Table:
             untracked: also files that the log does not know: those of crashed writers, but with a short
                 grace those of a writer at work, too.
         """
-        with _as_store_error(f"cannot vacuum {self._url}"):
+        with store_errors(f"cannot vacuum {self._url}"):
             unused = self._delta.vacuum(
                 retention_hours=0,
                 dry_run=True,
@@ -352,6 +360,19 @@ class Table:
         except (DeltaError, OSError) as error:
             raise StoreError(f"cannot {what} {self._url}: {error}") from error
 
+    def _has_taken(self, version: int, commit_id: str) -> bool:
+        """Whether an entry is one's own, though an object store's answer to it was lost."""
+        if "://" not in self._url:
+            return False
+        try:
+            found = read_commit(self.storage, version)
+        except (StoreError, OSError):
+            return False
+        if found.metadata.get(COMMIT_ID) != commit_id:
+            return False
+        acknowledge(self.storage, version)
+        return True
+
     def _in_its_format(self, rows: pa.Table | pa.RecordBatchReader) -> pa.Table | pa.RecordBatchReader:
         """Rows without the columns that a table of an older format does not have."""
         if self.format == FORMAT_VERSION or isinstance(rows, pa.RecordBatchReader):
@@ -367,14 +388,6 @@ class Table:
             return self._commit("maintain", operation, "rows", rebase=True)[1]
 
         return retry_stale(f"maintenance of {self.spec.name}", attempt)
-
-
-@contextmanager
-def _as_store_error(what: str) -> Iterator[None]:
-    try:
-        yield
-    except (DeltaError, OSError) as error:
-        raise StoreError(f"{what}: {error}") from error
 
 
 def _is_in(column: str, values: Iterable[str]) -> str:

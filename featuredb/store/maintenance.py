@@ -13,6 +13,7 @@ from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
 from featuredb.store.durable.ages import store_time, write_times
+from featuredb.store.durable.filesystem import store_errors
 from featuredb.store.durable.log import list_entries
 from featuredb.store.retry import retry_stale
 from featuredb.store.scans import has_scans, retired_since, scan_rows
@@ -59,7 +60,11 @@ def vacuum(
     Raises:
         ConflictError, StoreError
     """
-    options = options or VacuumOptions()
+    with store_errors(f"cannot vacuum {database.url}"):
+        return _vacuum(database, options or VacuumOptions(), dry_run)
+
+
+def _vacuum(database: Database, options: VacuumOptions, dry_run: bool) -> VacuumReport:
     now = store_time(database.table(MAPS).storage)
     kept_from = retry_stale("vacuum", lambda: _announce(database, options, now, dry_run))
     named = write_ids_of_history(database, kept_from)

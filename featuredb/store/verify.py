@@ -3,6 +3,7 @@
 import hashlib
 import logging
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,8 +23,8 @@ from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
-from featuredb.store.durable.copies import LIST, cut_off
-from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.copies import LIST, CopyPlace, cut_off
+from featuredb.store.durable.filesystem import one_line, store_errors, table_files
 from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
@@ -108,6 +109,23 @@ def verify(database: Database) -> VerifyReport:
     Raises:
         StoreError: the store cannot be reached, or there is no database.
     """
+    with store_errors(f"cannot verify {database.url}"):
+        report = _verify(database)
+        if report.problems and "://" in database.url:
+            # Requests that failed look like damage: whoever can read all bytes now looks again.
+            _read_all(CopyPlace(database.url, database.storage_options))
+            report = _verify(database)
+        return report
+
+
+def _read_all(place: CopyPlace) -> None:
+    """Raises OSError where the store does not answer."""
+    for path in place.sizes():
+        with suppress(FileNotFoundError):
+            place.sha256(path)
+
+
+def _verify(database: Database) -> VerifyReport:
     problems = list(check_logs(database))
     if unfinished := cut_off(database.url, database.storage_options):
         problems.insert(0, (LIST, unfinished))
@@ -182,7 +200,7 @@ def _file_problems(table: Table) -> Iterator[Found]:
             digest = digests.get(fragment.path)
             same = digest is None or digest == _sha256(table.storage, fragment.path)
         except (OSError, pa.ArrowException) as error:
-            yield where, f"cannot be opened: {_one_line(error)}"
+            yield where, f"cannot be opened: {one_line(error)[:300]}"
             continue
         if found != expected[fragment.path]:
             yield where, f"expected {expected[fragment.path]} rows by the log, found {found}"
@@ -205,7 +223,7 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Found]:
         except (OSError, pa.ArrowException) as error:
             # Types that Arrow cannot filter: older releases left them in files of which they removed rows.
             advice = "; run `featuredb upgrade`" if isinstance(error, pa.ArrowNotImplementedError) else ""
-            yield where, f"cannot read its {name}: {_one_line(error)}{advice}"
+            yield where, f"cannot read its {name}: {one_line(error)[:300]}{advice}"
     if len(tables) < len(CHILD_TABLES):
         return
     found = [
@@ -219,7 +237,7 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Found]:
     try:
         digest = content_digest(snapshot.load_any(row["map_id"]))
     except FeatureDbError as error:
-        yield where, f"cannot be loaded: {_one_line(error)}"
+        yield where, f"cannot be loaded: {one_line(error)[:300]}"
         return
     if digest != row["content_digest"]:
         yield where, "its rows are not those that were committed: content digests differ"
@@ -242,7 +260,7 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
             elsewhere += int((tile_of(utm) != batch["tile"].to_numpy(zero_copy_only=False)).sum())
             outside += int((~((utm >= low) & (utm <= high)).all(axis=1)).sum())
     except (OSError, pa.ArrowException) as error:
-        yield where, f"cannot read its points: {_one_line(error)}"
+        yield where, f"cannot read its points: {one_line(error)[:300]}"
         return
     if levels.tolist() != list(scan.level_points):
         yield where, f"expected {list(scan.level_points)} points by level, found {levels.tolist()}"
@@ -353,7 +371,3 @@ def _sha256(files: fs.FileSystem, path: str) -> str:
         while block := stream.read(_BLOCK_BYTES):
             digest.update(block)
     return digest.hexdigest()
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]

@@ -89,6 +89,7 @@ def _serve(args: argparse.Namespace) -> int:
     logger.info('loads %s; wait for "serving" before you ask', database.name, extra=fields("loading"))
     import cv2
 
+    from featuredb.stop_signals import end_process
     from reloc.service.live.options import LiveOptions
     from reloc.service.options import ServeOptions
     from reloc.service.serve import serve
@@ -121,4 +122,4 @@ def _serve(args: argparse.Namespace) -> int:
         sys.stdout.flush()
 
     serve(database, options, on_ready=announce)
-    return 0
+    end_process(0)

@@ -232,6 +232,18 @@ def test_a_frame_beyond_its_memory_is_refused() -> None:
         assert live.refusals[0].code == "TOO_LARGE"
 
 
+def test_frames_that_no_camera_streams_are_decoded_behind_queries() -> None:
+    bomb = png(4000, 4000, zeros((4000 * 8 + 1) * 4000), bits=16, colour=6)
+    with running_server(localiser(), ServeOptions(live=LIVE)) as server, client_of(server) as client:
+        with client.track(LENS) as live:
+            exchange(live, range(2))
+            assert os.getpriority(os.PRIO_PROCESS, live_worker(server)) == os.nice(0)
+        with client.track() as live:
+            live.send(bomb, 0.0)
+            wait_until(lambda: sum(live_status(server).frames.answered.values()) == 3, "its answer")
+            assert os.getpriority(os.PRIO_PROCESS, live_worker(server)) > os.nice(0)
+
+
 def test_who_has_several_sessions_gives_one_up_to_who_has_none() -> None:
     with (
         serving(max_sessions=2) as (server, greedy),

@@ -8,7 +8,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from featuredb.errors import StoreError
 from featuredb.store import Database
+from featuredb.store.canaries import list_canaries
 from featuredb.store.durable import local
 from tests.support.bit_flips import flip_bits, outcome, rich_database, seen
 from tests.support.maps import random_map
@@ -62,6 +64,18 @@ def test_a_checkpoint_that_says_less_than_the_entries(database: Database) -> Non
     first = next(i for i, add in enumerate(rows["add"].to_pylist()) if add)
     pq.write_table(pa.concat_tables([rows.slice(0, first), rows.slice(first + 1)]), path)
     assert outcome(database, truth) == "found"
+
+
+@pytest.mark.parametrize(("column", "value"), [("request", None), ("request", "{"), ("created_at", None)])
+def test_rows_of_known_queries_without_sense(database: Database, column: str, value: str | None) -> None:
+    truth = seen(database)
+    (path,) = Path(database.url, "canaries").glob("*.parquet")
+    rows = pq.read_table(path)
+    at = rows.column_names.index(column)
+    pq.write_table(rows.set_column(at, column, pa.array([value], rows[column].type)), path)
+    assert outcome(database, truth) == "found"
+    with pytest.raises(StoreError, match=r"damaged.*featuredb verify"):
+        list_canaries(database)
 
 
 @pytest.mark.parametrize(

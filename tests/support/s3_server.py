@@ -84,15 +84,15 @@ def ceph_gateway(folder: Path) -> Iterator[dict[str, str]]:
             "monmaptool", "--create", "--fsid", fsid, "--addv", "a", f"[v2:127.0.0.1:{monitor_port}]", monmap
         )
         _run("ceph-mon", "--mkfs", "-i", "a", *with_conf, "--monmap", monmap)
-        stack.enter_context(_daemon("ceph-mon", "-i", "a", "-f", *with_conf))
+        stack.enter_context(daemon("ceph-mon", "-i", "a", "-f", *with_conf))
         _run("ceph", *with_conf, "osd", "new", osd_uuid)
         _run("ceph-osd", "-i", "0", "--mkfs", "--osd-uuid", osd_uuid, *with_conf)
-        stack.enter_context(_daemon("ceph-osd", "-i", "0", "-f", *with_conf))
+        stack.enter_context(daemon("ceph-osd", "-i", "0", "-f", *with_conf))
         _run(
             "radosgw-admin", *with_conf, "user", "create", "--uid", "test", "--display-name", "test",
             "--access-key", ACCESS_KEY, "--secret", SECRET_KEY,
         )  # fmt: skip
-        stack.enter_context(_daemon("radosgw", "-n", "client.admin", "-f", *with_conf))
+        stack.enter_context(daemon("radosgw", "-n", "client.admin", "-f", *with_conf))
         yield _options_with_bucket(gateway_port)
 
 
@@ -108,7 +108,7 @@ def moto_server() -> Iterator[dict[str, str]]:
         "from werkzeug.serving import run_simple\n"
         f"run_simple('127.0.0.1', {port}, create_backend_app('s3'), threaded=False)\n"
     )
-    with _daemon(sys.executable, "-c", code):
+    with daemon(sys.executable, "-c", code):
         yield _options_with_bucket(port)
 
 
@@ -124,7 +124,8 @@ def _run(*command: str | Path) -> None:
 
 
 @contextmanager
-def _daemon(*command: str) -> Iterator[None]:
+def daemon(*command: str) -> Iterator[None]:
+    """A process that is killed at the end."""
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield
@@ -133,8 +134,8 @@ def _daemon(*command: str) -> Iterator[None]:
         process.wait()
 
 
-def _options_with_bucket(port: int) -> dict[str, str]:
-    """Wait for the server, make the bucket."""
+def wait_for(port: int) -> None:
+    """Until a server on loopback listens."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:
         try:
@@ -144,6 +145,11 @@ def _options_with_bucket(port: int) -> dict[str, str]:
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.1)
+
+
+def _options_with_bucket(port: int) -> dict[str, str]:
+    """Wait for the server, make the bucket."""
+    wait_for(port)
     S3FileSystem(
         access_key=ACCESS_KEY,
         secret_key=SECRET_KEY,

@@ -38,7 +38,7 @@ def read_events(
         table = dataset.to_table(list(columns) if columns else None, filter=wanted, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"cannot read the table candidates ({error}); run `featuredb verify`") from error
-    return sorted(rows_of(table, "happened_at"), key=event_order)
+    return sorted(rows_of(table, CANDIDATES, "happened_at"), key=event_order)
 
 
 def by_candidate(events: Iterable[Row]) -> dict[str, list[Row]]:

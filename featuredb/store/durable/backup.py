@@ -8,13 +8,11 @@ it has not moved on, they are what it needs. Files never change, so one that is 
 import hashlib
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import unquote
 
-import pyarrow as pa
 import pyarrow.fs as fs
 
 from featuredb.errors import StoreError
@@ -31,6 +29,7 @@ from featuredb.store.durable.copies import (
     others_at_work,
     superfluous,
 )
+from featuredb.store.durable.filesystem import store_errors
 from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_name, whole_entry
 from featuredb.store.retry import StaleVersionError, retry_stale
 from featuredb.store.tables import (
@@ -87,7 +86,7 @@ def backup(database: Database, target: str, storage_options: Mapping[str, str] |
         raise StoreError(f"cannot back up {url} to itself: choose another folder or URL")
     place = CopyPlace(url, dict(storage_options or {}) or None)
     source = CopyPlace(database.url, database.storage_options)
-    with _store_errors(f"cannot back up {database.url} to {url}"):
+    with store_errors(f"cannot back up {database.url} to {url}"):
         before = _list_of(place, "backup", database.url)
         return retry_stale(f"backup of {database.url}", lambda: _back_up(database, source, place, before))
 
@@ -106,7 +105,7 @@ def restore(source: str, target: Database, storage_options: Mapping[str, str] | 
     url = normal_url(source)
     backup_place = CopyPlace(url, dict(storage_options or {}) or None)
     place = CopyPlace(target.url, target.storage_options)
-    with _store_errors(f"cannot restore {url} to {target.url}"):
+    with store_errors(f"cannot restore {url} to {target.url}"):
         found = backup_place.read_list()
         if found is None or found.purpose != "backup":
             raise StoreError(f"no backup at {url}: expected a folder or URL that `featuredb backup` has made")
@@ -281,11 +280,3 @@ def _acknowledge(place: CopyPlace, paths: Iterable[str]) -> int:
     for name, version in newest.items():
         acknowledge(fs.SubTreeFileSystem(name, place.files), version)
     return newest[MAPS]
-
-
-@contextmanager
-def _store_errors(what: str) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{what}: {error}") from error

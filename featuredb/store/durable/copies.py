@@ -16,7 +16,7 @@ from typing import Any
 import pyarrow.fs as fs
 
 from featuredb.errors import StoreError
-from featuredb.store.durable.filesystem import object_writer, table_files
+from featuredb.store.durable.filesystem import object_writer, one_line, table_files
 from featuredb.store.durable.log import ACKNOWLEDGED
 from featuredb.store.durable.publish import flush, make_folder
 from featuredb.store.tables import SPECS
@@ -188,12 +188,16 @@ def check_restored(url: str, storage_options: dict[str, str] | None) -> None:
     """Refuse a place where a restore is not done: what is there may be an older state.
 
     Raises:
-        StoreError: so it is.
+        StoreError: so it is, or the store does not answer.
     """
     try:
         found = CopyPlace(url, storage_options).read_list()
-    except (StoreError, OSError):  # whoever opens the tables is told of the store; of the list `verify` tells
+    except StoreError:  # `verify` tells of a damaged list
         return
+    except OSError as error:
+        if "://" not in url:  # whoever opens the tables is told of the disk
+            return
+        raise StoreError(f"cannot open {url}: {one_line(error)}") from error
     if found is not None and found.purpose == "restore" and not found.whole:
         raise StoreError(f"cannot open {url}: {_unfinished(found)}")
 

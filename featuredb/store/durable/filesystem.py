@@ -1,13 +1,20 @@
 """A table's folder as Arrow sees it, on a local disk or in an object store."""
 
 import atexit
+import re
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.fs as fs
+from deltalake.exceptions import DeltaError
 from deltalake.fs import DeltaStorageHandler
+
+from featuredb.errors import StoreError
 
 
 def table_files(url: str, storage_options: dict[str, str] | None, opened: Any = None) -> fs.FileSystem:
@@ -30,6 +37,20 @@ def object_writer(files: fs.PyFileSystem, path: str) -> Any:
     Not through Arrow, which hands deltalake's stream buffers of its own: it takes bytes alone.
     """
     return files.handler._handler.open_output_stream(path, None)
+
+
+@contextmanager
+def store_errors(what: str) -> Iterator[None]:
+    """What deltalake and Arrow raise of a store, as `StoreError` in one line."""
+    try:
+        yield
+    except (DeltaError, OSError, pa.ArrowException) as error:
+        raise StoreError(f"{what}: {one_line(error)}") from error
+
+
+def one_line(error: Exception) -> str:
+    """A message without line ends, and without the colours that deltalake gives some."""
+    return " ".join(re.sub(r"\x1b\[\d*m", "", str(error)).split())
 
 
 @cache

@@ -6,10 +6,10 @@ from typing import Any
 
 import pyarrow as pa
 from deltalake import ColumnProperties, DeltaTable, WriterProperties
-from deltalake.exceptions import TableNotFoundError
+from deltalake.exceptions import DeltaError, TableNotFoundError
 
 from featuredb.errors import DatabaseNotFoundError, SnapshotNotFoundError, StoreError
-from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.filesystem import one_line, table_files
 from featuredb.store.durable.log import damaged, log_problems
 from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, SPECS, TableSpec
 
@@ -113,9 +113,9 @@ def why_not_opened(
         return DatabaseNotFoundError(
             f"no featuredb table at {url}; check the path, or create the database with `featuredb init`"
         )
-    if version is not None:
+    if version is not None and isinstance(error, DeltaError):  # an OSError: the store does not answer
         return SnapshotNotFoundError(f"{url} has no version {version}: {error}")
-    return StoreError(f"cannot open {url}: {error}")
+    return StoreError(f"cannot open {url}: {one_line(error)}")
 
 
 def check_place(url: str) -> None:
