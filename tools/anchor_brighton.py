@@ -43,15 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.write("before, placed by GPS\n")
         before = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
         sys.stdout.write(table(before) + "\n")
-        featuredb("lidar", "add", str(database), str(args.scan))
-        map_id = Database.open(database).snapshot().maps()[0].map_id
-        out = work / "anchor"
-        featuredb(
-            *("anchor", str(database), map_id, "--photos", str(args.photos), "--out", str(out)),
-            *("--auto", "--quiet"),
-        )
+        anchored = anchored_on(database, args.scan, args.photos, work / "anchor")
         sys.stdout.write("after, anchored on the scan\n")
-        after = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
+        after = ask_poses(anchored, args.photos, args.held_out, frame, poses)
         sys.stdout.write(table(after) + "\n")
     figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
     write_figures(args.json, figures | shape)
@@ -60,6 +54,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"(scan {shape['scan_focal_px']:.0f}), cameras {shape['gps_shape_m']:.3f} m off after a similarity\n"
     )
     return 0
+
+
+def anchored_on(database: Path, scan: Path, photos: Path, out: Path) -> Database:
+    """The database, after its oldest map is placed on the scan, which is added to it; `out`: the report."""
+    featuredb("lidar", "add", str(database), str(scan))
+    map_id = Database.open(database).snapshot().maps()[0].map_id
+    words = ("anchor", str(database), map_id, "--photos", str(photos), "--out", str(out), "--auto", "--quiet")
+    featuredb(*words)
+    return Database.open(database)
 
 
 def read_poses(path: Path) -> tuple[LocalFrame, dict[str, Rigid3]]:

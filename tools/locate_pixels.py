@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         refused = 0
         for photo in truth.group("queries"):
             data = (world.world.folder / photo.name).read_bytes()
-            view = _view(localiser, data)
+            view = view_of(localiser, data)
             if view is None:
                 continue
             surface = scan_surface(database, view)
@@ -80,12 +80,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             surface.common_m = _STRIPS_M
             target = _Target(scene, truth, photo, view)
             pixels = target.pixels(rng, _PIXELS)
-            found = _misses(target, pixels, locate(view, surface, pixels))
+            found = misses(view, target.places(pixels), locate(view, surface, pixels))
             answered += found
             refused += len(pixels) - len(found)
             for _ in range(_DRAWS):
                 drawn += target.drawn(rng, surface, _PIXELS // 5)
-    figures = _figures("answered", answered) | _figures("drawn", drawn)
+    figures = miss_figures("answered", answered) | miss_figures("drawn", drawn)
     figures |= {"refused": refused, "located": len(answered), "draws": len(drawn)}
     write_figures(args.json, figures)
     sys.stdout.write("\n".join(f"{name} {value:.4g}" for name, value in figures.items()) + "\n")
@@ -127,24 +127,26 @@ class _Target:
             camera = replace(camera, params=tuple(np.array(camera.params) - error[6:]))
         view = replace(self.view, camera=camera, cam_from_local=pose)
         pixels = self.pixels(rng, count)
-        return _misses(self, pixels, locate(view, surface, pixels))
+        return misses(view, self.places(pixels), locate(view, surface, pixels))
 
 
-def _misses(target: _Target, pixels: FloatArray, found: Sequence[PixelPlace]) -> list[Miss]:
-    misses = []
-    for place, true in zip(found, target.places(pixels), strict=True):
+def misses(view: AnsweredView, places: FloatArray, found: Sequence[PixelPlace]) -> list[Miss]:
+    """Misses of the pixels that have a place; `places`: (n, 3) true ones, in the frame of the view."""
+    missed = []
+    for place, true in zip(found, places, strict=True):
         if place.utm is None or place.covariance is None:
             continue
-        error = target.view.frame.enu_from_utm(place.utm, place.epsg) - true
+        error = view.frame.enu_from_utm(place.utm, place.epsg) - true
         squared = float(error @ np.linalg.solve(place.covariance, error))
-        misses.append(Miss(error_m=error, squared=squared, at_edge=place.at_edge))
-    return misses
+        missed.append(Miss(error_m=error, squared=squared, at_edge=place.at_edge))
+    return missed
 
 
-def _figures(name: str, misses: Sequence[Miss]) -> dict[str, float]:
-    far = np.array([np.linalg.norm(miss.error_m) for miss in misses])
-    edge = np.array([miss.at_edge for miss in misses])
-    squared = np.array([miss.squared for miss in misses])
+def miss_figures(name: str, missed: Sequence[Miss]) -> dict[str, float]:
+    """Errors in metres and shares inside the bounds, off edges and at them; `name` stands before each."""
+    far = np.array([np.linalg.norm(miss.error_m) for miss in missed])
+    edge = np.array([miss.at_edge for miss in missed])
+    squared = np.array([miss.squared for miss in missed])
     inside = {share: squared < chi2.ppf(share / 100, 3) for share in (68, 95)}
     return {
         f"{name}_median_m": float(np.median(far)),
@@ -152,11 +154,12 @@ def _figures(name: str, misses: Sequence[Miss]) -> dict[str, float]:
         f"{name}_68": float(inside[68][~edge].mean()),
         f"{name}_95": float(inside[95][~edge].mean()),
         f"{name}_edges": float(edge.mean()),
-        f"{name}_edge_95": float(inside[95][edge].mean()),
+        f"{name}_edge_95": float(inside[95][edge].mean()) if edge.any() else float("nan"),
     }
 
 
-def _view(localiser: Localiser, data: bytes) -> AnsweredView | None:
+def view_of(localiser: Localiser, data: bytes) -> AnsweredView | None:
+    """The camera of the answer to a photo, asked with nothing but its file; None where there is no answer."""
     reply = answer_query(
         data,
         LocaliseWireRequest(),

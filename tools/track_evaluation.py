@@ -12,8 +12,10 @@
 Prints for each film how many errors lie inside their bounds, over all frames with a pose and over the quarter
 of them with the fewest landmarks; the errors of position and orientation over all frames with a pose, the
 first and the last 200 of them (a half each of fewer than 400), lost frames, what was invented where the film
-shows another town, and how long it took to be found again; frames per second, the longest time between two
-poses, and the machine's load, since a busy machine's speed is not the program's. Writes track.json.
+shows another town, and how long it took to be found again; with --draw how far a layer that `featuredb draw`
+lays over the film by that track is from where it belongs (tools/drawn_layer.py); frames per second, the
+longest time between two poses, and the machine's load, since a busy machine's speed is not the program's.
+Writes track.json.
 """
 
 import argparse
@@ -33,7 +35,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
 from featuredb.lidar.load import load_cloud
 from featuredb.simworld.scoring import pose_difference
-from featuredb.simworld.world import WorldOptions
+from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from ingest.register.frame_registration import FramePrior
@@ -44,6 +46,7 @@ from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored, featuredb
+from tools.drawn_layer import DrawnMarks, drawn_marks
 from tools.figures import write_figures
 from tools.growth_common import say, table
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
@@ -101,6 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     inputs = args.inputs or args.out
     database = anchored_map(args.out, args.size, args.seed, args.workers, inputs)
     results: dict[str, Tracked] = {}
+    drawn: dict[str, DrawnMarks] = {}
     for name in args.films:
         options = film_options(name, args.size, args.seed, args.frames)
         film = inputs / f"film-{args.size}-{args.seed}-{name}-{args.frames}"
@@ -113,9 +117,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
         results[name] = judge_film(tracked, truth, metres, degrees, off, load)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
+        if args.draw:
+            drawn[name] = drawn_marks(
+                args.out, film, truth, town_of(options.world), tracked.trajectory, database
+            )
+            say(f"{name}: {drawn[name]}")
     head = ("film", *asdict(next(iter(results.values()))))
     sys.stdout.write(table([(n, *asdict(r).values()) for n, r in results.items()], head) + "\n")
-    write_figures(args.out / "track.json", {n: asdict(r) for n, r in results.items()})
+    layers = {f"{name}_layer": asdict(marks) for name, marks in drawn.items()}
+    write_figures(args.out / "track.json", {n: asdict(r) for n, r in results.items()} | layers)
     return 0
 
 
@@ -290,6 +300,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=1200)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
+    parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
     parser.add_argument("--inputs", type=Path, default=None, help="keep world and films there, not in --out")
     parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
     return parser.parse_args(argv)

@@ -1,4 +1,4 @@
-"""ROS 2 messages of a pose, in CDR, written into an MCAP file: no ROS installation is needed.
+"""ROS 2 messages of a pose, in CDR, and written into an MCAP file: no ROS installation is needed.
 
 `/featuredb/pose` PoseWithCovarianceStamped in the frame `map` (east, north, up at the origin, REP 103 and
 105), `/featuredb/fix` NavSatFix, and `/tf`, `map` to `base_link`. Bodies are forward, left, up.
@@ -25,7 +25,7 @@ _HEADER = f"{_LINE}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_
 _QUATERNION = f"{_LINE}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
 _XYZ = "float64 x\nfloat64 y\nfloat64 z\n"
 # Topic: type, definition.
-_TOPICS = {
+TOPICS = {
     "/featuredb/pose": (
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n"
@@ -85,7 +85,7 @@ class McapLog:
                     name=name, encoding="ros2msg", data=definition.encode()
                 ),
             )
-            for topic, (name, definition) in _TOPICS.items()
+            for topic, (name, definition) in TOPICS.items()
         }
         return self
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from featuredb.geo.local_frame import LocalFrame
     from reloc.bridge.robot_pose import RobotPose
@@ -34,8 +34,16 @@ def register(subparsers: Any) -> None:
         help="ODOMETRY, VISION_POSITION_ESTIMATE or GPS_INPUT; may be repeated; default odometry, which "
         "PX4 takes. For ArduPilot: --message vision",
     )
-    ros2 = kinds.add_parser("ros2", help="ROS 2 messages in an MCAP file", description="Write an MCAP file.")
-    ros2.add_argument("--out", type=Path, required=True, metavar="FILE.mcap", help="file to write")
+    ros2 = kinds.add_parser(
+        "ros2",
+        help="ROS 2 messages in an MCAP file or over Zenoh",
+        description="Write an MCAP file, publish to ROS 2 nodes whose middleware is rmw_zenoh, or both.",
+    )
+    ros2.add_argument("--out", type=Path, metavar="FILE.mcap", help="file to write")
+    ros2.add_argument(
+        "--connect", metavar="ENDPOINT", help="ROS 2's Zenoh router, where to publish: tcp/127.0.0.1:7447"
+    )
+    ros2.add_argument("--domain", type=int, default=0, metavar="ID", help="ROS_DOMAIN_ID; default 0")
     nmea = kinds.add_parser("nmea", help="NMEA 0183 to standard output", description="Print GGA and GST.")
     for kind in (mavlink, ros2):
         kind.add_argument(
@@ -82,14 +90,28 @@ def _mavlink(args: argparse.Namespace) -> int:
 
 
 def _ros2(args: argparse.Namespace) -> int:
+    from contextlib import ExitStack
+
     from reloc.bridge.ros2 import McapLog
 
-    count = 0
-    with McapLog(args.out, origin=_origin(args.origin)) as log:
+    if args.out is None and args.connect is None:
+        raise InvalidValueError("bridge ros2: expected --out FILE.mcap, --connect ENDPOINT or both")
+    origin, count = _origin(args.origin), 0
+    with ExitStack() as opened:
+        sinks: list[Callable[[RobotPose], None]] = []
+        if args.out is not None:
+            sinks.append(opened.enter_context(McapLog(args.out, origin=origin)).write)
+        if args.connect is not None:
+            from reloc.bridge.rmw_zenoh import RmwZenohNode
+
+            node = RmwZenohNode(args.connect, domain=args.domain, origin=origin)
+            sinks.append(opened.enter_context(node).write)
         for pose in _poses(args):
-            log.write(pose)
+            for sink in sinks:
+                sink(pose)
             count += 1
-    return _said(f"wrote {args.out}: {count} poses", count)
+    where = " and ".join(str(what) for what in (args.out, args.connect) if what is not None)
+    return _said(f"{count} poses written to {where}", count)
 
 
 def _nmea(args: argparse.Namespace) -> int:

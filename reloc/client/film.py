@@ -1,7 +1,10 @@
 """A film or a camera streamed to a live session, at its own speed."""
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import cv2
@@ -54,33 +57,65 @@ class StreamedFilm:
 
 @dataclass(slots=True)
 class _Answers:
-    """Poses so far."""
+    """Poses so far, taken as they come by a thread of their own: a camera's next frame does not hold them up.
+
+    Attributes:
+        taking: that thread; it ends with the session.
+    """
 
     live: LiveTrack
     on_pose: OnPose | None
     points: list[TrajectoryPoint] = field(default_factory=list)
     latency_ms: list[float] = field(default_factory=list)
     timings_ms: dict[str, list[float]] = field(default_factory=dict)
+    taking: "Future[None]" = field(default_factory=Future)
+    _changed: threading.Condition = field(default_factory=threading.Condition)
 
-    def take(self, timeout_s: float) -> bool:
-        """Wait for one pose; False if none came in time."""
-        pose = self.live.next(timeout_s)
-        if pose is None:
-            return False
+    def start(self, pool: ThreadPoolExecutor) -> None:
+        """Take poses from now on."""
+        self.taking = pool.submit(self._run)
+        self.taking.add_done_callback(self._tell)
+
+    def check(self) -> None:
+        """Raise what has ended the thread before its time."""
+        if self.taking.done():
+            self.taking.result()
+
+    def await_frame(self, index: int) -> None:
+        """Wait for the pose of the frame that was sent last; the server never drops it."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self.taking.done() or (self.points and self.points[-1].index >= index), _LAST_WAIT_S
+            )
+        self.check()
+
+    def _run(self) -> None:
+        for pose in self.live:
+            self._take(pose)
+
+    def _tell(self, _: object) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _take(self, pose: TrackPose) -> None:
         latency_ms = self.live.latency_ms(pose.sequence)
-        self.points.append(point_of_message(pose))
+        if self.on_pose is not None:
+            self.on_pose(pose, latency_ms)
         if latency_ms is not None:
             self.latency_ms.append(latency_ms)
         for stage, ms in pose.timings_ms.items():
             self.timings_ms.setdefault(stage, []).append(ms)
-        if self.on_pose is not None:
-            self.on_pose(pose, latency_ms)
-        return True
+        self.points.append(point_of_message(pose))
+        self._tell(pose)
 
-    def until(self, moment: float) -> None:
-        """Take what comes until a moment of `time.perf_counter`, and what is there already."""
-        while self.take(max(0.0, moment - time.perf_counter())):
-            pass
+
+@contextmanager
+def _answered(live: LiveTrack, on_pose: OnPose | None) -> Iterator[_Answers]:
+    """An open session whose poses are taken; both end with the block."""
+    answers = _Answers(live, on_pose)
+    with ThreadPoolExecutor(1, "poses") as pool, live:
+        answers.start(pool)
+        yield answers
 
 
 def stream_film(
@@ -100,7 +135,7 @@ def stream_film(
         source: see `featuredb.video.frames.open_video`.
         camera: intrinsics of the film's frames, of any size; None: estimated.
         prior: where the film begins. options: how it is read.
-        on_pose: called with each pose, and the milliseconds from sending its frame.
+        on_pose: called with each pose, and the milliseconds from sending its frame, in a thread of its own.
 
     Raises:
         VideoError: the film cannot be read at all, or has no frames.
@@ -111,21 +146,22 @@ def stream_film(
     sent, last = 0, -1
     with (
         open_video(source, options) as video,
-        client.track(camera, prior) as live,
+        _answered(client.track(camera, prior), on_pose) as answers,
     ):
-        answers, info = _Answers(live, on_pose), video.info
+        live, info = answers.live, video.info
         begun: float | None = None
         try:
             for frame in until_it_ends(video, trouble):
                 now = time.perf_counter()
                 begun = now - frame.time_s if begun is None else begun
                 due = now if info.live else begun + frame.time_s
-                answers.until(due)
+                time.sleep(max(0.0, due - time.perf_counter()))
+                answers.check()
                 last = frame.index
                 if time.perf_counter() - due <= _MAX_LATE_S:
                     live.send(_jpeg(frame.gray), frame.time_s, frame.index)
                     sent += 1
-            _await_last(answers, last)
+            answers.await_frame(last)
         except ServiceError as error:
             trouble.append(f"the session ended: {error}")
         refusals = tuple(f"frame {event.sequence}: {event.message}" for event in live.refusals)
@@ -147,14 +183,6 @@ def stream_film(
         refusals=refusals,
         complaints=complaints,
     )
-
-
-def _await_last(answers: _Answers, last: int) -> None:
-    """Poses of the frames that were sent last; the very last is never dropped by the server."""
-    end = time.perf_counter() + _LAST_WAIT_S
-    while not answers.points or answers.points[-1].index < last:
-        if not answers.take(end - time.perf_counter()) and time.perf_counter() >= end:
-            return
 
 
 def _jpeg(gray: NDArray[np.uint8]) -> bytes:

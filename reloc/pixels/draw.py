@@ -18,6 +18,7 @@ _DEPTH_PX = 1600  # longer side of the picture that decides what is hidden
 _COLOURS_RGB = ((255, 70, 50), (60, 200, 255), (255, 210, 40), (110, 230, 90), (230, 110, 255))
 _STEP_PX = 6.0  # between points of a line at which visibility is asked
 _MOST_PIECES = 20_000
+_SIXTEENTHS = 4  # OpenCV's shift
 _BEFORE_REL = 0.005  # of the distance; with a spacing of the scan what may stand before a line laid on it
 
 
@@ -42,8 +43,10 @@ def draw_layer(
         colour = colours[shape.name]
         if shape.is_point:
             pixels, shown = seen(shape.points)
-            for x, y in (pixels[shown] * scale).round().astype(int):
-                cv2.circle(picture, (int(x), int(y)), 4 * thick, colour, thick, cv2.LINE_AA)
+            for x, y in pixels[shown] * scale:
+                cv2.circle(
+                    picture, _sixteenths(x, y), 16 * 4 * thick, colour, thick, cv2.LINE_AA, _SIXTEENTHS
+                )
                 where = (int(x) + 6 * thick, int(y))
                 cv2.putText(
                     picture,
@@ -59,9 +62,13 @@ def draw_layer(
         pixels, shown = seen(_cut(view, shape.points))
         both = shown[1:] & shown[:-1]
         for a, b in zip((pixels[:-1] * scale)[both], (pixels[1:] * scale)[both], strict=True):
-            first, last = ((round(float(x) * 16), round(float(y) * 16)) for x, y in (a, b))
-            cv2.line(picture, first, last, colour, thick, cv2.LINE_AA, 4)  # in sixteenths of a pixel
+            cv2.line(picture, _sixteenths(*a), _sixteenths(*b), colour, thick, cv2.LINE_AA, _SIXTEENTHS)
     return picture
+
+
+def _sixteenths(x: float, y: float) -> tuple[int, int]:
+    """A pixel as OpenCV draws it with that shift: the centre of the top-left one is (0, 0)."""
+    return round(16.0 * (float(x) - 0.5)), round(16.0 * (float(y) - 0.5))
 
 
 class _Visibility:

@@ -2,8 +2,10 @@
 
 import csv
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from reloc.client.film import stream_film
 from reloc.service.server import Server
 from reloc.tracking.pose_message import point_of_message, pose_message
 from reloc.wire.track import TrackPose
-from tests.support.live import LENS, error_m, frame, localiser
+from tests.support.live import LENS, SOON_S, error_m, frame, localiser
 from tests.support.planar_map import CAMERA
 from tests.support.service import running_server
 
@@ -84,6 +86,47 @@ def test_the_command_streams_a_film_and_writes_its_track(
     assert {"relocalised", "tracking"} <= {pose.state for pose in poses}
     assert all(file.exists() for file in outs)
     assert json.loads(said.out.splitlines()[-1])["latency_ms"] > 0
+
+
+class OneFrame:
+    """A camera whose second frame comes when the first one's pose has been told, or after a while."""
+
+    def __init__(self) -> None:
+        self.info = SimpleNamespace(live=True, name="camera", creation_time=None)
+        self.report = SimpleNamespace(complaints=lambda: ())
+        self.told = threading.Event()
+        self.in_time = False
+
+    def __enter__(self) -> "OneFrame":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[SimpleNamespace]:
+        gray = frame(0)
+        yield SimpleNamespace(time_s=0.0, index=0, gray=gray)
+        self.in_time = self.told.wait(SOON_S)
+        yield SimpleNamespace(time_s=SOON_S, index=1, gray=gray)
+
+
+def test_a_pose_does_not_wait_for_the_camera_s_next_frame(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = OneFrame()
+    monkeypatch.setattr("reloc.client.film.open_video", lambda *_: camera)
+    with Client(server.endpoints[0]) as client:
+        found = stream_film(client, "camera", camera=LENS, on_pose=lambda *_: camera.told.set())
+    assert camera.in_time
+    assert found.sent == 2
+
+
+def test_what_the_receiver_of_poses_raises_ends_the_stream(server: Server, film: Path) -> None:
+    def closed(*_: object) -> None:
+        raise BrokenPipeError
+
+    with Client(server.endpoints[0]) as client, pytest.raises(BrokenPipeError):
+        stream_film(client, film, camera=LENS, on_pose=closed)
 
 
 def test_without_json_it_speaks_to_people(

@@ -10,9 +10,9 @@ import pytest
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from reloc.pixels.draw import draw_layer
-from reloc.pixels.layer import laid_on, read_layer
+from reloc.pixels.layer import Shape, laid_on, read_layer
 from tests.support.scanned_map import EPSG, FRAME
-from tests.unit.test_locate_pixels import LENS, POSE, step, view_of
+from tests.unit.test_locate_pixels import LENS, POSE, step, true_place, view_of
 
 CLOUD = step()
 
@@ -47,6 +47,26 @@ def test_a_line_without_heights_lies_on_the_scan_and_shows_where_the_camera_sees
     apart = np.linalg.norm(found[:, None] - expected, axis=2)
     assert apart.min(axis=1).max() < 2.0
     assert apart.min(axis=0).max() < 2.0  # from end to end
+
+
+def test_marks_and_lines_lie_on_their_pixels_by_a_fraction_of_one() -> None:
+    """The centre of the top-left pixel is (0.5, 0.5); OpenCV draws as if it were (0, 0)."""
+    black = np.zeros((LENS.height, LENS.width, 3), np.uint8)
+    pixels = np.random.default_rng(2).uniform([50.0, 50.0], [750.0, 550.0], (30, 2))
+    places = np.array([true_place(view_of(POSE), pixel, 0.0) for pixel in pixels])
+    columns, rows = np.meshgrid(*(np.arange(n) + 0.5 for n in (LENS.width, LENS.height)))
+    centres = []
+    for place in places:
+        bright = draw_layer(black, view_of(POSE), [Shape(points=place[None], name="")], None).max(axis=2)
+        centres.append([np.average(columns, weights=bright), np.average(rows, weights=bright)])
+    assert np.abs(np.array(centres) - pixels).max() < 0.1
+    ends = np.array([[-15.0, 1.3, 0.0], [-2.0, 1.3, 0.0]])  # level in the picture
+    bright = draw_layer(black, view_of(POSE), [Shape(points=ends, name="")], None).max(axis=2)
+    here = bright.max(axis=0) > 0
+    along = LENS.project(POSE.act(np.linspace(*ends, 2000)))
+    expected = np.interp(columns[0, here], along[:, 0], along[:, 1])
+    found = (bright * rows).sum(axis=0)[here] / bright.sum(axis=0)[here]
+    assert abs(np.median(found - expected)) < 0.1
 
 
 def test_what_stands_before_a_line_hides_it(tmp_path: Path) -> None:

@@ -43,6 +43,30 @@ SPEED: tuple[Row, ...] = (
         minutes=15,
     ),
     Row(
+        name="bridge-latency",
+        group="speed",
+        form="full",
+        claim="`live --json | bridge` on a film that shows a photo of `brighton`: from a reply as any "
+        "subscriber gets it to the bridge's message, decoded (pymavlink from UDP, rosbags from Zenoh)",
+        commands=(
+            _MADE,
+            ("tools.bridge_latency", "{work}/db", f"{BRIGHTON}/DJI_0025.JPG", *OUT),
+        ),
+        figures=same("load", "mavlink_poses", "ros2_poses"),
+        text="MAVLink: median {mavlink_median_ms:.1f} ms, 99 % within {mavlink_99_ms:.1f} ms of "
+        "{mavlink_decoded}; ROS 2: {ros2_median_ms:.1f} ms, {ros2_99_ms:.1f} ms of {ros2_decoded}",
+        limits=tuple(
+            limit
+            for kind in ("mavlink", "ros2")
+            for limit in (
+                Limit(figure=f"{kind}_median_ms", most=5),
+                Limit(figure=f"{kind}_decoded", least=100),  # the 99th percentile is one of them
+            )
+        ),
+        needs=("brighton/images",),
+        minutes=4,
+    ),
+    Row(
         name="service-attacks",
         group="speed",
         form="full",

@@ -162,6 +162,33 @@ REAL: tuple[Row, ...] = (
         minutes=4,
     ),
     Row(
+        name="brighton-located-pixels",
+        group="real",
+        form="full",
+        claim="`brighton` anchored on its scan: pixels of the 4 others, located on the scan and by the map "
+        "alone, against the scan's points that they show from poses that the scan alone gives",
+        commands=(
+            (
+                *("tools.locate_brighton", "--photos", BRIGHTON, "--scan", SCAN),
+                *("--poses", "{cache}/brighton-poses.json", "--held-out", *HELD_OUT, *OUT),
+            ),
+        ),
+        figures=same("scan_edges", "scan_edge_95"),
+        text="of {asked} pixels {scan_located} on the scan, median {scan_median_m:.3f} m, 95 % off edges "
+        "within {scan_clear_95_m:.3f} m, {scan_68:.0%} and {scan_95:.1%} inside 68 and 95 % bounds; "
+        "{map_located} by the map, median {map_median_m:.3f} m, 95 % within {map_clear_95_m:.3f} m, "
+        "{map_68:.0%} and {map_95:.1%} inside",
+        limits=(
+            Limit(figure="photos", least=4),
+            Limit(figure="scan_median_m", most=0.05),
+            Limit(figure="scan_95", least=0.90),
+            Limit(figure="map_median_m", most=0.05),
+            Limit(figure="map_95", least=0.90),
+        ),
+        needs=("brighton/images", "brighton/model.laz"),
+        minutes=4,
+    ),
+    Row(
         name="lewis-held-out",
         group="real",
         form="full",

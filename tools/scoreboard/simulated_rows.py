@@ -212,11 +212,12 @@ SIMULATED: tuple[Row, ...] = (
         name="track-short",
         group="simulated",
         form="quick",
-        claim="films of 150 frames over the town, smooth and with a cut to another town, tracked on its map",
+        claim="films of 150 frames over the town, smooth and with a cut to another town, tracked on its map; "
+        "the marks of a GeoJSON layer that `draw` lays over them, against where they belong",
         commands=(
             (
                 *("tools.track_evaluation", "--out", "{work}", "--inputs", "{cache}", "--size", "short"),
-                *("--frames", "150", "--films", "smooth", "cut", "--on", "map"),
+                *("--frames", "150", "--films", "smooth", "cut", "--on", "map", "--draw"),
             ),
         ),
         json="{work}/track.json",
@@ -224,9 +225,17 @@ SIMULATED: tuple[Row, ...] = (
             f"{film}_{name}": f"{film}.{name}"
             for film in ("smooth", "cut")
             for name in ("frames", "lost", "invented", "mean_m", "largest_m", "rate_hz", "found_s")
+        }
+        | {
+            f"{film}_layer_{name}": f"{film}_layer.{name}"
+            for film in ("smooth", "cut")
+            for name in ("frames", "marks", "stray", "median_px", "largest_px")
         },
         text="smooth: {smooth_lost} lost, mean {smooth_mean_m:.3f} m, {smooth_rate_hz:.0f} frames/s; "
-        "cut: {cut_lost} lost, mean {cut_mean_m:.3f} m, {cut_invented} invented",
+        "cut: {cut_lost} lost, mean {cut_mean_m:.3f} m, {cut_invented} invented; {smooth_layer_marks} marks "
+        "in {smooth_layer_frames} smooth frames: median {smooth_layer_median_px:.1f} px, largest "
+        "{smooth_layer_largest_px:.1f} px; {cut_layer_marks} in {cut_layer_frames} with the cut: "
+        "{cut_layer_median_px:.1f} px, {cut_layer_largest_px:.1f} px",
         limits=(
             Limit(figure="smooth_lost", most=0),
             Limit(figure="smooth_mean_m", most=0.10),
@@ -234,6 +243,9 @@ SIMULATED: tuple[Row, ...] = (
             Limit(figure="cut_largest_m", most=1.0),
             Limit(figure="cut_invented", most=0),
             Limit(figure="cut_found_s", most=1.0),
+            *(Limit(figure=f"{film}_layer_largest_px", most=2.0) for film in ("smooth", "cut")),
+            *(Limit(figure=f"{film}_layer_stray", most=0) for film in ("smooth", "cut")),
+            Limit(figure="smooth_layer_frames", least=150),
         ),
         minutes=4,
     ),

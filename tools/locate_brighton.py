@@ -1,0 +1,111 @@
+"""What is at a pixel of a real photo: places on the scan, and by the map alone, against the scan's own poses.
+
+    python -m tools.locate_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --held-out A.JPG ...
+
+1. A map of all photos but the held-out ones is anchored on the scan (tools/anchor_brighton.py).
+2. Each held-out photo is localised; pixels at random are located on the scan, and on the map's own points.
+3. The truth of a pixel: the points of the scan file that it shows from the pose, and with the lens, of
+   tools/scan_poses.py. That pose comes of the photo and the scan alone, by code that shares nothing with map,
+   anchoring, localisation and renderer. Pixels whose nearest points lie at several depths have no truth.
+
+Exit code 0.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.store import Database
+from reloc.answered_view import AnsweredView
+from reloc.localiser import Localiser
+from reloc.overlay import map_points_in_view
+from reloc.pixels.locate import locate
+from reloc.pixels.surfaces import MapSurface, RaySurface, scan_surface
+from tools import scan_poses
+from tools.anchor_brighton import anchored_on, read_poses
+from tools.figures import study_parser, work_folder, write_figures
+from tools.locate_pixels import Miss, miss_figures, misses, view_of
+from tools.picked import Scan, read_scan, visible
+from tools.real_photos import ingest
+from tools.unplaced_brighton import camera_of
+
+_SEED, _PIXELS = 1, 300  # of each photo
+_NEAR, _REACH_PX = 12, 12.0  # points of the scan around a pixel, and how far they may be
+_ONE_SURFACE_M = 0.3  # between the depths of nine tenths of them
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    if not args.poses.exists():
+        scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
+    frame, poses = read_poses(args.poses)
+    document = json.loads(args.poses.read_text(encoding="utf-8"))
+    camera, epsg = camera_of(document), int(document["crs"].removeprefix("EPSG:"))
+    scan = read_scan(args.scan, frame, epsg)
+    rng = np.random.default_rng(_SEED)
+    found: dict[str, list[Miss]] = {"scan": [], "map": []}
+    asked = photos = 0
+    with work_folder(args.work) as work:
+        ingest(work / "db", args.photos, args.held_out)
+        database = anchored_on(work / "db", args.scan, args.photos, work / "anchor")
+        localiser = Localiser.open(database)
+        for name in args.held_out:
+            view = view_of(localiser, (args.photos / name).read_bytes())
+            if view is None:
+                continue
+            pixels, places = _truth(scan, camera, poses[name], rng)
+            true = view.frame.enu_from(frame).act(places)
+            asked, photos = asked + len(pixels), photos + 1
+            for kind, surface in _surfaces(database, localiser, view).items():
+                found[kind] += misses(view, true, locate(view, surface, pixels))
+    figures = {"photos": photos, "asked": asked}
+    for kind, those in found.items():
+        figures |= {f"{kind}_located": len(those)} | miss_figures(kind, those)
+    write_figures(args.json, figures)
+    sys.stdout.write("\n".join(f"{name} {value:.4g}" for name, value in figures.items()) + "\n")
+    return 0
+
+
+def _surfaces(database: Database, localiser: Localiser, view: AnsweredView) -> dict[str, RaySurface]:
+    scan = scan_surface(database, view)
+    assert scan is not None
+    utm = map_points_in_view(localiser.areas_of(view.map_ids[:1]), view)
+    return {"scan": scan, "map": MapSurface(points=view.frame.enu_from_utm(utm, view.epsg))}
+
+
+def _truth(
+    scan: Scan, camera: Camera, pose: Rigid3, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) that show one surface of the scan, and their places (n, 3) in the scan's local frame."""
+    rows, shown = visible(scan, camera, pose)
+    depth = pose.act(scan.local[rows])[:, 2]
+    pixels = rng.uniform([0.0, 0.0], [camera.width, camera.height], (_PIXELS, 2))
+    apart, near = cKDTree(shown).query(pixels, k=_NEAR)
+    around = depth[near]
+    low, middle, high = np.quantile(around, [0.05, 0.5, 0.95], axis=1)
+    known: NDArray[np.bool_] = (apart[:, -1] < _REACH_PX) & (high - low < _ONE_SURFACE_M)
+    rays = np.column_stack([camera.unproject(pixels), np.ones(_PIXELS)])
+    return pixels[known], pose.inverse().act(rays * middle[:, None])[known]
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = study_parser(__doc__)
+    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
+    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
+    parser.add_argument("--held-out", nargs="+", required=True, metavar="NAME")
+    parser.add_argument("--work", type=Path, default=None, help="keep the database and the report there")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
