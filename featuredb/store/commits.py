@@ -12,7 +12,7 @@ from featuredb.store.changes import Change
 from featuredb.store.delta import Table
 from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, Row, map_rows_table, rows_of
-from featuredb.store.tables import FORMAT_VERSION, MAPS, SPECS
+from featuredb.store.tables import FORMAT_VERSION
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
 # orphans; it is well below the vacuum's shortest default grace of a day.
@@ -95,25 +95,27 @@ def write_time(write_id: str) -> datetime:
     return datetime.fromtimestamp(int(write_id[:12], 16) / 1000.0, tz=UTC)
 
 
-def read_rows(maps: Table) -> list[Row]:
-    """All rows of a version of `maps`.
+def read_rows(table: Table) -> list[Row]:
+    """All rows of a version of a table that has `created_at`.
 
     Raises:
         SnapshotNotFoundError: its files are gone.
         StoreError: they cannot be read.
     """
     try:
-        table = maps.dataset().to_table()
-        for field in SPECS[MAPS].schema:  # those that an older format does not have
-            if field.name not in table.column_names:
-                table = table.append_column(field.name, pa.nulls(len(table), field.type))
-        return rows_of(table, MAPS, "created_at")
+        rows = table.dataset().to_table()
+        for field in table.spec.schema:  # those that an older format does not have
+            if field.name not in rows.column_names:
+                rows = rows.append_column(field.name, pa.nulls(len(rows), field.type))
+        return rows_of(rows, table.spec.name, "created_at")
     except FileNotFoundError as error:
         raise SnapshotNotFoundError(
-            f"version {maps.version} is gone, vacuum removed its files ({error}); choose a newer one"
+            f"version {table.version} is gone, vacuum removed its files ({error}); choose a newer one"
         ) from error
     except (OSError, ValueError) as error:
-        raise StoreError(f"cannot read the table maps ({error}); run `featuredb verify`") from error
+        raise StoreError(
+            f"cannot read the table {table.spec.name} ({error}); run `featuredb verify`"
+        ) from error
 
 
 def commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:
