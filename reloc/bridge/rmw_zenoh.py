@@ -1,6 +1,6 @@
 """ROS 2 messages of a pose, published over Zenoh as rmw_zenoh publishes them: no ROS installation is needed.
 
-Keys, liveliness tokens and attachments are those of rmw_zenoh_cpp since 0.2.4 (docs/design.md,
+Keys, liveliness tokens and attachments are those of rmw_zenoh_cpp since 0.2.4 (its page of design,
 liveliness_utils.cpp and attachment_helpers.cpp in ros2/rmw_zenoh). Nodes receive the messages, and the tokens
 show them in ROS 2's graph.
 """
