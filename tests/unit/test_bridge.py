@@ -7,6 +7,7 @@ import socket
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -73,24 +74,28 @@ def test_odometry_is_north_east_down_with_its_covariance() -> None:
     yaw, pitch, roll = Rotation.from_quat([x, y, z, w]).as_euler("ZYX", degrees=True)
     np.testing.assert_allclose([yaw, pitch, roll], [HEADING_DEG, PITCH_DEG, ROLL_DEG], atol=5e-3)
     assert found.time_usec == round(TIME_S * 1e6)
-    assert np.isnan(found.vx)
-    told = np.zeros((6, 6))
-    told[np.triu_indices(6)] = found.pose_covariance
-    np.testing.assert_allclose(told[:3, :3], np.triu(_drawn()[:3, :3]), rtol=0.1, atol=2e-4)
+    unknown = [found.vx, found.vy, found.vz, found.rollspeed, found.pitchspeed, found.yawspeed]
+    assert np.isnan([*unknown, *found.velocity_covariance]).all()
+    assert (found.estimator_type, found.quality) == (common.MAV_ESTIMATOR_TYPE_VISION, 0)  # 0: not told
+    np.testing.assert_allclose(found.pose_covariance, upper(), rtol=2e-3, atol=1e-6)
 
 
-def _drawn() -> FloatArray:
-    """Covariance of north, east, down, roll, pitch, yaw by drawing answers."""
-    rng = np.random.default_rng(1)
-    swap, rows = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]), []
-    turn = body_from_angles()
-    for error in rng.normal(size=(4000, 6)) @ ROOT.T:
-        ned_from_frd = (
-            swap @ (Rotation.from_rotvec(error[:3]) * turn).as_matrix() @ np.diag([1.0, -1.0, -1.0])
-        )
-        yaw, pitch, roll = Rotation.from_matrix(ned_from_frd).as_euler("ZYX")
-        rows.append([*(swap @ error[3:]), roll, pitch, yaw])
-    return np.cov(np.array(rows).T)
+def upper() -> FloatArray:
+    """Covariance of north, east, down, roll, pitch, yaw, row by row from the diagonal on.
+
+    By differences of SciPy's angles: MAVLink's roll turns first, about the nose.
+    """
+    swap, step = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]), 1e-6
+
+    def angles(error: FloatArray) -> FloatArray:
+        turned = (Rotation.from_rotvec(error) * body_from_angles()).as_matrix()
+        return Rotation.from_matrix(swap @ turned @ np.diag([1.0, -1.0, -1.0])).as_euler("ZYX")[::-1]
+
+    by_given = np.zeros((6, 6))
+    by_given[:3, 3:] = swap
+    for axis, error in enumerate(step * np.eye(3)):
+        by_given[3:, axis] = (angles(error) - angles(-error)) / (2.0 * step)
+    return (by_given @ GIVEN @ by_given.T)[np.triu_indices(6)]
 
 
 def test_the_vision_estimate_has_the_covariance_of_its_angles() -> None:
@@ -99,13 +104,26 @@ def test_the_vision_estimate_has_the_covariance_of_its_angles() -> None:
     assert found.get_type() == "VISION_POSITION_ESTIMATE"
     angles = np.degrees([found.roll, found.pitch, found.yaw])
     np.testing.assert_allclose(angles, [ROLL_DEG, PITCH_DEG, HEADING_DEG], atol=5e-3)
-    told = np.zeros((6, 6))
-    told[np.triu_indices(6)] = found.covariance
-    scale = np.sqrt(np.diag(told))
-    # Four standard deviations of correlations of 4000 draws.
-    np.testing.assert_allclose(
-        told / np.outer(scale, scale), np.triu(_drawn() / np.outer(scale, scale)), atol=0.09
+    np.testing.assert_allclose([found.x, found.y, found.z], [345.0, 12.0, -6.0], atol=1e-3)
+    assert found.usec == round(TIME_S * 1e6)
+    np.testing.assert_allclose(found.covariance, upper(), rtol=2e-3, atol=1e-6)
+
+
+def test_places_are_those_that_proj_gives() -> None:
+    """Local coordinates of ODOMETRY and of the frame `map` by PROJ's topocentric conversion."""
+    position = answer(body_from_angles())["position"]
+    pipeline = (
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +step "
+        f"+proj=topocentric +lat_0={ORIGIN.latitude_deg} +lon_0={ORIGIN.longitude_deg} +h_0={ORIGIN.height_m}"
     )
+    place = [position[name] for name in ("lon", "lat", "h")]  # type: ignore[index]
+    east, north, up = pyproj.Transformer.from_pipeline(pipeline).transform(*place)
+    found = decoded(MavlinkSender(("odometry",), origin=ORIGIN).pack(pose())[0])
+    np.testing.assert_allclose([found.x, found.y, found.z], [north, east, -up], atol=1e-4)
+    made = messages(pose(), ORIGIN)["/featuredb/pose"]
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    at = store.deserialize_cdr(made, "geometry_msgs/msg/PoseWithCovarianceStamped").pose.pose.position
+    np.testing.assert_allclose([at.x, at.y, at.z], [east, north, up], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -221,9 +239,14 @@ def test_ros_messages_are_read_by_two_libraries(tmp_path: Path) -> None:
     fix = store.deserialize_cdr(made["/featuredb/fix"], "sensor_msgs/msg/NavSatFix")
     np.testing.assert_allclose([fix.latitude, fix.longitude, fix.altitude], ORIGIN.geodetic_from_enu(PLACE))
     np.testing.assert_allclose(fix.position_covariance.reshape(3, 3), GIVEN[3:, 3:])
-    assert fix.position_covariance_type == 3
+    assert (fix.position_covariance_type, fix.status.status, fix.status.service) == (3, 0, 0)
     (moved,) = store.deserialize_cdr(made["/tf"], "tf2_msgs/msg/TFMessage").transforms
     assert (moved.header.frame_id, moved.child_frame_id) == ("map", "base_link")
+    q = moved.transform.rotation
+    assert (Rotation.from_quat([q.x, q.y, q.z, q.w]) * body_from_angles().inv()).magnitude() < 1e-4
+    for header in (fix.header, moved.header):
+        assert (header.stamp.sec, header.stamp.nanosec) == (int(TIME_S), 250_000_000)
+    assert fix.header.frame_id == "base_link"
     np.testing.assert_allclose(
         [getattr(moved.transform.translation, axis) for axis in "xyz"], PLACE, atol=1e-6
     )
