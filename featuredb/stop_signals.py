@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import NoReturn
 
 
@@ -27,9 +27,12 @@ def end_process(code: int) -> NoReturn:
     Python's own end takes the interpreter from under them: of 25 processes with threads that polled a
     database 23 ended with SIGSEGV, of 25 that ended so none.
     """
-    for child in multiprocessing.active_children():
-        child.kill()
-    logging.shutdown()
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    os._exit(code)
+    try:
+        for child in multiprocessing.active_children():
+            child.kill()
+        logging.shutdown()
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):  # whoever reads it is gone
+                stream.flush()
+    finally:
+        os._exit(code)

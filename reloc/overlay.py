@@ -26,7 +26,7 @@ _RESIDUAL_BGR = (40, 40, 240)
 _OTHER_BGR = (240, 160, 40)
 _MAX_OTHER = 4000  # more dots hide the photo
 _SAME_POINT_M = 0.001
-_LEGEND = "green: keypoints that agree; red: how far their map points are off; blue: other map points"
+_LEGEND = "green: keypoints that agree; red: how far off; blue: other map points"
 _MAX_SIDE_PX = 1600  # of the picture; larger ones only take longer to open
 
 

@@ -71,6 +71,8 @@ def _looks(reply: LocaliseReply) -> str:
     heading, pitch, roll = pose.heading_pitch_roll_deg
     text = f"heading {heading:.2f} deg from true north, pitch {pitch:+.2f}, roll {roll:+.2f}"
     if abs(pitch) <= _STEEP_DEG:
+        if abs(roll) < 0.05:  # as it is printed, neither end
+            return text
         text += f" (the horizon's right end is {'higher' if roll > 0 else 'lower'})"
     else:
         up = pose.true_enu_from_body[:, 2]

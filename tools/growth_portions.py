@@ -8,7 +8,7 @@
    or without GPS at a made-up place with a median viewing distance of 50 m. Photos of later portions are
    reconstructed among themselves and go through `ingest.growth.run.grow`, as photos of whoever keeps the
    database. What cannot be placed waits, is tried with the next portion, and once
-   more at the end. With --adjust all maps are then adjusted together, as `featuredb adjust` does.
+   more at the end.
 3. Camera centres of both are compared after a similarity, in metres for photos with GPS. Without GPS a
    metre is a hundredth of the extent of the camera centres (diagonal of their box), and the drift budget,
    which is in metres, is left out.
@@ -37,7 +37,6 @@ from featuredb.store import Database
 from ingest.executor import InProcessExecutor
 from ingest.fingerprint import digest
 from ingest.growing import reconstructed_photos
-from ingest.growth.graph.joint.adjust import adjust_maps
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.run import grow
 from ingest.growth.values import GrowthOptions
@@ -109,8 +108,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         for number, rows in enumerate([*cut, []], start=1):
             state.waiting = sorted([*state.waiting, *rows])
             _take_in(state, f"portion {number}" if rows else "end")
-        if args.adjust:
-            _adjust(state)
         grown_s = time.process_time() - started
     return _judge(state, joint, args, joint_s, grown_s)
 
@@ -224,20 +221,6 @@ def _find_centers(state: State) -> None:
     state.waiting = [r for r in state.waiting if state.photos[r].name not in state.centers]
 
 
-def _adjust(state: State) -> None:
-    """All maps adjusted together, as `featuredb adjust` does; camera centres are the new ones then."""
-    ids = [m.map_id for m in state.database.snapshot().maps()]
-    if len(ids) < 2:
-        print("  adjust: nothing to do, there is one map")
-        return
-    found = adjust_maps(state.database, ids, free=ids)
-    print(f"  adjust: {found.message}; {found.shared_points} points in several maps")
-    for report in found.reports:
-        moved = f"moved {report.move_m:.2f} m, bent {report.shape_m:.2f} m"
-        print(f"    {report.map_id}: {moved}, {report.kept:.1%} of its observations fit")
-    _find_centers(state)
-
-
 def _reconstruct(
     photos: Sequence[Photo], rows: Sequence[int], making: MapMakingOptions, work: Path
 ) -> list[Component]:
@@ -304,7 +287,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--photos", type=Path, required=True, help="folder of photos")
     parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
     parser.add_argument("--work", type=Path, required=True, help="work folder; features and matches are kept")
-    parser.add_argument("--adjust", action="store_true", help="adjust all maps together at the end")
     parser.add_argument("-v", "--verbose", action="store_true", help="one line a photo")
     parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
     return parser.parse_args(argv)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from featuredb.geo.local_frame import LocalFrame
     from reloc.bridge.robot_pose import RobotPose
 
+_MOST_DOMAIN = 232  # of ROS 2
 _NO_POSE = 1  # exit code: everything worked, and no answer had a pose
 
 
@@ -96,16 +97,18 @@ def _ros2(args: argparse.Namespace) -> int:
 
     if args.out is None and args.connect is None:
         raise InvalidValueError("bridge ros2: expected --out FILE.mcap, --connect ENDPOINT or both")
+    if not 0 <= args.domain <= _MOST_DOMAIN:
+        raise InvalidValueError(f"--domain: expected 0 to {_MOST_DOMAIN}, found {args.domain}")
     origin, count = _origin(args.origin), 0
     with ExitStack() as opened:
         sinks: list[Callable[[RobotPose], None]] = []
-        if args.out is not None:
-            sinks.append(opened.enter_context(McapLog(args.out, origin=origin)).write)
         if args.connect is not None:
             from reloc.bridge.rmw_zenoh import RmwZenohNode
 
             node = RmwZenohNode(args.connect, domain=args.domain, origin=origin)
             sinks.append(opened.enter_context(node).write)
+        if args.out is not None:  # begun once the router is there: nothing is overwritten for nothing
+            sinks.append(opened.enter_context(McapLog(args.out, origin=origin)).write)
         for pose in _poses(args):
             for sink in sinks:
                 sink(pose)

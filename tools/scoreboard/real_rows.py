@@ -14,10 +14,10 @@ def _portions(photos: str, cut: str, minutes: float) -> Row:
         name=f"{photos.split('/')[0]}-portions-{cut}",
         group="real",
         form="full",
-        claim=f"`{photos.split('/')[0]}` in three portions ({cut}), grown and adjusted, against all at once",
+        claim=f"`{photos.split('/')[0]}` in three portions ({cut}), grown, against all at once",
         commands=(
             (
-                *("tools.growth_portions", "--photos", f"{{data}}/{photos}", "--cut", cut, "--adjust"),
+                *("tools.growth_portions", "--photos", f"{{data}}/{photos}", "--cut", cut),
                 *("--work", "{work}/cache", *OUT),
             ),
         ),

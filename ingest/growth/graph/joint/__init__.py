@@ -1,1 +1,0 @@
-"""Maps that overlap, adjusted together: one bundle adjustment of all their photos."""
