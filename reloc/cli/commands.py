@@ -1,6 +1,7 @@
 """Subcommands `query` and `localise`; `serve` and `live` have modules of their own."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -66,14 +67,20 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
     """Which server is asked, and for which database."""
     parser.add_argument(
         "--connect",
-        default=DEFAULT_ENDPOINT,
+        default=os.environ.get("FEATUREDB_CONNECT", DEFAULT_ENDPOINT),
         metavar="ENDPOINT",
-        help=f"Zenoh endpoint of the server; default {DEFAULT_ENDPOINT}",
+        help="Zenoh endpoint of the server; default: FEATUREDB_CONNECT of the environment, or "
+        + DEFAULT_ENDPOINT,
     )
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect"
     )
-    parser.add_argument("--database", metavar="NAME", help="default: the only one that is served")
+    parser.add_argument(
+        "--database",
+        default=os.environ.get("FEATUREDB_DATABASE"),
+        metavar="NAME",
+        help="default: FEATUREDB_DATABASE of the environment, or the only one that is served",
+    )
 
 
 def add_request_arguments(parser: argparse.ArgumentParser) -> None:

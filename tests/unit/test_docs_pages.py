@@ -13,7 +13,7 @@ _LISTS = re.compile(r"\w*(Reason|ReasonText|ErrorCode|ERROR_CODES)")
 _ARGUMENTS = {"reason", "reason_code"}
 _CODE, _LIKE_A_CODE = re.compile(r"[A-Z_]{3,}|[a-z]+(_[a-z]+)*"), re.compile(r"[A-Z]+(_[A-Z]+)+")
 _NO_REASONS = re.compile(
-    r"\w+_NUM_THREADS|XDG_CACHE_HOME|DELTA_LENGTH_BYTE_ARRAY|MEDIA_TYPE|[A-Z_]*(OPENCV|PINHOLE|RADIAL|FISHEYE)"
+    r"FEATUREDB_.*|\w+_NUM_THREADS|XDG_CACHE_HOME|DELTA_LENGTH_BYTE_ARRAY|MEDIA_TYPE|[A-Z_]*(OPENCV|PINHOLE|RADIAL|FISHEYE)"
 )
 
 
