@@ -1,11 +1,10 @@
 """`featuredb bridge ros2 --connect`: what a plain Zenoh session hears, taken apart as rmw_zenoh takes it."""
 
-import io
 import json
 import queue
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -36,6 +35,14 @@ def router() -> Iterator[tuple[zenoh.Session, str]]:
         yield session, endpoint
 
 
+def _until(line: str, heard: Callable[[], bool]) -> Iterator[str]:
+    """Answers until they are heard: a publisher may put its first ones before it knows who listens."""
+    end = time.monotonic() + _SOON_S
+    while not heard() and time.monotonic() < end:
+        yield line
+        time.sleep(0.02)
+
+
 def test_ros_2_hears_the_poses_and_sees_the_node(
     router: tuple[zenoh.Session, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -49,10 +56,10 @@ def test_ros_2_hears_the_poses_and_sees_the_node(
         only_command(monkeypatch, "bridge", "reloc.cli.bridge:register"),
     ):
         line = json.dumps(answer(body_from_angles())) + "\n"
-        monkeypatch.setattr("sys.stdin", io.StringIO(2 * line))
+        monkeypatch.setattr("sys.stdin", _until(line, lambda: heard.qsize() >= 12 and seen.qsize() >= 4))
         origin = f"--origin={ORIGIN.latitude_deg},{ORIGIN.longitude_deg},{ORIGIN.height_m}"
         assert main(["bridge", "ros2", "--connect", endpoint, "--domain", str(_DOMAIN), origin]) == 0
-        samples = [heard.get(timeout=_SOON_S) for _ in range(6)]
+        samples = [heard.get_nowait() for _ in range(heard.qsize())]
         tokens = [seen.get(timeout=_SOON_S) for _ in range(8)]
 
     store, gids, told = get_typestore(Stores.ROS2_JAZZY), {}, {}
@@ -68,10 +75,11 @@ def test_ros_2_hears_the_poses_and_sees_the_node(
         assert length == 16
         gids.setdefault(kind, set()).add(gid)
         told.setdefault(kind, {})[number] = store.deserialize_cdr(sample.payload.to_bytes(), kind)
-    assert [set(found) for found in told.values()] == [{1, 2}] * 3
+    assert len(told) == 3
+    assert all(len(found) >= 2 for found in told.values())
     assert [len(found) for found in gids.values()] == [1, 1, 1]
     assert len(set.union(*gids.values())) == 3
-    pose = told[_TYPES["featuredb/pose"]][2]
+    pose = list(told[_TYPES["featuredb/pose"]].values())[-1]
     at = pose.pose.pose.position
     np.testing.assert_allclose([at.x, at.y, at.z], PLACE, atol=1e-6)
     swap = [3, 4, 5, 0, 1, 2]
