@@ -100,6 +100,7 @@ class VerifyReport:
         return not self.problems
 
 
+_TOLD = 3  # problems in a message
 Found = tuple[str, str]  # where, and what
 
 
@@ -113,7 +114,14 @@ def verify(database: Database) -> VerifyReport:
         report = _verify(database)
         if report.problems and "://" in database.url:
             # Requests that failed look like damage: whoever can read all bytes now looks again.
-            _read_all(CopyPlace(database.url, database.storage_options))
+            try:
+                _read_all(CopyPlace(database.url, database.storage_options))
+            except OSError as error:
+                seen = "; ".join(f"{p.where}: {p.what}" for p in report.problems[:_TOLD])
+                raise StoreError(
+                    f"cannot verify {database.url}: {one_line(error)}; "
+                    f"found before, this failure or damage: {seen}"
+                ) from error
             report = _verify(database)
         return report
 

@@ -10,11 +10,12 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable, write_deltalake
 
+from featuredb.errors import StoreError
 from featuredb.store import Database
 from featuredb.store.durable import local
 from featuredb.store.durable import log as log_module
 from featuredb.store.durable.log import log_problems
-from featuredb.store.verify import verify
+from featuredb.store.verify import DatabaseProblem, VerifyReport, verify
 from tests.support.maps import random_map
 
 
@@ -170,3 +171,17 @@ def test_each_log_entry_is_read_once(database: Database, monkeypatch: pytest.Mon
     read.clear()
     assert log_module.whole_entry(files, 3)[0] == (log / log_module.entry_name(3)).read_bytes()
     assert len(read) == 1
+
+
+def test_what_was_found_before_a_store_failed_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stored:
+        url, storage_options = "s3://bucket/maps", None
+
+    def denied(place: object) -> None:
+        raise OSError("access denied")
+
+    found = VerifyReport(problems=(DatabaseProblem(where="points", what="a file is gone"),))
+    monkeypatch.setattr("featuredb.store.verify._verify", lambda database: found)
+    monkeypatch.setattr("featuredb.store.verify._read_all", denied)
+    with pytest.raises(StoreError, match=r"access denied; found before.*points: a file is gone"):
+        verify(Stored())  # type: ignore[arg-type]  # it is asked for nothing else
