@@ -32,7 +32,7 @@ from tools.real_photos import ask_poses, error_figures, ingest, table
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    args = arguments(__doc__, argv)
     if not args.poses.exists():
         scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
     frame, poses = read_poses(args.poses)
@@ -103,8 +103,9 @@ def by_gps(database: Database, frame: LocalFrame, poses: Path) -> dict[str, floa
     }
 
 
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
+def arguments(doc: str | None, argv: Sequence[str] | None) -> argparse.Namespace:
+    """What studies of photos held out of a set with a scan are told; `doc`: of the program's module."""
+    parser = study_parser(doc)
     parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
     parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")

@@ -11,11 +11,9 @@
 Exit code 0.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +29,8 @@ from reloc.overlay import map_points_in_view
 from reloc.pixels.locate import locate
 from reloc.pixels.surfaces import MapSurface, RaySurface, scan_surface
 from tools import scan_poses
-from tools.anchor_brighton import anchored_on, read_poses
-from tools.figures import study_parser, work_folder, write_figures
+from tools.anchor_brighton import anchored_on, arguments, read_poses
+from tools.figures import work_folder, write_figures
 from tools.locate_pixels import Miss, miss_figures, misses, view_of
 from tools.picked import Scan, read_scan, visible
 from tools.real_photos import ingest
@@ -44,7 +42,7 @@ _ONE_SURFACE_M = 0.3  # between the depths of nine tenths of them
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    args = arguments(__doc__, argv)
     if not args.poses.exists():
         scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
     frame, poses = read_poses(args.poses)
@@ -95,16 +93,6 @@ def _truth(
     known: NDArray[np.bool_] = (apart[:, -1] < _REACH_PX) & (high - low < _ONE_SURFACE_M)
     rays = np.column_stack([camera.unproject(pixels), np.ones(_PIXELS)])
     return pixels[known], pose.inverse().act(rays * middle[:, None])[known]
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
-    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
-    parser.add_argument("--held-out", nargs="+", required=True, metavar="NAME")
-    parser.add_argument("--work", type=Path, default=None, help="keep the database and the report there")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":
