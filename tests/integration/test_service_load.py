@@ -13,6 +13,7 @@ from reloc.client import NO_SERVER, Client
 from reloc.service.logs import JsonLinesFormatter
 from reloc.service.options import ServeOptions
 from reloc.service.session import ServiceStartError
+from reloc.service.workers import pool as pool_module
 from reloc.service.workers import process
 from reloc.wire.query import ErrorCode, LocaliseReply
 from tests.support.service import (
@@ -140,8 +141,15 @@ def test_the_queue_is_bounded_in_bytes_too():
         assert first.result(timeout=10) == "not_localised"
 
 
-def test_a_query_that_waits_past_the_deadline_gets_deadline_in_time_while_the_worker_is_still_busy():
-    gate = Gate()
+def test_a_query_that_waits_past_the_deadline_gets_deadline_in_time_while_no_worker_is_free(monkeypatch):
+    gate, may_start = Gate(), threading.Event()
+    may_start.set()
+
+    def started(*args):
+        may_start.wait(10)
+        return process.WorkerProcess(*args)
+
+    monkeypatch.setattr(pool_module, "WorkerProcess", started)
     options = ServeOptions(workers=1, deadline_s=0.3)
     with (
         running_server(gated(1, gate), options) as server,
@@ -151,10 +159,12 @@ def test_a_query_that_waits_past_the_deadline_gets_deadline_in_time_while_the_wo
         start = time.monotonic()
         in_hand = pool.submit(outcome, client)
         assert gate.entered.acquire(timeout=10)
+        may_start.clear()  # the process that replaces the late one takes nothing before both are answered
         waiting = pool.submit(outcome, client)
         assert in_hand.result(timeout=10) == "DEADLINE"
         assert waiting.result(timeout=10) == "DEADLINE"
         assert 0.3 <= time.monotonic() - start < 5.0
+        may_start.set()
         gate.open()
         # The late pose of the first is never sent; the second is not even computed.
         assert client.status().queries.errors == {"DEADLINE": 2}
