@@ -9,8 +9,10 @@ A server (`featuredb serve`) follows a film that shows the photo again and again
 - the bridge's message, decoded by the libraries of those who get it: pymavlink from a UDP port, rosbags from
   a Zenoh session that stands for ROS 2's router.
 
-The latency is the difference of the two moments, of replies with a pose; Zenoh's own way is in both. Figures
-say how busy the machine was (load), since a busy machine's latency is not the program's.
+The bridge's latency is the difference of the two moments, pose by pose. It holds the wire's own jitter: two
+subscribers hear one reply up to some milliseconds apart. So both ways are also measured from the moment when
+the server received the frame, and their quantiles compared: by how much the slowest hundredth of the bridge's
+messages is later than the slowest hundredth of the replies. Figures say how busy the machine was (load).
 """
 
 import argparse
@@ -35,6 +37,7 @@ from pymavlink.dialects.v20 import common
 from rosbags.typesys import Stores, get_typestore
 
 from featuredb.features.decode import decode_rgb
+from featuredb.geometry.arrays import FloatArray
 from featuredb.video.writer import VideoWriter
 from reloc.service.session import bind_free_port
 from reloc.wire.keys import Keys
@@ -47,7 +50,7 @@ _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
 class Moments:
-    """When replies and messages came, by the microsecond of the pose's time; threads share it."""
+    """When replies and messages came (Unix time), by the microsecond when the server received the frame."""
 
     def __init__(self) -> None:
         self.replies: dict[int, float] = {}
@@ -55,19 +58,21 @@ class Moments:
 
     def reply(self, sample: zenoh.Sample) -> None:
         """A pose of a live session, as the server sends it."""
-        now = time.perf_counter()
+        now = time.time()
         pose = TrackPose.model_validate_json(sample.payload.to_bytes())
         if pose.position is not None:
             self.replies[round(datetime.fromisoformat(pose.received_at).timestamp() * 1e6)] = now
 
     def message(self, time_us: int) -> None:
         """A message that is decoded."""
-        self.messages.setdefault(time_us, time.perf_counter())
+        self.messages.setdefault(time_us, time.time())
 
-    def milliseconds(self) -> list[float]:
-        """Latencies of the poses of which both are there."""
-        both = self.replies.keys() & self.messages.keys()
-        return [1e3 * (self.messages[key] - self.replies[key]) for key in sorted(both)]
+    def milliseconds(self) -> FloatArray:
+        """(2, n) from the server's frame to the reply and to the message, of poses of which both are there."""
+        both = sorted(self.replies.keys() & self.messages.keys())
+        return np.array(
+            [[1e3 * came[us] - 1e-3 * us for us in both] for came in (self.replies, self.messages)]
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -170,14 +175,17 @@ def _ros2(moments: Moments) -> Iterator[tuple[str, ...]]:
 
 
 def _figures(name: str, moments: Moments) -> dict[str, float]:
-    found = moments.milliseconds()
-    if not found:
+    wire, message = moments.milliseconds()
+    if not len(wire):
         raise SystemExit(f"bridge {name}: no message of any of {len(moments.replies)} poses")
     return {
         f"{name}_poses": len(moments.replies),
-        f"{name}_decoded": len(found),
-        f"{name}_median_ms": float(np.median(found)),
-        f"{name}_99_ms": float(np.quantile(found, 0.99)),
+        f"{name}_decoded": len(wire),
+        f"{name}_median_ms": float(np.median(message - wire)),
+        f"{name}_95_ms": float(np.quantile(message - wire, 0.95)),
+        f"{name}_99_ms": float(np.quantile(message - wire, 0.99)),
+        f"{name}_wire_99_ms": float(np.quantile(wire, 0.99)),
+        f"{name}_over_wire_99_ms": float(np.quantile(message, 0.99) - np.quantile(wire, 0.99)),
     }
 
 

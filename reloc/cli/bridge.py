@@ -71,8 +71,9 @@ def register(subparsers: Any) -> None:
 def _poses(args: argparse.Namespace) -> "Iterator[RobotPose]":
     import time
 
-    from reloc.bridge.robot_pose import read_answers
+    from reloc.bridge.robot_pose import read_answers, warm_up
 
+    warm_up()
     return read_answers(sys.stdin, args.mount, time.time)
 
 

@@ -52,14 +52,25 @@ SPEED: tuple[Row, ...] = (
             _MADE,
             ("tools.bridge_latency", "{work}/db", f"{BRIGHTON}/DJI_0025.JPG", *OUT),
         ),
-        figures=same("load", "mavlink_poses", "ros2_poses"),
-        text="MAVLink: median {mavlink_median_ms:.1f} ms, 99 % within {mavlink_99_ms:.1f} ms of "
-        "{mavlink_decoded}; ROS 2: {ros2_median_ms:.1f} ms, {ros2_99_ms:.1f} ms of {ros2_decoded}",
+        figures=same(
+            "load",
+            "mavlink_poses",
+            "ros2_poses",
+            "mavlink_99_ms",
+            "ros2_99_ms",
+            "mavlink_wire_99_ms",
+            "ros2_wire_99_ms",
+        ),
+        text="MAVLink: median {mavlink_median_ms:.1f} ms, 95 % within {mavlink_95_ms:.1f} ms of "
+        "{mavlink_decoded}, the slowest hundredth {mavlink_over_wire_99_ms:.1f} ms later than the wire's; "
+        "ROS 2: {ros2_median_ms:.1f} ms, {ros2_95_ms:.1f} ms of {ros2_decoded}, "
+        "{ros2_over_wire_99_ms:.1f} ms",
         limits=tuple(
             limit
             for kind in ("mavlink", "ros2")
             for limit in (
-                Limit(figure=f"{kind}_median_ms", most=5),
+                Limit(figure=f"{kind}_95_ms", most=5),
+                Limit(figure=f"{kind}_over_wire_99_ms", most=5),
                 Limit(figure=f"{kind}_decoded", least=100),  # the 99th percentile is one of them
             )
         ),
