@@ -68,7 +68,7 @@ class Moments:
         self.messages.setdefault(time_us, time.time())
 
     def milliseconds(self) -> FloatArray:
-        """(2, n) from the server's frame to the reply and to the message, of poses of which both are there."""
+        """(2, n) from the server's frame to the reply and to the message, of poses that have both."""
         both = sorted(self.replies.keys() & self.messages.keys())
         return np.array(
             [[1e3 * came[us] - 1e-3 * us for us in both] for came in (self.replies, self.messages)]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from featuredb.errors import VideoError
-from featuredb.features.exif.angles import XMP_ANGLES
+from featuredb.features.exif.angles import DJI_GIMBAL
 from featuredb.features.exif.write import gps_directory
 from featuredb.features.exif.xmp_write import with_properties
 from featuredb.features.film_lens import UNNAMED_MAKE, shot_model
@@ -24,7 +24,6 @@ from ingest.video.keyframes import KeyframeChoice
 from ingest.video.positions import GimbalAngles, Position
 from ingest.workspace import atomic_file
 
-_GIMBAL = XMP_ANGLES["drone-dji"]
 _QUALITY = 95  # of JPEG; films are compressed already, and what it adds should not be seen
 
 
@@ -111,7 +110,7 @@ def _jpeg(
         exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps_directory(place))
     xmp = b""
     if angles is not None:
-        words = {f"drone-dji:{name}": f"{angle:+.2f}" for name, angle in zip(_GIMBAL, angles, strict=True)}
+        words = {f"drone-dji:{name}": f"{angle:+.2f}" for name, angle in zip(DJI_GIMBAL, angles, strict=True)}
         xmp = with_properties(b"", words)
     out = io.BytesIO()
     Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=_QUALITY, subsampling=0, exif=exif, xmp=xmp)

@@ -11,11 +11,13 @@ DEFAULT_SIGMA_YAW_DEG, DEFAULT_SIGMA_TILT_DEG = 4.0, 2.0
 _COMPASS_SIGMA_DEG = 20.0  # of a phone, magnetic north among it; chosen
 MOST_PITCH_DEG = 95.0  # straight up or down, and what gimbals overshoot
 _LEAST_SIGMA_DEG = 0.05
-XMP_ANGLES = {  # namespace: names, whose angles are the camera's, not the aircraft's
-    "drone-dji": ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
+# Names of yaw, pitch and roll of a camera, not of its aircraft, by an expression for their namespace.
+DJI_GIMBAL = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
+XMP_GIMBALS = {
+    "drone(?:-dji)?": DJI_GIMBAL,  # Autel's is without "-dji"
     "drone-parrot": ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
-    "Camera": ("Yaw", "Pitch", "Roll"),  # Pix4D's, which senseFly, Parrot and others write
 }
+XMP_BODY = ("Yaw", "Pitch", "Roll")  # of Pix4D's namespace, which senseFly, Parrot and others write
 
 
 def camera_angles(
@@ -27,8 +29,8 @@ def camera_angles(
     (`orientation`) only the compass counts: whether angles are those of the turned picture is not known.
     """
     xmp = xmp if orientation == 1 else {}
-    for space in ("drone-dji", "drone-parrot"):
-        yaw, pitch, roll = (xmp.get(name) for name in XMP_ANGLES[space])
+    for names in XMP_GIMBALS.values():
+        yaw, pitch, roll = (xmp.get(name) for name in names)
         if pitch is None or (not yaw and not pitch and not roll):
             continue
         if abs(pitch) > MOST_PITCH_DEG:
@@ -41,7 +43,7 @@ def camera_angles(
             sigma_yaw_deg=DEFAULT_SIGMA_YAW_DEG,
             sigma_tilt_deg=DEFAULT_SIGMA_TILT_DEG,
         )
-    yaw, pitch, roll = (xmp.get(name) for name in XMP_ANGLES["Camera"])
+    yaw, pitch, roll = (xmp.get(name) for name in XMP_BODY)
     if yaw is not None and pitch is not None and roll is not None and (yaw or pitch or roll):
         tilt = [xmp.get(f"IMU{name}Accuracy", 0.0) for name in ("Pitch", "Roll")]
         sense_fly = make.strip().lower() == "sensefly"  # counts roll the other way, as OpenDroneMap knows

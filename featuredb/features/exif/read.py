@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 
 from featuredb.errors import ImageError, InvalidValueError
-from featuredb.features.exif.angles import XMP_ANGLES, camera_angles
+from featuredb.features.exif.angles import XMP_BODY, XMP_GIMBALS, camera_angles
 from featuredb.features.exif.gps import (
     DEFAULT_SIGMA_HORIZONTAL_M,
     DEFAULT_SIGMA_VERTICAL_M,
@@ -34,19 +34,24 @@ _FOCAL_RANGE = (0.1, 40.0)
 _MAX_TEXT = 200
 _MAX_WARNINGS = 20
 
-_XMP_NAMES = {  # by namespace, which Autel writes without "-dji", and some Pix4D's with a small letter
-    "drone(?:-dji)?": (
-        *XMP_ANGLES["drone-dji"],
-        *("RelativeAltitude", "AbsoluteAltitude", "RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
-        *("GpsLatitude", "GpsLongitude", "GpsLongtitude"),
+_XMP_NAMES = (  # of numbers, by an expression for their namespace
+    *XMP_GIMBALS.items(),
+    (
+        "drone(?:-dji)?",
+        (
+            *("RelativeAltitude", "AbsoluteAltitude", "RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
+            *("GpsLatitude", "GpsLongitude", "GpsLongtitude"),
+        ),
     ),
-    "drone-parrot": XMP_ANGLES["drone-parrot"],
-    "[Cc]amera": (  # Pix4D's, which Parrot, senseFly and others write
-        *XMP_ANGLES["Camera"],
-        *("GPSXYAccuracy", "GPSZAccuracy", "IMUYawAccuracy", "IMUPitchAccuracy", "IMURollAccuracy"),
+    (
+        "[Cc]amera",  # Pix4D's
+        (
+            *XMP_BODY,
+            *("GPSXYAccuracy", "GPSZAccuracy", "IMUYawAccuracy", "IMUPitchAccuracy", "IMURollAccuracy"),
+        ),
     ),
-}
-_XMP_TAGS = "|".join(f"{space}:(?:{'|'.join(names)})" for space, names in _XMP_NAMES.items())
+)
+_XMP_TAGS = "|".join(f"{space}:(?:{'|'.join(names)})" for space, names in _XMP_NAMES)
 _XMP_VALUE = re.compile(
     rf"({_XMP_TAGS})\s*(?:=\s*[\"']|>)\s*([+-]?\d{{1,9}}(?:\.\d{{0,12}})?)\s*[\"'<]".encode()
 )

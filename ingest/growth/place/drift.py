@@ -28,7 +28,6 @@ _PIECE = 5  # photos; a photo alone says more of its own noise than of where its
 # Of the standard deviation of an observation with what its neighbours share; it is measured on the residuals,
 # which a handful of observations keeps too small.
 _LEAST_PX = 0.1
-_MOST_PHOTOS = 300  # of more, nothing is said; the equations are dense
 _MOST_POINTS = 20_000  # free points that take part; fewer know less, so the bound stays one
 
 
@@ -38,7 +37,7 @@ class PhotoSpread:
 
     Attributes:
         poses: (k, 6, 6) of the left perturbation of each cam_from_local; NaN for photos that see nothing, and
-            for all where there are more than `_MOST_PHOTOS`.
+            for all where no existing point is kept.
         turns: (k, 3, 3) radians squared, about the local axes: how the piece of the model around each photo
             may be turned: the mean rotation of the photo and those that share most points with it. What comes
             next is tied to such a piece. NaN as before.
@@ -77,7 +76,7 @@ def photo_covariances(
         turns=np.full((count, 3, 3), np.nan),
         lens_turns=np.full((count, 3, 3), np.nan),
     )
-    if count > _MOST_PHOTOS or not kept.any():
+    if not kept.any():
         return spread
     model = _thinned(model)
     everything = np.ones(len(model.point_of), dtype=np.bool_)
