@@ -2,7 +2,9 @@
 
 import logging
 import multiprocessing
+import multiprocessing.util
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -25,11 +27,13 @@ def end_process(code: int) -> NoReturn:
     """End a process that has done its work, though threads of it may still be in native code.
 
     Python's own end takes the interpreter from under them: of 25 processes with threads that polled a
-    database 23 ended with SIGSEGV, of 25 that ended so none.
+    database 23 ended with SIGSEGV, of 25 that ended so none. What multiprocessing keeps in a folder for
+    temporary files goes with it.
     """
     try:
         for child in multiprocessing.active_children():
             child.kill()
+        shutil.rmtree(multiprocessing.util.get_temp_dir(), ignore_errors=True)
         logging.shutdown()
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):  # whoever reads it is gone

@@ -5,7 +5,7 @@
 1. The tree is clean, and CHANGELOG.md has a section of pyproject.toml's version.
 2. `uv build`; the wheel that is made of the sdist has the same files.
 3. The wheel goes into a new environment without extras: its version, its names, a database, completion.
-4. With --publish: a tag, and `uv publish`. Without, what would be done is said.
+4. With --publish: `uv publish`, and a tag. Without, what would be done is said.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as scratch:
         wheel = _built(Path(scratch))
         _tried(wheel, Path(scratch) / "env", version)
-        last = (("git", "tag", f"v{version}"), ("uv", "publish", str(wheel), str(_sdist(Path(scratch)))))
+        last = (("uv", "publish", str(wheel), str(_sdist(Path(scratch)))), ("git", "tag", f"v{version}"))
         for command in last:
             sys.stdout.write(f"{'' if publish else 'would run: '}{' '.join(command)}\n")
             if publish:
@@ -76,7 +76,9 @@ def _tried(wheel: Path, environment: Path, version: str) -> None:
     program, database = str(environment / "bin" / "featuredb"), str(environment / "maps.db")
     if version not in _run(program, "--version"):
         raise SystemExit(f"expected version {version}")
-    _run(str(environment / "bin" / "python"), "-c", "import featuredb; featuredb.open; featuredb.Camera")
+    _run(
+        str(environment / "bin" / "python"), "-I", "-c", "import featuredb; featuredb.open; featuredb.Camera"
+    )
     for words in (("init", database), ("maps", database), ("verify", database), ("completion", "bash")):
         _run(program, *words)
     sys.stdout.write("the wheel works without extras\n")

@@ -6,7 +6,7 @@
 import argparse
 import csv
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,7 @@ from featuredb.cli.common import (
 from featuredb.store.vacuum_options import VacuumOptions
 
 if TYPE_CHECKING:
+    from featuredb.maps.place_bounds import PlaceBounds
     from featuredb.store import MapSummary, UnplacedSummary
     from featuredb.store.sql import SqlResult
 
@@ -93,12 +94,13 @@ def run_maps(args: argparse.Namespace) -> int:
         rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
         write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
         return 0
-    sys.stdout.write(maps_table(maps) + unplaced_text(unplaced))
+    bounds = {m.map_id: snapshot.place_bounds(m.map_id) for m in maps}
+    sys.stdout.write(maps_table(maps, bounds) + unplaced_text(unplaced))
     return 0
 
 
-def maps_table(maps: Sequence["MapSummary"]) -> str:
-    """Maps with a place, and why some are in quarantine."""
+def maps_table(maps: Sequence["MapSummary"], bounds: Mapping[str, "PlaceBounds"]) -> str:
+    """Maps with a place, how far off each may be, by id, and why some are in quarantine."""
     header = (
         "map", "name", "status", "method", "gen", "drift_m", "epsg", "images", "points", "residual_m",
         "place_95_m", "tilt_95_deg", "heading_95_deg", "committed",
@@ -107,10 +109,10 @@ def maps_table(maps: Sequence["MapSummary"]) -> str:
         (
             m.map_id, m.name, m.status, m.method, m.generation,
             None if m.drift_m is None else round(m.drift_m, 3), m.epsg, m.images, m.points,
-            round(m.residual_rms_m, 3), round(m.bounds.horizontal_m, 2), round(m.bounds.tilt_deg, 2),
-            round(m.bounds.heading_deg, 2), m.created_at,
+            round(m.residual_rms_m, 3), round(b.horizontal_m, 2), round(b.tilt_deg, 2),
+            round(b.heading_deg, 2), m.created_at,
         )
-        for m in maps
+        for m, b in ((m, bounds[m.map_id]) for m in maps)
     ]  # fmt: skip
     words = _BOUNDS if maps else ""
     return (

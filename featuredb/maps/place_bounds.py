@@ -4,8 +4,13 @@ import math
 from dataclasses import dataclass
 from typing import Self
 
+from numpy.typing import ArrayLike
+
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.error_radius import error_radius
+from featuredb.geometry.sim3 import point_jacobian
+
+_NO_HEIGHT_M = 1e4  # no place is so high; where no photo tells a height, 1e5 m and more are left open
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -13,7 +18,7 @@ class PlaceBounds:
     """What holds 95 % of the errors of a placement, by its covariance.
 
     Attributes:
-        horizontal_m, vertical_m: of the frame's origin, which is the middle of the photos' positions; metres.
+        horizontal_m, vertical_m: of the map's middle, metres.
         tilt_deg: of the map's up against the true one.
         heading_deg: of the map about up.
     """
@@ -24,10 +29,18 @@ class PlaceBounds:
     heading_deg: float
 
     @classmethod
-    def of(cls, covariance: FloatArray) -> Self:
-        """Of a placement's covariance (7, 7): scale, turn (3), place (3) along the local axes."""
+    def of(cls, covariance: FloatArray, middle: ArrayLike) -> Self:
+        """
+        Args:
+            covariance: (7, 7) of a placement: scale, turn (3), place (3) along the local axes, about the
+                origin.
+            middle: (3,) of the map, in the local frame, metres.
+        """
+        jacobian = point_jacobian(middle)
+        place, turn = jacobian @ covariance @ jacobian.T, covariance[1:4, 1:4]
         tilt, heading, across, up = (
-            error_radius(covariance[a:b, a:b], 0.95) for a, b in ((1, 3), (3, 4), (4, 6), (6, 7))
+            error_radius(of[a:b, a:b], 0.95)
+            for of, a, b in ((turn, 0, 2), (turn, 2, 3), (place, 0, 2), (place, 2, 3))
         )
         return cls(
             horizontal_m=across,
@@ -39,9 +52,11 @@ class PlaceBounds:
     def words(self) -> tuple[str, str]:
         """Place and turn, a sentence each."""
         rise_m = 100.0 * math.tan(math.radians(min(self.tilt_deg, 45.0)))
+        height = f"and {self.vertical_m:.2f} m vertically (95 %)"
+        if self.vertical_m > _NO_HEIGHT_M:
+            height = "(95 %); its height is not known"
         return (
-            f"place: right to {self.horizontal_m:.2f} m horizontally and {self.vertical_m:.2f} m vertically "
-            "(95 %)",
+            f"place: right to {self.horizontal_m:.2f} m horizontally {height}",
             f"turn: may be tilted by {self.tilt_deg:.1f} degrees, which is {rise_m:.1f} m of height at 100 m "
             f"from its middle, and turned about the vertical by {self.heading_deg:.1f} degrees (95 %)",
         )

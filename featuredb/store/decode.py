@@ -53,11 +53,7 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
         return FeatureMap(
             epsg=row["epsg"],
             height_datum=row["height_datum"],
-            frame=LocalFrame(
-                latitude_deg=row["origin_latitude_deg"],
-                longitude_deg=row["origin_longitude_deg"],
-                height_m=row["origin_height_m"],
-            ),
+            frame=frame_of(row),
             points=MapPoints(utm=points.pop("coordinates"), **points),
             placement=_decode_placement(row),
             generation=row["generation"],
@@ -67,6 +63,15 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
         raise StoreError(
             f"map {row['map_id']}: stored rows do not make a map ({error}); run `featuredb verify`"
         ) from error
+
+
+def frame_of(row: Row) -> LocalFrame:
+    """Of a map with a place."""
+    return LocalFrame(
+        latitude_deg=row["origin_latitude_deg"],
+        longitude_deg=row["origin_longitude_deg"],
+        height_m=row["origin_height_m"],
+    )
 
 
 def has_place(row: Row) -> bool:

@@ -15,7 +15,7 @@ from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
 from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, UnplacedStatus
 from featuredb.store.changes import RETIRED
-from featuredb.store.decode import decode_map, decode_no_place, has_place
+from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_place
 from featuredb.store.delta import Table
 from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS, CHILD_TABLES
@@ -31,6 +31,15 @@ class UtmBox:
     max_easting: float
     max_northing: float
     max_height: float
+
+    @property
+    def middle(self) -> tuple[float, float, float]:
+        """Easting, northing, height, metres."""
+        return (
+            (self.min_easting + self.max_easting) / 2,
+            (self.min_northing + self.max_northing) / 2,
+            (self.min_height + self.max_height) / 2,
+        )
 
     def touches(self, e0: float, n0: float, e1: float, n1: float) -> bool:
         """Whether the box has a point in e0 <= e <= e1, n0 <= n <= n1, at any height."""
@@ -79,7 +88,6 @@ class MapSummary(_Summary):
         residual_rms_m: of the placement, metres.
         drift_m, budget_m: of a map that other maps placed: 95 % bound of its position against its anchors,
             and what growth allowed, metres; None where the placement does not say.
-        bounds: what holds 95 % of the errors of the placement.
     """
 
     status: MapStatus
@@ -91,7 +99,6 @@ class MapSummary(_Summary):
     generation: int
     parents: tuple[str, ...]
     residual_rms_m: float
-    bounds: PlaceBounds
     drift_m: float | None = None
     budget_m: float | None = None
 
@@ -145,6 +152,16 @@ class Snapshot:
         if not has_place(row):
             raise _without_place(row)
         return _summary(row)
+
+    def place_bounds(self, map_id: str) -> PlaceBounds:
+        """What holds 95 % of the errors of a placement, at the middle of the map's points.
+
+        Raises:
+            MapNotFoundError, UnplacedMapError: as `get`.
+        """
+        box, row = self.get(map_id).box, self._row(map_id)
+        middle = np.zeros(3) if box is None else frame_of(row).enu_from_utm(box.middle, row["epsg"])
+        return PlaceBounds.of(np.reshape(row["placement_covariance"], (7, 7)), middle)
 
     def get_any(self, map_id: str) -> MapSummary | UnplacedSummary:
         """The summary of one map, retired or not.
@@ -291,6 +308,5 @@ def _summary(row: Row) -> MapSummary:
         parents=tuple(row["parents"]),
         drift_m=drift_m,
         budget_m=budget_m,
-        bounds=PlaceBounds.of(np.reshape(row["placement_covariance"], (7, 7))),
         **{name: row[name] for name in (*_AS_STORED, *_PLACED_AS_STORED)},
     )

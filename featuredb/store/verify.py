@@ -105,7 +105,9 @@ Found = tuple[str, str]  # where, and what
 
 
 def verify(database: Database) -> VerifyReport:
-    """Check the newest snapshot, scans, contributed photos and known queries; reads all of them once.
+    """Check the newest snapshot, scans, contributed photos and known queries; reads all of them.
+
+    In an object store what seems damaged is read again.
 
     Raises:
         StoreError: the store cannot be reached, or there is no database.
@@ -116,13 +118,13 @@ def verify(database: Database) -> VerifyReport:
             # Requests that failed look like damage: whoever can read all bytes now looks again.
             try:
                 _read_all(CopyPlace(database.url, database.storage_options))
-            except OSError as error:
+                return _verify(database)
+            except (OSError, StoreError) as error:
                 seen = "; ".join(f"{p.where}: {p.what}" for p in report.problems[:_TOLD])
                 raise StoreError(
                     f"cannot verify {database.url}: {one_line(error)}; "
                     f"found before, this failure or damage: {seen}"
                 ) from error
-            report = _verify(database)
         return report
 
 

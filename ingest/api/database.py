@@ -59,7 +59,12 @@ class FeatureDatabase:
     def maps(self) -> ListedMaps:
         """The maps of the newest version that are not retired: ids, places, counts."""
         snapshot = self.store.snapshot()
-        return ListedMaps(placed=tuple(snapshot.maps()), unplaced=tuple(snapshot.unplaced_maps()))
+        placed = tuple(snapshot.maps())
+        return ListedMaps(
+            placed=placed,
+            unplaced=tuple(snapshot.unplaced_maps()),
+            bounds={m.map_id: snapshot.place_bounds(m.map_id) for m in placed},
+        )
 
     def __repr__(self) -> str:
         return f"<featuredb {self.url}, version {self.store.poll_version()}>"

@@ -1,11 +1,12 @@
 """What the methods of a database give back: values that a notebook shows."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
 from featuredb.cli.database import maps_table, unplaced_text
+from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.store import MapSummary, UnplacedSummary
 from ingest.anchoring import Anchoring
 from ingest.api.ingesting import summary
@@ -20,10 +21,15 @@ from reloc.tracking.trajectory.plot import plot_png
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ListedMaps:
-    """The maps of a database at one version; those without a place come last."""
+    """The maps of a database at one version; those without a place come last.
+
+    Attributes:
+        bounds: of each placed map, by id.
+    """
 
     placed: tuple[MapSummary, ...]
     unplaced: tuple[UnplacedSummary, ...]
+    bounds: Mapping[str, PlaceBounds]
 
     def __getitem__(self, row: int) -> MapSummary | UnplacedSummary:
         every: tuple[MapSummary | UnplacedSummary, ...] = (*self.placed, *self.unplaced)
@@ -37,7 +43,7 @@ class ListedMaps:
         yield from self.unplaced
 
     def __str__(self) -> str:
-        return maps_table(self.placed) + unplaced_text(self.unplaced)
+        return maps_table(self.placed, self.bounds) + unplaced_text(self.unplaced)
 
     def __repr__(self) -> str:
         return str(self)

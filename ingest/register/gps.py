@@ -11,6 +11,7 @@ leaves of the stated sigmas is taken for a bias that all positions share. Two te
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -156,12 +157,14 @@ def _judged(
     inliers = np.asarray(fit.used.all(axis=1))
     turn_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])))
     checked_deg = max(turn_deg, float(np.degrees(fit.checked_turn_rad)))
+    told = [bool(known[:, k].any()) for k in range(3)]
+    axes = [any(told[:2]), told[2]]
     figures = figures | {
         "inliers": int(inliers.sum()),
-        "noise_m": fit.noise.white,
-        "drift_m": fit.noise.drift,
+        "noise_m": _where(axes, fit.noise.white),
+        "drift_m": _where(axes, fit.noise.drift),
         "lag_s": fit.lag_s,
-        "bias_sigma_m": bias.tolist(),
+        "bias_sigma_m": _where(told, bias.tolist()),
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
         "turn_sigma_deg": turn_deg,
         "checked_turn_sigma_deg": checked_deg,
@@ -235,6 +238,10 @@ def _words(placed: str, figures: dict[str, Any]) -> str:
     if not against:
         return placed
     return f"{placed}; the cameras' angles contradict it and hardly count: {', '.join(against)} (median)"
+
+
+def _where(known: Sequence[bool], values: Sequence[float]) -> list[float | None]:
+    return [value if there else None for there, value in zip(known, values, strict=True)]
 
 
 def _rms(residuals_m: FloatArray) -> float | None:

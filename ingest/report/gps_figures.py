@@ -6,7 +6,8 @@ from typing import Any
 # As `ingest.register.gps` names them; those of `angles` stand below it there. What has no line is not shown.
 FIGURES = {
     "photos_with_gps": "photos that have a position",
-    "inliers": "photos whose position was used; others are far out",
+    "inliers": "photos whose position agrees; others are far out. Of more than 400 as many, evenly in time, "
+    "place the map",
     "rms_horizontal_m": "distance of used positions from the photos' places in the map (RMS), metres",
     "rms_vertical_m": "the same in height",
     "noise_m": "estimated noise of one position, horizontally and in height, metres",
@@ -36,6 +37,8 @@ def figure_rows(figures: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if value is None:
+        return "not known"
     if isinstance(value, list | tuple):
         return ", ".join(_value(one) for one in value)
     return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -71,9 +71,15 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         height_datum=made.height_datum,
         scale=made.placement.local_from_sfm.scale,
         residual_rms_m=made.placement.residual_rms_m,
-        place=PlaceBounds.of(made.placement.covariance),
+        place=PlaceBounds.of(made.placement.covariance, _middle(made)),
         plan=_plan(component, made),
     )
+
+
+def _middle(feature_map: FeatureMap) -> FloatArray:
+    """(3,) of the box of its points, in its frame."""
+    utm = feature_map.points.utm
+    return feature_map.frame.enu_from_utm((utm.min(axis=0) + utm.max(axis=0)) / 2, feature_map.epsg)
 
 
 def _map_of(component: Component) -> AnyMap | None:
@@ -147,7 +153,7 @@ def registered_photos(component: Component, result: Reconstructed) -> dict[str, 
         photo.name: replace(
             outcomes[photo.name],
             gps_residual_m=None if np.isnan(gps[k, 0]) else tuple(residuals[k].tolist()),
-            gps_used=used.get(k, False) if photo.gps is not None else None,
+            gps_used=used.get(k),
         )
         for k, photo in enumerate(component.photos)
     }
@@ -220,8 +226,14 @@ def _centers_and_gps(
 
 
 def _gps_used(component: Component) -> dict[int, bool]:
-    """Whether a photo's GPS helped to place the map, by place in the component."""
-    return {k: bool(inner) for k, inner in zip(component.with_gps, component.placement.inliers, strict=True)}
+    """Whether a photo's GPS agrees with the others', by place in the component.
+
+    Empty where that was not asked: control points place a map without it, and too few are not compared.
+    """
+    placed = component.placement
+    if component.control is not None or placed.local_from_sfm is None:
+        return {}
+    return {k: bool(inner) for k, inner in zip(component.with_gps, placed.inliers, strict=True)}
 
 
 def _cameras(component: Component, options: MapMakingOptions) -> tuple[CameraOutcome, ...]:

@@ -66,10 +66,10 @@ class PhotoOutcome:
         matches: verified with other photos.
         observations: of map points.
         map_id: its map, "" for none.
-        reprojection_px: mean reprojection error of its observations.
+        reprojection_px: mean reprojection error of the points that it observes, in all their photos.
         gps_residual_m: GPS position minus its place in the map along UTM's axes (east, north, up),
             metres; up is NaN without a height.
-        gps_used: whether its GPS helped to place the map (False: it was an outlier).
+        gps_used: whether its GPS agrees with the others' (False: an outlier); None where that was not asked.
         warnings: what was wrong in its metadata.
     """
 

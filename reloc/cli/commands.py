@@ -67,7 +67,7 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
     """Which server is asked, and for which database."""
     parser.add_argument(
         "--connect",
-        default=os.environ.get("FEATUREDB_CONNECT", DEFAULT_ENDPOINT),
+        default=os.environ.get("FEATUREDB_CONNECT") or DEFAULT_ENDPOINT,
         metavar="ENDPOINT",
         help="Zenoh endpoint of the server; default: FEATUREDB_CONNECT of the environment, or "
         + DEFAULT_ENDPOINT,
@@ -77,7 +77,7 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--database",
-        default=os.environ.get("FEATUREDB_DATABASE"),
+        default=os.environ.get("FEATUREDB_DATABASE") or None,
         metavar="NAME",
         help="default: FEATUREDB_DATABASE of the environment, or the only one that is served",
     )

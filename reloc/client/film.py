@@ -82,10 +82,11 @@ class _Answers:
             self.taking.result()
 
     def await_frame(self, index: int) -> None:
-        """Wait for the pose of the frame that was sent last; the server never drops it."""
+        """Wait for the pose of the frame that was sent last, -1: none; the server never drops it."""
         with self._changed:
             self._changed.wait_for(
-                lambda: self.taking.done() or (self.points and self.points[-1].index >= index), _LAST_WAIT_S
+                lambda: self.taking.done() or index < 0 or (self.points and self.points[-1].index >= index),
+                _LAST_WAIT_S,
             )
         self.check()
 
@@ -143,7 +144,7 @@ def stream_film(
     """
     options = options or VideoOptions(max_side_px=SENT_SIDE_PX)
     trouble: list[str] = []
-    sent, last = 0, -1
+    sent, last, last_sent = 0, -1, -1
     with (
         open_video(source, options) as video,
         _answered(client.track(camera, prior), on_pose) as answers,
@@ -152,16 +153,16 @@ def stream_film(
         begun: float | None = None
         try:
             for frame in until_it_ends(video, trouble):
+                last = frame.index
                 now = time.perf_counter()
                 begun = now - frame.time_s if begun is None else begun
                 due = now if info.live else begun + frame.time_s
                 time.sleep(max(0.0, due - time.perf_counter()))
                 answers.check()
-                last = frame.index
                 if time.perf_counter() - due <= _MAX_LATE_S:
                     live.send(_jpeg(frame.gray), frame.time_s, frame.index)
-                    sent += 1
-            answers.await_frame(last)
+                    sent, last_sent = sent + 1, frame.index
+            answers.await_frame(last_sent)
         except ServiceError as error:
             trouble.append(f"the session ended: {error}")
         refusals = tuple(f"frame {event.sequence}: {event.message}" for event in live.refusals)

@@ -3,6 +3,7 @@
 import csv
 import json
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from featuredb.cli.main import main
-from featuredb.errors import VideoError
+from featuredb.errors import ServiceError, VideoError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.video.writer import VideoWriter
 from reloc.client import Client
@@ -119,6 +120,27 @@ def test_a_pose_does_not_wait_for_the_camera_s_next_frame(
         found = stream_film(client, "camera", camera=LENS, on_pose=lambda *_: camera.told.set())
     assert camera.in_time
     assert found.sent == 2
+
+
+def test_a_session_that_ends_before_the_first_frame_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Ended:
+        opened, refusals = SimpleNamespace(snapshot=1), ()
+
+        def __enter__(self) -> "Ended":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def __iter__(self) -> Iterator[TrackPose]:
+            raise ServiceError("IDLE", "no frame came for 5 s")
+
+    monkeypatch.setattr("reloc.client.film.open_video", lambda *_: OneFrame())
+    client = SimpleNamespace(database="town", track=lambda *_: Ended())
+    monkeypatch.setattr("time.sleep", lambda _, wait=time.sleep: wait(0.1))  # the session's end comes first
+    found = stream_film(client, "camera", camera=LENS)  # type: ignore[arg-type]
+    assert found.sent == 0
+    assert any("no frame came for 5 s" in what for what in found.complaints)
 
 
 def test_what_the_receiver_of_poses_raises_ends_the_stream(server: Server, film: Path) -> None:

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.store import MapSummary
 from featuredb.store.snapshot import UtmBox
 from reloc.localiser import _group
@@ -55,7 +54,6 @@ def summary(
         generation=0,
         parents=(),
         residual_rms_m=0.0,
-        bounds=PlaceBounds(horizontal_m=1.0, vertical_m=1.0, tilt_deg=1.0, heading_deg=1.0),
         extractor_fingerprint=kind,
         source="",
         licence="",

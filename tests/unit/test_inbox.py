@@ -222,6 +222,17 @@ def test_closing_does_not_wait_for_ever(store, opened):
     assert inbox.status().lost == 1
 
 
+def test_what_a_stop_leaves_is_told_with_the_batch_in_hand(store, opened, caplog):
+    store.gate = Gate()
+    inbox = opened(InboxOptions(batch=1))
+    give(inbox, contribution(1))
+    until(lambda: store.attempts == 1, "the store has it in hand")
+    give(inbox, contribution(2))
+    inbox.close(0.1)
+    (said,) = [record for record in caplog.records if "contributions lost" in record.message]
+    assert said.fields["count"] == 2
+
+
 def test_many_threads_give_at_once(store, opened):
     inbox = opened(InboxOptions(max_queue=1000))
 

@@ -1,5 +1,6 @@
 """An operation of deltalake on a local table, so that what it commits survives a power cut."""
 
+import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -7,6 +8,7 @@ from urllib.parse import unquote
 
 import pyarrow as pa
 from deltalake import DeltaTable
+from deltalake.exceptions import DeltaError
 
 from featuredb.store.durable.log import LOG, Action
 from featuredb.store.durable.publish import (
@@ -18,6 +20,8 @@ from featuredb.store.durable.publish import (
 )
 
 T = TypeVar("T")
+
+logger = logging.getLogger(__name__)
 
 # What an operation looks at: columns; also the list of files; also the rows in them.
 Sight = Literal["columns", "files", "rows"]
@@ -53,9 +57,12 @@ def commit_locally(
         result = operation(DeltaTable(work))
         version = publish(_entries(work, 1), work, table, delta.version(), rebase=rebase)
     if version > delta.version() and version % CHECKPOINT_INTERVAL == 0:
-        with scratch(table, links=links_of_log(table, version)) as work:
-            DeltaTable(work).create_checkpoint()
-            publish_checkpoint(work, table)
+        try:  # the commit is done, with or without
+            with scratch(table, links=links_of_log(table, version)) as work:
+                DeltaTable(work).create_checkpoint()
+                publish_checkpoint(work, table)
+        except (OSError, DeltaError) as error:
+            logger.warning("%s: no checkpoint of version %d: %s", table, version, error)
     return version, result
 
 

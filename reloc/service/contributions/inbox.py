@@ -109,8 +109,8 @@ class Inbox:
         self._stop.set()
         self._thread.join(timeout_s)
         with self._changed:
-            if self._queue:
-                _lost(len(self._queue), "the server stopped before the store took them")
+            if self._thread.is_alive():  # with a batch in hand that the store may still take
+                _lost(self._reserved, "the server stopped before the store took them")
 
     def reserve(self, owner: str, size: int) -> Ticket | InboxRefusal:
         """A place for a photo of `size` bytes, or why there is none. Returns at once."""

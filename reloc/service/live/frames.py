@@ -3,9 +3,10 @@
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -152,14 +153,18 @@ class FrameAnswerer:
 def _yielding_where_heavy() -> Iterator[None]:
     """Where a picture takes longer than frames of cameras do, this process works behind queries from then on.
 
-    A session's process is its own; a priority that was given up does not come back.
+    A session's process is its own; a priority that was given up does not come back. Linux has priorities by
+    thread: all that are there get it, and those to come inherit it.
     """
     start = time.thread_time()
     try:
         yield
     finally:
         if time.thread_time() - start > _HEAVY_S and os.nice(0) < _YIELDING:
-            os.nice(_YIELDING)
+            tasks = Path("/proc/self/task")
+            for task in [int(one.name) for one in tasks.iterdir()] if tasks.exists() else [0]:
+                with suppress(OSError):  # it has ended meanwhile
+                    os.setpriority(os.PRIO_PROCESS, task, _YIELDING)
 
 
 def _smaller(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:

@@ -1,0 +1,73 @@
+"""A film ends at its end, at a frame that cannot be read, or by Ctrl-C; what came before is kept."""
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from featuredb.errors import VideoError
+from reloc.tracking.film_end import until_it_ends
+
+
+def film(end: BaseException | None = None) -> Iterator[int]:
+    yield from range(3)
+    if end is not None:
+        raise end
+
+
+def test_a_film_ends_at_its_end() -> None:
+    trouble: list[str] = []
+    assert list(until_it_ends(film(), trouble)) == [0, 1, 2]
+    assert trouble == []
+
+
+@pytest.mark.parametrize(
+    ("end", "said"), [(VideoError("torn"), "torn"), (KeyboardInterrupt(), "stopped by hand")]
+)
+def test_frames_before_the_end_are_kept(end: BaseException, said: str) -> None:
+    trouble: list[str] = []
+    assert list(until_it_ends(film(end), trouble)) == [0, 1, 2]
+    assert trouble == [said]
+
+
+def test_without_a_frame_the_error_is_the_callers() -> None:
+    with pytest.raises(VideoError, match="torn"):
+        list(until_it_ends((frame for frame in _raising()), []))
+
+
+def _raising() -> Iterator[int]:
+    raise VideoError("torn")
+    yield 0
+
+
+def test_a_frame_in_hand_is_the_last_one_after_ctrl_c() -> None:
+    trouble: list[str] = []
+    before = signal.getsignal(signal.SIGINT)
+    worked = []
+    for frame in until_it_ends(film(), trouble):
+        if frame == 1:
+            signal.raise_signal(signal.SIGINT)
+        worked.append(frame)
+    assert (worked, trouble) == ([0, 1], ["stopped by hand"])
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_second_ctrl_c_does_not_wait_for_the_frame_in_hand() -> None:
+    frames = until_it_ends(film(), [])
+    next(frames)
+    signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    frames.close()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_ends_a_wait_for_a_frame() -> None:
+    def camera() -> Iterator[int]:
+        yield 0
+        signal.raise_signal(signal.SIGINT)
+        yield 1
+
+    trouble: list[str] = []
+    assert list(until_it_ends(camera(), trouble)) == [0]
+    assert trouble == ["stopped by hand"]
