@@ -1,17 +1,15 @@
 """The paper's results beside ours, row by row (Bodensteiner et al., section 3).
 
-    python -m tools.paper --out DIR [--data FOLDER] [--only descriptors film shares]
+    python -m tools.paper --out DIR [--data FOLDER] [--only film shares]
 
-descriptors   figure 4 and section 3.1.1: right matches between photos and renders of laser scans.
-film          section 3.1.2 and 3.2: a simulated film without any telemetry becomes a map; six picks in one
-              frame place it on an intensity-only scan; all frames are tracked. The paper measures distances
-              from a bundle adjustment; here from the truth, which no adjustment's own error softens, and
-              beside it from the map's adjusted keyframes.
-shares        section 3 and 3.1: films and collections that become maps: karma, `brighton` as a film
-              without GPS, and two photo collections of many people.
+film    section 3.1.2 and 3.2: a simulated film without any telemetry becomes a map; six picks in one frame
+        place it on an intensity-only scan; all frames are tracked. The paper measures distances from a bundle
+        adjustment; here from the truth, which no adjustment's own error softens, and beside it from the map's
+        adjusted keyframes.
+shares  section 3 and 3.1: films and collections that become maps: karma, `brighton` as a film without GPS,
+        and two photo collections of many people.
 
-Prints a table, writes paper.json and figure 4's curves (descriptors.png). What fails stands in the table with
-its reason.
+Prints a table and writes paper.json. What fails stands in the table with its reason.
 """
 
 import argparse
@@ -31,7 +29,6 @@ from ingest.workspace import default_root
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
-from tools import descriptor_study
 from tools.anchor_simworld import featuredb
 from tools.figures import write_figures
 from tools.growth_common import table
@@ -41,9 +38,7 @@ from tools.track_evaluation import errors, film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from tools.worlds.scan_world import make_scan_world
 
-_PARTS = ("descriptors", "film", "shares")
-_METHODS = ("SIFT", "SIFT upright", "KAZE upright", "ORB", "FREAK")
-_RATIO = 0.9  # of the table's matches; the curves are in the figure
+_PARTS = ("film", "shares")
 _FILM_SEED, _FRAMES = 1, 1200
 _PLACED = "placed.json"  # what came of the film; who starts again goes on from there
 
@@ -63,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     lines: list[Line] = []
     figures: dict[str, Any] = {}
-    parts = {"descriptors": descriptors, "film": film, "shares": shares}
+    parts = {"film": film, "shares": shares}
     for name in args.only:
         found, numbers = parts[name](args)
         lines += found
@@ -72,36 +67,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.stdout.write(table(rows, ("result", "section", "paper", "ours")) + "\n")
     write_figures(args.out / "paper.json", figures)
     return 0
-
-
-def descriptors(args: argparse.Namespace) -> tuple[list[Line], dict[str, Any]]:
-    """Figure 4: recall over precision; the share of right matches."""
-    words = ["--pairs", "1", "--simworld", "--out", str(args.out)]
-    stadium = args.data / "autzen"
-    if stadium.is_dir():
-        words += ["--autzen", str(stadium / "stadium.laz"), str(stadium / "stadium_ortho.tif")]
-    descriptor_study.main(words)
-    lines: list[Line] = []
-    figures: dict[str, float] = {}
-    upright: list[float] = []
-    at = descriptor_study.RATIOS.index(_RATIO)
-    for (source, method), counts in descriptor_study.read_csv(args.out / "descriptors.csv").items():
-        right, kept, true = counts[at]
-        if "intensity" not in source or method not in _METHODS:
-            continue
-        share, recall = right / max(kept, 1), right / max(true, 1)
-        figures[f"{source}, {method}"] = float(share)
-        upright += [float(share)] if method == "SIFT upright" else []
-        lines.append(
-            Line(
-                what=f"right matches at ratio {_RATIO}: {source}, {method}",
-                section="3.1.1, figure 4",
-                paper="3 to 7 %",
-                ours=f"{share:.1%} (recall {recall:.1%})",
-            )
-        )
-    of_upright = {"sources": len(upright), "least_share": min(upright), "largest_share": max(upright)}
-    return lines, {"inliers": figures} | of_upright
 
 
 def film(args: argparse.Namespace) -> tuple[list[Line], dict[str, Any]]:

@@ -45,8 +45,6 @@ NOT_RUN = {
     "pip install": "installs; the extra is looked up",
     "uv sync": "installs; these tests run in what it makes",
     "source": "these tests run in what it activates",
-    "tools/scan_poses.py": _REAL_DATA,
-    "tools/descriptor_study.py": _REAL_DATA,
     "tools/frame_real_photos.py": _REAL_DATA,
     "tools/autzen_windows.py": _REAL_DATA,
 }

@@ -284,19 +284,6 @@ SIMULATED: tuple[Row, ...] = (
         minutes=25,
     ),
     *(_films(seed) for seed in (1, 2)),
-    Row(
-        name="paper-figure-4",
-        group="simulated",
-        form="full",
-        claim="upright SIFT between renders of airborne intensity and pictures, ratio 0.9: share of right "
-        "matches (paper: 3 to 7 %), on the town and on `autzen`",
-        commands=(("tools.paper", "--out", "{work}", "--data", "{data}", "--only", "descriptors"),),
-        json="{work}/paper.json",
-        text="{least_share:.1%} to {largest_share:.1%} in {sources} sources",
-        limits=(Limit(figure="sources", least=2), Limit(figure="least_share", least=0.03)),
-        needs=("autzen",),
-        minutes=5,
-    ),
     _growth(
         *("growth-community", "48 photos of a small town by twelve people: growth finds their places"),
         *(("tools.growth_community", "--size", "short"), "community", 25),
