@@ -318,8 +318,9 @@ REAL: tuple[Row, ...] = (
         name="karma-in-map",
         group="real",
         form="full",
-        claim="`karma.mp4`, 12 s by a drone, becomes a map without a place, and is followed in its frame; at "
-        "keyframes the track agrees with the map's own cameras, relative to the distance of the points",
+        claim="`karma.mp4`, 12 s by a drone, becomes a map without a place (paper: 98 of 115 films), and is "
+        "followed in its frame; at keyframes the track agrees with the map's own cameras, relative to the "
+        "distance of the points",
         commands=(("tools.film_in_map", "{data}/video/karma.mp4", "--work", "{work}", *OUT),),
         text="{mapped} of {keyframes} keyframes, {tracked} of {frames} frames; {center_rel:.2%} and "
         "{angle_deg:.2f} degrees",
@@ -336,7 +337,7 @@ REAL: tuple[Row, ...] = (
         group="real",
         form="full",
         claim="`reichstag`: 74 photos of one landmark by many people; of those in COLMAP's largest model "
-        "(exhaustive, incremental), how many are in our largest map",
+        "(exhaustive, incremental), how many are in our largest map (paper: 7 and 22 % of collections)",
         commands=(
             (
                 *("tools.colmap_baseline", "{data}/reichstag/images", "--no-positions"),
@@ -347,24 +348,6 @@ REAL: tuple[Row, ...] = (
         limits=(Limit(figure="share", least=0.9), Limit(figure="placed", most=0)),
         needs=("reichstag/images",),
         minutes=15,
-    ),
-    Row(
-        name="paper-shares",
-        group="real",
-        form="full",
-        claim="`karma.mp4` and `brighton` as a film without GPS become maps (paper: 98 of 115 films); photos "
-        "of collections in the largest map (paper: 7 % and 22 %)",
-        commands=(("tools.paper", "--out", "{work}", "--data", "{data}", "--only", "shares"),),
-        json="{work}/paper.json",
-        text="{films_mapped} of {films} films; {reichstag} of 74 of `reichstag`, {sacre_coeur} of 10 of "
-        "`sacre_coeur`",
-        limits=(
-            Limit(figure="films_mapped", least=2),
-            Limit(figure="reichstag", least=60),
-            Limit(figure="sacre_coeur", least=9),
-        ),
-        needs=("video/karma.mp4", "brighton/images", "reichstag/images", "sacre_coeur/mapping"),
-        minutes=12,
     ),
     _laser("fountain-P11", 9, "quick", Limit(figure="map_deg", most=0.1)),
     _laser("entry-P10", 8, "full"),

@@ -268,12 +268,14 @@ SIMULATED: tuple[Row, ...] = (
         group="simulated",
         form="full",
         claim="a film of 1,200 frames without telemetry and an intensity-only scan: placed by six picks in "
-        "one frame, tracked from end to end",
-        commands=(("tools.paper", "--out", "{work}", "--inputs", "{cache}", "--only", "film"),),
+        "one frame, tracked from end to end (paper: 0.4 m, 29.7 frames/s with a GPU; a frame 15 to 30 s, "
+        "structure projection 1 s)",
+        commands=(("tools.paper", "--out", "{work}", "--inputs", "{cache}"),),
         json="{work}/paper.json",
-        figures=same("largest_m", "adjusted_m", "made_s", "frame_s", "projection_s"),
-        text="mean {mean_m:.3f} m (first quarter {first_m:.3f}, last {last_m:.3f}), {lost} lost, "
-        "{rate_hz:.0f} frames/s",
+        figures=same("largest_m", "made_s"),
+        text="mean {mean_m:.3f} m (first quarter {first_m:.3f}, last {last_m:.3f}; from the map's adjusted "
+        "keyframes {adjusted_m:.3f}), {lost} lost, {rate_hz:.0f} frames/s; a frame {frame_s:.0f} s, "
+        "structure projection {projection_s:.1f} s",
         limits=(
             Limit(figure="placed", least=1),
             Limit(figure="mean_m", most=0.10),
