@@ -131,11 +131,7 @@ SIMULATED: tuple[Row, ...] = (
         name="town-held-out",
         claim="60 held-out drone photos of the town, survey-grade tags; photos that show no mapped place",
         commands=f"tools.simulated_evaluation --out {{work}}/town --seed 3 {OUT}",
-        figures=same("median_deg")
-        | {
-            "inside_horizontal": "coverage.survey receiver.horizontal",
-            "inside_orientation": "coverage.survey receiver.orientation",
-        },
+        figures=same("median_deg"),
         text="{answered} of {asked}, {within:.1%} within 0.25 m and 0.3 degrees, median {median_m:.3f} m; "
         "{negatives_answered} of {negatives} others answered, {street_answered} of {street} from the street",
         # Inside: 68 % within two standard deviations of the count of 60.
