@@ -28,7 +28,7 @@ from featuredb.store import Database
 from tools import scan_poses
 from tools.anchor_simworld import featuredb
 from tools.figures import study_parser, work_folder, write_figures
-from tools.real_photos import ask_poses, error_figures, ingest, table
+from tools.real_photos import ask_poses, error_figures, ingest
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,17 +42,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         shape = by_gps(Database.open(database), frame, args.poses)
         sys.stdout.write("before, placed by GPS\n")
         before = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
-        sys.stdout.write(table(before) + "\n")
+        sys.stdout.write("".join(f"{row}\n" for row in before))
         anchored = anchored_on(database, args.scan, args.photos, work / "anchor")
         sys.stdout.write("after, anchored on the scan\n")
         after = ask_poses(anchored, args.photos, args.held_out, frame, poses)
-        sys.stdout.write(table(after) + "\n")
+        sys.stdout.write("".join(f"{row}\n" for row in after))
     figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
     write_figures(args.json, figures | shape)
-    sys.stdout.write(
-        f"by GPS: focal length {shape['gps_focal_px']:.0f} px +- {shape['gps_focal_sigma']:.1%} "
-        f"(scan {shape['scan_focal_px']:.0f}), cameras {shape['gps_shape_m']:.3f} m off after a similarity\n"
-    )
     return 0
 
 

@@ -48,12 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         refused = anchored(work, mapped, world, other=True)[1]
         database, placed = anchored(work, mapped, world, other=False)
         queries = world.world.images("queries")
-        say = sys.stdout.write
-        say(f"scan of another town: {'refused' if not refused else 'PLACED, which is wrong'}\n")
         figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
         for name, path in (("gps", mapped), ("scan", database)):
             found = judged(Database.open(path), world.world.truth, queries)
-            say(f"placed by {name}: {found}\n")
             figures |= {f"{name}_{key}": value for key, value in found.items()}
         write_figures(args.json, figures)
     return 0 if placed and not refused else 1

@@ -255,24 +255,17 @@ def _summary(outcomes: Sequence[WindowOutcome], figures: Path | None) -> None:
     wrong = [o for o in windows if o.accepted and (o.error_m is None or o.error_m > _WRONG_M)]
     foreign = [o for o in outcomes if o.kind != "window"]
     taken = [o for o in foreign if o.accepted]
-    rate = len(close) / max(len(structured), 1)
-    print(f"windows: {len(windows)}, with structure: {len(structured)}")
-    print(f"registered within {_LIMIT_M} m: {len(close)} of {len(structured)} ({rate:.0%})")
     accepted = [o for o in windows if o.accepted]
     errors = [o.error_m for o in accepted if o.error_m is not None]
-    if errors:
-        print(
-            f"accepted: {len(accepted)}; error median {np.median(errors):.2f} m, largest {max(errors):.2f} m"
-        )
-    print(f"accepted and wrong by more than {_WRONG_M} m: {len(wrong)}")
-    print(f"windows of another place: {len(foreign)}, accepted: {len(taken)}")
-    print(f"CPU seconds each: median {np.median([o.seconds for o in outcomes]):.1f}")
     write_figures(
         figures,
         {
+            "windows": len(windows),
             "structured": len(structured),
             "close": len(close),
-            "rate": rate,
+            "rate": len(close) / max(len(structured), 1),
+            "accepted": len(accepted),
+            "median_m": float(np.median(errors or [np.nan])),
             "largest_m": max(errors, default=float("nan")),
             "wrong": len(wrong),
             "foreign": len(foreign),

@@ -63,15 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "colmap_s": theirs.wall_s,
         "ours_s": mine.wall_s,
         "times": mine.wall_s / theirs.wall_s,
+        "missing": sorted(theirs.largest - mine.largest),
     }
-    sys.stdout.write(
-        f"{args.folder}: COLMAP {len(theirs.largest)} of {figures['photos']} photos in one model, "
-        f"{theirs.wall_s:.0f} s; ours {len(mine.largest)} in one, {both} of COLMAP's "
-        f"({figures['share']:.1%}), {mine.wall_s:.0f} s; parts {figures['our_groups']}\n"
-    )
-    missing = sorted(theirs.largest - mine.largest)
-    if missing:
-        sys.stdout.write(f"of COLMAP's not in ours: {', '.join(missing)}\n")
     write_figures(args.json, figures)
     return 0
 

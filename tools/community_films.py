@@ -33,7 +33,7 @@ from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
 from tools.film_scripts import six_films
 from tools.film_tracks import JudgedTrack, judge_track, track_figures
-from tools.growth_common import say, table
+from tools.growth_common import say
 from tools.picked import place_by_picks, read_scan
 
 
@@ -58,18 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         figures["placed"] = int(placed)
         tracks = _tracked(database, inputs / "films", work, truth) if placed else []
         figures |= track_figures(tracks)
-        sys.stdout.write(track_table(tracks))
+        say("".join(f"\n{track.film}: {track_figures([track])}" for track in tracks))
     write_figures(args.json, figures)
     return 0
-
-
-def track_table(tracks: Sequence[JudgedTrack]) -> str:
-    """A line for each film."""
-    rows = [
-        (t.film, t.frames, len(t.metres), t.inside, t.foreign, *track_figures([t]).values()) for t in tracks
-    ]
-    head = ("film", "frames", "tracked", "inside", "foreign", *track_figures([]))
-    return table(rows, head) + "\n" if rows else ""
 
 
 def _ingest(database: Path, films: Path, work: Path) -> float:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -26,7 +27,9 @@ def work_folder(kept: Path | None) -> Iterator[Path]:
 
 
 def write_figures(path: Path | None, figures: Mapping[str, Any]) -> None:
-    """Write the figures as JSON; numbers that are not finite become null. Nothing is done without a path."""
+    """Print the figures as JSON, and write them to a path; numbers that are not finite become null."""
+    text = json.dumps(plain(figures), indent=1) + "\n"
+    sys.stdout.write(text)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(plain(figures), indent=1) + "\n", encoding="utf-8")
+        path.write_text(text, encoding="utf-8")

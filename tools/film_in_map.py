@@ -59,7 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as scratch:
         made = film_in_map(args.film, args.work or Path(scratch))
-    sys.stdout.write(f"{made}\n")
     shares = {"mapped_share": made.mapped_share, "tracked_share": made.tracked_share}
     write_figures(args.json, asdict(made) | shares)
     return 0 if made.tracked else 1

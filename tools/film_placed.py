@@ -56,7 +56,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as scratch:
         made = film_placed(args.film, args.work or Path(scratch))
-    sys.stdout.write(f"{made}\n")
     write_figures(args.json, asdict(made))
     return 0
 

@@ -294,8 +294,6 @@ def _cell(value: object) -> str:
 
 def conclude(out: Path, name: str, verdicts: Sequence[Verdict], figures: dict[str, Any]) -> int:
     """Print what holds, write `<name>.json`; 0 if everything holds."""
-    for v in verdicts:
-        sys.stdout.write(f"{'holds' if v.holds else 'FAILS'}  {v.name}: {v.text}\n")
     document = {
         "lines": {v.name: {"figure": v.text, "holds": v.holds} for v in verdicts},
         "figures": figures,

@@ -267,18 +267,19 @@ def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: fl
             print(f"    {name:<28} {distance:.3f} m")
     missing = sorted(reference.keys() - state.centers.keys())
     median = float(np.median(apart)) if len(both) else float("nan")
-    place = np.array(list(reference.values()))
-    print(
-        f"{args.photos.parent.name + '/' + args.photos.name:<22} {args.cut:<12} photos {len(state.photos)}, "
-        f"joint {len(reference)}, grown {len(state.centers)}, of the joint ones {len(both)}; difference "
-        f"median {median:.3f} m, largest {apart.max(initial=0):.3f} m; "
-        f"{'metres by GPS' if metric else 'own scale'}, extent {_extent(place):.0f} m, viewing distance "
-        f"{sim.scale * _viewing_distance(joint):.0f} m; CPU {joint_s:.0f} s joint, {grown_s:.0f} s grown"
-        f"{'; missing ' + ', '.join(missing) if missing else ''}"
-    )
     largest_m = float(apart.max(initial=0))
-    figures = {"photos": len(state.photos), "joint": len(reference), "grown": len(both)}
-    write_figures(args.json, figures | {"missing": len(missing), "median_m": median, "largest_m": largest_m})
+    figures = {
+        "photos": len(state.photos),
+        "joint": len(reference),
+        "grown": len(both),
+        "missing": len(missing),
+        "missing_photos": missing,
+        "median_m": median,
+        "largest_m": largest_m,
+        "joint_cpu_s": joint_s,
+        "grown_cpu_s": grown_s,
+    }
+    write_figures(args.json, figures)
     return 0
 
 

@@ -7,11 +7,10 @@ and `featuredb grow` runs once. After each step photos that nobody contributes (
 ask where they were taken, and the new maps are compared with the truth. When everything has arrived, the
 survey at the far end is ingested and growth runs again.
 
-For each step: active maps, how far coverage reaches, the drift that the maps claim (95 %, against the
-anchor), the bound on Earth (95 %, with what the anchor is uncertain by) beside the true error (length of the
-median error of a map's photos) of the map where the two are closest, the photo that is worst, probes
-answered, their errors, how many lie inside their own 95 % ellipsoid. Writes
-walk.json; everything is kept in DIR, and a run that was
+walk.json has for each step: active maps, how far coverage reaches, the drift that the maps claim (95 %,
+against the anchor), the bound on Earth (95 %, with what the anchor is uncertain by) beside the true error
+(length of the median error of a map's photos) of the map where the two are closest, the photo that is worst,
+probes answered, their errors and how many sigmas these are. Everything is kept in DIR, and a run that was
 interrupted goes on.
 
 Exit code 0 if: coverage follows for at least 600 m (the default budget ends before); the true drift of every
@@ -53,7 +52,6 @@ from tools.growth_common import (
     recording,
     registered,
     say,
-    table,
     tell,
 )
 from tools.worlds.album_files import AlbumFact
@@ -118,7 +116,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         steps.append(take_step(database, album, batch, options))
         log.write_text(json.dumps([asdict(s) for s in steps]) + "\n", encoding="utf-8")
     end, commits = second_anchor(database, album, options, common)
-    sys.stdout.write(step_table(steps))
     figures: dict[str, Any] = {"steps": [asdict(s) for s in steps], "after": asdict(end), "commits": commits}
     return conclude(args.out, "walk", judge(steps, end, commits, args.budget, world), figures)
 
@@ -274,26 +271,6 @@ def judge(
         ),
         none_failed(sum(s.failed for s in (*steps, end))),
     ]
-
-
-def step_table(steps: Sequence[Step]) -> str:
-    rows = []
-    for s in steps:
-        errors = [p.error_m for p in s.probes if p.error_m is not None]
-        inside = sum((p.normalised or 0.0) <= _INSIDE for p in s.probes if p.normalised is not None)
-        rows.append(
-            (
-                s.step + 1, s.reach_m, s.maps, s.quarantined, s.drift_m, s.true_m, s.ratio, s.worst_m,
-                s.stopped,
-                f"{len(errors)}/{len(s.probes)}", float(np.median(errors)) if errors else float("nan"),
-                max(errors, default=float("nan")), f"{inside}/{len(errors)}",
-            )
-        )  # fmt: skip
-    head = (
-        *("step", "reach m", "maps", "held", "claimed m", "true m", "ratio", "photo m", "stopped"),
-        *("probes", "median m", "worst m", "in 95 %"),
-    )
-    return table(rows, head) + "\n"
 
 
 def _along(album: Album, fact: AlbumFact) -> float:

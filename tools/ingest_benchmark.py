@@ -84,7 +84,7 @@ def measured(folder: Path) -> Cost:
             *("-m", "featuredb.cli", "ingest", "photos", str(database), str(folder), "--quiet")
         )
         largest = max(len(one.images) for one in all_maps(database))
-    cost = Cost(
+    return Cost(
         folder=folder.parent.name,
         photos=len(photo_names(folder)),
         colmap_s=colmap_s,
@@ -92,12 +92,6 @@ def measured(folder: Path) -> Cost:
         ours_s=ours_s,
         ours_photos=largest,
     )
-    sys.stdout.write(
-        f"{cost.folder}: COLMAP {cost.colmap_s:.0f} s for {cost.colmap_photos} of {cost.photos} photos, "
-        f"ours {cost.ours_s:.0f} s for {cost.ours_photos}: {cost.ratio:.2f} times\n"
-    )
-    sys.stdout.flush()
-    return cost
 
 
 def _processor_s(*argv: str) -> tuple[float, str]:

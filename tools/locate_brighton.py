@@ -69,7 +69,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     for kind, those in found.items():
         figures |= {f"{kind}_located": len(those)} | miss_figures(kind, those)
     write_figures(args.json, figures)
-    sys.stdout.write("\n".join(f"{name} {value:.4g}" for name, value in figures.items()) + "\n")
     return 0
 
 

@@ -88,7 +88,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     figures = miss_figures("answered", answered) | miss_figures("drawn", drawn)
     figures |= {"refused": refused, "located": len(answered), "draws": len(drawn)}
     write_figures(args.json, figures)
-    sys.stdout.write("\n".join(f"{name} {value:.4g}" for name, value in figures.items()) + "\n")
     return 0
 
 

@@ -54,7 +54,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     with work_folder(args.work) as work:
         control = () if args.gcp is None else ("--gcp", str(args.gcp))
         made = make(work / "db", "photos", args.photos, len(photo_names(args.photos)), control)
-    sys.stdout.write(f"{made}\n")
     write_figures(args.json, asdict(made))
     return 0 if made.maps else 1
 

@@ -65,13 +65,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     unknown = sum(row[5] == "not in the reconstruction" for row in rows)
     lost = sum(row[2] == "lost" for row in rows)
     middle, largest = (np.median(metres), max(metres)) if metres else (np.nan, np.nan)
-    sys.stdout.write(
-        f"{args.photos}: {len(rows)} frames, {lost} lost, {len(metres)} compared: median {middle:.3f} m, "
-        f"largest {largest:.3f} m; {unknown} with a pose that the reconstruction has not; both "
-        f"reconstructions differ by {off_m:.3f} m at the median camera\n"
-    )
     figures = {"frames": len(rows), "lost": lost, "median_m": float(middle), "largest_m": float(largest)}
-    write_figures(args.json, figures | {"unknown": unknown})
+    figures |= {"compared": len(metres), "unknown": unknown, "apart_m": off_m}
+    write_figures(args.json, figures)
     return 0
 
 

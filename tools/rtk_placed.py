@@ -124,9 +124,6 @@ def ingested(database: Path, source: Path, truth: Truth, way: str) -> dict[str, 
     metres, _ = camera_errors(feature_map, truth)
     evidence = feature_map.placement.evidence
     sigma_m = float(np.hypot(evidence["bias_sigma_m"][0], evidence["noise_m"][0]))
-    sys.stdout.write(
-        f"{way}: {placed.status}, {len(metres)} photos, {np.median(metres):.4f} m, sigma {sigma_m:.4f} m\n"
-    )
     return {
         f"{way}_m": float(np.median(metres)),
         f"{way}_active": int(placed.status == "active"),

@@ -81,15 +81,6 @@ def measure(kind: str, strips: Sequence[CameraStrip], seed: int) -> dict[str, fl
                 for level in LEVELS
             },
         }
-        sys.stdout.write(
-            f"{kind} strips {'without' if name else 'with'} angles: {len(scores)} of {len(strips)} placed, "
-            f"{answer} answer, turn {figures[f'{kind}_{name}turn_deg']:.1f} degrees; inside 68 and 95 %: "
-            + "; ".join(
-                f"{part} {inside(scores, part, 0.68):.0%} and {inside(scores, part, 0.95):.0%}"
-                for part in PARTS
-            )
-            + "\n"
-        )
     return figures
 
 

@@ -9,13 +9,8 @@
 3. Each is tracked as `featuredb track` does, with the lens of its camera. --on says by what: the map, or the
    scan alone (from a pose of the first frame that is off by 10 m and 5 degrees).
 
-Prints for each film how many errors lie inside their bounds, over all frames with a pose and over the quarter
-of them with the fewest landmarks; the errors of position and orientation over all frames with a pose, the
-first and the last 200 of them (a half each of fewer than 400), lost frames, what was invented where the film
-shows another town, and how long it took to be found again; with --draw how far a layer that `featuredb draw`
-lays over the film by that track is from where it belongs (tools/drawn_layer.py); frames per second, the
-longest time between two poses, and the machine's load, since a busy machine's speed is not the program's.
-Writes track.json.
+Writes into track.json for each film what `Tracked` says; with --draw how far a layer that `featuredb draw`
+lays over the film by that track is from where it belongs (tools/drawn_layer.py), too.
 """
 
 import argparse
@@ -48,7 +43,7 @@ from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored, featuredb
 from tools.drawn_layer import DrawnMarks, drawn_marks
 from tools.figures import write_figures
-from tools.growth_common import say, table
+from tools.growth_common import say
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
 from tools.worlds.flight_path import PathOptions
 from tools.worlds.scan_world import make_scan_world
@@ -122,8 +117,6 @@ def main(argv: Sequence[str] | None = None) -> int:
                 args.out, film, truth, town_of(options.world), tracked.trajectory, database
             )
             say(f"{name}: {drawn[name]}")
-    head = ("film", *asdict(next(iter(results.values()))))
-    sys.stdout.write(table([(n, *asdict(r).values()) for n, r in results.items()], head) + "\n")
     layers = {f"{name}_layer": asdict(marks) for name, marks in drawn.items()}
     write_figures(args.out / "track.json", {n: asdict(r) for n, r in results.items()} | layers)
     return 0

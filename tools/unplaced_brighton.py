@@ -68,7 +68,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
             placed += [one] if one else []
     figures |= summed(placed, _DRAWS)
-    sys.stdout.write(f"{figures}\n")
     write_figures(args.json, figures)
     return 0
 

@@ -61,7 +61,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             figures |= {f"{name}_{what}": v for what, v in errors(maps[name], frame, poses, move).items()}
     if "loose" in maps:
         figures["bound_m"] = maps["loose"].placement.evidence["growth"]["drift_m"]
-    sys.stdout.write(f"{figures}\n")
     write_figures(args.json, figures)
     return 0
 

@@ -60,7 +60,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "anchored_s": anchored_s,
     }
     write_figures(args.out / "video_map.json", figures)
-    sys.stdout.write(f"{figures}\n")
     return 0
 
 
