@@ -1,6 +1,6 @@
 """The simulated world end to end: photos, scan, anchoring without a person, queries against the truth.
 
-    python -m tools.anchor_simworld [--size short|full] [--seed N] [--work DIR]
+    python -m tools.anchor_simworld [--work DIR]
 
 1. `featuredb simworld --lidar` writes photos whose GPS has a drone's errors, an airborne scan with
    intensities only, an ortho image of another day, and the same of another town at the same place.
@@ -38,11 +38,8 @@ _ROOT = Path(__file__).resolve().parent.parent
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     with work_folder(args.work) as work:
-        inputs = args.inputs or work
-        world = make_scan_world(
-            inputs / f"scan-world-{args.size}-{args.seed}", args.seed, args.size, args.workers
-        )
-        mapped = work / f"mapped-{args.size}-{args.seed}"
+        world = make_scan_world(args.inputs or work)
+        mapped = work / "mapped"
         if not mapped.exists():
             featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
         refused = anchored(work, mapped, world, other=True)[1]
@@ -139,9 +136,6 @@ def featuredb(*words: str, may_refuse: bool = False, refusals: Sequence[int] = (
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = study_parser(__doc__)
-    parser.add_argument("--size", choices=("short", "full"), default="short")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=0, help="processes that render photos; default: cores")
     parser.add_argument("--work", type=Path, default=None, help="keep world, databases and reports there")
     parser.add_argument("--inputs", type=Path, default=None, help="keep the world there, not in --work")
     return parser.parse_args(argv)

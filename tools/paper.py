@@ -33,7 +33,7 @@ from tools.track_evaluation import errors, film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from tools.worlds.scan_world import make_scan_world
 
-_FILM_SEED, _FRAMES = 1, 1200
+_FRAMES = 1200
 _PLACED = "placed.json"  # what came of the film; who starts again goes on from there
 
 
@@ -47,9 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def film(args: argparse.Namespace) -> dict[str, Any]:
     """A film that says nothing of its place, placed by one frame, tracked from end to end."""
     inputs = args.inputs or args.out
-    world = make_scan_world(inputs / f"scan-world-short-{_FILM_SEED}", _FILM_SEED, "short", 0)
-    options = film_options("smooth", "short", _FILM_SEED, _FRAMES)
-    folder = write_film(inputs / f"film-short-{_FILM_SEED}-smooth-{_FRAMES}", options, 0)
+    world = make_scan_world(inputs)
+    folder = write_film(inputs / f"film-smooth-{_FRAMES}", film_options("smooth", _FRAMES))
     truth = read_film_truth(folder)
     work = args.out / "film"
     if not (work / _PLACED).exists():

@@ -1,6 +1,6 @@
 """How right tracked films are: flights over the simulated town, anchored on its scan, against true poses.
 
-    python -m tools.track_evaluation --out DIR [--size full] [--films smooth jerky cut]
+    python -m tools.track_evaluation --out DIR [--films smooth jerky cut]
 
 1. The world of `tools.worlds.scan_world`: `featuredb ingest photos` maps the drone's photos,
    `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
@@ -30,7 +30,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
 from featuredb.lidar.load import load_cloud
 from featuredb.simworld.scoring import pose_difference
-from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.simworld.world import town_of
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from ingest.register.frame_registration import FramePrior
@@ -45,9 +45,10 @@ from tools.drawn_layer import DrawnMarks, drawn_marks
 from tools.figures import write_figures
 from tools.growth_common import say
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
-from tools.worlds.flight_path import PathOptions
-from tools.worlds.scan_world import make_scan_world
+from tools.worlds.flight_path import FlightStyle, PathOptions
+from tools.worlds.scan_world import SCAN_WORLD, make_scan_world
 
+_SEED = 1
 _FILMS = ("smooth", "jerky", "cut")
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
 _END = 200  # frames at each end whose errors are compared; of short films, a half each
@@ -97,15 +98,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.out
-    database = anchored_map(args.out, args.size, args.seed, args.workers, inputs)
+    database = anchored_map(args.out, inputs)
     results: dict[str, Tracked] = {}
     drawn: dict[str, DrawnMarks] = {}
     for name in args.films:
-        options = film_options(name, args.size, args.seed, args.frames)
-        film = inputs / f"film-{args.size}-{args.seed}-{name}-{args.frames}"
-        folder = write_film(film, options, args.workers, _progress(name))
+        options = film_options(name, args.frames)
+        film = inputs / f"film-{name}-{args.frames}"
+        folder = write_film(film, options, 0, _progress(name))
         truth = read_film_truth(folder)
-        finder = finder_on(args.on, database, truth, args.seed)
+        finder = finder_on(args.on, database, truth)
         tracked = track_video(folder / FILM_FILE, finder, camera=truth.camera)
         load = os.getloadavg()[0]
         metres, degrees = errors(tracked, truth)
@@ -122,12 +123,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def anchored_map(out: Path, size: str, seed: int, workers: int, inputs: Path | None = None) -> Path:
-    """A database with the map of the drone's photos, placed on the scan; kept in a folder of `out`."""
-    out = out / f"{size}-{seed}"
-    out.mkdir(parents=True, exist_ok=True)
-    folder = out / "world" if inputs is None else inputs / f"scan-world-{size}-{seed}"
-    world = make_scan_world(folder, seed, size, workers)
+def anchored_map(out: Path, inputs: Path) -> Path:
+    """A database with the map of the drone's photos, placed on the scan; kept in `out`."""
+    world = make_scan_world(inputs)
     done = out / "anchored.txt"
     if not done.exists():
         mapped = out / "mapped"
@@ -139,7 +137,7 @@ def anchored_map(out: Path, size: str, seed: int, workers: int, inputs: Path | N
     return out / done.read_text()
 
 
-def finder_on(what: str, database: Path, truth: FilmTruth, seed: int) -> Finder:
+def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
     """What a film is tracked by: its map, or its scan from a coarse first pose."""
     maps = Localiser.open(Database.open(database)).areas
     if what == "map":
@@ -148,12 +146,12 @@ def finder_on(what: str, database: Path, truth: FilmTruth, seed: int) -> Finder:
     cloud = load_cloud(Database.open(database), truth.frame, scan_ids=[scan.scan_id])
     first = truth.cam_from_local[0]
     assert first is not None
-    return ScanFinder(cloud, scan.scan_id, truth.epsg, coarse_start(first, seed))
+    return ScanFinder(cloud, scan.scan_id, truth.epsg, coarse_start(first))
 
 
-def coarse_start(pose: Rigid3, seed: int) -> FramePrior:
+def coarse_start(pose: Rigid3) -> FramePrior:
     """A pose that is off by 10 m to some side and 5 degrees about some axis, and says so."""
-    rng = np.random.default_rng((seed, 5))
+    rng = np.random.default_rng((_SEED, 5))
     side, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     rotation = so3_exp(np.radians(_START_DEG) * axis) @ pose.rotation
     return FramePrior(
@@ -165,13 +163,12 @@ def coarse_start(pose: Rigid3, seed: int) -> FramePrior:
     )
 
 
-def film_options(name: str, size: str, seed: int, frames: int) -> FilmOptions:
-    world = WorldOptions.short(seed) if size == "short" else WorldOptions(seed=seed)
-    extent = (32.0, 26.0) if size == "short" else PathOptions().half_extent_m
-    path = PathOptions(seed=seed, style="jerky" if name == "jerky" else "smooth", half_extent_m=extent)
+def film_options(name: str, frames: int) -> FilmOptions:
+    style: FlightStyle = "jerky" if name == "jerky" else "smooth"
+    path = PathOptions(seed=_SEED, style=style, half_extent_m=(32.0, 26.0))
     cut = tuple(round(share * frames) for share in _CUT) if name == "cut" else None
     return FilmOptions(
-        world=world,
+        world=SCAN_WORLD,
         path=path,
         frames=frames,
         cut=None if cut is None else (cut[0], cut[1]),
@@ -288,14 +285,11 @@ def _progress(name: str) -> Callable[[int, int], None]:
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("track-evaluation"))
-    parser.add_argument("--size", choices=("short", "full"), default="full")
-    parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=1200)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
     parser.add_argument("--inputs", type=Path, default=None, help="keep world and films there, not in --out")
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
     return parser.parse_args(argv)
 
 

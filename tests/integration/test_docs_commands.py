@@ -238,7 +238,7 @@ def test_commands_are_found_and_joined() -> None:
         ("featuredb maps my.db other.db", False, "unrecognized arguments: other.db"),
         ("uv run --extra gone featuredb maps my.db", False, "no such extra: gone"),
         ("pip install 'featuredb[gone]'", True, "no such extra: gone"),
-        ("python -m tools.growth_community --size gone", False, "invalid choice: 'gone'"),
+        ("python -m tools.track_evaluation --on gone", False, "invalid choice: 'gone'"),
         ("tools/growth_community.py --gone 3", True, "no option --gone"),
         ("tools/gone.py", True, "no file tools/gone.py"),
         ("uv run --extra docs mkdocs gone", True, "gone"),

@@ -13,13 +13,12 @@ _TRACKED = (
 )
 
 
-def _track(film: str, on: str, size: str, frames: int, mean_m: float, minutes: float) -> Row:
+def _track(film: str, on: str, mean_m: float) -> Row:
     return _row(
-        name=f"track-{film}-{on}-{size}-{frames}",
-        claim=f"a {film} film of {frames} frames over the town ({size}), tracked on "
-        + {"map": "its map", "scan": "its scan alone"}[on],
-        commands=f"tools.track_evaluation --out {{work}} --inputs {{cache}} --size {size} --frames {frames} "
-        f"--films {film} --on {on}",
+        name=f"track-{film}-{on}-short-600",
+        claim=f"a {film} film of 600 frames over the town, tracked on its {on} alone",
+        commands=f"tools.track_evaluation --out {{work}} --inputs {{cache}} --frames 600 --films {film} "
+        f"--on {on}",
         json="{work}/track.json",
         figures={name: f"{film}.{name}" for name in _TRACKED.split()},
         text="{lost} of {frames} lost, {invented} invented, mean {mean_m:.3f} m, largest {largest_m:.2f} m; "
@@ -28,7 +27,7 @@ def _track(film: str, on: str, size: str, frames: int, mean_m: float, minutes: f
         "right)",
         limits=f"mean_m <= {mean_m:g}, 0.9 <= few_position_95, 0.9 <= few_orientation_95, largest_m <= 1, "
         "invented <= 0",
-        minutes=minutes,
+        minutes=10,
     )
 
 
@@ -49,11 +48,11 @@ def _films(seed: int) -> Row:
     )
 
 
-def _growth(kind: str, claim: str, more: str = "") -> Row:
+def _growth(kind: str, claim: str) -> Row:
     return _row(
         name=f"growth-{kind}",
         claim=claim,
-        commands=f"tools.growth_{kind} --size short{more} --out {{work}}",
+        commands=f"tools.growth_{kind} --out {{work}}",
         json=f"{{work}}/{kind}.json",
         text="{summary}",
         limits="failed <= 0",
@@ -145,7 +144,7 @@ SIMULATED: tuple[Row, ...] = (
         form="quick",
         claim="films of 150 frames over the town, smooth and with a cut to another town, tracked on its map; "
         "the marks of a GeoJSON layer that `draw` lays over them, against where they belong",
-        commands="tools.track_evaluation --out {work} --inputs {cache} --size short --frames 150 --films "
+        commands="tools.track_evaluation --out {work} --inputs {cache} --frames 150 --films "
         "smooth cut --on map --draw",
         json="{work}/track.json",
         figures={
@@ -168,8 +167,8 @@ SIMULATED: tuple[Row, ...] = (
         "smooth_layer_stray <= 0, cut_layer_stray <= 0, 150 <= smooth_layer_frames",
         minutes=4,
     ),
-    _track("jerky", "map", "short", 600, 0.25, 10),
-    _track("smooth", "scan", "short", 600, 0.20, 10),
+    _track("jerky", "map", 0.25),
+    _track("smooth", "scan", 0.20),
     _row(
         name="film-map",
         claim="a film of 1,200 frames with telemetry becomes a map that is placed on the scan",
@@ -197,11 +196,7 @@ SIMULATED: tuple[Row, ...] = (
     ),
     *(_films(seed) for seed in (1, 2)),
     _growth("community", "48 photos of a small town by twelve people: growth finds their places"),
-    _growth(
-        "poison",
-        "look-alikes, liars and forgers in a small town: nothing wrong is promoted",
-        ' --poison "all together"',
-    ),
+    _growth("poison", "look-alikes, liars and forgers in a small town: nothing wrong is promoted"),
     _growth("walk", "a walk of 270 m from one anchor by contributed photos alone: the bound is true"),
     _row(
         name="studies",

@@ -62,43 +62,25 @@ class PoisonOptions:
     """
 
     seed: int = 4
-    town_size_m: tuple[float, float] = (560.0, 260.0)
+    town_size_m: tuple[float, float] = (400.0, 200.0)
     flight: FlightOptions = field(
         default_factory=lambda: FlightOptions(
-            lines=6, per_line=12, oblique=8, gps_error="rtk", center_m=(-130.0, 0.0)
+            lines=4, per_line=8, oblique=4, width=1200, gps_error="rtk", center_m=(-100.0, 10.0)
         )
     )
-    honest: int = 60
-    late: int = 40
-    canaries: int = 20
-    per_poison: int = 30
-    sights: int = 14
-    width: int = 1440
+    honest: int = 20
+    late: int = 12
+    canaries: int = 6
+    per_poison: int = 10
+    sights: int = 6
+    width: int = 1200
     geotags: GeotagOptions = field(default_factory=lambda: GeotagOptions(sigma_m=15.0, far_share=0.0))
     texel_m: float = 0.06
-    pieces: int = 16
+    pieces: int = 4
 
     def __post_init__(self) -> None:
         if min(self.honest, self.late, self.canaries, self.per_poison) < 0 or self.sights < 1:
             raise InvalidValueError(f"PoisonOptions: value out of range in {self}")
-
-    @classmethod
-    def short(cls, seed: int = 4) -> "PoisonOptions":
-        """A smaller town and a third of the photos, for a first look in minutes."""
-        return cls(
-            seed=seed,
-            town_size_m=(400.0, 200.0),
-            flight=FlightOptions(
-                lines=4, per_line=8, oblique=4, width=1200, gps_error="rtk", center_m=(-100.0, 10.0)
-            ),
-            honest=20,
-            late=12,
-            canaries=6,
-            per_poison=10,
-            sights=6,
-            width=1200,
-            pieces=4,
-        )
 
     def scene(self, key: str) -> Scene:
         """Scenes "home/...", "forged/..." and "away/light/week"."""
