@@ -9,7 +9,6 @@ median distance from the map's cameras to their points, and the angle. Exit code
 
 import csv
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
-from tools.figures import study_parser, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,8 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("film", type=Path)
     parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
     args = parser.parse_args(argv)
-    with tempfile.TemporaryDirectory() as scratch:
-        made = film_in_map(args.film, args.work or Path(scratch))
+    with work_folder(args.work) as work:
+        made = film_in_map(args.film, work)
     shares = {"mapped_share": made.mapped_share, "tracked_share": made.tracked_share}
     write_figures(args.json, asdict(made) | shares)
     return 0 if made.tracked else 1

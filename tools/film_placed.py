@@ -9,7 +9,6 @@ distances between track and telemetry, the radius is that of the track: of the h
 
 import csv
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.store import Database
 from featuredb.video.telemetry import telemetry_of_video
 from tools.anchor_simworld import featuredb
-from tools.figures import study_parser, write_figures
+from tools.figures import study_parser, work_folder, write_figures
 
 _WITHIN = float(chi2.ppf(0.95, 2))
 
@@ -54,8 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("film", type=Path)
     parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
     args = parser.parse_args(argv)
-    with tempfile.TemporaryDirectory() as scratch:
-        made = film_placed(args.film, args.work or Path(scratch))
+    with work_folder(args.work) as work:
+        made = film_placed(args.film, work)
     write_figures(args.json, asdict(made))
     return 0
 

@@ -11,7 +11,6 @@
 Exit code 0.
 """
 
-import json
 import sys
 from collections.abc import Sequence
 
@@ -28,13 +27,12 @@ from reloc.localiser import Localiser
 from reloc.overlay import map_points_in_view
 from reloc.pixels.locate import locate
 from reloc.pixels.surfaces import MapSurface, RaySurface, scan_surface
-from tools import scan_poses
-from tools.anchor_brighton import anchored_on, arguments, read_poses
+from tools.anchor_brighton import anchored_on, arguments
 from tools.figures import work_folder, write_figures
 from tools.locate_pixels import Miss, miss_figures, misses, view_of
 from tools.picked import Scan, read_scan, visible
 from tools.real_photos import ingest
-from tools.unplaced_brighton import camera_of
+from tools.scan_truth import scan_truth
 
 _SEED, _PIXELS = 1, 300  # of each photo
 _NEAR, _REACH_PX = 12, 12.0  # points of the scan around a pixel, and how far they may be
@@ -43,12 +41,8 @@ _ONE_SURFACE_M = 0.3  # between the depths of nine tenths of them
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = arguments(__doc__, argv)
-    if not args.poses.exists():
-        scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
-    frame, poses = read_poses(args.poses)
-    document = json.loads(args.poses.read_text(encoding="utf-8"))
-    camera, epsg = camera_of(document), int(document["crs"].removeprefix("EPSG:"))
-    scan = read_scan(args.scan, frame, epsg)
+    truth = scan_truth(args)
+    scan = read_scan(args.scan, truth.frame, truth.epsg)
     rng = np.random.default_rng(_SEED)
     found: dict[str, list[Miss]] = {"scan": [], "map": []}
     asked = photos = 0
@@ -60,8 +54,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             view = view_of(localiser, (args.photos / name).read_bytes())
             if view is None:
                 continue
-            pixels, places = _truth(scan, camera, poses[name], rng)
-            true = view.frame.enu_from(frame).act(places)
+            pixels, places = _truth(scan, truth.camera, truth.poses[name], rng)
+            true = view.frame.enu_from(truth.frame).act(places)
             asked, photos = asked + len(pixels), photos + 1
             for kind, surface in _surfaces(database, localiser, view).items():
                 found[kind] += misses(view, true, locate(view, surface, pixels))

@@ -219,8 +219,7 @@ REAL: tuple[Row, ...] = (
         name="strip-draws",
         claim="single strips of photos, nine of `brighton` and simulated ones, placed by positions with the "
         "cameras' angles and without",
-        commands=f"tools.scan_poses {SCAN} {BRIGHTON} --poses {{cache}}/brighton_poses.json\n"
-        f"tools.strip_draws --poses {{cache}}/brighton_poses.json --photos {BRIGHTON} --draws 300 {OUT}",
+        commands=f"tools.strip_draws --photos {BRIGHTON} --scan {SCAN} --poses {POSES} --draws 300 {OUT}",
         text="; ".join(_STRIPS.replace("KIND", kind) for kind in ("real", "simulated")),
         limits="1 <= real_answer, real_without_answer <= 0, 0.85 <= simulated_answer, "
         "simulated_without_answer <= 0.05, "
