@@ -28,7 +28,11 @@ SPEED: tuple[Row, ...] = (
         name="ingest-time",
         claim="ingest of `brighton` and `seneca` against COLMAP's own pipeline, processor time of one run",
         commands=f"tools.ingest_benchmark {BRIGHTON} {{data}}/seneca/images {OUT}",
-        figures=same("brighton_ours_s brighton_colmap_s seneca_ours_s seneca_colmap_s"),
+        figures={
+            f"{photos}_{name}": f"{photos}.{name}"
+            for photos in ("brighton", "seneca")
+            for name in ("ratio", "ours_photos", "colmap_photos", "ours_s", "colmap_s")
+        },
         text="{brighton_ratio:.2f} and {seneca_ratio:.2f} times COLMAP's time; {brighton_ours_photos:.0f} "
         "and {seneca_ours_photos:.0f} photos in a map, COLMAP {brighton_colmap_photos:.0f} and "
         "{seneca_colmap_photos:.0f}",

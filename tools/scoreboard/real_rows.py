@@ -180,8 +180,14 @@ REAL: tuple[Row, ...] = (
         name="reichstag-map",
         claim="`reichstag`: 74 photos of one landmark by many people; of those in COLMAP's largest model "
         "(exhaustive, incremental), how many are in our largest map (paper: 7 and 22 % of collections)",
-        commands=f"tools.colmap_baseline {{data}}/reichstag/images --no-positions --work {{cache}}/reichstag "
-        f"{OUT}",
+        commands=f"tools.ingest_benchmark {{data}}/reichstag/images {OUT}",
+        figures={
+            "ours_of_colmap_largest": "reichstag.both",
+            "colmap_largest": "reichstag.colmap_photos",
+            "share": "reichstag.share",
+            "times": "reichstag.ratio",
+            "placed": "reichstag.placed",
+        },
         text="{ours_of_colmap_largest} of {colmap_largest} ({share:.0%}), in {times:.1f} times COLMAP's time",
         limits="0.9 <= share, placed <= 0",
         minutes=15,
