@@ -59,6 +59,7 @@ _STEPS = (225, 200)  # columns, rows between windows
 _HEIGHT_M = 1000.0
 _OFFSET_PX = (-7.0, -2.0)  # columns, rows
 _PRIOR_M, _PRIOR_DEG = 20.0, 5.0
+_EACH = 8  # photos of a folder
 _KINDS = ("window", "mirrored", "elsewhere", "photo")
 _LIMIT_M, _WRONG_M = 1.5, 5.0
 
@@ -127,7 +128,7 @@ def _photos(
         # The picture of one end with the prior in the corner farthest from it, out of the search's reach.
         far = (0 if 2 * c >= w - WINDOW_PX else w - WINDOW_PX, 0 if 2 * r >= h - WINDOW_PX else h - WINDOW_PX)
         yield "elsewhere", *far, cut(c, r)
-    for i, path in enumerate(_foreign(folders, 8)):
+    for i, path in enumerate(_foreign(folders)):
         gray = decode_gray(path)
         scale = 2.2 * WINDOW_PX / max(gray.shape)
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -136,12 +137,12 @@ def _photos(
         yield "photo", c, r, np.ascontiguousarray(gray[y : y + WINDOW_PX, x : x + WINDOW_PX])
 
 
-def _foreign(folders: Sequence[Path], each: int) -> list[Path]:
+def _foreign(folders: Sequence[Path]) -> list[Path]:
     """A few photos of each folder, spread over it."""
     found = []
     for folder in folders:
         photos = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg"))
-        found += photos[:: max(1, len(photos) // each)][:each]
+        found += photos[:: max(1, len(photos) // _EACH)][:_EACH]
     return found
 
 

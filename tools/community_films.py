@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     inputs = (args.inputs or args.work) / f"community-{args.seed}"
     scripts = six_films(args.seed)
-    truth = write_films(inputs / "films", scripts, 0)
+    truth = write_films(inputs / "films", scripts)
     write_truth(inputs / "truth.json", truth)
     work = args.work / f"run-{args.seed}"
     shutil.rmtree(work, ignore_errors=True)

@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from featuredb.features.decode import decode_gray
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import rotation_angle
@@ -30,8 +31,13 @@ from ingest.growth.map_places import drift_m, places_of
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
+from reloc.localise.result import LocaliseResult
+from reloc.localiser import Localiser
+from reloc.service.handler import localise_request
+from reloc.wire.query import LocaliseWireRequest
 from tools.figures import write_figures
 from tools.growth_gates import WRONG_M, recorded
+from tools.worlds.album import PlannedPhoto, write_album
 from tools.worlds.album_files import TABLE_FILES, AlbumFact, read_facts
 
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
@@ -129,14 +135,14 @@ def log_to_stderr(verbose: bool) -> None:
     logging.getLogger("faiss").setLevel(logging.WARNING)
 
 
-def made(write: Callable[..., Path], folder: Path, options: Any) -> "Album":
-    """The album in `folder`, made or finished unless it is complete."""
+def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) -> "Album":
+    """The album of these options in `folder`, made or finished unless it is complete."""
 
     def progress(done: int, total: int) -> None:
         if done % 100 == 0 or done == total:
             say(f"{folder.name}: {done} of {total} photos")
 
-    write(folder, options, progress=progress)
+    write_album(folder, options, partial(plan, options), progress=progress)
     return open_album(folder)
 
 
@@ -256,6 +262,13 @@ def recording(out: Path, album: Album, name: str = "gates") -> AbstractContextMa
         return None if image is None else image.cam_from_local.center
 
     return recorded(out / f"{name}.jsonl", album.truth.frame, true_place)
+
+
+def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
+    """The answer to a photo, asked as a client does that knows nothing but the file."""
+    data = photo.read_bytes()
+    gray = decode_gray(data)
+    return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray))
 
 
 def newest_copy(source: Path, target: Path) -> Database:

@@ -39,7 +39,7 @@ from tools.growth_common import (
     tell,
 )
 from tools.worlds.album_files import AlbumFact
-from tools.worlds.community import CommunityOptions, write_community
+from tools.worlds.community import CommunityOptions, community_album
 
 _OWN = ("street", "drone")
 _FOREIGN = ("other_town", "indoor", "portrait")
@@ -48,7 +48,7 @@ _SHARE, _MEDIAN_M = 0.70, 0.30
 
 def main(argv: Sequence[str] | None = None) -> int:
     out = out_folder(__doc__, argv)
-    album = made(write_community, out / "world", CommunityOptions())
+    album = made(community_album, out / "world", CommunityOptions())
     database = anchored(out / "db", album, "survey")
     everything = album.of(*_OWN, *_FOREIGN, "copy")
     give(database, album, everything)

@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 
-from featuredb.features.decode import decode_gray
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
@@ -39,13 +38,12 @@ from featuredb.store.canaries import KnownPose, add_canary
 from ingest.growing import grow_candidates
 from ingest.growth.trust.promotion import promote_by_hand
 from reloc.localiser import Localiser
-from reloc.service.handler import localise_request
-from reloc.wire.query import LocaliseWireRequest
 from tools.growth_common import (
     GROWING,
     Album,
     Verdict,
     anchored,
+    answer_of,
     conclude,
     failures,
     give,
@@ -58,7 +56,7 @@ from tools.growth_common import (
     say,
     tell,
 )
-from tools.worlds.poison_world import POISONS, PoisonOptions, write_poison
+from tools.worlds.poison_world import POISONS, PoisonOptions, poison_album
 
 _OFF_M, _OFF_SHARE = 1.0, 0.02
 _MOVE_M = 3.0
@@ -91,7 +89,7 @@ class PoisonOutcome:
 
 def main(argv: Sequence[str] | None = None) -> int:
     out, world = out_folder(__doc__, argv), PoisonOptions()
-    album = made(write_poison, out / "world", world)
+    album = made(poison_album, out / "world", world)
     base = honest_base(out / "db", album)
     clean = max(off_shares(base, album, world).values(), default=0.0)
     say(f"honest maps: at most {clean:.2%} of the points {_OFF_M} m off the true surface")
@@ -237,9 +235,7 @@ def answers(database: Database, album: Album) -> dict[str, str]:
     localiser = Localiser.open(database)
     found = {}
     for fact in [*album.of("canary"), *album.of("honest")[:20]]:
-        data = (album.folder / fact.name).read_bytes()
-        gray = decode_gray(data)
-        result = localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray))
+        result = answer_of(localiser, album.folder / fact.name)
         pose = result.pose
         found[fact.name] = repr(
             (

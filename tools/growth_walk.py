@@ -29,13 +29,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from featuredb.features.decode import decode_gray
 from featuredb.store import Database
 from ingest.growing import grow_candidates
 from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localiser import Localiser
-from reloc.service.handler import localise_request
-from reloc.wire.query import LocaliseWireRequest
 from tools.growth_common import (
     GROWING,
     WRONG_M,
@@ -43,6 +40,7 @@ from tools.growth_common import (
     Registered,
     Verdict,
     anchored,
+    answer_of,
     conclude,
     failures,
     give,
@@ -55,7 +53,7 @@ from tools.growth_common import (
     tell,
 )
 from tools.worlds.album_files import AlbumFact
-from tools.worlds.walk_world import WalkOptions, write_walk
+from tools.worlds.walk_world import WalkOptions, plan_walk
 
 _WALK_M = 120.0
 _AFTER_M = 0.3
@@ -101,7 +99,7 @@ class Step:
 
 def main(argv: Sequence[str] | None = None) -> int:
     out = out_folder(__doc__, argv)
-    album = made(write_walk, out / "world", WalkOptions())
+    album = made(plan_walk, out / "world", WalkOptions())
     database = anchored(out / "db", album, "survey")
     log = out / "steps.json"
     steps = _read_steps(log)
@@ -165,15 +163,13 @@ def worst_map(found: Sequence[Registered]) -> tuple[float, float]:
 
 
 def ask_probes(database: Database, album: Album, upto: int, edge: float) -> list[Probe]:
-    """Ask for every probe of the steps so far, as a client does that knows nothing but the file."""
+    """Ask for every probe of the steps so far."""
     localiser = Localiser.open(database)
     probes = []
     for fact in album.of("probe"):
         if fact.batch > upto:
             continue
-        data = (album.folder / fact.name).read_bytes()
-        gray = decode_gray(data)
-        pose = localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray)).pose
+        pose = answer_of(localiser, album.folder / fact.name).pose
         error, normalised = None, None
         if pose is not None:
             true = album.truth.images[fact.name].cam_from_local.center

@@ -143,7 +143,7 @@ def bent(seed: int) -> float | None:
     )
     shown = [scene.seen(pose) for pose in poses]
     with tempfile.TemporaryDirectory() as scratch:
-        model = _model_of(scene, shown, measured, np.array([4.0, 4.0, 10.0]), Path(scratch))
+        model = _model_of(shown, measured, np.array([4.0, 4.0, 10.0]), Path(scratch))
     if model is None or len(model.rows) < len(poses):
         return None
     fit = similarity_closed_form(model.centers(), centers[model.rows])
@@ -257,7 +257,7 @@ def _map_of(scene: LensDraw, poses: Sequence[Rigid3], frame: LocalFrame, sigma_m
     measured = centers + scene.rng.normal(0.0, part, 3) + scene.rng.normal(0.0, part, centers.shape)
     photos = [_photo(k, frame, position, sigma_m) for k, position in enumerate(measured)]
     with tempfile.TemporaryDirectory() as scratch:
-        model = _model_of(scene, shown, measured, np.full(3, sigma_m), Path(scratch))
+        model = _model_of(shown, measured, np.full(3, sigma_m), Path(scratch))
     if model is None:
         return None
     chosen = [photos[row] for row in model.rows]
@@ -303,7 +303,6 @@ def _photo(number: int, frame: LocalFrame, position: FloatArray, sigma_m: float)
 
 
 def _model_of(
-    scene: LensDraw,
     shown: Sequence[tuple[NDArray[np.int64], Features]],
     measured: FloatArray,
     sigmas_m: FloatArray,

@@ -29,7 +29,7 @@ from tools.anchor_simworld import featuredb
 from tools.figures import write_figures
 from tools.made_maps import bare_film, make
 from tools.picked import Seen, place_by_picks, read_scan
-from tools.track_evaluation import errors, film_options
+from tools.track_evaluation import axis_errors, film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from tools.worlds.scan_world import make_scan_world
 
@@ -61,7 +61,8 @@ def film(args: argparse.Namespace) -> dict[str, Any]:
     areas = Localiser.open(Database.open(work / "db")).areas
     camera = feature_map.cameras[0].scaled_to(truth.camera.width, truth.camera.height)
     tracked = track_video(work / FILM_FILE, MapFinder(areas), camera=camera)
-    metres, _ = errors(tracked, truth)
+    off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
+    metres = np.linalg.norm(off[:, 3:], axis=1)
     figures = track_figures(metres) | {"placed": 1, "keyframes": made["keyframes"], "made_s": made["made_s"]}
     figures["adjusted_m"] = from_keyframes(tracked, feature_map)
     figures["rate_hz"] = len(metres) / tracked.seconds.total

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from featuredb.features.decode import decode_gray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.negatives import NEGATIVE_KINDS
 from featuredb.simworld.scoring import PoseError, pose_error, summarise
@@ -26,10 +25,9 @@ from featuredb.store import Database
 from ingest.demo import ingest_world, make_world
 from reloc.localise.result import LocalisedPose
 from reloc.localiser import Localiser
-from reloc.service.handler import localise_request
-from reloc.wire.query import LocaliseWireRequest
 from tools.calibration import inside_over_placements
 from tools.figures import study_parser, write_figures
+from tools.growth_common import answer_of
 
 _DRAWS = 300  # of placements
 
@@ -86,10 +84,7 @@ def ask_world(world: World, localiser: Localiser) -> list[Asked]:
 
 
 def _ask(world: World, localiser: Localiser, group: str, path: Path) -> Asked:
-    """As a client asks that knows nothing but the file."""
-    data = path.read_bytes()
-    gray = decode_gray(data)
-    pose = localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray)).pose
+    pose = answer_of(localiser, path).pose
     name = path.relative_to(world.folder).as_posix()
     true = world.truth.images.get(name)
     if pose is None or true is None:

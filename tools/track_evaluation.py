@@ -29,7 +29,6 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
 from featuredb.lidar.load import load_cloud
-from featuredb.simworld.scoring import pose_difference
 from featuredb.simworld.world import town_of
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
@@ -109,9 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         finder = finder_on(args.on, database, truth)
         tracked = track_video(folder / FILM_FILE, finder, camera=truth.camera)
         load = os.getloadavg()[0]
-        metres, degrees = errors(tracked, truth)
-        off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
-        results[name] = judge_film(tracked, truth, metres, degrees, off, load)
+        results[name] = judge_film(tracked, truth, load)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
         if args.draw:
             drawn[name] = drawn_marks(
@@ -175,23 +172,6 @@ def film_options(name: str, frames: int) -> FilmOptions:
     )
 
 
-def errors(tracked: TrackedVideo, truth: FilmTruth) -> tuple[FloatArray, FloatArray]:
-    """Metres and degrees (n,) of every frame that shows the town; NaN without a pose, inf where invented."""
-    metres, degrees = np.full(len(truth.times_s), np.nan), np.full(len(truth.times_s), np.nan)
-    for point in tracked.trajectory.points:
-        if point.pose is None:
-            continue
-        true = truth.cam_from_local[point.index]
-        if true is None:
-            metres[point.index] = degrees[point.index] = np.inf
-            continue
-        off = pose_difference(
-            truth.frame, true, point.pose.epsg, point.pose.utm, point.pose.cam_from_utm_xyzw
-        )
-        metres[point.index], degrees[point.index] = off.position_m, off.angle_deg
-    return metres, degrees
-
-
 def axis_errors(
     trajectory: Trajectory, frame: LocalFrame, cam_from_local: Sequence[Rigid3 | None]
 ) -> FloatArray:
@@ -208,17 +188,10 @@ def axis_errors(
     return off
 
 
-def judge_film(
-    tracked: TrackedVideo,
-    truth: FilmTruth,
-    metres: FloatArray,
-    degrees: FloatArray,
-    off: FloatArray,
-    load: float,
-) -> Tracked:
-    """Args:
-    metres, degrees: of `errors`. off: of `axis_errors`.
-    """
+def judge_film(tracked: TrackedVideo, truth: FilmTruth, load: float) -> Tracked:
+    """The film's track against its truth; load: of the machine."""
+    off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
+    metres = np.linalg.norm(off[:, 3:], axis=1)
     known = np.isfinite(metres)
     if not known.any():
         raise SystemExit(f"track_evaluation: no frame of {tracked.trajectory.source} has a pose")
@@ -227,11 +200,11 @@ def judge_film(
     return Tracked(
         frames=int(truth.at_home.sum()),
         lost=int((truth.at_home & np.isnan(metres)).sum()),
-        invented=int(np.isinf(metres).sum()),
+        invented=sum(p.pose is not None for p in tracked.trajectory.points) - int(known.sum()),
         mean_m=float(m.mean()),
         p95_m=float(np.quantile(m, 0.95)),
         largest_m=float(m.max()),
-        mean_deg=float(degrees[known].mean()),
+        mean_deg=float(np.degrees(np.linalg.norm(off[known, :3], axis=1)).mean()),
         first_m=float(m[:end].mean()),
         last_m=float(m[-end:].mean()),
         found_s=_found_s(truth, known),

@@ -7,7 +7,6 @@ other_town; copy (a re-upload by somebody else); indoor, portrait (belong nowher
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto, Progress, Subject, write_album
+from tools.worlds.album import PlannedPhoto, Subject
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
@@ -101,20 +100,10 @@ def _base(options: CommunityOptions, town: str) -> Scene:
     )
 
 
-def write_community(
-    folder: Path, options: CommunityOptions, workers: int = 0, progress: Progress | None = None
-) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
-
-    def plan() -> list[PlannedPhoto]:
-        survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
-        return survey + plan_community(options)
-
-    return write_album(folder, options, plan, workers, progress)
+def community_album(options: CommunityOptions) -> list[PlannedPhoto]:
+    """All photos."""
+    survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
+    return survey + plan_community(options)
 
 
 def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:

@@ -17,7 +17,6 @@ stands there mirrored. Kinds of photos:
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +25,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto, Progress, write_album
+from tools.worlds.album import PlannedPhoto
 from tools.worlds.album_files import Geotag
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
@@ -169,20 +168,10 @@ def _covers(outer: Rect, block: Rect) -> bool:
     return outer[0] <= x <= outer[2] and outer[1] <= y <= outer[3]
 
 
-def write_poison(
-    folder: Path, options: PoisonOptions, workers: int = 0, progress: Progress | None = None
-) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
-
-    def plan() -> list[PlannedPhoto]:
-        survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
-        return survey + plan_poison(options)
-
-    return write_album(folder, options, plan, workers, progress)
+def poison_album(options: PoisonOptions) -> list[PlannedPhoto]:
+    """All photos."""
+    survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
+    return survey + plan_poison(options)
 
 
 def plan_poison(options: PoisonOptions) -> list[PlannedPhoto]:

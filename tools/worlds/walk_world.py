@@ -7,8 +7,7 @@ survey_far/. Kinds: survey, survey_far, walk, probe.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import lru_cache
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import make_town
-from tools.worlds.album import PlannedPhoto, Progress, write_album
+from tools.worlds.album import PlannedPhoto
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.geotags import geotag_at
 from tools.worlds.people import Person, community
@@ -100,17 +99,6 @@ def _base(options: WalkOptions) -> Scene:
         texel_m=options.texel_m,
         pieces=options.pieces,
     )
-
-
-def write_walk(
-    folder: Path, options: WalkOptions, workers: int = 0, progress: Progress | None = None
-) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
-    return write_album(folder, options, partial(plan_walk, options), workers, progress)
 
 
 def plan_walk(options: WalkOptions) -> list[PlannedPhoto]:
