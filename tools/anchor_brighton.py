@@ -1,6 +1,7 @@
 """Photos and a scan end to end: a map placed by GPS is anchored on the scan; held-out photos judge it.
 
-    python -m tools.anchor_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --held-out A.JPG ...
+    python -m tools.anchor_brighton --photos FOLDER --scan SCAN.laz --poses poses.json \\
+        --work FOLDER --held-out A.JPG ...
 
 1. `featuredb ingest photos` makes a map of all photos but the held-out ones.
 2. `featuredb lidar add` adds the scan; `featuredb anchor --auto` places the map by it.
@@ -23,7 +24,7 @@ from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
-from tools.figures import work_folder, write_figures
+from tools.figures import write_figures
 from tools.real_photos import ask_poses, error_figures, ingest
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
@@ -31,17 +32,17 @@ from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 def main(argv: Sequence[str] | None = None) -> int:
     args = arguments(__doc__, argv)
     truth = scan_truth(args)
-    with work_folder(args.work) as work:
-        database = work / "anchored"
-        ingest(database, args.photos, args.held_out)
-        shape = by_gps(Database.open(database), truth)
-        sys.stdout.write("before, placed by GPS\n")
-        before = ask_poses(Database.open(database), args.photos, args.held_out, truth.frame, truth.poses)
-        sys.stdout.write("".join(f"{row}\n" for row in before))
-        anchored = anchored_on(database, args.scan, args.photos, work / "anchor")
-        sys.stdout.write("after, anchored on the scan\n")
-        after = ask_poses(anchored, args.photos, args.held_out, truth.frame, truth.poses)
-        sys.stdout.write("".join(f"{row}\n" for row in after))
+    work: Path = args.work
+    database = work / "anchored"
+    ingest(database, args.photos, args.held_out)
+    shape = by_gps(Database.open(database), truth)
+    sys.stdout.write("before, placed by GPS\n")
+    before = ask_poses(Database.open(database), args.photos, args.held_out, truth.frame, truth.poses)
+    sys.stdout.write("".join(f"{row}\n" for row in before))
+    anchored = anchored_on(database, args.scan, args.photos, work / "anchor")
+    sys.stdout.write("after, anchored on the scan\n")
+    after = ask_poses(anchored, args.photos, args.held_out, truth.frame, truth.poses)
+    sys.stdout.write("".join(f"{row}\n" for row in after))
     figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
     write_figures(args.json, figures | shape)
     return 0
@@ -80,7 +81,7 @@ def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
 
 def arguments(doc: str | None, argv: Sequence[str] | None) -> argparse.Namespace:
     """What studies of photos held out of a set with a scan are told; `doc`: of the program's module."""
-    parser = scan_parser(doc)
+    parser = scan_parser(doc, "--work")
     parser.add_argument("--held-out", nargs="+", required=True, metavar="NAME")
     return parser.parse_args(argv)
 

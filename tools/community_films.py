@@ -102,11 +102,7 @@ def _tracked(database: Path, films: Path, work: Path, truth: FilmsTruth) -> list
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument(
-        "--work", type=Path, required=True, help="databases, reports and tracks are kept there"
-    )
-    parser.add_argument("--inputs", type=Path, default=None, help="keep films and scan there, not in --work")
+    parser = study_parser(__doc__, "--work", "--inputs")
     parser.add_argument("--seed", type=int, default=1, help="of town, flights and picks")
     return parser.parse_args(argv)
 

@@ -1,6 +1,6 @@
 """A film with telemetry becomes a map with a place; its track is compared with the telemetry itself.
 
-    python -m tools.film_placed FILM.mp4 [--work FOLDER]
+    python -m tools.film_placed FILM.mp4 --work FOLDER
 
 `featuredb ingest video`, then `featuredb track` by the map. The receiver's own noise is part of the
 distances between track and telemetry, the radius is that of the track: of the horizontal ellipse that holds
@@ -21,7 +21,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.store import Database
 from featuredb.video.telemetry import telemetry_of_video
 from tools.anchor_simworld import featuredb
-from tools.figures import study_parser, work_folder, write_figures
+from tools.figures import study_parser, write_figures
 
 _WITHIN = float(chi2.ppf(0.95, 2))
 
@@ -49,12 +49,10 @@ class FilmPlaced:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
+    parser = study_parser(__doc__, "--work")
     parser.add_argument("film", type=Path)
-    parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
     args = parser.parse_args(argv)
-    with work_folder(args.work) as work:
-        made = film_placed(args.film, work)
+    made = film_placed(args.film, args.work)
     write_figures(args.json, asdict(made))
     return 0
 

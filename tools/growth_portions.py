@@ -284,10 +284,8 @@ def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: fl
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, required=True, help="folder of photos")
+    parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
-    parser.add_argument("--work", type=Path, required=True, help="work folder; features and matches are kept")
     parser.add_argument("-v", "--verbose", action="store_true", help="one line a photo")
     parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
     return parser.parse_args(argv)

@@ -219,9 +219,8 @@ def _database(folder: Path, work: Path) -> Path:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
+    parser = study_parser(__doc__, "--work")
     parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
-    parser.add_argument("--work", type=Path, required=True, help="databases are kept there")
     return parser.parse_args(argv)
 
 

@@ -1,6 +1,7 @@
 """What is at a pixel of a real photo: places on the scan, and by the map alone, against the scan's own poses.
 
-    python -m tools.locate_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --held-out A.JPG ...
+    python -m tools.locate_brighton --photos FOLDER --scan SCAN.laz --poses poses.json \\
+        --work FOLDER --held-out A.JPG ...
 
 1. A map of all photos but the held-out ones is anchored on the scan (tools/anchor_brighton.py).
 2. Each held-out photo is localised; pixels at random are located on the scan, and on the map's own points.
@@ -28,7 +29,7 @@ from reloc.overlay import map_points_in_view
 from reloc.pixels.locate import locate
 from reloc.pixels.surfaces import MapSurface, RaySurface, scan_surface
 from tools.anchor_brighton import anchored_on, arguments
-from tools.figures import work_folder, write_figures
+from tools.figures import write_figures
 from tools.locate_pixels import Miss, miss_figures, misses, view_of
 from tools.picked import Scan, read_scan, visible
 from tools.real_photos import ingest
@@ -46,19 +47,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     rng = np.random.default_rng(_SEED)
     found: dict[str, list[Miss]] = {"scan": [], "map": []}
     asked = photos = 0
-    with work_folder(args.work) as work:
-        ingest(work / "db", args.photos, args.held_out)
-        database = anchored_on(work / "db", args.scan, args.photos, work / "anchor")
-        localiser = Localiser.open(database)
-        for name in args.held_out:
-            view = view_of(localiser, (args.photos / name).read_bytes())
-            if view is None:
-                continue
-            pixels, places = _truth(scan, truth.camera, truth.poses[name], rng)
-            true = view.frame.enu_from(truth.frame).act(places)
-            asked, photos = asked + len(pixels), photos + 1
-            for kind, surface in _surfaces(database, localiser, view).items():
-                found[kind] += misses(view, true, locate(view, surface, pixels))
+    made = args.work / "db"
+    ingest(made, args.photos, args.held_out)
+    database = anchored_on(made, args.scan, args.photos, args.work / "anchor")
+    localiser = Localiser.open(database)
+    for name in args.held_out:
+        view = view_of(localiser, (args.photos / name).read_bytes())
+        if view is None:
+            continue
+        pixels, places = _truth(scan, truth.camera, truth.poses[name], rng)
+        true = view.frame.enu_from(truth.frame).act(places)
+        asked, photos = asked + len(pixels), photos + 1
+        for kind, surface in _surfaces(database, localiser, view).items():
+            found[kind] += misses(view, true, locate(view, surface, pixels))
     figures = {"photos": photos, "asked": asked}
     for kind, those in found.items():
         figures |= {f"{kind}_located": len(those)} | miss_figures(kind, those)

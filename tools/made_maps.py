@@ -1,6 +1,6 @@
 """What becomes of a folder of photos whose positions nobody knows: maps, and photos in them.
 
-    python -m tools.made_maps --photos FOLDER [--gcp FILE]
+    python -m tools.made_maps --photos FOLDER --work FOLDER [--gcp FILE]
 
 The folder is ingested into a new database.
 Prints how many photos are in the largest map, in any map, and in how many, placed or not, and
@@ -23,7 +23,7 @@ from featuredb.features.jpeg_segments import EXIF_PREFIX, with_app1
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
-from tools.figures import study_parser, work_folder, write_figures
+from tools.figures import study_parser, write_figures
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 _GPS_IFD = 34853
@@ -50,9 +50,8 @@ class Made:
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    with work_folder(args.work) as work:
-        control = () if args.gcp is None else ("--gcp", str(args.gcp))
-        made = make(work / "db", "photos", args.photos, len(photo_names(args.photos)), control)
+    control = () if args.gcp is None else ("--gcp", str(args.gcp))
+    made = make(args.work / "db", "photos", args.photos, len(photo_names(args.photos)), control)
     write_figures(args.json, asdict(made))
     return 0 if made.maps else 1
 
@@ -113,10 +112,8 @@ def without_position(jpeg: bytes) -> bytes:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, metavar="FOLDER", required=True)
+    parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--gcp", type=Path, default=None, metavar="FILE", help="control points of the photos")
-    parser.add_argument("--work", type=Path, default=None, help="keep the database there")
     return parser.parse_args(argv)
 
 

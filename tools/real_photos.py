@@ -1,6 +1,6 @@
 """Real photos end to end: some are held out, localised over Zenoh, and compared with a map of all photos.
 
-    python -m tools.real_photos --photos FOLDER --held-out DJI_0020.JPG DJI_0025.JPG
+    python -m tools.real_photos --photos FOLDER --work FOLDER --held-out DJI_0020.JPG DJI_0025.JPG
 
 1. `featuredb ingest photos` takes all photos but the held-out ones, in a process and a database of its own.
 2. The same takes all photos, into another database: what its map says of the held-out ones is the reference.
@@ -32,7 +32,8 @@ from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
-from tools.figures import study_parser, work_folder, write_figures
+from tools.figures import study_parser, write_figures
+from tools.made_maps import photo_names
 
 _ROOT = Path(__file__).resolve().parent.parent
 _EVERY = 5  # without --held-out, one photo in so many is held out
@@ -73,12 +74,12 @@ class HeldOutRow:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     held_out = tuple(args.held_out) or every_nth(args.photos)
-    with work_folder(args.work) as work:
-        part = ingest(work / "part", args.photos, held_out)
-        sys.stdout.write(f"{part}\n")
-        whole = ingest(work / "whole", args.photos, ())
-        sys.stdout.write(f"{whole}\n")
-        rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
+    work: Path = args.work
+    part = ingest(work / "part", args.photos, held_out)
+    sys.stdout.write(f"{part}\n")
+    whole = ingest(work / "whole", args.photos, ())
+    sys.stdout.write(f"{whole}\n")
+    rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
     sys.stdout.write("".join(f"{row}\n" for row in rows))
     write_figures(
         args.json,
@@ -89,8 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def every_nth(folder: Path) -> tuple[str, ...]:
     """Names of every fifth photo of the folder."""
-    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
-    return tuple(names[_EVERY // 2 :: _EVERY])
+    return tuple(photo_names(folder)[_EVERY // 2 :: _EVERY])
 
 
 def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None) -> Ingest:
@@ -104,6 +104,7 @@ def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | No
     """
     if database.exists():
         raise SystemExit(f"{database} is there already; a map is made from nothing there")
+    database.parent.mkdir(parents=True, exist_ok=True)
     report = database.with_name(f"{database.name}-report")
     command = [sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)]
     command += ["--quiet", "--report", str(report), *(f"--exclude={name}" for name in exclude)]
@@ -208,12 +209,10 @@ def _children_cpu_s() -> float:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
+    parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument(
         "--held-out", nargs="+", default=[], metavar="NAME", help=f"default: every {_EVERY}th photo"
     )
-    parser.add_argument("--work", type=Path, default=None, help="keep both databases and reports there")
     return parser.parse_args(argv)
 
 

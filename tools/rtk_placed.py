@@ -49,10 +49,7 @@ _POINTS, _MARK_PX = 9, 0.5
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--inputs", type=Path, default=None, help="keep the photos there, not in --work")
-    args = parser.parse_args(argv)
+    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
     flight = FlightOptions(lines=3, per_line=5, oblique=3, width=1024)
     options = replace(WorldOptions.short(_SEED), flight=flight, queries=0, street=0, negatives_per_kind=0)
     inputs = (args.inputs or args.work) / f"rtk-flight-{_SEED}"

@@ -24,13 +24,10 @@ class ScanTruth:
     poses: dict[str, Rigid3]
 
 
-def scan_parser(doc: str | None) -> argparse.ArgumentParser:
-    """What studies of photos with a scan are told; `doc`: of the program's module."""
-    parser = study_parser(doc)
-    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
+def scan_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
+    """What studies of photos with a scan are told; arguments as those of `study_parser`."""
+    parser = study_parser(doc, "--photos", "--scan", *shared)
     parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
-    parser.add_argument("--work", type=Path, default=None, help="keep databases and reports there")
     return parser
 
 

@@ -1,6 +1,6 @@
 """A map without a place, placed on a scan by six picks in one photo: how often, and how right?
 
-    python -m tools.unplaced_brighton --photos FOLDER --scan SCAN.laz --poses poses.json
+    python -m tools.unplaced_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --work FOLDER
 
 1. The photos but the held-out ones, without any position, become one map without a place.
 2. Each draw picks six points of the scan in one photo of the map, with the given error in pixels, and
@@ -22,7 +22,7 @@ import numpy as np
 
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
-from tools.figures import work_folder, write_figures
+from tools.figures import write_figures
 from tools.made_maps import copied, make, photo_names
 from tools.picked import Scan, picks, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
@@ -36,29 +36,29 @@ _SIGMA_PX = 3.0  # of a pick, each axis
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = scan_parser(__doc__).parse_args(argv)
+    args = scan_parser(__doc__, "--work").parse_args(argv)
     truth = scan_truth(args)
     scan = read_scan(args.scan, truth.frame, truth.epsg)
     names = [name for name in photo_names(args.photos) if name not in _HELD_OUT]
     figures: dict[str, object] = {"photos": len(names), "draws": _DRAWS}
     placed: list[dict[str, float]] = []
-    with work_folder(args.work) as work:
-        if not (work / _MADE).exists():
-            photos = copied(args.photos, names, work / "photos", strip=True)
-            copied(args.photos, _HELD_OUT, work / "asked", strip=True)
-            made = make(work / "db", "photos", photos, len(names))
-            featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
-            write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
-        figures |= json.loads((work / _MADE).read_text(encoding="utf-8"))
-        (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
-        for number in range(_DRAWS):
-            done = work / f"draw-{number}.json"
-            if not done.exists():
-                judgement = _draw(number, work, summary.map_id, scan, truth)
-                done.write_text(json.dumps(judgement), encoding="utf-8")
-            one = json.loads(done.read_text(encoding="utf-8"))
-            sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
-            placed += [one] if one else []
+    work: Path = args.work
+    if not (work / _MADE).exists():
+        photos = copied(args.photos, names, work / "photos", strip=True)
+        copied(args.photos, _HELD_OUT, work / "asked", strip=True)
+        made = make(work / "db", "photos", photos, len(names))
+        featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
+        write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
+    figures |= json.loads((work / _MADE).read_text(encoding="utf-8"))
+    (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
+    for number in range(_DRAWS):
+        done = work / f"draw-{number}.json"
+        if not done.exists():
+            judgement = _draw(number, work, summary.map_id, scan, truth)
+            done.write_text(json.dumps(judgement), encoding="utf-8")
+        one = json.loads(done.read_text(encoding="utf-8"))
+        sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
+        placed += [one] if one else []
     figures |= summed(placed, _DRAWS)
     write_figures(args.json, figures)
     return 0

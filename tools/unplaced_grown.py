@@ -25,7 +25,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
-from tools.figures import work_folder, write_figures
+from tools.figures import write_figures
 from tools.made_maps import copied, photo_names
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
@@ -33,11 +33,10 @@ _STRANGE = 10
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = scan_parser(__doc__)
+    parser = scan_parser(__doc__, "--work")
     parser.add_argument("--strange", type=Path, required=True, metavar="FOLDER", help="photos of elsewhere")
     args = parser.parse_args(argv)
-    with work_folder(args.work) as work:
-        write_figures(args.json, grown(args, work))
+    write_figures(args.json, grown(args, args.work))
     return 0
 
 

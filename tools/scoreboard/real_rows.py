@@ -62,7 +62,7 @@ REAL: tuple[Row, ...] = (
         name="brighton-held-out",
         form="quick",
         claim="`brighton`: 14 of 18 photos become a map; the 4 others over Zenoh, against a map of all 18",
-        commands=f"tools.real_photos --photos {BRIGHTON} --held-out {HELD_OUT} {OUT}",
+        commands=f"tools.real_photos --photos {BRIGHTON} --held-out {HELD_OUT} --work {{work}}/maps {OUT}",
         text="{registered} of {usable} in {ingest_s:.0f} s; " + ANSWERS,
         limits="14 <= registered, 4 <= answered, largest_m <= 1, largest_deg <= 0.5",
         readme=True,
@@ -74,7 +74,7 @@ REAL: tuple[Row, ...] = (
         claim="`brighton` anchored on its scan without a person; the 4 others over Zenoh, against poses that "
         "the scan alone gives",
         commands=f"tools.anchor_brighton --photos {BRIGHTON} --scan {SCAN} "
-        f"--poses {POSES} --held-out {HELD_OUT} {OUT}",
+        f"--poses {POSES} --held-out {HELD_OUT} --work {{work}}/maps {OUT}",
         figures=ERRORS,
         text=ANSWERS + " (by GPS {before_median_m:.1f} m; its focal length {gps_focal_px:.0f} px, known to "
         "{gps_focal_sigma:.1%}, the scan's {scan_focal_px:.0f}; cameras {gps_shape_m:.3f} m off after a "
@@ -88,7 +88,7 @@ REAL: tuple[Row, ...] = (
         claim="`brighton` anchored on its scan: pixels of the 4 others, located on the scan and by the map "
         "alone, against the scan's points that they show from poses that the scan alone gives",
         commands=f"tools.locate_brighton --photos {BRIGHTON} --scan {SCAN} "
-        f"--poses {POSES} --held-out {HELD_OUT} {OUT}",
+        f"--poses {POSES} --held-out {HELD_OUT} --work {{work}}/maps {OUT}",
         figures=same("scan_edges scan_edge_95"),
         text="of {asked} pixels {scan_located} on the scan, median {scan_median_m:.3f} m, 95 % off edges "
         "within {scan_clear_95_m:.3f} m, {scan_68:.0%} and {scan_95:.1%} inside 68 and 95 % bounds; "
@@ -100,7 +100,7 @@ REAL: tuple[Row, ...] = (
     _row(
         name="lewis-held-out",
         claim="`lewis`: every fifth of 55 oblique photos is held out, against a map of all",
-        commands=f"tools.real_photos --photos {{data}}/lewis/images {OUT}",
+        commands=f"tools.real_photos --photos {{data}}/lewis/images --work {{work}}/maps {OUT}",
         figures=ERRORS,
         text="{registered} of {usable} in {ingest_s:.0f} s; " + ANSWERS,
         limits="40 <= registered, median_m <= 1",
