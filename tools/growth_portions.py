@@ -1,6 +1,6 @@
 """Real photos in three portions: a first map, the others added by growth, compared with all at once.
 
-    uv run python tools/growth_portions.py --photos FOLDER --cut interleaved --work WORK
+    python -m tools.growth_portions --photos FOLDER --cut interleaved --work WORK
 
 1. Joint: all photos are reconstructed at once. The largest reconstruction is the reference.
 2. Portions: the photos, sorted by name, are cut into three, by turns (interleaved) or one after the other
@@ -13,7 +13,7 @@
    metre is a hundredth of the extent of the camera centres (diagonal of their box), and the drift budget,
    which is in metres, is left out.
 
-Prints one line a photo with -v, and one line a set.
+Prints one line a photo with -v.
 """
 
 import argparse

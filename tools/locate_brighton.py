@@ -8,8 +8,6 @@
 3. The truth of a pixel: the points of the scan file that it shows from the pose, and with the lens, of
    tools/scan_poses.py. That pose comes of the photo and the scan alone, by code that shares nothing with map,
    anchoring, localisation and renderer. Pixels whose nearest points lie at several depths have no truth.
-
-Exit code 0.
 """
 
 import sys

@@ -7,8 +7,6 @@
 3. Bounds: poses and lenses are drawn around the truth as each answer's covariance says, and pixels located
    from them. So the bounds are tested by themselves: one map has one error, which is in all of its answers.
    What the scan's strips are off by is stated, as from a data sheet.
-
-Exit code 0.
 """
 
 import sys
