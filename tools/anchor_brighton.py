@@ -1,6 +1,7 @@
 """Photos and a scan end to end: a map placed by GPS is anchored on the scan; held-out photos judge it.
 
-    python -m tools.anchor_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --held-out A.JPG ...
+    python -m tools.anchor_brighton --photos FOLDER --scan SCAN.laz --poses poses.json \\
+        --work FOLDER --held-out A.JPG ...
 
 1. `featuredb ingest photos` makes a map of all photos but the held-out ones.
 2. `featuredb lidar add` adds the scan; `featuredb anchor --auto` places the map by it.
@@ -13,46 +14,37 @@
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
-from tools import scan_poses
 from tools.anchor_simworld import featuredb
-from tools.figures import study_parser, work_folder, write_figures
-from tools.real_photos import ask_poses, error_figures, ingest, table
+from tools.figures import write_figures
+from tools.real_photos import ask_poses, error_figures, ingest
+from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = arguments(__doc__, argv)
-    if not args.poses.exists():
-        scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
-    frame, poses = read_poses(args.poses)
-    with work_folder(args.work) as work:
-        database = work / "anchored"
-        ingest(database, args.photos, args.held_out)
-        shape = by_gps(Database.open(database), frame, args.poses)
-        sys.stdout.write("before, placed by GPS\n")
-        before = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
-        sys.stdout.write(table(before) + "\n")
-        anchored = anchored_on(database, args.scan, args.photos, work / "anchor")
-        sys.stdout.write("after, anchored on the scan\n")
-        after = ask_poses(anchored, args.photos, args.held_out, frame, poses)
-        sys.stdout.write(table(after) + "\n")
+    truth = scan_truth(args)
+    work: Path = args.work
+    database = work / "anchored"
+    ingest(database, args.photos, args.held_out)
+    shape = by_gps(Database.open(database), truth)
+    sys.stdout.write("before, placed by GPS\n")
+    before = ask_poses(Database.open(database), args.photos, args.held_out, truth.frame, truth.poses)
+    sys.stdout.write("".join(f"{row}\n" for row in before))
+    anchored = anchored_on(database, args.scan, args.photos, work / "anchor")
+    sys.stdout.write("after, anchored on the scan\n")
+    after = ask_poses(anchored, args.photos, args.held_out, truth.frame, truth.poses)
+    sys.stdout.write("".join(f"{row}\n" for row in after))
     figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
     write_figures(args.json, figures | shape)
-    sys.stdout.write(
-        f"by GPS: focal length {shape['gps_focal_px']:.0f} px +- {shape['gps_focal_sigma']:.1%} "
-        f"(scan {shape['scan_focal_px']:.0f}), cameras {shape['gps_shape_m']:.3f} m off after a similarity\n"
-    )
     return 0
 
 
@@ -65,34 +57,18 @@ def anchored_on(database: Path, scan: Path, photos: Path, out: Path) -> Database
     return Database.open(database)
 
 
-def read_poses(path: Path) -> tuple[LocalFrame, dict[str, Rigid3]]:
-    """The frame and the poses that tools/scan_poses.py wrote."""
-    document = json.loads(path.read_text(encoding="utf-8"))
-    easting, northing, height = document["origin"]
-    frame = LocalFrame.from_utm(easting, northing, height, int(document["crs"].removeprefix("EPSG:")))
-    poses = {
-        name: Rigid3(
-            rotation=np.array(entry["cam_from_local_rotation"]),
-            translation=np.array(entry["cam_from_local_translation"]),
-        )
-        for name, entry in document["poses"].items()
-    }
-    return frame, poses
-
-
-def by_gps(database: Database, frame: LocalFrame, poses: Path) -> dict[str, float]:
+def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
     """What the map's own lens and shape are worth against the scan's, whatever its place."""
     snapshot = database.snapshot()
     feature_map = snapshot.load_map(snapshot.maps()[0].map_id)
-    scan_px = float(json.loads(poses.read_text(encoding="utf-8"))["camera"]["params"][0])
-    true = read_poses(poses)[1]
+    scan_px = truth.camera.focal_px
     own = np.array([image.cam_from_local.center for image in feature_map.images])
-    wanted = np.array([true[image.name].center for image in feature_map.images])
-    fit = similarity_closed_form(frame.enu_from(feature_map.frame).act(own), wanted)
+    wanted = np.array([truth.poses[image.name].center for image in feature_map.images])
+    fit = similarity_closed_form(truth.frame.enu_from(feature_map.frame).act(own), wanted)
     uncertainty = LensUncertainty.of_provenance(feature_map.provenance)
     if fit is None or uncertainty is None:
         raise SystemExit("the map has no lens uncertainty, or its cameras lie on one point")
-    rest = fit.act(frame.enu_from(feature_map.frame).act(own)) - wanted
+    rest = fit.act(truth.frame.enu_from(feature_map.frame).act(own)) - wanted
     focal_px = feature_map.cameras[0].focal_px
     return {
         "gps_focal_px": focal_px,
@@ -105,12 +81,8 @@ def by_gps(database: Database, frame: LocalFrame, poses: Path) -> dict[str, floa
 
 def arguments(doc: str | None, argv: Sequence[str] | None) -> argparse.Namespace:
     """What studies of photos held out of a set with a scan are told; `doc`: of the program's module."""
-    parser = study_parser(doc)
-    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
-    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
+    parser = scan_parser(doc, "--work")
     parser.add_argument("--held-out", nargs="+", required=True, metavar="NAME")
-    parser.add_argument("--work", type=Path, default=None, help="keep the database and the report there")
     return parser.parse_args(argv)
 
 

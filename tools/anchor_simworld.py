@@ -1,6 +1,6 @@
 """The simulated world end to end: photos, scan, anchoring without a person, queries against the truth.
 
-    python -m tools.anchor_simworld [--size short|full] [--seed N] [--work DIR]
+    python -m tools.anchor_simworld --work DIR [--inputs DIR]
 
 1. `featuredb simworld --lidar` writes photos whose GPS has a drone's errors, an airborne scan with
    intensities only, an ortho image of another day, and the same of another town at the same place.
@@ -12,7 +12,6 @@
 Exit code 0 if the map was placed, and the other town's scan was refused.
 """
 
-import argparse
 import shutil
 import subprocess
 import sys
@@ -29,33 +28,27 @@ from featuredb.store import Database
 from reloc.client import Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
-from tools.figures import study_parser, work_folder, write_figures
+from tools.figures import study_parser, write_figures
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 _ROOT = Path(__file__).resolve().parent.parent
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
-    with work_folder(args.work) as work:
-        inputs = args.inputs or work
-        world = make_scan_world(
-            inputs / f"scan-world-{args.size}-{args.seed}", args.seed, args.size, args.workers
-        )
-        mapped = work / f"mapped-{args.size}-{args.seed}"
-        if not mapped.exists():
-            featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
-        refused = anchored(work, mapped, world, other=True)[1]
-        database, placed = anchored(work, mapped, world, other=False)
-        queries = world.world.images("queries")
-        say = sys.stdout.write
-        say(f"scan of another town: {'refused' if not refused else 'PLACED, which is wrong'}\n")
-        figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
-        for name, path in (("gps", mapped), ("scan", database)):
-            found = judged(Database.open(path), world.world.truth, queries)
-            say(f"placed by {name}: {found}\n")
-            figures |= {f"{name}_{key}": value for key, value in found.items()}
-        write_figures(args.json, figures)
+    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+    work: Path = args.work
+    world = make_scan_world(args.inputs or work)
+    mapped = work / "mapped"
+    if not mapped.exists():
+        featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
+    refused = anchored(work, mapped, world, other=True)[1]
+    database, placed = anchored(work, mapped, world, other=False)
+    queries = world.world.images("queries")
+    figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
+    for name, path in (("gps", mapped), ("scan", database)):
+        found = judged(Database.open(path), world.world.truth, queries)
+        figures |= {f"{name}_{key}": value for key, value in found.items()}
+    write_figures(args.json, figures)
     return 0 if placed and not refused else 1
 
 
@@ -138,16 +131,6 @@ def featuredb(*words: str, may_refuse: bool = False, refusals: Sequence[int] = (
         raise SystemExit(f"exit code {done.returncode}\n{done.stderr}")
     sys.stdout.write(done.stderr if done.returncode > 1 else "")
     return done.returncode
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--size", choices=("short", "full"), default="short")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=0, help="processes that render photos; default: cores")
-    parser.add_argument("--work", type=Path, default=None, help="keep world, databases and reports there")
-    parser.add_argument("--inputs", type=Path, default=None, help="keep the world there, not in --work")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -114,7 +114,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                     load=os.getloadavg()[0],
                 )
             )
-            _say(measured[-1])
+            sys.stdout.write(f"{measured[-1]}\n")
+            sys.stdout.flush()
     write_figures(args.json, figures(measured, points))
     return 0
 
@@ -186,15 +187,6 @@ def _web_client(service: Service, photos: Sequence[bytes]) -> Iterator[list[tupl
     finally:
         stop.set()
         thread.join()
-
-
-def _say(m: Measured) -> None:
-    sys.stdout.write(
-        f"{m.attack:<24}{m.asked:>4} asked, median {m.p50_s:.2f} s, 99 % {m.p99_s:.2f} s, failed "
-        f"{m.failures or 0}, wrong {m.wrong}; HTTP {m.http_asked}, 99 % {m.http_p99_s:.2f} s, failed "
-        f"{m.http_failures}; {m.peak_mib:.0f} MiB at the peak, {m.after_mib:.0f} after; load {m.load:.0f}\n"
-    )
-    sys.stdout.flush()
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -59,6 +59,7 @@ _STEPS = (225, 200)  # columns, rows between windows
 _HEIGHT_M = 1000.0
 _OFFSET_PX = (-7.0, -2.0)  # columns, rows
 _PRIOR_M, _PRIOR_DEG = 20.0, 5.0
+_EACH = 8  # photos of a folder
 _KINDS = ("window", "mirrored", "elsewhere", "photo")
 _LIMIT_M, _WRONG_M = 1.5, 5.0
 
@@ -127,7 +128,7 @@ def _photos(
         # The picture of one end with the prior in the corner farthest from it, out of the search's reach.
         far = (0 if 2 * c >= w - WINDOW_PX else w - WINDOW_PX, 0 if 2 * r >= h - WINDOW_PX else h - WINDOW_PX)
         yield "elsewhere", *far, cut(c, r)
-    for i, path in enumerate(_foreign(folders, 8)):
+    for i, path in enumerate(_foreign(folders)):
         gray = decode_gray(path)
         scale = 2.2 * WINDOW_PX / max(gray.shape)
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -136,12 +137,12 @@ def _photos(
         yield "photo", c, r, np.ascontiguousarray(gray[y : y + WINDOW_PX, x : x + WINDOW_PX])
 
 
-def _foreign(folders: Sequence[Path], each: int) -> list[Path]:
+def _foreign(folders: Sequence[Path]) -> list[Path]:
     """A few photos of each folder, spread over it."""
     found = []
     for folder in folders:
         photos = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg"))
-        found += photos[:: max(1, len(photos) // each)][:each]
+        found += photos[:: max(1, len(photos) // _EACH)][:_EACH]
     return found
 
 
@@ -255,24 +256,17 @@ def _summary(outcomes: Sequence[WindowOutcome], figures: Path | None) -> None:
     wrong = [o for o in windows if o.accepted and (o.error_m is None or o.error_m > _WRONG_M)]
     foreign = [o for o in outcomes if o.kind != "window"]
     taken = [o for o in foreign if o.accepted]
-    rate = len(close) / max(len(structured), 1)
-    print(f"windows: {len(windows)}, with structure: {len(structured)}")
-    print(f"registered within {_LIMIT_M} m: {len(close)} of {len(structured)} ({rate:.0%})")
     accepted = [o for o in windows if o.accepted]
     errors = [o.error_m for o in accepted if o.error_m is not None]
-    if errors:
-        print(
-            f"accepted: {len(accepted)}; error median {np.median(errors):.2f} m, largest {max(errors):.2f} m"
-        )
-    print(f"accepted and wrong by more than {_WRONG_M} m: {len(wrong)}")
-    print(f"windows of another place: {len(foreign)}, accepted: {len(taken)}")
-    print(f"CPU seconds each: median {np.median([o.seconds for o in outcomes]):.1f}")
     write_figures(
         figures,
         {
+            "windows": len(windows),
             "structured": len(structured),
             "close": len(close),
-            "rate": rate,
+            "rate": len(close) / max(len(structured), 1),
+            "accepted": len(accepted),
+            "median_m": float(np.median(errors or [np.nan])),
             "largest_m": max(errors, default=float("nan")),
             "wrong": len(wrong),
             "foreign": len(foreign),

@@ -93,7 +93,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             server.stop()
     write_figures(args.json, figures)
-    sys.stdout.write("\n".join(f"{name} {value:.4g}" for name, value in figures.items()) + "\n")
     return 0
 
 

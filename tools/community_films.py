@@ -33,7 +33,7 @@ from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
 from tools.film_scripts import six_films
 from tools.film_tracks import JudgedTrack, judge_track, track_figures
-from tools.growth_common import say, table
+from tools.growth_common import say
 from tools.picked import place_by_picks, read_scan
 
 
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     inputs = (args.inputs or args.work) / f"community-{args.seed}"
     scripts = six_films(args.seed)
-    truth = write_films(inputs / "films", scripts, 0)
+    truth = write_films(inputs / "films", scripts)
     write_truth(inputs / "truth.json", truth)
     work = args.work / f"run-{args.seed}"
     shutil.rmtree(work, ignore_errors=True)
@@ -58,18 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         figures["placed"] = int(placed)
         tracks = _tracked(database, inputs / "films", work, truth) if placed else []
         figures |= track_figures(tracks)
-        sys.stdout.write(track_table(tracks))
+        say("".join(f"\n{track.film}: {track_figures([track])}" for track in tracks))
     write_figures(args.json, figures)
     return 0
-
-
-def track_table(tracks: Sequence[JudgedTrack]) -> str:
-    """A line for each film."""
-    rows = [
-        (t.film, t.frames, len(t.metres), t.inside, t.foreign, *track_figures([t]).values()) for t in tracks
-    ]
-    head = ("film", "frames", "tracked", "inside", "foreign", *track_figures([]))
-    return table(rows, head) + "\n" if rows else ""
 
 
 def _ingest(database: Path, films: Path, work: Path) -> float:
@@ -111,11 +102,7 @@ def _tracked(database: Path, films: Path, work: Path, truth: FilmsTruth) -> list
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument(
-        "--work", type=Path, required=True, help="databases, reports and tracks are kept there"
-    )
-    parser.add_argument("--inputs", type=Path, default=None, help="keep films and scan there, not in --work")
+    parser = study_parser(__doc__, "--work", "--inputs")
     parser.add_argument("--seed", type=int, default=1, help="of town, flights and picks")
     return parser.parse_args(argv)
 

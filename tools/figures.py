@@ -1,32 +1,35 @@
-"""What programs that measure something share: arguments, a folder to work in, figures for the scoreboard."""
+"""What programs that measure something share: arguments, and figures for the scoreboard."""
 
 import argparse
 import json
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from featuredb.plain_json import plain
 
+_SHARED: dict[str, dict[str, Any]] = {
+    "--json": {"metavar": "FILE", "help": "write the figures there, too"},
+    "--photos": {"metavar": "FOLDER", "required": True},
+    "--scan": {"metavar": "LAZ", "required": True},
+    "--work": {"metavar": "FOLDER", "required": True, "help": "what is made is kept there"},
+    "--inputs": {"metavar": "FOLDER", "help": "keep worlds and films there, not in --work"},
+}
 
-def study_parser(doc: str | None) -> argparse.ArgumentParser:
-    """The parser of a program; `doc`: of its module."""
+
+def study_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
+    """The parser of a program, with --json and the shared arguments of these names; `doc`: of its module."""
     parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the figures there")
+    for name in ("--json", *shared):
+        parser.add_argument(name, type=Path, **_SHARED[name])
     return parser
 
 
-@contextmanager
-def work_folder(kept: Path | None) -> Iterator[Path]:
-    """The folder that is to be kept, or else one that goes with the block."""
-    with tempfile.TemporaryDirectory() as scratch:
-        yield kept or Path(scratch)
-
-
 def write_figures(path: Path | None, figures: Mapping[str, Any]) -> None:
-    """Write the figures as JSON; numbers that are not finite become null. Nothing is done without a path."""
+    """Print the figures as JSON, and write them to a path; numbers that are not finite become null."""
+    text = json.dumps(plain(figures), indent=1) + "\n"
+    sys.stdout.write(text)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(plain(figures), indent=1) + "\n", encoding="utf-8")
+        path.write_text(text, encoding="utf-8")

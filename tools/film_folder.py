@@ -49,7 +49,7 @@ class FilmsTruth:
     films: dict[str, tuple[FrameTruth, ...]]
 
 
-def write_films(folder: Path, scripts: tuple[Script, ...], workers: int = 0) -> FilmsTruth:
+def write_films(folder: Path, scripts: tuple[Script, ...]) -> FilmsTruth:
     """Draw what is not there yet; a film whose script is the same is left as it is."""
     folder.mkdir(parents=True, exist_ok=True)
     stamps = folder.with_suffix(".json")
@@ -61,7 +61,7 @@ def write_films(folder: Path, scripts: tuple[Script, ...], workers: int = 0) -> 
             continue
         quality = VideoWriterOptions(crf=script.crf, preset="veryfast")
         with VideoWriter(file, width=WIDTH, height=HEIGHT, fps=RATE_HZ, options=quality) as writer:
-            for picture in in_order(partial(film_picture, script), script.frames, workers):
+            for picture in in_order(partial(film_picture, script), script.frames, 0):
                 writer.write(picture)
         known[file.name] = stamp
         stamps.write_text(json.dumps(known) + "\n", encoding="utf-8")

@@ -1,6 +1,6 @@
 """A film without positions becomes a map, and the same film is followed in that map's own frame.
 
-    python -m tools.film_in_map FILM.mp4 [--work FOLDER]
+    python -m tools.film_in_map FILM.mp4 --work FOLDER
 
 Ingests the film without its telemetry, tracks it by the largest map, which has no place, and compares the
 track at the keyframes with the poses that the map itself has of them: the distance of the centres over the
@@ -9,7 +9,6 @@ median distance from the map's cameras to their points, and the angle. Exit code
 
 import csv
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -53,13 +52,10 @@ class FilmInMap:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
+    parser = study_parser(__doc__, "--work")
     parser.add_argument("film", type=Path)
-    parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
     args = parser.parse_args(argv)
-    with tempfile.TemporaryDirectory() as scratch:
-        made = film_in_map(args.film, args.work or Path(scratch))
-    sys.stdout.write(f"{made}\n")
+    made = film_in_map(args.film, args.work)
     shares = {"mapped_share": made.mapped_share, "tracked_share": made.tracked_share}
     write_figures(args.json, asdict(made) | shares)
     return 0 if made.tracked else 1

@@ -1,6 +1,6 @@
 """A film with telemetry becomes a map with a place; its track is compared with the telemetry itself.
 
-    python -m tools.film_placed FILM.mp4 [--work FOLDER]
+    python -m tools.film_placed FILM.mp4 --work FOLDER
 
 `featuredb ingest video`, then `featuredb track` by the map. The receiver's own noise is part of the
 distances between track and telemetry, the radius is that of the track: of the horizontal ellipse that holds
@@ -9,7 +9,6 @@ distances between track and telemetry, the radius is that of the track: of the h
 
 import csv
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -50,13 +49,10 @@ class FilmPlaced:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
+    parser = study_parser(__doc__, "--work")
     parser.add_argument("film", type=Path)
-    parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
     args = parser.parse_args(argv)
-    with tempfile.TemporaryDirectory() as scratch:
-        made = film_placed(args.film, args.work or Path(scratch))
-    sys.stdout.write(f"{made}\n")
+    made = film_placed(args.film, args.work)
     write_figures(args.json, asdict(made))
     return 0
 

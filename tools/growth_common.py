@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from featuredb.features.decode import decode_gray
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import rotation_angle
@@ -27,16 +28,25 @@ from featuredb.store.candidates.states import Contribution, candidate_id_of
 from ingest.growing import GrowingOptions
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.map_places import drift_m, places_of
-from ingest.growth.values import GrowthOptions
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
+from reloc.localise.result import LocaliseResult
+from reloc.localiser import Localiser
+from reloc.service.handler import localise_request
+from reloc.wire.query import LocaliseWireRequest
 from tools.figures import write_figures
 from tools.growth_gates import WRONG_M, recorded
+from tools.worlds.album import PlannedPhoto, write_album
 from tools.worlds.album_files import TABLE_FILES, AlbumFact, read_facts
 
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
 _SURVEY_SIGMA_M = (0.02, 0.03)
+_WORKERS = 2
+_MAKING = MapMakingOptions(
+    extractor=ExtractorOptions(max_features=8000), maps=MapOptions(height_datum="ellipsoidal")
+)
+GROWING = GrowingOptions(making=_MAKING, workers=_WORKERS)
 _UNSAID_M = 30.0  # accuracy of a geotag that names none
 
 
@@ -102,17 +112,16 @@ class Verdict:
     holds: bool
 
 
-def growth_arguments(doc: str | None, name: str, seed: int) -> argparse.ArgumentParser:
-    """What the programs of made worlds take."""
+def out_folder(doc: str | None, argv: Sequence[str] | None) -> Path:
+    """The folder that a program of a made world is told, made; `doc`: of its module."""
     parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path(f"growth-{name}"))
-    parser.add_argument("--size", choices=("short", "full"), default="full")
-    parser.add_argument("--seed", type=int, default=seed)
-    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
-    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, required=True, help="where all is kept")
     parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
-    return parser
+    args = parser.parse_args(argv)
+    log_to_stderr(args.verbose)
+    args.out.mkdir(parents=True, exist_ok=True)
+    out: Path = args.out
+    return out
 
 
 def say(text: str) -> None:
@@ -126,14 +135,14 @@ def log_to_stderr(verbose: bool) -> None:
     logging.getLogger("faiss").setLevel(logging.WARNING)
 
 
-def made(write: Callable[..., Path], folder: Path, options: Any, workers: int) -> "Album":
-    """The album in `folder`, made or finished unless it is complete."""
+def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) -> "Album":
+    """The album of these options in `folder`, made or finished unless it is complete."""
 
     def progress(done: int, total: int) -> None:
         if done % 100 == 0 or done == total:
             say(f"{folder.name}: {done} of {total} photos")
 
-    write(folder, options, workers, progress)
+    write_album(folder, options, partial(plan, options), progress=progress)
     return open_album(folder)
 
 
@@ -143,31 +152,12 @@ def open_album(folder: Path) -> Album:
     return Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
 
 
-def making_options(max_features: int) -> MapMakingOptions:
-    return MapMakingOptions(
-        extractor=ExtractorOptions(max_features=max_features), maps=MapOptions(height_datum="ellipsoidal")
-    )
-
-
-def growing_options(max_features: int, workers: int, budget_m: float) -> GrowingOptions:
-    return GrowingOptions(
-        growth=GrowthOptions(drift_budget_m=budget_m),
-        making=making_options(max_features),
-        workers=workers,
-    )
-
-
-def anchored(path: Path, album: Album, survey: str, *, max_features: int, workers: int) -> Database:
+def anchored(path: Path, album: Album, survey: str) -> Database:
     """The database in `path`, with the survey of that folder of the album as an anchor."""
     database = Database.create(path)
     if any(m.name == survey for m in database.snapshot().maps()):
         return database
-    options = IngestOptions(
-        gps_sigma_m=_SURVEY_SIGMA_M,
-        making=making_options(max_features),
-        name=survey,
-        workers=workers,
-    )
+    options = IngestOptions(gps_sigma_m=_SURVEY_SIGMA_M, making=_MAKING, name=survey, workers=_WORKERS)
     report = ingest_photos(database, album.folder / survey, options)
     placed = [m for m in report.maps if m.status != "refused"]
     if len(placed) != 1:
@@ -274,6 +264,13 @@ def recording(out: Path, album: Album, name: str = "gates") -> AbstractContextMa
     return recorded(out / f"{name}.jsonl", album.truth.frame, true_place)
 
 
+def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
+    """The answer to a photo, asked as a client does that knows nothing but the file."""
+    data = photo.read_bytes()
+    gray = decode_gray(data)
+    return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray))
+
+
 def newest_copy(source: Path, target: Path) -> Database:
     """A copy of a database, made anew."""
     shutil.rmtree(target, ignore_errors=True)
@@ -294,8 +291,6 @@ def _cell(value: object) -> str:
 
 def conclude(out: Path, name: str, verdicts: Sequence[Verdict], figures: dict[str, Any]) -> int:
     """Print what holds, write `<name>.json`; 0 if everything holds."""
-    for v in verdicts:
-        sys.stdout.write(f"{'holds' if v.holds else 'FAILS'}  {v.name}: {v.text}\n")
     document = {
         "lines": {v.name: {"figure": v.text, "holds": v.holds} for v in verdicts},
         "figures": figures,

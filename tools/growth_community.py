@@ -1,11 +1,11 @@
 """Twelve people's photos of a town that a survey has mapped in part: how many register, and how well?
 
-    python -m tools.growth_community --out DIR [--size full] [--seed 1] [--alike 30]
+    python -m tools.growth_community --out DIR
 
 The world is that of `tools.worlds.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
-most of the photos, as on photo sites; with --alike 30, thirty sights have nearly as many each.
+most of the photos, as on photo sites.
 
 Prints what became of each kind of photo, by kind, owner and geotag; writes community.json.
 Everything is kept in DIR and goes on where it was. Exit code 0 if at least 70 % of the town's photos are in
@@ -13,16 +13,15 @@ active maps with a median error of at most 0.30 m, none of another town or of no
 more than 2 m.
 """
 
-import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from ingest.growing import grow_candidates
 from tools.growth_common import (
+    GROWING,
     Album,
     Registered,
     Verdict,
@@ -30,11 +29,9 @@ from tools.growth_common import (
     conclude,
     failures,
     give,
-    growing_options,
-    growth_arguments,
-    log_to_stderr,
     made,
     none_failed,
+    out_folder,
     recording,
     registered,
     say,
@@ -42,7 +39,7 @@ from tools.growth_common import (
     tell,
 )
 from tools.worlds.album_files import AlbumFact
-from tools.worlds.community import CommunityOptions, write_community
+from tools.worlds.community import CommunityOptions, community_album
 
 _OWN = ("street", "drone")
 _FOREIGN = ("other_town", "indoor", "portrait")
@@ -50,33 +47,21 @@ _SHARE, _MEDIAN_M = 0.70, 0.30
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
-    log_to_stderr(args.verbose)
-    args.out.mkdir(parents=True, exist_ok=True)
-    options = CommunityOptions.short(args.seed) if args.size == "short" else CommunityOptions(seed=args.seed)
-    if args.pieces is not None:
-        options = replace(options, pieces=args.pieces)
-    name = f"world-{args.size}-{args.seed}-{options.pieces}"
-    if args.alike is not None:
-        options = replace(options, sights=args.alike, zipf=None)
-        name += f"-alike-{args.alike}"
-    album = made(write_community, args.out / name, options, args.workers)
-    database = anchored(
-        args.out / "db", album, "survey", max_features=args.max_features, workers=args.workers
-    )
+    out = out_folder(__doc__, argv)
+    album = made(community_album, out / "world", CommunityOptions())
+    database = anchored(out / "db", album, "survey")
     everything = album.of(*_OWN, *_FOREIGN, "copy")
     give(database, album, everything)
     say(f"{len(everything)} photos contributed")
-    growing = growing_options(args.max_features, args.workers, args.budget)
-    with recording(args.out, album):
-        report = grow_candidates(database, growing)
+    with recording(out, album):
+        report = grow_candidates(database, GROWING)
     tell(report)
     found = registered(database, album)
     codes = Counter(p.reason_code for p in report.photos if p.reason_code)
     sys.stdout.write(breakdown(album, found))
     verdicts = [*judge(album, found), none_failed(failures(report))]
     figures = {"reasons": dict(codes), "seconds": report.seconds, "rounds": report.rounds}
-    return conclude(args.out, "community", verdicts, figures)
+    return conclude(out, "community", verdicts, figures)
 
 
 def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
@@ -145,15 +130,6 @@ def breakdown(album: Album, found: Sequence[Registered]) -> str:
             )
     head = ("photos", "all", "active", "quarantined", "median m", "worst m", "wrong")
     return table(rows, head) + "\n"
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = growth_arguments(__doc__, "community", seed=1)
-    parser.add_argument("--pieces", type=int, default=None, help="of the town's walls; 1: a town of twins")
-    parser.add_argument(
-        "--alike", type=int, default=None, metavar="SIGHTS", help="so many sights, visited nearly alike"
-    )
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Poison: look-alike blocks, mirrors, liars and forgers send photos. Is anything wrong promoted?
 
-    python -m tools.growth_poison --out DIR [--size full] [--seed 4]
+    python -m tools.growth_poison --out DIR
 
 The world is that of `tools.worlds.poison_world`. The survey is ingested, honest photos are grown, and
-held-out photos become canaries with their true poses. Then for each kind of poison, and for all together, a
-copy of that database gets the poison, grows, gets honest photos that come later, and grows again. Whatever is
-active then is compared with the truth:
+held-out photos become canaries with their true poses. Then a copy of that database gets all kinds of poison
+together, grows, gets honest photos that come later, and grows again. Whatever is active then is compared with
+the truth:
 
 - photos registered more than 2 m off, or without a place in this town at all;
 - points of grown maps more than 1 m off the surface that their photo truly sees, over all points of the map
@@ -16,20 +16,18 @@ Then wrong maps are forced in by hand: every quarantined map with poison, and, s
 honest grown map moved by 3 m under a new id. Answers to the canaries and to honest photos are compared,
 before, while it is in service, and after `retire`: bit for bit, but for the number of the snapshot.
 
-Prints a line per poison; writes poison.json. Exit code 0 if nothing wrong was promoted
-and every answer came back.
+Writes poison.json. Exit code 0 if nothing wrong was promoted and every answer came back.
 """
 
-import argparse
 import sys
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from featuredb.features.decode import decode_gray
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
@@ -37,56 +35,51 @@ from featuredb.maps.move import move_map
 from featuredb.simworld.camera.photograph import render_depth
 from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
-from ingest.growing import GrowingOptions, grow_candidates
+from ingest.growing import grow_candidates
 from ingest.growth.trust.promotion import promote_by_hand
 from reloc.localiser import Localiser
-from reloc.service.handler import localise_request
-from reloc.wire.query import LocaliseWireRequest
 from tools.growth_common import (
+    GROWING,
     Album,
     Verdict,
     anchored,
+    answer_of,
     conclude,
     failures,
     give,
-    growing_options,
-    growth_arguments,
-    log_to_stderr,
     made,
     newest_copy,
     none_failed,
+    out_folder,
     recording,
     registered,
     say,
-    table,
     tell,
 )
-from tools.worlds.poison_world import POISONS, PoisonOptions, write_poison
+from tools.worlds.poison_world import POISONS, PoisonOptions, poison_album
 
 _OFF_M, _OFF_SHARE = 1.0, 0.02
 _MOVE_M = 3.0
-_ALL = "all together"
 _CANARY_M, _CANARY_DEG = 0.5, 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoisonOutcome:
-    """What a poison did.
+    """What the poison did.
 
     Attributes:
-        sent: photos. active, quarantined: of them, in such maps. wrong: registered wrongly in active maps,
-            the poison's photos and honest ones alike.
+        sent: photos. active, quarantined: of them, in such maps. wrong: photos registered wrongly in active
+            maps by their kind, the poison's and honest ones alike.
         off_share: largest share of points off the true surface among active grown maps with poison.
         forced: maps that were forced in. restored: whether all answers came back; changed: whether any had
             changed meanwhile.
         failed: photos lost by an exception.
     """
 
-    poison: str
     sent: int
     active: int
     quarantined: int
-    wrong: int
+    wrong: dict[str, int]
     off_share: float
     forced: int = 0
     changed: bool = False
@@ -95,37 +88,20 @@ class PoisonOutcome:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
-    log_to_stderr(args.verbose)
-    args.out.mkdir(parents=True, exist_ok=True)
-    world = PoisonOptions.short(args.seed) if args.size == "short" else PoisonOptions(seed=args.seed)
-    folder = args.out / f"world-{args.size}-{args.seed}"
-    album = made(write_poison, folder, world, args.workers)
-    options = growing_options(args.max_features, args.workers, args.budget)
-    base = honest_base(args.out / "db", album, args.max_features, options)
+    out, world = out_folder(__doc__, argv), PoisonOptions()
+    album = made(poison_album, out / "world", world)
+    base = honest_base(out / "db", album)
     clean = max(off_shares(base, album, world).values(), default=0.0)
     say(f"honest maps: at most {clean:.2%} of the points {_OFF_M} m off the true surface")
-    outcomes = []
-    for poison in args.poison or (*POISONS, _ALL):
-        kinds = POISONS if poison == _ALL else (poison,)
-        outcomes.append(try_poison(args.out, base, album, world, options, poison, kinds))
-        say(str(outcomes[-1]))
-    fabricated = force_and_retire(
-        newest_copy(args.out / "db", args.out / "db-forced"), album, [], fabricate=True
-    )
-    sys.stdout.write(outcome_table(outcomes))
-    verdicts = judge(outcomes, clean, fabricated)
-    figures: dict[str, Any] = {
-        "outcomes": [{n: getattr(o, n) for n in PoisonOutcome.__dataclass_fields__} for o in outcomes],
-        "clean_off_share": clean,
-        "fabricated": fabricated,
-    }
-    return conclude(args.out, "poison", verdicts, figures)
+    outcome = try_poison(out, base, album, world)
+    fabricated = force_and_retire(newest_copy(out / "db", out / "db-forced"), album, [], fabricate=True)
+    figures = {"outcome": asdict(outcome), "clean_off_share": clean, "fabricated": fabricated}
+    return conclude(out, "poison", judge(outcome, clean, fabricated), figures)
 
 
-def honest_base(path: Path, album: Album, max_features: int, options: GrowingOptions) -> Database:
+def honest_base(path: Path, album: Album) -> Database:
     """The database before any poison: survey, honest photos, canaries."""
-    database = anchored(path, album, "survey", max_features=max_features, workers=options.workers)
+    database = anchored(path, album, "survey")
     if any(m.method == "map" for m in database.snapshot().maps()):
         return database
     for fact in album.of("canary"):
@@ -142,44 +118,34 @@ def honest_base(path: Path, album: Album, max_features: int, options: GrowingOpt
         add_canary(database, fact.photo_id, (album.folder / fact.name).read_bytes(), pose, origin="person")
     give(database, album, album.of("honest"))
     with recording(path.parent, album):
-        tell(grow_candidates(database, options))
+        tell(grow_candidates(database, GROWING))
     return database
 
 
-def try_poison(
-    out: Path,
-    base: Database,
-    album: Album,
-    world: PoisonOptions,
-    options: GrowingOptions,
-    poison: str,
-    kinds: Sequence[str],
-) -> PoisonOutcome:
-    """One poison on a copy of the honest database."""
-    name = poison.replace(" ", "-")
-    database = newest_copy(Path(base.url), out / f"db-{name}")
-    sent = album.of(*kinds)
+def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) -> PoisonOutcome:
+    """All poison on a copy of the honest database."""
+    database = newest_copy(Path(base.url), out / "db-poisoned")
+    sent = album.of(*POISONS)
     failed = 0
     for arrived in (sent, album.of("late")):
         give(database, album, arrived)
-        with recording(out, album, f"gates-{name}"):
-            report = grow_candidates(database, options)
+        with recording(out, album, "gates-poisoned"):
+            report = grow_candidates(database, GROWING)
         tell(report)
         failed += failures(report)
     found = registered(database, album)
     active = [r for r in found if r.status == "active" and r.generation > 0]
-    poisoned = {r.map_id for r in active if r.fact.kind in kinds}
+    poisoned = {r.map_id for r in active if r.fact.kind in POISONS}
     shares = off_shares(database, album, world)
     held = sorted(
-        {r.map_id for r in found if r.status == "quarantined" and (r.fact.kind in kinds or r.wrong)}
+        {r.map_id for r in found if r.status == "quarantined" and (r.fact.kind in POISONS or r.wrong)}
     )
     forced = force_and_retire(database, album, held, fabricate=False)
     return PoisonOutcome(
-        poison=poison,
         sent=len(sent),
-        active=sum(r.fact.kind in kinds for r in active),
-        quarantined=sum(r.fact.kind in kinds and r.status == "quarantined" for r in found),
-        wrong=sum(r.wrong for r in active),
+        active=sum(r.fact.kind in POISONS for r in active),
+        quarantined=sum(r.fact.kind in POISONS and r.status == "quarantined" for r in found),
+        wrong=dict(Counter(r.fact.kind for r in active if r.wrong)),
         off_share=max((shares[m] for m in poisoned if m in shares), default=0.0),
         forced=forced["forced"],
         changed=forced["changed"],
@@ -269,9 +235,7 @@ def answers(database: Database, album: Album) -> dict[str, str]:
     localiser = Localiser.open(database)
     found = {}
     for fact in [*album.of("canary"), *album.of("honest")[:20]]:
-        data = (album.folder / fact.name).read_bytes()
-        gray = decode_gray(data)
-        result = localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray))
+        result = answer_of(localiser, album.folder / fact.name)
         pose = result.pose
         found[fact.name] = repr(
             (
@@ -293,42 +257,27 @@ def answers(database: Database, album: Album) -> dict[str, str]:
     return found
 
 
-def judge(outcomes: Sequence[PoisonOutcome], clean: float, fabricated: dict[str, Any]) -> list[Verdict]:
+def judge(o: PoisonOutcome, clean: float, fabricated: dict[str, Any]) -> list[Verdict]:
     """The contract's lines."""
     limit = max(_OFF_SHARE, 2.0 * clean)
-    verdicts = [
+    kinds = ", ".join(f"{count} {kind}" for kind, count in o.wrong.items())
+    return [
         Verdict(
-            name=f"poison: {o.poison}",
-            text=f"{o.wrong} photos wrong in active maps, none wanted; {o.active} of {o.sent} registered; "
+            name="poison",
+            text=f"{kinds or 0} photos wrong in active maps, none wanted; {o.active} of {o.sent} registered; "
             f"points off the surface {o.off_share:.1%} of at most {limit:.1%}",
-            holds=o.wrong == 0 and o.off_share <= limit,
-        )
-        for o in outcomes
-    ]
-    forced = [o for o in outcomes if o.forced]
-    verdicts.append(
+            holds=not o.wrong and o.off_share <= limit,
+        ),
         Verdict(
             name="retire",
-            text=f"{sum(o.forced for o in forced)} quarantined maps forced in and retired, answers came back "
-            f"in {sum(o.restored for o in forced)} of {len(forced)} databases; a map moved by {_MOVE_M} m: "
+            text=f"{o.forced} quarantined maps forced in and retired, answers "
+            f"{'came back' if o.restored else 'DID NOT COME BACK'}; a map moved by {_MOVE_M} m: "
             f"answers {'changed' if fabricated['changed'] else 'did not change'} and "
             f"{'came back' if fabricated['restored'] else 'DID NOT COME BACK'}",
-            holds=all(o.restored for o in forced) and fabricated["restored"] and fabricated["changed"],
-        )
-    )
-    verdicts.append(none_failed(sum(o.failed for o in outcomes)))
-    return verdicts
-
-
-def outcome_table(outcomes: Sequence[PoisonOutcome]) -> str:
-    names = tuple(PoisonOutcome.__dataclass_fields__)
-    return table([[getattr(o, n) for n in names] for o in outcomes], names) + "\n"
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = growth_arguments(__doc__, "poison", seed=4)
-    parser.add_argument("--poison", action="append", choices=(*POISONS, _ALL), help="only these kinds")
-    return parser.parse_args(argv)
+            holds=o.restored and fabricated["restored"] and fabricated["changed"],
+        ),
+        none_failed(o.failed),
+    ]
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Real photos in three portions: a first map, the others added by growth, compared with all at once.
 
-    uv run python tools/growth_portions.py --photos FOLDER --cut interleaved --work WORK
+    python -m tools.growth_portions --photos FOLDER --cut interleaved --work WORK
 
 1. Joint: all photos are reconstructed at once. The largest reconstruction is the reference.
 2. Portions: the photos, sorted by name, are cut into three, by turns (interleaved) or one after the other
@@ -13,7 +13,7 @@
    metre is a hundredth of the extent of the camera centres (diagonal of their box), and the drift budget,
    which is in metres, is left out.
 
-Prints one line a photo with -v, and one line a set.
+Prints one line a photo with -v.
 """
 
 import argparse
@@ -267,26 +267,25 @@ def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: fl
             print(f"    {name:<28} {distance:.3f} m")
     missing = sorted(reference.keys() - state.centers.keys())
     median = float(np.median(apart)) if len(both) else float("nan")
-    place = np.array(list(reference.values()))
-    print(
-        f"{args.photos.parent.name + '/' + args.photos.name:<22} {args.cut:<12} photos {len(state.photos)}, "
-        f"joint {len(reference)}, grown {len(state.centers)}, of the joint ones {len(both)}; difference "
-        f"median {median:.3f} m, largest {apart.max(initial=0):.3f} m; "
-        f"{'metres by GPS' if metric else 'own scale'}, extent {_extent(place):.0f} m, viewing distance "
-        f"{sim.scale * _viewing_distance(joint):.0f} m; CPU {joint_s:.0f} s joint, {grown_s:.0f} s grown"
-        f"{'; missing ' + ', '.join(missing) if missing else ''}"
-    )
     largest_m = float(apart.max(initial=0))
-    figures = {"photos": len(state.photos), "joint": len(reference), "grown": len(both)}
-    write_figures(args.json, figures | {"missing": len(missing), "median_m": median, "largest_m": largest_m})
+    figures = {
+        "photos": len(state.photos),
+        "joint": len(reference),
+        "grown": len(both),
+        "missing": len(missing),
+        "missing_photos": missing,
+        "median_m": median,
+        "largest_m": largest_m,
+        "joint_cpu_s": joint_s,
+        "grown_cpu_s": grown_s,
+    }
+    write_figures(args.json, figures)
     return 0
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, required=True, help="folder of photos")
+    parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
-    parser.add_argument("--work", type=Path, required=True, help="work folder; features and matches are kept")
     parser.add_argument("-v", "--verbose", action="store_true", help="one line a photo")
     parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
     return parser.parse_args(argv)

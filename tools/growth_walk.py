@@ -1,20 +1,19 @@
 """A walk away from the anchor, from contributed queries alone: does coverage follow, and is the bound true?
 
-    python -m tools.growth_walk --out DIR [--size full] [--seed 2] [--budget 0.5]
+    python -m tools.growth_walk --out DIR
 
 The world is that of `tools.worlds.walk_world`. Step by step the photos of three people are contributed
 and `featuredb grow` runs once. After each step photos that nobody contributes (probes) of all steps so far
 ask where they were taken, and the new maps are compared with the truth. When everything has arrived, the
 survey at the far end is ingested and growth runs again.
 
-For each step: active maps, how far coverage reaches, the drift that the maps claim (95 %, against the
-anchor), the bound on Earth (95 %, with what the anchor is uncertain by) beside the true error (length of the
-median error of a map's photos) of the map where the two are closest, the photo that is worst, probes
-answered, their errors, how many lie inside their own 95 % ellipsoid. Writes
-walk.json; everything is kept in DIR, and a run that was
+walk.json has for each step: active maps, how far coverage reaches, the drift that the maps claim (95 %,
+against the anchor), the bound on Earth (95 %, with what the anchor is uncertain by) beside the true error
+(length of the median error of a map's photos) of the map where the two are closest, the photo that is worst,
+probes answered, their errors and how many sigmas these are. Everything is kept in DIR, and a run that was
 interrupted goes on.
 
-Exit code 0 if: coverage follows for at least 600 m (the default budget ends before); the true drift of every
+Exit code 0 if: coverage follows for at least 120 m; the true drift of every
 map stays inside its bound at every step; growth stopped by itself and no active map exceeds the budget; after
 the second anchor every probe that is answered is within 0.3 m, and the maps that were there moved in one
 commit. At no step may a probe be answered more than 2 m off: one that shows land beyond the maps, too.
@@ -30,36 +29,33 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from featuredb.features.decode import decode_gray
 from featuredb.store import Database
-from ingest.growing import GrowingOptions, grow_candidates
+from ingest.growing import grow_candidates
+from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localiser import Localiser
-from reloc.service.handler import localise_request
-from reloc.wire.query import LocaliseWireRequest
 from tools.growth_common import (
+    GROWING,
     WRONG_M,
     Album,
     Registered,
     Verdict,
     anchored,
+    answer_of,
     conclude,
     failures,
     give,
-    growing_options,
-    growth_arguments,
-    log_to_stderr,
     made,
     none_failed,
+    out_folder,
     recording,
     registered,
     say,
-    table,
     tell,
 )
 from tools.worlds.album_files import AlbumFact
-from tools.worlds.walk_world import WalkOptions, write_walk
+from tools.worlds.walk_world import WalkOptions, plan_walk
 
-_WALK_M = 600.0
+_WALK_M = 120.0
 _AFTER_M = 0.3
 _INSIDE = float(chi2.ppf(0.95, 3))
 _PROBE_SHARE = 0.90  # of the probes inside their 95 %: of a few dozen, more may miss by chance
@@ -102,32 +98,25 @@ class Step:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = growth_arguments(__doc__, "walk", seed=2).parse_args(argv)
-    log_to_stderr(args.verbose)
-    args.out.mkdir(parents=True, exist_ok=True)
-    world = WalkOptions.short(args.seed) if args.size == "short" else WalkOptions(seed=args.seed)
-    folder = args.out / f"world-{args.size}-{args.seed}"
-    album = made(write_walk, folder, world, args.workers)
-    common = {"max_features": args.max_features, "workers": args.workers}
-    database = anchored(args.out / "db", album, "survey", **common)
-    options = growing_options(args.max_features, args.workers, args.budget)
-    log = args.out / "steps.json"
+    out = out_folder(__doc__, argv)
+    album = made(plan_walk, out / "world", WalkOptions())
+    database = anchored(out / "db", album, "survey")
+    log = out / "steps.json"
     steps = _read_steps(log)
     batches = sorted({f.batch for f in album.of("walk")})
     for batch in batches[len(steps) :]:
-        steps.append(take_step(database, album, batch, options))
+        steps.append(take_step(database, album, batch))
         log.write_text(json.dumps([asdict(s) for s in steps]) + "\n", encoding="utf-8")
-    end, commits = second_anchor(database, album, options, common)
-    sys.stdout.write(step_table(steps))
+    end, commits = second_anchor(database, album)
     figures: dict[str, Any] = {"steps": [asdict(s) for s in steps], "after": asdict(end), "commits": commits}
-    return conclude(args.out, "walk", judge(steps, end, commits, args.budget, world), figures)
+    return conclude(out, "walk", judge(steps, end, commits), figures)
 
 
-def take_step(database: Database, album: Album, batch: int, options: GrowingOptions) -> Step:
+def take_step(database: Database, album: Album, batch: int) -> Step:
     """Contribute one step's photos, grow once, measure."""
     give(database, album, album.of("walk", batch=batch))
     with recording(Path(database.url).parent, album):
-        report = grow_candidates(database, options)
+        report = grow_candidates(database, GROWING)
     tell(report)
     stopped = sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
     step = replace(measure(database, album, batch, stopped), failed=failures(report))
@@ -174,15 +163,13 @@ def worst_map(found: Sequence[Registered]) -> tuple[float, float]:
 
 
 def ask_probes(database: Database, album: Album, upto: int, edge: float) -> list[Probe]:
-    """Ask for every probe of the steps so far, as a client does that knows nothing but the file."""
+    """Ask for every probe of the steps so far."""
     localiser = Localiser.open(database)
     probes = []
     for fact in album.of("probe"):
         if fact.batch > upto:
             continue
-        data = (album.folder / fact.name).read_bytes()
-        gray = decode_gray(data)
-        pose = localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray)).pose
+        pose = answer_of(localiser, album.folder / fact.name).pose
         error, normalised = None, None
         if pose is not None:
             true = album.truth.images[fact.name].cam_from_local.center
@@ -202,16 +189,14 @@ def ask_probes(database: Database, album: Album, upto: int, edge: float) -> list
     return probes
 
 
-def second_anchor(
-    database: Database, album: Album, options: GrowingOptions, common: dict[str, int]
-) -> tuple[Step, int]:
+def second_anchor(database: Database, album: Album) -> tuple[Step, int]:
     """Ingest the far survey, grow, measure; also in how many commits the maps that were there moved."""
     placed = {m.map_id: m.write_id for m in database.snapshot().maps()}
     version = database.poll_version()
     path = Path(database.url)
-    anchored(path, album, "survey_far", **common)
+    anchored(path, album, "survey_far")
     with recording(Path(database.url).parent, album):
-        report = grow_candidates(database, options)
+        report = grow_candidates(database, GROWING)
     tell(report)
     history = [database.snapshot(v) for v in range(version, database.poll_version() + 1)]
     commits, known = 0, placed
@@ -224,9 +209,7 @@ def second_anchor(
     return replace(measure(database, album, last, stopped), failed=failures(report)), commits
 
 
-def judge(
-    steps: Sequence[Step], end: Step, commits: int, budget_m: float, world: WalkOptions
-) -> list[Verdict]:
+def judge(steps: Sequence[Step], end: Step, commits: int) -> list[Verdict]:
     """The contract's lines."""
     reach = max((s.reach_m for s in steps), default=0.0)
     stopped = next((s for s in steps if s.stopped), None)
@@ -237,13 +220,12 @@ def judge(
     mean = float(np.mean([p.normalised or 0.0 for p in asked])) if asked else float("nan")
     answers = [p.error_m for s in (*steps, end) for p in s.probes if p.error_m is not None]
     errors = [p.error_m for p in end.probes if p.error_m is not None]
-    wanted = min(_WALK_M, world.end_m - world.start_m - 150.0)
     why = "not stopped" if stopped is None else f"stopped for the budget at step {stopped.step + 1}"
     return [
         Verdict(
             name="coverage follows",
-            text=f"{reach:.0f} m from the anchor's edge, {wanted:.0f} m wanted",
-            holds=reach >= wanted,
+            text=f"{reach:.0f} m from the anchor's edge, {_WALK_M:.0f} m wanted",
+            holds=reach >= _WALK_M,
         ),
         Verdict(
             name="true error inside the bound",
@@ -263,8 +245,8 @@ def judge(
         ),
         Verdict(
             name="budget",
-            text=f"largest claimed drift of an active map {over:.2f} of {budget_m:.2f} m, {why}",
-            holds=over <= budget_m and stopped is not None,
+            text=f"largest claimed drift of an active map {over:.2f} of {DRIFT_BUDGET_M:.2f} m, {why}",
+            holds=over <= DRIFT_BUDGET_M and stopped is not None,
         ),
         Verdict(
             name="second anchor",
@@ -274,26 +256,6 @@ def judge(
         ),
         none_failed(sum(s.failed for s in (*steps, end))),
     ]
-
-
-def step_table(steps: Sequence[Step]) -> str:
-    rows = []
-    for s in steps:
-        errors = [p.error_m for p in s.probes if p.error_m is not None]
-        inside = sum((p.normalised or 0.0) <= _INSIDE for p in s.probes if p.normalised is not None)
-        rows.append(
-            (
-                s.step + 1, s.reach_m, s.maps, s.quarantined, s.drift_m, s.true_m, s.ratio, s.worst_m,
-                s.stopped,
-                f"{len(errors)}/{len(s.probes)}", float(np.median(errors)) if errors else float("nan"),
-                max(errors, default=float("nan")), f"{inside}/{len(errors)}",
-            )
-        )  # fmt: skip
-    head = (
-        *("step", "reach m", "maps", "held", "claimed m", "true m", "ratio", "photo m", "stopped"),
-        *("probes", "median m", "worst m", "in 95 %"),
-    )
-    return table(rows, head) + "\n"
 
 
 def _along(album: Album, fact: AlbumFact) -> float:

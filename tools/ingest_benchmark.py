@@ -1,4 +1,4 @@
-"""What an ingest costs beside COLMAP's own pipeline on the same photos, in processor time of one run.
+"""What an ingest costs and maps beside COLMAP's own pipeline on the same photos; processor time of one run.
 
     python -m tools.ingest_benchmark FOLDER [FOLDER ...] [--json FILE]
 
@@ -8,6 +8,7 @@ commit. Each is a process of its own, the one after the other.
 """
 
 import argparse
+import json
 import resource
 import subprocess
 import sys
@@ -15,14 +16,16 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+from featuredb.maps.feature_map import FeatureMap
 from tools.figures import study_parser, write_figures
 from tools.made_maps import all_maps, photo_names
 
 _NEIGHBOURS = 15
 _SIDE_PX = 1600
 _THEIRS = f"""
-import sys
+import json, sys
 import pycolmap
 photos, work = sys.argv[1:]
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
@@ -40,37 +43,36 @@ if placed:
 else:
     pycolmap.match_exhaustive(database)
 models = pycolmap.incremental_mapping(database, photos, work).values()
-print(max((m.num_reg_images() for m in models), default=0))
+print(json.dumps(max(([m.image(i).name for i in m.reg_image_ids()] for m in models), key=len, default=[])))
 """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cost:
-    """Of one set: processor seconds, and photos in the largest model or map."""
+    """Of one set: processor seconds, photos in the largest model or map and in both, maps with a place."""
 
-    folder: str
     photos: int
     colmap_s: float
     colmap_photos: int
     ours_s: float
     ours_photos: int
+    both: int
+    placed: int
 
     @property
     def ratio(self) -> float:
         return self.ours_s / self.colmap_s
 
-    def figures(self) -> dict[str, float]:
-        found = asdict(self)
-        del found["folder"]
-        return found | {"ratio": self.ratio}
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    costs = [measured(folder) for folder in args.folders]
-    figures = {f"{cost.folder}_{name}": value for cost in costs for name, value in cost.figures().items()}
-    figures["worst_ratio"] = max(cost.ratio for cost in costs)
-    figures["fewer"] = max(cost.colmap_photos - cost.ours_photos for cost in costs)
+    costs = {folder.parent.name: measured(folder) for folder in args.folders}
+    figures: dict[str, Any] = {
+        name: asdict(cost) | {"ratio": cost.ratio, "share": cost.both / max(1, cost.colmap_photos)}
+        for name, cost in costs.items()
+    }
+    figures["worst_ratio"] = max(cost.ratio for cost in costs.values())
+    figures["fewer"] = max(cost.colmap_photos - cost.ours_photos for cost in costs.values())
     write_figures(args.json, figures)
     return 0
 
@@ -83,21 +85,18 @@ def measured(folder: Path) -> Cost:
         ours_s, _ = _processor_s(
             *("-m", "featuredb.cli", "ingest", "photos", str(database), str(folder), "--quiet")
         )
-        largest = max(len(one.images) for one in all_maps(database))
-    cost = Cost(
-        folder=folder.parent.name,
+        maps = all_maps(database)
+    theirs = set(json.loads(told.splitlines()[-1]))
+    ours = {image.name for image in max(maps, key=lambda one: len(one.images)).images}
+    return Cost(
         photos=len(photo_names(folder)),
         colmap_s=colmap_s,
-        colmap_photos=int(told.split()[-1]),
+        colmap_photos=len(theirs),
         ours_s=ours_s,
-        ours_photos=largest,
+        ours_photos=len(ours),
+        both=len(theirs & ours),
+        placed=sum(isinstance(one, FeatureMap) for one in maps),
     )
-    sys.stdout.write(
-        f"{cost.folder}: COLMAP {cost.colmap_s:.0f} s for {cost.colmap_photos} of {cost.photos} photos, "
-        f"ours {cost.ours_s:.0f} s for {cost.ours_photos}: {cost.ratio:.2f} times\n"
-    )
-    sys.stdout.flush()
-    return cost
 
 
 def _processor_s(*argv: str) -> tuple[float, str]:

@@ -18,7 +18,6 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -53,7 +52,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     with tempfile.TemporaryDirectory() as scratch:
         figures = judged(read_laser_set(args.folder), Path(scratch) / args.folder.name)
-    sys.stdout.write(args.folder.name + "\n" + text(figures) + "\n")
     write_figures(args.json, figures)
     return 0
 
@@ -165,25 +163,6 @@ def pose_errors(
         told_deg=tuple(told_deg),
         wanted=wanted,
     )
-
-
-def text(figures: Mapping[str, Any]) -> str:
-    """A line for each kind."""
-    lines = [
-        f"  {'':<9}{'found':>8}{'mm':>8}{'largest':>9}{'reported':>10}{'COLMAP':>8}"
-        f"{'deg':>8}{'largest':>9}{'reported':>10}{'COLMAP':>8}"
-    ]
-    for kind in ("map", "told", "unknown"):
-        f = {key: figures[f"{kind}_{key}"] for key in ("found", "wanted")}
-        line = f"  {kind:<9}{f['found']:>4} / {f['wanted']}"
-        for unit, factor, digits in (("m", 1e3, 1), ("deg", 1.0, 3)):
-            values = (
-                figures[f"{kind}_{name}{unit}"] * factor for name in ("", "largest_", "reported_", "colmap_")
-            )
-            line += "".join(f"{v:>{w}.{digits}f}" for v, w in zip(values, (8, 9, 10, 8), strict=True))
-        lines.append(line)
-    last = f"  worst ratio {figures['worst']:.2f}; lens off by {figures['lens_off']:.2f} of its sigmas (rms)"
-    return "\n".join([*lines, last])
 
 
 def _median(values: Sequence[float]) -> float:

@@ -83,16 +83,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     assumed = assumed_widths(options)
     measured = measured_widths(told, assumed, options)
     limits = {name: limits_of(told, measured, k, options) for k, name in enumerate(WIDTHS)}
-    sys.stdout.write(f"{len(told)} lenses, {sum(one.has_exif for one in told)} with EXIF\n")
-    sys.stdout.write(f"{'':12} {'assumed':>9} {'measured':>9}   95 %\n")
-    for k, name in enumerate(WIDTHS):
-        low, high = limits[name]
-        sys.stdout.write(f"{name:12} {assumed[k]:9.5f} {measured[k]:9.5f}   {low:.5f} to {high:.5f}\n")
     inside = {name: limits[name][0] <= assumed[k] <= limits[name][1] for k, name in enumerate(WIDTHS)}
     figures = {
         "lenses": len(told),
         **{name: measured[k] for k, name in enumerate(WIDTHS)},
         "inside": sum(inside.values()),
+        "assumed": dict(zip(WIDTHS, assumed, strict=True)),
+        "limits": limits,
+        "with_exif": sum(one.has_exif for one in told),
         "disagreement": float(np.exp(np.mean(np.log(disagreement)))) if disagreement else float("nan"),
     }
     write_figures(args.json, figures)
@@ -221,9 +219,8 @@ def _database(folder: Path, work: Path) -> Path:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
+    parser = study_parser(__doc__, "--work")
     parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
-    parser.add_argument("--work", type=Path, required=True, help="databases are kept there")
     return parser.parse_args(argv)
 
 

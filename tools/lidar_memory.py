@@ -8,7 +8,6 @@ and all its children (resident set) is sampled ten times a second, and the large
 process is asked for in the end.
 """
 
-import json
 import os
 import shutil
 import subprocess
@@ -140,7 +139,6 @@ def main() -> int:
     figures["points_per_cpu_second"] = args.points / figures["cpu_seconds"]
     figures["database_bytes"] = sum(f.stat().st_size for f in database.rglob("*") if f.is_file())
     figures = {k: round(v, 1) for k, v in figures.items()}
-    sys.stdout.write(json.dumps(figures, indent=2) + "\n")
     write_figures(args.json, figures)
     return 0
 

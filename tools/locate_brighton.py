@@ -1,17 +1,15 @@
 """What is at a pixel of a real photo: places on the scan, and by the map alone, against the scan's own poses.
 
-    python -m tools.locate_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --held-out A.JPG ...
+    python -m tools.locate_brighton --photos FOLDER --scan SCAN.laz --poses poses.json \\
+        --work FOLDER --held-out A.JPG ...
 
 1. A map of all photos but the held-out ones is anchored on the scan (tools/anchor_brighton.py).
 2. Each held-out photo is localised; pixels at random are located on the scan, and on the map's own points.
 3. The truth of a pixel: the points of the scan file that it shows from the pose, and with the lens, of
    tools/scan_poses.py. That pose comes of the photo and the scan alone, by code that shares nothing with map,
    anchoring, localisation and renderer. Pixels whose nearest points lie at several depths have no truth.
-
-Exit code 0.
 """
 
-import json
 import sys
 from collections.abc import Sequence
 
@@ -28,13 +26,12 @@ from reloc.localiser import Localiser
 from reloc.overlay import map_points_in_view
 from reloc.pixels.locate import locate
 from reloc.pixels.surfaces import MapSurface, RaySurface, scan_surface
-from tools import scan_poses
-from tools.anchor_brighton import anchored_on, arguments, read_poses
-from tools.figures import work_folder, write_figures
+from tools.anchor_brighton import anchored_on, arguments
+from tools.figures import write_figures
 from tools.locate_pixels import Miss, miss_figures, misses, view_of
 from tools.picked import Scan, read_scan, visible
 from tools.real_photos import ingest
-from tools.unplaced_brighton import camera_of
+from tools.scan_truth import scan_truth
 
 _SEED, _PIXELS = 1, 300  # of each photo
 _NEAR, _REACH_PX = 12, 12.0  # points of the scan around a pixel, and how far they may be
@@ -43,33 +40,28 @@ _ONE_SURFACE_M = 0.3  # between the depths of nine tenths of them
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = arguments(__doc__, argv)
-    if not args.poses.exists():
-        scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
-    frame, poses = read_poses(args.poses)
-    document = json.loads(args.poses.read_text(encoding="utf-8"))
-    camera, epsg = camera_of(document), int(document["crs"].removeprefix("EPSG:"))
-    scan = read_scan(args.scan, frame, epsg)
+    truth = scan_truth(args)
+    scan = read_scan(args.scan, truth.frame, truth.epsg)
     rng = np.random.default_rng(_SEED)
     found: dict[str, list[Miss]] = {"scan": [], "map": []}
     asked = photos = 0
-    with work_folder(args.work) as work:
-        ingest(work / "db", args.photos, args.held_out)
-        database = anchored_on(work / "db", args.scan, args.photos, work / "anchor")
-        localiser = Localiser.open(database)
-        for name in args.held_out:
-            view = view_of(localiser, (args.photos / name).read_bytes())
-            if view is None:
-                continue
-            pixels, places = _truth(scan, camera, poses[name], rng)
-            true = view.frame.enu_from(frame).act(places)
-            asked, photos = asked + len(pixels), photos + 1
-            for kind, surface in _surfaces(database, localiser, view).items():
-                found[kind] += misses(view, true, locate(view, surface, pixels))
+    made = args.work / "db"
+    ingest(made, args.photos, args.held_out)
+    database = anchored_on(made, args.scan, args.photos, args.work / "anchor")
+    localiser = Localiser.open(database)
+    for name in args.held_out:
+        view = view_of(localiser, (args.photos / name).read_bytes())
+        if view is None:
+            continue
+        pixels, places = _truth(scan, truth.camera, truth.poses[name], rng)
+        true = view.frame.enu_from(truth.frame).act(places)
+        asked, photos = asked + len(pixels), photos + 1
+        for kind, surface in _surfaces(database, localiser, view).items():
+            found[kind] += misses(view, true, locate(view, surface, pixels))
     figures = {"photos": photos, "asked": asked}
     for kind, those in found.items():
         figures |= {f"{kind}_located": len(those)} | miss_figures(kind, those)
     write_figures(args.json, figures)
-    sys.stdout.write("\n".join(f"{name} {value:.4g}" for name, value in figures.items()) + "\n")
     return 0
 
 

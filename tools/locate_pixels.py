@@ -1,17 +1,14 @@
 """What is at a pixel: places of the simulated town's pixels against the truth, and the bounds.
 
-    python -m tools.locate_pixels [--work DIR] [--inputs DIR] [--json FILE]
+    python -m tools.locate_pixels --work DIR [--inputs DIR] [--json FILE]
 
 1. A world with a scan is made, its photos become a map that is placed on the scan (tools/anchor_simworld.py).
 2. Each held-out photo is localised; pixels at random, of what stands still, are located on the scan.
 3. Bounds: poses and lenses are drawn around the truth as each answer's covariance says, and pixels located
    from them. So the bounds are tested by themselves: one map has one error, which is in all of its answers.
    What the scan's strips are off by is stated, as from a data sheet.
-
-Exit code 0.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +26,7 @@ from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.town.scene import Scene, texture_index
 from featuredb.simworld.truth import TrueImage, Truth
-from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.simworld.world import town_of
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.answered_view import AnsweredView
@@ -39,8 +36,8 @@ from reloc.pixels.surfaces import RaySurface, scan_surface
 from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored, featuredb
-from tools.figures import study_parser, work_folder, write_figures
-from tools.worlds.scan_world import make_scan_world
+from tools.figures import study_parser, write_figures
+from tools.worlds.scan_world import SCAN_WORLD, make_scan_world
 
 _SEED = 1
 _PIXELS, _DRAWS = 60, 16  # of each photo: pixels, and draws of a pose and a lens
@@ -58,37 +55,36 @@ class Miss:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
-    with work_folder(args.work) as work:
-        world = make_scan_world((args.inputs or work) / f"scan-world-short-{_SEED}", _SEED, "short", 0)
-        featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
-        path = anchored(work, work / "mapped", world, other=False)[0]
-        database = Database.open(path)
-        scene, truth = town_of(WorldOptions.short(_SEED)), world.world.truth
-        rng = np.random.default_rng(_SEED)
-        localiser = Localiser.open(database)
-        answered: list[Miss] = []
-        drawn: list[Miss] = []
-        refused = 0
-        for photo in truth.group("queries"):
-            data = (world.world.folder / photo.name).read_bytes()
-            view = view_of(localiser, data)
-            if view is None:
-                continue
-            surface = scan_surface(database, view)
-            assert surface is not None
-            surface.common_m = _STRIPS_M
-            target = _Target(scene, truth, photo, view)
-            pixels = target.pixels(rng, _PIXELS)
-            found = misses(view, target.places(pixels), locate(view, surface, pixels))
-            answered += found
-            refused += len(pixels) - len(found)
-            for _ in range(_DRAWS):
-                drawn += target.drawn(rng, surface, _PIXELS // 5)
+    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+    work: Path = args.work
+    world = make_scan_world(args.inputs or work)
+    featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
+    path = anchored(work, work / "mapped", world, other=False)[0]
+    database = Database.open(path)
+    scene, truth = town_of(SCAN_WORLD), world.world.truth
+    rng = np.random.default_rng(_SEED)
+    localiser = Localiser.open(database)
+    answered: list[Miss] = []
+    drawn: list[Miss] = []
+    refused = 0
+    for photo in truth.group("queries"):
+        data = (world.world.folder / photo.name).read_bytes()
+        view = view_of(localiser, data)
+        if view is None:
+            continue
+        surface = scan_surface(database, view)
+        assert surface is not None
+        surface.common_m = _STRIPS_M
+        target = _Target(scene, truth, photo, view)
+        pixels = target.pixels(rng, _PIXELS)
+        found = misses(view, target.places(pixels), locate(view, surface, pixels))
+        answered += found
+        refused += len(pixels) - len(found)
+        for _ in range(_DRAWS):
+            drawn += target.drawn(rng, surface, _PIXELS // 5)
     figures = miss_figures("answered", answered) | miss_figures("drawn", drawn)
     figures |= {"refused": refused, "located": len(answered), "draws": len(drawn)}
     write_figures(args.json, figures)
-    sys.stdout.write("\n".join(f"{name} {value:.4g}" for name, value in figures.items()) + "\n")
     return 0
 
 
@@ -169,13 +165,6 @@ def view_of(localiser: Localiser, data: bytes) -> AnsweredView | None:
         clock=StageClock(),
     )
     return AnsweredView.of_reply(reply) if reply.status == "localised" else None
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--work", type=Path, default=None, help="keep databases there")
-    parser.add_argument("--inputs", type=Path, default=None, help="keep the world there, not in --work")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What becomes of a folder of photos whose positions nobody knows: maps, and photos in them.
 
-    python -m tools.made_maps --photos FOLDER [--gcp FILE]
+    python -m tools.made_maps --photos FOLDER --work FOLDER [--gcp FILE]
 
 The folder is ingested into a new database.
 Prints how many photos are in the largest map, in any map, and in how many, placed or not, and
@@ -13,21 +13,20 @@ import io
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from PIL import Image
 
+from featuredb.features.jpeg_segments import EXIF_PREFIX, with_app1
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
-from tools.figures import study_parser, work_folder, write_figures
+from tools.figures import study_parser, write_figures
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 _GPS_IFD = 34853
-_EXIF, _XMP = b"Exif\x00\x00", b"http://ns.adobe.com/"
-_APP1, _SCAN = 0xE1, 0xDA
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,10 +50,8 @@ class Made:
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    with work_folder(args.work) as work:
-        control = () if args.gcp is None else ("--gcp", str(args.gcp))
-        made = make(work / "db", "photos", args.photos, len(photo_names(args.photos)), control)
-    sys.stdout.write(f"{made}\n")
+    control = () if args.gcp is None else ("--gcp", str(args.gcp))
+    made = make(args.work / "db", "photos", args.photos, len(photo_names(args.photos)), control)
     write_figures(args.json, asdict(made))
     return 0 if made.maps else 1
 
@@ -107,42 +104,16 @@ def copied(folder: Path, names: Sequence[str], target: Path, *, strip: bool) -> 
 
 
 def without_position(jpeg: bytes) -> bytes:
-    """A JPEG without the GPS directory of its EXIF and without XMP; all else as it was."""
+    """A JPEG without the GPS directory of its EXIF and with empty XMP; the picture as it was."""
     with Image.open(io.BytesIO(jpeg)) as image:
         exif = image.getexif()
     exif.pop(_GPS_IFD, None)
-    parts = [jpeg[:2]]
-    for marker, content in _segments(jpeg):
-        body = content
-        if marker == _APP1 and content.startswith(_EXIF):
-            body = exif.tobytes()
-        elif marker == _APP1 and content.startswith(_XMP):
-            continue
-        parts.append(bytes((0xFF, marker)) + (len(body) + 2).to_bytes(2, "big") + body)
-    return b"".join([*parts, jpeg[_picture_start(jpeg) :]])
-
-
-def _segments(jpeg: bytes) -> Iterator[tuple[int, bytes]]:
-    """Markers and contents of the segments before the picture."""
-    at, end = 2, _picture_start(jpeg)
-    while at < end:
-        size = int.from_bytes(jpeg[at + 2 : at + 4], "big")
-        yield jpeg[at + 1], jpeg[at + 4 : at + 2 + size]
-        at += 2 + size
-
-
-def _picture_start(jpeg: bytes) -> int:
-    at = 2
-    while jpeg[at + 1] != _SCAN:
-        at += 2 + int.from_bytes(jpeg[at + 2 : at + 4], "big")
-    return at
+    return with_app1(jpeg, exif.tobytes().removeprefix(EXIF_PREFIX), b"")
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, metavar="FOLDER", required=True)
+    parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--gcp", type=Path, default=None, metavar="FILE", help="control points of the photos")
-    parser.add_argument("--work", type=Path, default=None, help="keep the database there")
     return parser.parse_args(argv)
 
 

@@ -116,8 +116,7 @@ _KINDS: dict[str, Callable[[Flight, np.random.Generator], FloatArray]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
-    parser.add_argument("--work", type=Path, required=True, help="maps are made there, and found again")
+    parser = study_parser(__doc__, "--work")
     parser.add_argument("--photos", type=Path, nargs="*", default=[], metavar="FOLDER")
     parser.add_argument("--draws", type=int, default=25, help="of each kind")
     parser.add_argument("--chance", type=int, default=1000, help="draws of random positions")

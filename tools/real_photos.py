@@ -1,6 +1,6 @@
 """Real photos end to end: some are held out, localised over Zenoh, and compared with a map of all photos.
 
-    uv run python tools/real_photos.py --photos FOLDER --held-out DJI_0020.JPG DJI_0025.JPG
+    python -m tools.real_photos --photos FOLDER --work FOLDER --held-out DJI_0020.JPG DJI_0025.JPG
 
 1. `featuredb ingest photos` takes all photos but the held-out ones, in a process and a database of its own.
 2. The same takes all photos, into another database: what its map says of the held-out ones is the reference.
@@ -32,7 +32,8 @@ from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
-from tools.figures import study_parser, work_folder, write_figures
+from tools.figures import study_parser, write_figures
+from tools.made_maps import photo_names
 
 _ROOT = Path(__file__).resolve().parent.parent
 _EVERY = 5  # without --held-out, one photo in so many is held out
@@ -59,31 +60,27 @@ class Ingest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOutRow:
-    """One held-out photo: the answer against the reference."""
+    """One held-out photo: the answer against the reference, and the 68 % radii that it states."""
 
     name: str
     reason: str
     error: PoseError | None
     inliers: int
-    confidence: float
     camera: str
-    horizontal_68_m: float
-    vertical_68_m: float
+    position_68_m: float
     orientation_68_deg: float
-    wall_ms: float
-    position_68_m: float = float("nan")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     held_out = tuple(args.held_out) or every_nth(args.photos)
-    with work_folder(args.work) as work:
-        part = ingest(work / "part", args.photos, held_out)
-        _tell(part, f"all but {len(held_out)} photos")
-        whole = ingest(work / "whole", args.photos, ())
-        _tell(whole, "all photos")
-        rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
-    sys.stdout.write(table(rows) + "\n")
+    work: Path = args.work
+    part = ingest(work / "part", args.photos, held_out)
+    sys.stdout.write(f"{part}\n")
+    whole = ingest(work / "whole", args.photos, ())
+    sys.stdout.write(f"{whole}\n")
+    rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
+    sys.stdout.write("".join(f"{row}\n" for row in rows))
     write_figures(
         args.json,
         {"usable": part.usable, "registered": part.registered, "ingest_s": part.wall_s} | error_figures(rows),
@@ -93,8 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def every_nth(folder: Path) -> tuple[str, ...]:
     """Names of every fifth photo of the folder."""
-    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
-    return tuple(names[_EVERY // 2 :: _EVERY])
+    return tuple(photo_names(folder)[_EVERY // 2 :: _EVERY])
 
 
 def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None) -> Ingest:
@@ -108,6 +104,7 @@ def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | No
     """
     if database.exists():
         raise SystemExit(f"{database} is there already; a map is made from nothing there")
+    database.parent.mkdir(parents=True, exist_ok=True)
     report = database.with_name(f"{database.name}-report")
     command = [sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)]
     command += ["--quiet", "--report", str(report), *(f"--exclude={name}" for name in exclude)]
@@ -170,60 +167,25 @@ def ask_poses(
         Client(server.endpoints[0]) as client,
     ):
         for name in names:
-            start = time.perf_counter()
             reply = client.localise(photos / name, camera=camera, timeout_s=60.0)
-            rows.append(_row(name, reply, frame, poses[name], 1e3 * (time.perf_counter() - start)))
+            rows.append(_row(name, reply, frame, poses[name]))
     return rows
 
 
-def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3, wall_ms: float) -> HeldOutRow:
+def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3) -> HeldOutRow:
     error, nan = None, float("nan")
     if reply.utm is not None:
         utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
         error = pose_difference(frame, pose, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
-    accuracy = reply.accuracy
     return HeldOutRow(
         name=name,
         reason=reply.reason or "",
         error=error,
         inliers=reply.inliers,
-        confidence=reply.confidence,
         camera=reply.camera.source if reply.camera else "",
-        horizontal_68_m=accuracy.horizontal_68_m if accuracy else nan,
-        vertical_68_m=accuracy.vertical_68_m if accuracy else nan,
-        orientation_68_deg=accuracy.orientation_68_deg if accuracy else nan,
-        wall_ms=wall_ms,
         position_68_m=nan if reply.covariance is None else error_radius(np.array(reply.covariance)[3:, 3:]),
+        orientation_68_deg=reply.accuracy.orientation_68_deg if reply.accuracy else nan,
     )
-
-
-def table(rows: Sequence[HeldOutRow]) -> str:
-    """Differences and reported radii, one line for each photo."""
-    lines = [
-        f"{'photo':<20}{'east m':>8}{'north m':>9}{'up m':>8}{'all m':>8}{'deg':>8}{'inliers':>9}"
-        f"{'68 %: hor m':>13}{'ver m':>7}{'deg':>7}{'camera':>11}{'ms':>7}"
-    ]
-    for row in rows:
-        end = f"{row.camera or '-':>11}{row.wall_ms:>7.0f}"
-        if row.error is None:
-            lines.append(f"{row.name:<20}{row.reason:>41}{row.inliers:>9}{'':>27}{end}")
-            continue
-        e = row.error
-        lines.append(
-            f"{row.name:<20}{e.east_m:>8.3f}{e.north_m:>9.3f}{e.up_m:>8.3f}{e.position_m:>8.3f}"
-            f"{e.angle_deg:>8.3f}{row.inliers:>9}{row.horizontal_68_m:>13.2f}{row.vertical_68_m:>7.2f}"
-            f"{row.orientation_68_deg:>7.2f}{end}"
-        )
-    return "\n".join(lines)
-
-
-def _tell(done: Ingest, what: str) -> None:
-    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in done.stages_s.items())
-    sys.stdout.write(
-        f"ingest of {what}: {done.registered} of {done.usable} registered, {done.wall_s:.1f} s wall, "
-        f"{done.cpu_s:.1f} s of CPU ({stages})\n"
-    )
-    sys.stdout.flush()
 
 
 def error_figures(rows: Sequence[HeldOutRow]) -> dict[str, float]:
@@ -247,12 +209,10 @@ def _children_cpu_s() -> float:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
+    parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument(
         "--held-out", nargs="+", default=[], metavar="NAME", help=f"default: every {_EVERY}th photo"
     )
-    parser.add_argument("--work", type=Path, default=None, help="keep both databases and reports there")
     return parser.parse_args(argv)
 
 

@@ -1,9 +1,9 @@
 """Real photos played as a film: every frame's pose against a reconstruction of all photos.
 
-    python -m tools.real_sequence --photos FOLDER [--seconds 1] [--work DIR]
+    python -m tools.real_sequence --photos FOLDER --work DIR
 
 1. `featuredb ingest photos` makes a map of every second photo, and in another database one of all of them.
-2. All photos in the order of their names are the frames of a film, `--seconds` apart, which is tracked by the
+2. All photos in the order of their names are the frames of a film, a second apart, which is tracked by the
    first map as `featuredb track` does: no lens, no positions. Consecutive photos overlap little, so that most
    frames are looked for anew.
 3. Each frame's pose is compared with that of the reconstruction of all photos, laid on the first map by the
@@ -11,7 +11,6 @@
 
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,25 +26,23 @@ from featuredb.video.folder import natural_key
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
-from tools.figures import study_parser, work_folder, write_figures
+from tools.figures import study_parser, write_figures
 from tools.growth_common import table
+from tools.made_maps import photo_names
 from tools.real_photos import ingest, reference
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
-    names = sorted(
-        (p.name for p in args.photos.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png")),
-        key=natural_key,
-    )
-    with work_folder(args.work) as work:
-        for name, left_out in (("part", names[1::2]), ("whole", [])):
-            if not (work / name).exists():
-                ingest(work / name, args.photos, left_out, work / "cache")
-        part, whole = reference(work / "part"), reference(work / "whole")
-        moved, off_m = laid_on(whole, part)
-        frames = film_of(args.photos, names, work / "frames")
-        tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
+    args = study_parser(__doc__, "--photos", "--work").parse_args(argv)
+    names = sorted(photo_names(args.photos), key=natural_key)
+    work: Path = args.work
+    for name, left_out in (("part", names[1::2]), ("whole", [])):
+        if not (work / name).exists():
+            ingest(work / name, args.photos, left_out, work / "cache")
+    part, whole = reference(work / "part"), reference(work / "whole")
+    moved, off_m = laid_on(whole, part)
+    frames = film_of(args.photos, names, work / "frames")
+    tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
     mapped = {image.name for image in part.images}
     rows, metres = [], []
     for name, point in zip(names, tracked.trajectory.points, strict=True):
@@ -65,13 +62,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     unknown = sum(row[5] == "not in the reconstruction" for row in rows)
     lost = sum(row[2] == "lost" for row in rows)
     middle, largest = (np.median(metres), max(metres)) if metres else (np.nan, np.nan)
-    sys.stdout.write(
-        f"{args.photos}: {len(rows)} frames, {lost} lost, {len(metres)} compared: median {middle:.3f} m, "
-        f"largest {largest:.3f} m; {unknown} with a pose that the reconstruction has not; both "
-        f"reconstructions differ by {off_m:.3f} m at the median camera\n"
-    )
     figures = {"frames": len(rows), "lost": lost, "median_m": float(middle), "largest_m": float(largest)}
-    write_figures(args.json, figures | {"unknown": unknown})
+    figures |= {"compared": len(metres), "unknown": unknown, "apart_m": off_m}
+    write_figures(args.json, figures)
     return 0
 
 
@@ -99,13 +92,6 @@ def film_of(photos: Path, names: Sequence[str], folder: Path) -> Path:
     lines = [f"{i:.3f}" for i in range(len(names))]
     (folder / "times.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, required=True)
-    parser.add_argument("--work", type=Path, default=None, help="keep databases and cache there")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

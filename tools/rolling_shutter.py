@@ -46,10 +46,7 @@ _OUTSIDE = float(chi2.ppf(0.999, 3))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--inputs", type=Path, default=None, help="keep the pictures there, not in --work")
-    args = parser.parse_args(argv)
+    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
     figures = {"flights": 0, "active": 0, "outside": 0, "held_back": 0, "unnamed": 0}
     worst = 0.0
     for style in _STYLES:

@@ -49,10 +49,7 @@ _POINTS, _MARK_PX = 9, 0.5
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--inputs", type=Path, default=None, help="keep the photos there, not in --work")
-    args = parser.parse_args(argv)
+    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
     flight = FlightOptions(lines=3, per_line=5, oblique=3, width=1024)
     options = replace(WorldOptions.short(_SEED), flight=flight, queries=0, street=0, negatives_per_kind=0)
     inputs = (args.inputs or args.work) / f"rtk-flight-{_SEED}"
@@ -124,9 +121,6 @@ def ingested(database: Path, source: Path, truth: Truth, way: str) -> dict[str, 
     metres, _ = camera_errors(feature_map, truth)
     evidence = feature_map.placement.evidence
     sigma_m = float(np.hypot(evidence["bias_sigma_m"][0], evidence["noise_m"][0]))
-    sys.stdout.write(
-        f"{way}: {placed.status}, {len(metres)} photos, {np.median(metres):.4f} m, sigma {sigma_m:.4f} m\n"
-    )
     return {
         f"{way}_m": float(np.median(metres)),
         f"{way}_active": int(placed.status == "active"),

@@ -43,9 +43,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     cv2.setNumThreads(1)
     found = register(args.scan, args.photos, args.crs)
-    _print_accuracy(found)
+    text = json.dumps(found, indent=1) + "\n"
     if args.poses:
-        args.poses.write_text(json.dumps(found, indent=1) + "\n")
+        args.poses.write_text(text)
+    else:
+        sys.stdout.write(text)
     return 0
 
 
@@ -161,23 +163,6 @@ def _angle_deg(a: Floats, b: Floats) -> float:
     return float(np.degrees(np.linalg.norm(cv2.Rodrigues(a @ b.T)[0])))
 
 
-def _print_accuracy(found: dict[str, Any]) -> None:
-    camera = found["camera"]
-    print(f"camera {camera['model']} {camera['width']}x{camera['height']}: ", end="")
-    print(", ".join(f"{value:.6g}" for value in camera["params"]))
-    print(f"{len(found['poses'])} photos registered")
-    for name in ("halves_of_correspondences", "halves_of_photos"):
-        print(f"{name.replace('_', ' ')} differ by: ", end="")
-        print(", ".join(f"{key} {value:.3f}" for key, value in found[name].items()))
-    print(f"{'photo':<16}{'grid east':>12}{'grid north':>13}{'height':>9}{'points':>8}{'median px':>11}")
-    for name, pose in sorted(found["poses"].items()):
-        east, north, up = pose["center_grid"]
-        print(
-            f"{name:<16}{east:>12.2f}{north:>13.2f}{up:>9.2f}{pose['correspondences']:>8}"
-            f"{pose['median_residual_px']:>11.2f}"
-        )
-
-
 def _say(text: str) -> None:
     sys.stderr.write(text + "\n")
 
@@ -187,7 +172,9 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("scan", type=Path, metavar="SCAN", help="LAS or LAZ with colour")
     parser.add_argument("photos", type=Path, metavar="FOLDER", help="photos of one camera")
     parser.add_argument("--crs", default=None, help="of the scan, where the file names none")
-    parser.add_argument("--poses", type=Path, default=None, metavar="FILE", help="write the poses as JSON")
+    parser.add_argument(
+        "--poses", type=Path, default=None, metavar="FILE", help="write there, not on the output"
+    )
     return parser.parse_args(argv)
 
 

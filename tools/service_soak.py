@@ -117,7 +117,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "exit_code": exit_code,
         "load": os.getloadavg()[0],
     }
-    sys.stdout.write("".join(f"{name:<14}{value}\n" for name, value in figures.items()))
     write_figures(args.json, figures)
     return 0
 

@@ -102,7 +102,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "slowest_s": max(one.seconds for one in found),
         "codes": dict(codes),
     }
-    sys.stdout.write("".join(f"{name:<12}{value}\n" for name, value in figures.items()))
     write_figures(args.json, figures)
     return 0
 

@@ -25,6 +25,7 @@ from tools.serve_process import CommandProcess, ServeProcess
 HONEST, ATTACKER, WEB = ("alice", "bob", "carol"), "mallory", "web"
 _SAME_M = 0.5  # two answers to one photo
 _SIDE_PX = 1024  # longer one of what is sent
+_PAUSE_S = 1.0  # of an honest client
 DEADLINE_S = 8.0  # of a query
 
 
@@ -175,7 +176,7 @@ def first_answers(service: Service, photos: Sequence[bytes]) -> list[LocaliseRep
 
 @contextmanager
 def honest_clients(
-    service: Service, photos: Sequence[bytes], expected: Sequence[LocaliseReply], pause_s: float = 1.0
+    service: Service, photos: Sequence[bytes], expected: Sequence[LocaliseReply]
 ) -> Iterator[Heard]:
     """Within the block each honest client asks again and again, after a pause; one of them anew connected.
 
@@ -203,7 +204,7 @@ def honest_clients(
                     while not stop.is_set():
                         ask(client, number)
                         number += 5
-                        stop.wait(pause_s)
+                        stop.wait(_PAUSE_S)
                         if again:
                             break
             except ServiceError as error:  # it cannot connect

@@ -31,11 +31,7 @@ _SHIFT_M = 50_000.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, metavar="FOLDER", required=True)
-    parser.add_argument("--scan", type=Path, metavar="FILE", required=True)
-    parser.add_argument("--work", type=Path, required=True)
-    args = parser.parse_args(argv)
+    args = study_parser(__doc__, "--photos", "--scan", "--work").parse_args(argv)
     names = photo_names(args.photos)
     right = copied(args.photos, names[::2], args.work / "right", strip=False)
     shifted = copied(args.photos, names[1::2], args.work / "shifted", strip=False)

@@ -1,6 +1,6 @@
 """Single strips of photos, placed by positions with the cameras' angles and without: are the bounds true?
 
-    python -m tools.strip_draws --poses POSES.json --photos FOLDER [--draws 200] [--seed 1] [--json FILE]
+    python -m tools.strip_draws --photos FOLDER --scan SCAN.laz --poses POSES.json [--draws 200] [--json FILE]
 
 Real strips are runs of five or six photos along one line of the folder, with the positions and angles of
 their EXIF and XMP; the truth is POSES.json (tools/scan_poses.py, from a scan alone). Simulated ones have
@@ -23,9 +23,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from tools.anchor_brighton import read_poses
-from tools.figures import study_parser, write_figures
+from tools.figures import write_figures
 from tools.position_draws import LEVELS, PARTS, SIGMAS, Flight, inside, squares
+from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
 _LEAST, _MOST_BEND = 5, 0.1  # photos of a real strip; its width over its length
 _EACH_DEG, _COMMON_DEG = np.array([1.3, 1.3, 1.8]), np.array([1.5, 1.5, 2.2])  # camera x and y, up
@@ -43,13 +43,11 @@ class CameraStrip:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__)
-    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
-    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
+    parser = scan_parser(__doc__)
     parser.add_argument("--draws", type=int, default=200, help="simulated strips")
     args = parser.parse_args(argv)
     with threadpool_limits(1):
-        figures = measure("real", list(real_strips(args.poses, args.photos)), _SEED)
+        figures = measure("real", list(real_strips(scan_truth(args), args.photos)), _SEED)
         drawn = [simulated_strip(np.random.default_rng((_SEED, draw))) for draw in range(args.draws)]
         figures |= measure("simulated", drawn, _SEED)
     write_figures(args.json, figures)
@@ -81,21 +79,12 @@ def measure(kind: str, strips: Sequence[CameraStrip], seed: int) -> dict[str, fl
                 for level in LEVELS
             },
         }
-        sys.stdout.write(
-            f"{kind} strips {'without' if name else 'with'} angles: {len(scores)} of {len(strips)} placed, "
-            f"{answer} answer, turn {figures[f'{kind}_{name}turn_deg']:.1f} degrees; inside 68 and 95 %: "
-            + "; ".join(
-                f"{part} {inside(scores, part, 0.68):.0%} and {inside(scores, part, 0.95):.0%}"
-                for part in PARTS
-            )
-            + "\n"
-        )
     return figures
 
 
-def real_strips(poses: Path, photos: Path) -> Iterator[CameraStrip]:
+def real_strips(truth: ScanTruth, photos: Path) -> Iterator[CameraStrip]:
     """Runs of photos, in the order of their names, that lie along a line."""
-    frame, by_name = read_poses(poses)
+    frame, by_name = truth.frame, truth.poses
     names = sorted(by_name)
     told = [read_exif((photos / name).read_bytes()) for name in names]
     positions = np.array(

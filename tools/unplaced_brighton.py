@@ -1,6 +1,6 @@
 """A map without a place, placed on a scan by six picks in one photo: how often, and how right?
 
-    python -m tools.unplaced_brighton --photos FOLDER --scan SCAN.laz --poses poses.json
+    python -m tools.unplaced_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --work FOLDER
 
 1. The photos but the held-out ones, without any position, become one map without a place.
 2. Each draw picks six points of the scan in one photo of the map, with the given error in pixels, and
@@ -8,10 +8,10 @@
    tools/scan_poses.py finds by the scan alone (kept in the file of --poses).
 3. The held-out photos are asked of the placed map and compared with those poses.
 
-A draw is placed, refused, or wrong: placed with the held-out photos a metre off or not answered.
+A draw is placed, refused, or wrong: placed with the held-out photos a metre off or not answered. A run that
+was stopped goes on in --work.
 """
 
-import argparse
 import json
 import shutil
 import sys
@@ -20,17 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database
-from tools import scan_poses
-from tools.anchor_brighton import read_poses
 from tools.anchor_simworld import featuredb
-from tools.figures import study_parser, work_folder, write_figures
+from tools.figures import write_figures
 from tools.made_maps import copied, make, photo_names
 from tools.picked import Scan, picks, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
+from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
 _HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
 _MADE = "made.json"  # what came of the photos; who starts again goes on from there
@@ -40,54 +36,40 @@ _SIGMA_PX = 3.0  # of a pick, each axis
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
-    if not args.poses.exists():
-        scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
-    frame, poses = read_poses(args.poses)
-    document = json.loads(args.poses.read_text(encoding="utf-8"))
-    camera, epsg = camera_of(document), int(document["crs"].removeprefix("EPSG:"))
-    scan = read_scan(args.scan, frame, epsg)
+    args = scan_parser(__doc__, "--work").parse_args(argv)
+    truth = scan_truth(args)
+    scan = read_scan(args.scan, truth.frame, truth.epsg)
     names = [name for name in photo_names(args.photos) if name not in _HELD_OUT]
     figures: dict[str, object] = {"photos": len(names), "draws": _DRAWS}
     placed: list[dict[str, float]] = []
-    with work_folder(args.work) as work:
-        if not (work / _MADE).exists():
-            photos = copied(args.photos, names, work / "photos", strip=True)
-            copied(args.photos, _HELD_OUT, work / "asked", strip=True)
-            made = make(work / "db", "photos", photos, len(names))
-            featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
-            write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
-        figures |= json.loads((work / _MADE).read_text(encoding="utf-8"))
-        (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
-        for number in range(_DRAWS):
-            done = work / f"draw-{number}.json"
-            if not done.exists():
-                judgement = _draw(args, number, work, summary.map_id, scan, camera, frame, poses)
-                done.write_text(json.dumps(judgement), encoding="utf-8")
-            one = json.loads(done.read_text(encoding="utf-8"))
-            sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
-            placed += [one] if one else []
+    work: Path = args.work
+    if not (work / _MADE).exists():
+        photos = copied(args.photos, names, work / "photos", strip=True)
+        copied(args.photos, _HELD_OUT, work / "asked", strip=True)
+        made = make(work / "db", "photos", photos, len(names))
+        featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
+        write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
+    figures |= json.loads((work / _MADE).read_text(encoding="utf-8"))
+    (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
+    for number in range(_DRAWS):
+        done = work / f"draw-{number}.json"
+        if not done.exists():
+            judgement = _draw(number, work, summary.map_id, scan, truth)
+            done.write_text(json.dumps(judgement), encoding="utf-8")
+        one = json.loads(done.read_text(encoding="utf-8"))
+        sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
+        placed += [one] if one else []
     figures |= summed(placed, _DRAWS)
-    sys.stdout.write(f"{figures}\n")
     write_figures(args.json, figures)
     return 0
 
 
-def _draw(
-    args: argparse.Namespace,
-    number: int,
-    work: Path,
-    map_id: str,
-    scan: Scan,
-    camera: Camera,
-    frame: LocalFrame,
-    poses: dict[str, Rigid3],
-) -> dict[str, float] | None:
+def _draw(number: int, work: Path, map_id: str, scan: Scan, truth: ScanTruth) -> dict[str, float] | None:
     """Place a copy of the map by the picks of one draw: errors of the held-out photos, or None: refused."""
     rng = np.random.default_rng((_SEED, number))
     photos = work / "photos"
-    image = str(rng.choice([name for name in photo_names(photos) if name in poses]))
-    drawn = picks(scan, camera, poses[image], rng, _SIGMA_PX)
+    image = str(rng.choice([name for name in photo_names(photos) if name in truth.poses]))
+    drawn = picks(scan, truth.camera, truth.poses[image], rng, _SIGMA_PX)
     file = write_picks(work / f"picks-{number}.csv", image, *drawn)
     database = work / "placed"
     shutil.rmtree(database, ignore_errors=True)
@@ -97,20 +79,8 @@ def _draw(
     # 1: the map is not placed by them. 2: picks that leave the pose open, before anything is tried.
     if featuredb(*words, *out, may_refuse=True, refusals=(1, 2)) != 0:
         return None
-    return judged(database, work / "asked", _HELD_OUT, frame, poses)
-
-
-def camera_of(document: dict[str, dict[str, object]]) -> Camera:
-    """The camera that tools/scan_poses.py wrote."""
-    entry = {key: document["camera"][key] for key in ("model", "width", "height", "params")}
-    return Camera(**entry | {"params": tuple(entry["params"])})  # type: ignore[arg-type]
-
-
-def judged(
-    database: Path, photos: Path, names: Sequence[str], frame: LocalFrame, poses: dict[str, Rigid3]
-) -> dict[str, float]:
-    """Errors of the answers to the held-out photos."""
-    return error_figures(ask_poses(Database.open(database), photos, names, frame, poses))
+    asked = ask_poses(Database.open(database), work / "asked", _HELD_OUT, truth.frame, truth.poses)
+    return error_figures(asked)
 
 
 def summed(placed: Sequence[dict[str, float]], draws: int) -> dict[str, float]:
@@ -128,20 +98,6 @@ def summed(placed: Sequence[dict[str, float]], draws: int) -> dict[str, float]:
         "median_deg": float(np.median(degrees)),
         "worst_deg": max(degrees),
     }
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
-    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
-    parser.add_argument(
-        "--work",
-        type=Path,
-        default=None,
-        help="keep databases and reports there; a run that was stopped goes on with the next draw",
-    )
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -26,15 +26,14 @@ from tools.track_evaluation import film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from tools.worlds.scan_world import make_scan_world
 
-_SEED, _FRAMES = 1, 1200
+_FRAMES = 1200
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    world = make_scan_world(args.out / f"short-{_SEED}" / "world", _SEED, "short", 0)
-    options = film_options("smooth", "short", _SEED, _FRAMES)
-    folder = write_film(args.out / "film-smooth", options, 0)
+    world = make_scan_world(args.out)
+    folder = write_film(args.out / "film-smooth", film_options("smooth", _FRAMES))
     database = args.out / "film.db"
     shutil.rmtree(database, ignore_errors=True)
     featuredb("lidar", "add", str(database), str(world.scan))
@@ -60,7 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "anchored_s": anchored_s,
     }
     write_figures(args.out / "video_map.json", figures)
-    sys.stdout.write(f"{figures}\n")
     return 0
 
 

@@ -45,8 +45,6 @@ NOT_RUN = {
     "pip install": "installs; the extra is looked up",
     "uv sync": "installs; these tests run in what it makes",
     "source": "these tests run in what it activates",
-    "tools/scan_poses.py": _REAL_DATA,
-    "tools/descriptor_study.py": _REAL_DATA,
     "tools/frame_real_photos.py": _REAL_DATA,
     "tools/autzen_windows.py": _REAL_DATA,
 }
@@ -240,7 +238,7 @@ def test_commands_are_found_and_joined() -> None:
         ("featuredb maps my.db other.db", False, "unrecognized arguments: other.db"),
         ("uv run --extra gone featuredb maps my.db", False, "no such extra: gone"),
         ("pip install 'featuredb[gone]'", True, "no such extra: gone"),
-        ("python -m tools.growth_community --size gone", False, "invalid choice: 'gone'"),
+        ("python -m tools.track_evaluation --on gone", False, "invalid choice: 'gone'"),
         ("tools/growth_community.py --gone 3", True, "no option --gone"),
         ("tools/gone.py", True, "no file tools/gone.py"),
         ("uv run --extra docs mkdocs gone", True, "gone"),

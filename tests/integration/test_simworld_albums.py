@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,8 +17,9 @@ from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.truth import read_truth
 from ingest.photos.table import read_table
+from tools.worlds.album import write_album
 from tools.worlds.album_files import TABLE_FILES, read_facts
-from tools.worlds.community import CommunityOptions, write_community
+from tools.worlds.community import CommunityOptions, community_album
 from tools.worlds.poison_world import POISONS, PoisonOptions, plan_poison, poison_places
 from tools.worlds.walk_world import WalkOptions, plan_walk
 
@@ -43,7 +45,7 @@ pytestmark = pytest.mark.evaluation  # worlds of studies
 
 @pytest.fixture(scope="module")
 def album(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_community(tmp_path_factory.mktemp("album"), TINY, workers=1)
+    return write_album(tmp_path_factory.mktemp("album"), TINY, partial(community_album, TINY), workers=1)
 
 
 def test_tables_name_every_contributed_photo_alike(album: Path) -> None:
@@ -122,7 +124,9 @@ def test_an_interrupted_album_goes_on_and_ends_the_same(album: Path, tmp_path: P
         (tmp_path / file).write_bytes((album / file).read_bytes())
     before = {file: (tmp_path / file).stat().st_mtime_ns for file in kept[::2]}
     calls: list[tuple[int, int]] = []
-    write_community(tmp_path, TINY, workers=1, progress=lambda *done: calls.append(done))
+    write_album(
+        tmp_path, TINY, partial(community_album, TINY), workers=1, progress=lambda *done: calls.append(done)
+    )
     assert calls[0] == (len(kept[::2]) + 1, len(kept))
     assert {file: (tmp_path / file).stat().st_mtime_ns for file in before} == before
     assert sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*.*")) == files

@@ -14,7 +14,6 @@ from tools.growth_common import Album, Registered, Verdict
 from tools.growth_poison import PoisonOutcome
 from tools.growth_walk import Probe, Step, worst_map
 from tools.worlds.album_files import AlbumFact
-from tools.worlds.walk_world import WalkOptions
 
 
 def fact(i: int, kind: str = "drone") -> AlbumFact:
@@ -96,23 +95,22 @@ def steps(ratio: float = 0.5, stopped: int = 0, reach: float = 700.0, drift: flo
 
 
 def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
-    world = WalkOptions()
     good = steps(stopped=9)
-    assert all(holding(growth_walk.judge(good, good[0], 1, 0.5, world)).values())
-    near = steps(reach=300.0, stopped=9)
-    assert not holding(growth_walk.judge(near, good[0], 1, 0.5, world))["coverage follows"]
-    assert not holding(growth_walk.judge(steps(stopped=0), good[0], 1, 0.5, world))["budget"]
+    assert all(holding(growth_walk.judge(good, good[0], 1)).values())
+    near = steps(reach=100.0, stopped=9)
+    assert not holding(growth_walk.judge(near, good[0], 1))["coverage follows"]
+    assert not holding(growth_walk.judge(steps(stopped=0), good[0], 1))["budget"]
     far = steps(ratio=1.2)
-    assert not holding(growth_walk.judge(far, good[0], 1, 0.5, world))["true error inside the bound"]
+    assert not holding(growth_walk.judge(far, good[0], 1))["true error inside the bound"]
     over = steps(drift=0.6, stopped=9)
-    assert not holding(growth_walk.judge(over, good[0], 1, 0.5, world))["budget"]
-    assert not holding(growth_walk.judge(good, good[0], 2, 0.5, world))["second anchor"]
+    assert not holding(growth_walk.judge(over, good[0], 1))["budget"]
+    assert not holding(growth_walk.judge(good, good[0], 2))["second anchor"]
     off = replace(good[0], probes=(replace(good[0].probes[0], error_m=0.31, normalised=20.0),))
-    assert not holding(growth_walk.judge(good, off, 1, 0.5, world))["second anchor"]
-    assert not holding(growth_walk.judge([off], good[0], 1, 0.5, world))["probes inside their 95 %"]
+    assert not holding(growth_walk.judge(good, off, 1))["second anchor"]
+    assert not holding(growth_walk.judge([off], good[0], 1))["probes inside their 95 %"]
     # One wrong answer at one early step, among any number of right ones.
     astray = replace(good[0], probes=(replace(good[0].probes[0], error_m=2.1), *good[0].probes))
-    assert not holding(growth_walk.judge([astray, *good], good[0], 1, 0.5, world))["no wrong answer"]
+    assert not holding(growth_walk.judge([astray, *good], good[0], 1))["no wrong answer"]
 
 
 def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:
@@ -123,13 +121,13 @@ def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:
 
 
 def test_poison_that_gets_in_fails() -> None:
-    clean = PoisonOutcome(poison="mirrored", sent=10, active=0, quarantined=0, wrong=0, off_share=0.0)
+    clean = PoisonOutcome(sent=10, active=0, quarantined=0, wrong={}, off_share=0.0)
     good = {"changed": True, "restored": True}
-    assert all(holding(growth_poison.judge([clean], 0.01, good)).values())
-    for bad in (replace(clean, wrong=1), replace(clean, off_share=0.03)):
-        assert not holding(growth_poison.judge([bad], 0.01, good))["poison: mirrored"]
-    assert holding(growth_poison.judge([replace(clean, off_share=0.03)], 0.02, good))["poison: mirrored"]
+    assert all(holding(growth_poison.judge(clean, 0.01, good)).values())
+    for bad in (replace(clean, wrong={"mirrored": 1}), replace(clean, off_share=0.03)):
+        assert not holding(growth_poison.judge(bad, 0.01, good))["poison"]
+    assert holding(growth_poison.judge(replace(clean, off_share=0.03), 0.02, good))["poison"]
     for bad in ({"changed": True, "restored": False}, {"changed": False, "restored": True}):
-        assert not holding(growth_poison.judge([clean], 0.01, bad))["retire"]
+        assert not holding(growth_poison.judge(clean, 0.01, bad))["retire"]
     held = replace(clean, forced=1, restored=False)
-    assert not holding(growth_poison.judge([held], 0.01, good))["retire"]
+    assert not holding(growth_poison.judge(held, 0.01, good))["retire"]

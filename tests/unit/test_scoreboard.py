@@ -1,6 +1,7 @@
 """The scoreboard: rows, limits, results by commit, and that the documentation says what was measured."""
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from tools.scoreboard.row import Limit, Row
 from tools.scoreboard.run import Folders, run
 
 _TOOL = "import json, pathlib, sys; pathlib.Path(sys.argv[1]).write_text(json.dumps({'a': {'m': 0.25}}))"
+_ARGV = "['', '{work}/figures.json', '{data}/set']"
 
 
 def row(text: str = "{m:.2f} m in {seconds:.0f} s", limit: float = 0.3, code: str = _TOOL) -> Row:
@@ -22,11 +24,10 @@ def row(text: str = "{m:.2f} m in {seconds:.0f} s", limit: float = 0.3, code: st
         group="real",
         form="quick",
         claim="a claim",
-        commands=(("timeit", "-n1", "-r1", f"import sys; sys.argv = ['', '{{work}}/figures.json']; {code}"),),
+        commands=shlex.join(("timeit", "-n1", "-r1", f"import sys; sys.argv = {_ARGV}; {code}")),
         figures={"m": "a.m"},
         text=text,
-        limits=(Limit(figure="m", most=limit),),
-        needs=("set",),
+        limits=f"m <= {limit}",
     )
 
 
@@ -89,12 +90,23 @@ def test_the_page_tells_what_holds_what_failed_and_what_was_not_run() -> None:
 
 def test_a_row_that_cannot_be_judged_is_refused() -> None:
     with pytest.raises(InvalidValueError, match="expected a command and a limit"):
-        replace(row(), limits=())
+        replace(row(), limits="")
     assert row(text="{gone} m").words({}) == "- m"
-    with pytest.raises(InvalidValueError, match="expected least, most or both"):
-        Limit(figure="m")
-    assert not Limit(figure="m", least=0.0).holds({"m": None})
-    assert not Limit(figure="m", least=0.0).holds({})
+    for text in ("m", "m < 3", "3", "m <= x", "1 <= m,2 <= n"):
+        with pytest.raises(InvalidValueError, match="expected one as `14 <= photos`"):
+            replace(row(), limits=f"1 <= k, {text}")
+
+
+def test_a_limit_is_what_its_text_says() -> None:
+    assert [Limit.of("0.5 <= m <= 2").holds({"m": m}) for m in (0.4, 0.5, 2, 2.1)] == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert [Limit.of("m = -1").holds({"m": m}) for m in (-1, 0)] == [True, False]
+    assert [Limit.of("0 <= m").holds({"m": m}) for m in (-1, 0, 1e9)] == [False, True, True]
+    assert not any(Limit.of("0 <= m").holds(figures) for figures in ({"m": None}, {"m": "1"}, {}))
 
 
 def test_rows_have_names_of_their_own_and_real_sets_are_not_outnumbered() -> None:

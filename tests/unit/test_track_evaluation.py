@@ -8,9 +8,9 @@ from tools.track_evaluation import film_options
 
 
 def test_only_one_film_is_cut() -> None:
-    assert film_options("cut", "short", 1, 100).cut == (40, 55)
-    assert film_options("smooth", "short", 1, 100).cut is None
-    assert film_options("jerky", "short", 1, 100).path.style == "jerky"
+    assert film_options("cut", 100).cut == (40, 55)
+    assert film_options("smooth", 100).cut is None
+    assert film_options("jerky", 100).path.style == "jerky"
 
 
 def test_marks_are_as_far_from_their_places_as_they_were_drawn() -> None:

@@ -34,7 +34,7 @@ def page(rows: Sequence[Row], results: Mapping[str, Result]) -> str:
     parts.append("## Commands\n")
     parts.append("`{data}` is the folder of the real sets, `{work}` and `{cache}` are folders for work.\n")
     for row in rows:
-        lines = [f"`python -m {' '.join(_quoted(word) for word in words)}`" for words in row.commands]
+        lines = [f"`python -m {line}`" for line in row.commands.splitlines()]
         parts.append(f"- **{row.name}**: {', '.join(lines)}")
     return "\n".join(parts).rstrip() + "\n"
 
@@ -65,14 +65,13 @@ def with_table(readme: str, table: str) -> str:
 
 
 def _line(row: Row, result: Result | None) -> str:
-    limits = ", ".join(map(str, row.limits))
     if result is None:
-        cells = ["not run", limits, "-", row.form, "", f"about {row.minutes:g}"]
+        cells = ["not run", row.limits, "-", row.form, "", f"about {row.minutes:g}"]
     elif result.failure:
         failure = result.failure.replace("|", "/").replace("`", "'").replace("<", "(").replace(">", ")")
-        cells = [f"FAILED: {failure}", limits, "no", row.form, f"{result.commit}, {result.date}", "-"]
+        cells = [f"FAILED: {failure}", row.limits, "no", row.form, f"{result.commit}, {result.date}", "-"]
     else:
-        cells = [row.words(result.figures), limits, _yes(row, result.figures), row.form]
+        cells = [row.words(result.figures), row.limits, _yes(row, result.figures), row.form]
         cells += [f"{result.commit}, {result.date}", f"{result.seconds / 60:.1f}"]
     return f"| {row.name} | {row.claim} | {' | '.join(cells)} |"
 
@@ -81,7 +80,3 @@ def _yes(row: Row, figures: Figures) -> str:
     """Whether it holds; if not, which limit is missed and by what figure."""
     missed = row.missed(figures)
     return f"**no**: {missed}" if missed else "yes"
-
-
-def _quoted(word: str) -> str:
-    return f'"{word}"' if " " in word else word

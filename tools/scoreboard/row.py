@@ -1,5 +1,8 @@
 """A row of the scoreboard: a claim, the command that measures it, and what its figures must be."""
 
+import math
+import re
+import shlex
 import string
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,32 +13,38 @@ from featuredb.errors import InvalidValueError
 Group = Literal["real", "simulated", "speed"]
 Form = Literal["quick", "full"]
 Figures = Mapping[str, float | int | str | None]
+_LIMIT = re.compile(r"(?:(-?[\d.]+) <= )?([a-z]\w*)(?: (<=|=) (-?[\d.]+))?")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limit:
-    """What a figure must be: `least` at the least, `most` at the most."""
+    """What a figure must be, as `14 <= photos`, `lost <= 0`, `0.63 <= share <= 0.73` or `maps = 1` say it."""
 
+    text: str
     figure: str
-    least: float | None = None
-    most: float | None = None
+    least: float
+    most: float
 
-    def __post_init__(self) -> None:
-        if self.least is None and self.most is None:
-            raise InvalidValueError(f"limit of {self.figure}: expected least, most or both, found neither")
+    @classmethod
+    def of(cls, text: str) -> "Limit":
+        """The limit that a text says.
+
+        Raises:
+            InvalidValueError: it says none.
+        """
+        found = _LIMIT.fullmatch(text)
+        least, figure, sign, most = found.groups() if found else (None,) * 4
+        if figure is None or (least is None and most is None):
+            raise InvalidValueError(
+                f"limit {text!r}: expected one as `14 <= photos`, `lost <= 0` or `maps = 1`"
+            )
+        low = most if sign == "=" else least
+        return cls(text=text, figure=figure, least=float(low or -math.inf), most=float(most or math.inf))
 
     def holds(self, figures: Figures) -> bool:
         """Whether the figure is there and within the limit."""
         value = figures.get(self.figure)
-        if value is None or isinstance(value, str):
-            return False
-        return (self.least is None or value >= self.least) and (self.most is None or value <= self.most)
-
-    def __str__(self) -> str:
-        if self.least == self.most:
-            return f"{self.figure} = {self.least:g}"
-        low = "" if self.least is None else f"{self.least:g} <= "
-        return f"{low}{self.figure}{'' if self.most is None else f' <= {self.most:g}'}"
+        return value is not None and not isinstance(value, str) and self.least <= value <= self.most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,29 +54,27 @@ class Row:
     Attributes:
         name: by which it is asked for. group: table in which it stands. form: with which it runs.
         claim: what is claimed, for readers.
-        commands: argument vectors, run one after the other by this Python; `{data}` is the folder of real
-            sets, `{work}` an empty folder of the row, `{cache}` one that rows and commits share, for inputs
-            that do not depend on the program. The first word is a module (`tools.x`, `featuredb.cli`).
+        commands: one a line, run one after the other by this Python; `{data}` is the folder of real sets,
+            `{work}` an empty folder of the row, `{cache}` one that rows and commits share, for inputs that do
+            not depend on the program. The first word is a module (`tools.x`, `featuredb.cli`).
         json: file with the figures, which the last command writes.
         text: the figures in words, a format string.
-        limits: all must hold.
+        limits: all must hold; between commas, each as `Limit` reads it.
         figures: name -> where it is in the file, keys joined by dots: of those that are kept beside what
             `text` and `limits` name, and of what does not stand there under its own name.
-        needs: paths under `{data}`; the row is skipped where one is absent.
         resumes: whether the command goes on with what it finds in `{work}` of the same commit.
         readme: whether README shows it. minutes: about how long it takes on two cores.
     """
 
     name: str
     group: Group
-    form: Form
+    form: Form = "full"
     claim: str
-    commands: tuple[tuple[str, ...], ...]
+    commands: str
     text: str
-    limits: tuple[Limit, ...]
+    limits: str
     figures: Mapping[str, str] = field(default_factory=dict)
     json: str = "{work}/figures.json"
-    needs: tuple[str, ...] = ()
     resumes: bool = False
     readme: bool = False
     minutes: float = 1.0
@@ -75,23 +82,38 @@ class Row:
     def __post_init__(self) -> None:
         if not self.limits or not self.commands:
             raise InvalidValueError(f"row {self.name}: expected a command and a limit")
+        self.each_limit()
+
+    def calls(self) -> list[list[str]]:
+        """The commands' argument vectors."""
+        return [shlex.split(line) for line in self.commands.splitlines()]
+
+    def needs(self) -> list[str]:
+        """Paths under `{data}` that the commands name; the row is skipped where one is absent."""
+        return re.findall(r"\{data\}/([\w./-]+)", self.commands)
+
+    def each_limit(self) -> list[Limit]:
+        """The limits, read."""
+        return [Limit.of(text) for text in self.limits.split(", ")]
 
     def read(self, document: Mapping[str, Any]) -> dict[str, float | int | str | None]:
         """The row's figures of what the command has written; None for what is not there."""
         words = (name for _, name, _, _ in string.Formatter().parse(self.text) if name is not None)
-        named = {*words, *(limit.figure for limit in self.limits)} - {"seconds"}
+        named = {*words, *(limit.figure for limit in self.each_limit())} - {"seconds"}
         paths = {name: name for name in sorted(named)} | dict(self.figures)
         return {name: _at(document, path) for name, path in paths.items()}
 
     def holds(self, figures: Figures) -> bool:
         """Whether all limits hold."""
-        return all(limit.holds(figures) for limit in self.limits)
+        return all(limit.holds(figures) for limit in self.each_limit())
 
     def missed(self, figures: Figures) -> str:
         """The limits that do not hold, each with its figure; "" where all do."""
-        found = [(limit, figures.get(limit.figure)) for limit in self.limits if not limit.holds(figures)]
+        found = [
+            (limit, figures.get(limit.figure)) for limit in self.each_limit() if not limit.holds(figures)
+        ]
         return ", ".join(
-            f"{limit} (it is {value:.3g})" if isinstance(value, float | int) else f"{limit} (not measured)"
+            limit.text + (f" (it is {value:.3g})" if isinstance(value, float | int) else " (not measured)")
             for limit, value in found
         )
 

@@ -27,7 +27,7 @@ class Folders:
 
     def missing(self, row: Row) -> list[Path]:
         """What the row needs and the data have not."""
-        return [self.data / name for name in row.needs if not (self.data / name).exists()]
+        return [self.data / name for name in row.needs() if not (self.data / name).exists()]
 
 
 def run(row: Row, places: Folders, commit: str) -> Result:
@@ -44,7 +44,7 @@ def run(row: Row, places: Folders, commit: str) -> Result:
     start, code, failure = time.monotonic(), 0, ""
     figures_file = Path(row.json.format(**names))
     with (places.work / f"{row.name}.log").open("w+", encoding="utf-8") as log:
-        for words in row.commands:
+        for words in row.calls():
             command = [sys.executable, "-m", *(word.format(**names) for word in words)]
             log.write(f"$ {' '.join(command[1:])}\n")
             log.flush()

@@ -7,7 +7,6 @@ other_town; copy (a re-upload by somebody else); indoor, portrait (belong nowher
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto, Progress, Subject, write_album
+from tools.worlds.album import PlannedPhoto, Subject
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
@@ -33,6 +32,9 @@ from tools.worlds.surveyed import (
 )
 
 _OTHER_SEED = 1000
+# How much more people visit the first sights (`plan_visits`). Photo sites show a few landmarks: the paper's
+# 120,000 photos were of seven, and in every town one place leads.
+_ZIPF = 1.0
 _TAGGED_HERE, _TAGGED_THERE = (
     0.6,
     0.8,
@@ -48,57 +50,34 @@ class CommunityOptions:
         flight: the anchored survey, of most of what people visit.
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
-        sights: places that people visit.
-        zipf: how much more they visit the first ones (`plan_visits`). Photo sites show a few landmarks: the
-            paper's 120,000 photos were of seven, and in every town one place leads. None: nearly alike.
-        width: of the widest camera, pixels.
+        sights: places that people visit. width: of the widest camera, pixels.
         geotags: how wrong they are.
         texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
     """
 
     seed: int = 1
-    town_size_m: tuple[float, float] = (440.0, 350.0)
+    town_size_m: tuple[float, float] = (260.0, 230.0)
     flight: FlightOptions = field(
         default_factory=lambda: FlightOptions(
-            lines=9, per_line=13, height_m=100.0, oblique=14, gps_error="rtk", center_m=(-50.0, 15.0)
+            lines=4, per_line=6, oblique=4, width=1200, gps_error="rtk", center_m=(-25.0, 10.0)
         )
     )
-    photos: int = 300
-    other_town: int = 100
-    copies: int = 40
-    indoor: int = 12
-    portraits: int = 12
-    sights: int = 12
-    zipf: float | None = 1.0
-    width: int = 1600
+    photos: int = 48
+    other_town: int = 12
+    copies: int = 6
+    indoor: int = 2
+    portraits: int = 2
+    sights: int = 6
+    width: int = 1200
     geotags: GeotagOptions = field(default_factory=GeotagOptions)
     texel_m: float = 0.06
-    pieces: int = 16
+    pieces: int = 4
 
     def __post_init__(self) -> None:
         if min(self.photos, self.other_town, self.copies, self.indoor, self.portraits) < 0:
             raise InvalidValueError(f"CommunityOptions: expected numbers >= 0, found {self}")
         if not (self.sights > 0 and self.width >= 64):
             raise InvalidValueError(f"CommunityOptions: value out of range in {self}")
-
-    @classmethod
-    def short(cls, seed: int = 1) -> "CommunityOptions":
-        """A small town with a tenth of the photos, for a first look in minutes."""
-        return cls(
-            seed=seed,
-            town_size_m=(260.0, 230.0),
-            flight=FlightOptions(
-                lines=4, per_line=6, oblique=4, width=1200, gps_error="rtk", center_m=(-25.0, 10.0)
-            ),
-            photos=48,
-            other_town=12,
-            copies=6,
-            indoor=2,
-            portraits=2,
-            sights=6,
-            width=1200,
-            pieces=4,
-        )
 
     def scene(self, key: str) -> Scene:
         """Scenes "home/light/week" and "away/light/week"."""
@@ -121,20 +100,10 @@ def _base(options: CommunityOptions, town: str) -> Scene:
     )
 
 
-def write_community(
-    folder: Path, options: CommunityOptions, workers: int = 0, progress: Progress | None = None
-) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
-
-    def plan() -> list[PlannedPhoto]:
-        survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
-        return survey + plan_community(options)
-
-    return write_album(folder, options, plan, workers, progress)
+def community_album(options: CommunityOptions) -> list[PlannedPhoto]:
+    """All photos."""
+    survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
+    return survey + plan_community(options)
 
 
 def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
@@ -142,7 +111,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
     home, away = options.scene("home/0/000"), options.scene("away/0/000")
     people = community(options.width)
     places = find_sights(home, options.sights, options.seed, options.flight.center_m)
-    mine = plan_visits(home, people, places, options.photos, options.seed, "home", zipf=options.zipf)
+    mine = plan_visits(home, people, places, options.photos, options.seed, "home", zipf=_ZIPF)
     places = find_sights(away, options.sights, options.seed + 1)
     theirs = plan_visits(
         away,
@@ -153,7 +122,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
         "away",
         first_visit=10_000,
         kind="other_town",
-        zipf=options.zipf,
+        zipf=_ZIPF,
     )
     rng = np.random.default_rng((options.seed, 58))
     mine = tagged(home, mine, people, options.geotags, rng)

@@ -17,7 +17,6 @@ stands there mirrored. Kinds of photos:
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +25,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto, Progress, write_album
+from tools.worlds.album import PlannedPhoto
 from tools.worlds.album_files import Geotag
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
@@ -62,43 +61,25 @@ class PoisonOptions:
     """
 
     seed: int = 4
-    town_size_m: tuple[float, float] = (560.0, 260.0)
+    town_size_m: tuple[float, float] = (400.0, 200.0)
     flight: FlightOptions = field(
         default_factory=lambda: FlightOptions(
-            lines=6, per_line=12, oblique=8, gps_error="rtk", center_m=(-130.0, 0.0)
+            lines=4, per_line=8, oblique=4, width=1200, gps_error="rtk", center_m=(-100.0, 10.0)
         )
     )
-    honest: int = 60
-    late: int = 40
-    canaries: int = 20
-    per_poison: int = 30
-    sights: int = 14
-    width: int = 1440
+    honest: int = 20
+    late: int = 12
+    canaries: int = 6
+    per_poison: int = 10
+    sights: int = 6
+    width: int = 1200
     geotags: GeotagOptions = field(default_factory=lambda: GeotagOptions(sigma_m=15.0, far_share=0.0))
     texel_m: float = 0.06
-    pieces: int = 16
+    pieces: int = 4
 
     def __post_init__(self) -> None:
         if min(self.honest, self.late, self.canaries, self.per_poison) < 0 or self.sights < 1:
             raise InvalidValueError(f"PoisonOptions: value out of range in {self}")
-
-    @classmethod
-    def short(cls, seed: int = 4) -> "PoisonOptions":
-        """A smaller town and a third of the photos, for a first look in minutes."""
-        return cls(
-            seed=seed,
-            town_size_m=(400.0, 200.0),
-            flight=FlightOptions(
-                lines=4, per_line=8, oblique=4, width=1200, gps_error="rtk", center_m=(-100.0, 10.0)
-            ),
-            honest=20,
-            late=12,
-            canaries=6,
-            per_poison=10,
-            sights=6,
-            width=1200,
-            pieces=4,
-        )
 
     def scene(self, key: str) -> Scene:
         """Scenes "home/...", "forged/..." and "away/light/week"."""
@@ -187,20 +168,10 @@ def _covers(outer: Rect, block: Rect) -> bool:
     return outer[0] <= x <= outer[2] and outer[1] <= y <= outer[3]
 
 
-def write_poison(
-    folder: Path, options: PoisonOptions, workers: int = 0, progress: Progress | None = None
-) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
-
-    def plan() -> list[PlannedPhoto]:
-        survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
-        return survey + plan_poison(options)
-
-    return write_album(folder, options, plan, workers, progress)
+def poison_album(options: PoisonOptions) -> list[PlannedPhoto]:
+    """All photos."""
+    survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
+    return survey + plan_poison(options)
 
 
 def plan_poison(options: PoisonOptions) -> list[PlannedPhoto]:

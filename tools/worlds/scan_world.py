@@ -1,11 +1,12 @@
 """A world with what was seen of its town from the air, for programs that anchor and track."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from featuredb.simworld.scan_world import OTHER_SCAN_FILE, SCAN_FILE, write_lidar
 from featuredb.simworld.world import World, WorldOptions, open_world, write_world
 
+SCAN_WORLD = WorldOptions.short(1)
 _DONE = "scan_world.done"
 
 
@@ -24,15 +25,11 @@ class ScanWorld:
     other_scan: Path
 
 
-def make_scan_world(folder: Path, seed: int, size: str, workers: int) -> ScanWorld:
-    """The world that `featuredb simworld FOLDER --lidar` writes, made unless it is there already.
-
-    Args:
-        size: short or full.
-    """
+def make_scan_world(inputs: Path) -> ScanWorld:
+    """The world that `featuredb simworld --lidar --size short` writes, in a folder of `inputs`, made once."""
+    folder = inputs / "scan-world"
     if not (folder / _DONE).exists():
-        options = WorldOptions.short(seed) if size == "short" else WorldOptions(seed=seed)
-        write_lidar(folder, options)
-        write_world(folder, replace(options, workers=workers))
+        write_lidar(folder, SCAN_WORLD)
+        write_world(folder, SCAN_WORLD)
         (folder / _DONE).touch()
     return ScanWorld(world=open_world(folder), scan=folder / SCAN_FILE, other_scan=folder / OTHER_SCAN_FILE)

@@ -7,8 +7,7 @@ survey_far/. Kinds: survey, survey_far, walk, probe.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import lru_cache
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import make_town
-from tools.worlds.album import PlannedPhoto, Progress, write_album
+from tools.worlds.album import PlannedPhoto
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.geotags import geotag_at
 from tools.worlds.people import Person, community
@@ -64,37 +63,22 @@ class WalkOptions:
     """
 
     seed: int = 2
-    town_size_m: tuple[float, float] = (1020.0, 210.0)
+    town_size_m: tuple[float, float] = (420.0, 200.0)
     flight: FlightOptions = field(
-        default_factory=lambda: FlightOptions(lines=5, per_line=8, oblique=6, gps_error="rtk")
+        default_factory=lambda: FlightOptions(lines=3, per_line=5, oblique=4, width=1200, gps_error="rtk")
     )
-    start_m: float = -430.0
-    end_m: float = 410.0
+    start_m: float = -140.0
+    end_m: float = 130.0
     step_m: float = 35.0
     per_step: int = 4
     probes: int = 2
-    width: int = 1440
+    width: int = 1200
     texel_m: float = 0.08
-    pieces: int = 16
+    pieces: int = 4
 
     def __post_init__(self) -> None:
         if not (self.start_m < self.end_m and self.step_m > 0 and self.per_step > 0 and self.probes >= 0):
             raise InvalidValueError(f"WalkOptions: value out of range in {self}")
-
-    @classmethod
-    def short(cls, seed: int = 2) -> "WalkOptions":
-        """A walk of about 150 m, for a first look in minutes."""
-        return cls(
-            seed=seed,
-            town_size_m=(420.0, 200.0),
-            flight=FlightOptions(lines=3, per_line=5, oblique=4, width=1200, gps_error="rtk"),
-            start_m=-140.0,
-            end_m=130.0,
-            per_step=4,
-            probes=2,
-            width=1200,
-            pieces=4,
-        )
 
     @property
     def steps(self) -> int:
@@ -115,17 +99,6 @@ def _base(options: WalkOptions) -> Scene:
         texel_m=options.texel_m,
         pieces=options.pieces,
     )
-
-
-def write_walk(
-    folder: Path, options: WalkOptions, workers: int = 0, progress: Progress | None = None
-) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
-    return write_album(folder, options, partial(plan_walk, options), workers, progress)
 
 
 def plan_walk(options: WalkOptions) -> list[PlannedPhoto]:
