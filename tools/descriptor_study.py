@@ -49,7 +49,6 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.lidar.intensity import stretch_of
 from featuredb.lidar.ortho import colour_by_ortho, open_ortho
 from featuredb.render.cloud import PointCloud
-from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
 from featuredb.render.shading import shaded_relief
@@ -61,6 +60,7 @@ from featuredb.simworld.laser.airborne import scan_town
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.ortho import make_ortho
 from featuredb.simworld.town.town import make_town
+from tools.worlds.clouds import build_cloud
 
 Floats = NDArray[np.float64]
 Gray = NDArray[np.uint8]
