@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from featuredb.adjust.block import Block
 from featuredb.geo.datum import check_datum
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -238,7 +237,7 @@ def place_by_survey(
     return ControlledPlacement(
         placement=placement,
         control=control,
-        model=_adjusted_model(model, block, placement),
+        model=_adjusted_model(model, placement),
         frame=where,
         map_placement=_map_placement(placement, evidence),
         file=survey.file,
@@ -246,7 +245,7 @@ def place_by_survey(
     )
 
 
-def _adjusted_model(model: Model, block: Block, placement: GcpPlacement) -> Model:
+def _adjusted_model(model: Model, placement: GcpPlacement) -> Model:
     if placement.reason is not None or placement.block is None or placement.local_from_block is None:
         return model
     return model_of_block(model, placement.block.moved(placement.local_from_block.inverse()))
