@@ -145,7 +145,7 @@ def test_points_of_known_poses(scene: tuple[NewPhotos, FloatArray]) -> None:
     geometries = {}
     for a in range(4):
         for b in range(a + 1, 4):
-            shared, at_a, at_b = np.intersect1d(new.world_of[a], new.world_of[b], return_indices=True)
+            _, at_a, at_b = np.intersect1d(new.world_of[a], new.world_of[b], return_indices=True)
             pairs = np.stack([at_a, at_b], axis=1).astype(np.uint32)
             geometries[a, b] = TwoView(
                 inliers=pairs,
@@ -153,7 +153,6 @@ def test_points_of_known_poses(scene: tuple[NewPhotos, FloatArray]) -> None:
                 essential=_essential(new.poses[a], new.poses[b]),
                 fundamental=np.zeros((3, 3)),
                 homography=np.zeros((3, 3)),
-                candidates=np.array(len(shared), dtype=np.int64),
             )
     model = triangulate_posed([CAMERA] * 4, photos, new.poses, geometries)
     assert len(model.rows) == 4
