@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import add_command, open_database
+
 if TYPE_CHECKING:
     from featuredb.geometry.camera import Camera
     from featuredb.maps.feature_map import GeoPrior
@@ -13,15 +15,14 @@ if TYPE_CHECKING:
 
 def register(subparsers: Any) -> None:
     """Add `track` to the parser of `featuredb`."""
-    from featuredb.cli.common import add_database_argument
-
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "track",
-        help="the pose of every frame of a video",
+        run_track,
+        "the pose of every frame of a video",
         description="Follow a video by the active maps, by a LiDAR scan, or by both. Each frame has a pose "
         "with its uncertainty, or is said to be lost. See docs/video.md.",
     )
-    add_database_argument(parser)
     parser.add_argument("video", metavar="VIDEO", help="film, folder of pictures, or an address (rtsp://...)")
     parser.add_argument(
         "--out",
@@ -75,7 +76,6 @@ def register(subparsers: Any) -> None:
         "--max-side", type=int, default=1280, metavar="PX", help="frames are tracked at; default 1280"
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    parser.set_defaults(run=run_track)
 
 
 def run_track(args: argparse.Namespace) -> int:
@@ -84,7 +84,6 @@ def run_track(args: argparse.Namespace) -> int:
     Raises:
         InvalidValueError, VideoError, StoreError, ServiceError, RegistrationError, ScanNotFoundError
     """
-    from featuredb.cli.common import open_database
     from ingest.api.tracking import track_film
     from ingest.track.finders import FilmGround
     from reloc.tracking.track_video import TrackVideoOptions
