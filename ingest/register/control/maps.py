@@ -13,6 +13,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
+from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import UnplacedMap
 from ingest.colmap.bridge import Model
 from ingest.photos.photo import Photo
@@ -22,7 +23,6 @@ from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control, control_frame, meet
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
 from ingest.register.gps import GpsPlacement
-from ingest.register.place_map import placed_map
 from ingest.sfm.extract import PhotoFeatures
 
 # A local frame is good for tens of kilometres; a new one further away keeps coordinates small.
