@@ -195,9 +195,7 @@ def block_and_marks(
         photo_of=model.photo_of[observation],
         xy=xy[observation],
     )
-    marks = Marks(
-        xyz=fixed.xyz[fixed.point_of[kept]], photo_of=fixed.photo_of[kept], xy=fixed.pixels[kept]
-    )
+    marks = Marks(xyz=fixed.xyz[fixed.point_of[kept]], photo_of=fixed.photo_of[kept], xy=fixed.pixels[kept])
     return whole_lens(block), marks
 
 
