@@ -13,7 +13,6 @@ from featuredb.store import Database
 from featuredb.store.candidates.photos import list_candidates, refuse
 from featuredb.store.candidates.states import Candidate
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
-from ingest.fingerprint import digest
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
 from ingest.growth.growth_report import GrowthReport, PhotoFate
 from ingest.growth.run import extractor_for, grow
@@ -107,8 +106,7 @@ def _prepared(
         return no_photos(), {}
     extractor: ExtractorOptions = extractor_for(database.snapshot(), options.making.extractor)
     making = replace(options.making, extractor=extractor)
-    job = digest("growth", making.fingerprint, *sorted(p.sha256 for p in photos))[:24]
-    done = reconstruct_photos(photos, Workspace(root=work, job_id=job), making, executor, progress=progress)
+    done = reconstruct_photos(photos, Workspace(root=work), making, executor, progress=progress)
     ids = dict(zip((p.name for p in photos), waiting.candidate_ids, strict=False))
     rows = {row: ids[photo.name] for row, photo in enumerate(done.usable)}
     return reconstructed_photos(done, rows), {

@@ -116,7 +116,7 @@ def ingest_photos(
     scanned = _scan(folder, options, root, clock, progress)
     photos = _with_sigmas(require_usable(scanned, folder, least=2), options)
     job_id = digest(options.fingerprint, *sorted(photo.sha256 for photo in photos))[:24]
-    workspace = Workspace(root=root, job_id=job_id)
+    workspace = Workspace(root=root)
     if options.stop_after == "scan":
         result = Reconstructed()
     else:

@@ -30,15 +30,9 @@ _TEMPORARY = ".tmp-"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Workspace:
-    """Folders of one job.
-
-    Attributes:
-        root: shared by all jobs of a database.
-        job_id: digest of the photos and options.
-    """
+    """Folders below a root that all jobs of a database share."""
 
     root: Path
-    job_id: str
 
     def features(self, fingerprint: str, sha256: str) -> Path:
         """The features of one photo under the given extractor options."""

@@ -13,8 +13,9 @@ from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
+from featuredb.maps.feature_map import GeoPrior
 from reloc.localise.jacobians import pixel_jacobians
-from reloc.wire.query import CameraRequest, Intrinsics, LocaliseReply
+from reloc.wire.query import CameraRequest, Intrinsics, LocaliseReply, PriorRequest
 from reloc.wire.track import TrackPose
 
 
@@ -151,3 +152,14 @@ def camera_of(lens: CameraRequest | Intrinsics) -> Camera:
         InvalidValueError: it is none.
     """
     return Camera(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+
+
+def geo_prior(prior: PriorRequest) -> GeoPrior:
+    """The prior that a message speaks of."""
+    return GeoPrior(
+        latitude_deg=prior.lat,
+        longitude_deg=prior.lon,
+        height_m=prior.h,
+        sigma_horizontal_m=prior.sigma_m,
+        sigma_vertical_m=prior.sigma_vertical_m,
+    )

@@ -11,38 +11,20 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap, MapPoints, Placement
+from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import UnplacedMap
 from reloc.localise.result import LocalisedPose, LocaliseResult, PoseInMap
 
-_EPSG = 32631
 _STAND_IN = LocalFrame(latitude_deg=0.0, longitude_deg=3.0, height_m=0.0)
 
 
 def at_stand_in(unplaced: UnplacedMap) -> FeatureMap:
     """The map at a place that means nothing, whose local frame is the map's own; exactly placed."""
-    everything = np.arange(len(unplaced.points))
-    return FeatureMap(
-        map_id=unplaced.map_id,
-        name=unplaced.name,
-        epsg=_EPSG,
-        height_datum="unknown",
-        frame=_STAND_IN,
-        cameras=unplaced.cameras,
-        camera_keys=unplaced.camera_keys,
-        images=unplaced.images,
-        points=MapPoints(
-            utm=_STAND_IN.utm_from_enu(unplaced.points.xyz, _EPSG), **unplaced.points.columns(everything)
-        ),
-        observations=unplaced.observations,
-        placement=Placement(
-            method="map",
-            local_from_sfm=Sim3.identity(),
-            covariance=np.zeros((7, 7)),
-            residual_rms_m=0.0,
-        ),
-        extractor_fingerprint=unplaced.extractor_fingerprint,
+    placement = Placement(
+        method="map", local_from_sfm=Sim3.identity(), covariance=np.zeros((7, 7)), residual_rms_m=0.0
     )
+    return placed_map(replace(unplaced, provenance={}), placement, _STAND_IN, "unknown")
 
 
 def in_own_frame(result: LocaliseResult, unplaced: UnplacedMap) -> LocaliseResult:

@@ -30,11 +30,11 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
-from featuredb.render.levels import build_cloud
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from tools.figures import study_parser, write_figures
+from tools.worlds.clouds import build_cloud
 
 _EPSG = 32615  # UTM zone of the scan of `brighton`
 _SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)

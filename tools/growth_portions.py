@@ -166,7 +166,7 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
         evidence={"made_up": True},
     )
     key = features_key(state.making.extractor)
-    read = Workspace(root=state.work, job_id="-").features
+    read = Workspace(root=state.work).features
     features = [read_features(read(key, photo.sha256)) for photo in component.photos]
     rows = [state.photos.index(photo) for photo in component.photos]
     return build_map(
@@ -235,8 +235,7 @@ def _reconstructed(
     photos: Sequence[Photo], rows: Sequence[int], making: MapMakingOptions, work: Path
 ) -> Reconstructed:
     chosen = [photos[r] for r in rows]
-    job = Workspace(root=work, job_id=digest(making.fingerprint, *(p.sha256 for p in chosen))[:24])
-    return reconstruct_photos(chosen, job, making, InProcessExecutor())
+    return reconstruct_photos(chosen, Workspace(root=work), making, InProcessExecutor())
 
 
 def _identity(rows: Sequence[int]) -> MapIdentity:

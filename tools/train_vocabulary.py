@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     photos = [p for f in args.folders for p in scan_folder(f, ScanOptions()).usable[:: args.every]]
     options = ExtractorOptions(max_features=_FEATURES)
     with tempfile.TemporaryDirectory() as scratch:
-        workspace = Workspace(root=Path(scratch), job_id="vocabulary")
+        workspace = Workspace(root=Path(scratch))
         if args.workers == 1:
             extract_photos(photos, workspace, options, InProcessExecutor())
         else:

@@ -42,11 +42,11 @@ def add_command(
     text: str,
     *,
     description: str | None = None,
-    epilog: str | None = None,
+    **more: Any,
 ) -> argparse.ArgumentParser:
-    """Add a subcommand on a database; `description` is `text` where none is given."""
+    """Add a subcommand on a database; `description` is `text` where none is given, `more` is argparse's."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
-        name, help=text, description=description or text, epilog=epilog
+        name, help=text, description=description or text, **more
     )
     add_database_argument(parser)
     parser.set_defaults(run=run)

@@ -20,7 +20,6 @@ def describe_at(
     xy: NDArray[np.float32],
     scale: NDArray[np.float32],
     angle: NDArray[np.float32],
-    options: ExtractorOptions | None = None,
 ) -> NDArray[np.uint8]:
     """RootSIFT (n, 128) at given keypoints.
 
@@ -38,7 +37,7 @@ def describe_at(
     """
     if not len(xy):
         return np.zeros((0, 128), np.uint8)
-    small, places, diameters = shrunk_for(gray, xy, scale, options or ExtractorOptions())
+    small, places, diameters = shrunk_for(gray, xy, scale)
     keypoints = [
         cv2.KeyPoint(x, y, diameter, float(turn), 1.0, _packed(diameter), row)
         for row, ((x, y), diameter, turn) in enumerate(
@@ -54,7 +53,7 @@ def describe_at(
 
 
 def shrunk_for(
-    gray: NDArray[np.uint8], xy: NDArray[np.float32], scale: NDArray[np.float32], options: ExtractorOptions
+    gray: NDArray[np.uint8], xy: NDArray[np.float32], scale: NDArray[np.float32]
 ) -> tuple[NDArray[np.uint8], FloatArray, FloatArray]:
     """The photo as it is described, and there the keypoints' places (n, 2), as OpenCV counts, and diameters.
 
@@ -62,7 +61,7 @@ def shrunk_for(
         gray, xy, scale: as for `describe_at`, at least one keypoint.
     """
     height, width = gray.shape
-    factor = min(1.0, options.max_side_px / max(height, width))
+    factor = min(1.0, ExtractorOptions().max_side_px / max(height, width))
     if float(scale.min()) * factor < _FINEST_PX:
         factor = 1.0
     size = (max(1, round(width * factor)), max(1, round(height * factor)))

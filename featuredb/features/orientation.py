@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.features.describe import OCTAVE_LAYERS, SIGMA, octave_and_layer, shrunk_for
-from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
 
 _BINS = 36
@@ -27,7 +26,6 @@ def orientations_at(
     gray: NDArray[np.uint8],
     xy: NDArray[np.float32],
     scale: NDArray[np.float32],
-    options: ExtractorOptions | None = None,
 ) -> NDArray[np.float32]:
     """Orientation (n,) of given keypoints: degrees in [0, 360), clockwise from the x axis.
 
@@ -38,7 +36,7 @@ def orientations_at(
     angles = np.zeros(len(xy), np.float32)
     if not len(xy):
         return angles
-    small, places, diameters = shrunk_for(gray, xy, scale, options or ExtractorOptions())
+    small, places, diameters = shrunk_for(gray, xy, scale)
     wanted: dict[tuple[int, int], list[int]] = defaultdict(list)
     for row, diameter in enumerate(diameters.tolist()):
         wanted[octave_and_layer(diameter)].append(row)

@@ -140,6 +140,12 @@ class Camera:
             pixels[np.hypot(points[:, 0], points[:, 1]) >= limit * points[:, 2]] = np.nan
         return pixels
 
+    def projection_jacobian(self, points_cam: FloatArray) -> FloatArray:
+        """(n, 2, 3) derivatives of `project` by points (n, 3) in front, by central differences."""
+        step = 1e-5 * np.maximum(points_cam[:, 2:], 1e-3)  # error about 1e-10 of the derivative in float64
+        ends = [self.project(points_cam + step * axis) for axis in (*np.eye(3), *-np.eye(3))]
+        return np.asarray(np.stack(ends[:3], axis=2) - np.stack(ends[3:], axis=2)) / (2.0 * step[:, None])
+
     def unproject(self, pixels: ArrayLike) -> FloatArray:
         """Normalised image coordinates (n, 2), the ray being (x, y, 1), of pixels (n, 2) or (2,).
 

@@ -1,6 +1,6 @@
 """Levels of detail of the store: which level and node a point goes to.
 
-The loops are those of featuredb.render.levels. The grid is the same for all scans and tiles: cells of level l
+The grid is the same for all scans and tiles: cells of level l
 have an edge of 4 m / 2^l and are counted from zero of UTM, so that pieces of a scan give what the whole
 would.
 """
@@ -18,7 +18,9 @@ from featuredb.render.compiled import compiled_module
 # kilometres.
 COARSEST_SPACING_M = 4.0
 FINEST_LEVEL = 12  # 1 mm
-NODE_BITS = 5  # a node is a cube of 2^5 cells of its level, as featuredb.render.levels has them
+# A node is a cube of 2^5 cells of its level: about a thousand points of a surface, cheap to cull and small
+# beside a camera's view.
+NODE_BITS = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

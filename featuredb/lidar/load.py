@@ -15,7 +15,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.near_frame import near_enu_from_utm
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.render.cloud import CloudNodes, PointCloud
-from featuredb.render.levels import point_spacing
+from featuredb.render.spacing import point_spacing
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_points
 

@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import utm_epsg
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints, Placement
+from featuredb.maps.unplaced_map import UnplacedMap
 
 _UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))  # order of MapPoints.covariance
 
@@ -50,6 +52,42 @@ def move_map(
         images=tuple(moved_image(image, move) for image in feature_map.images),
         points=_moved_points(feature_map, move),
         placement=moved,
+    )
+
+
+def placed_map(
+    unplaced: UnplacedMap, placement: Placement, frame: LocalFrame, height_datum: str
+) -> FeatureMap:
+    """The map where `placement.local_from_sfm` takes its own frame; ids, lenses and descriptors stay.
+
+    Args:
+        placement: its similarity leads from the map's own frame to `frame`, metres.
+    """
+    move = placement.local_from_sfm
+    epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
+    points = unplaced.points
+    return FeatureMap(
+        map_id=unplaced.map_id,
+        name=unplaced.name,
+        epsg=epsg,
+        height_datum=height_datum,
+        frame=frame,
+        cameras=unplaced.cameras,
+        camera_keys=unplaced.camera_keys,
+        images=tuple(moved_image(image, move) for image in unplaced.images),
+        points=MapPoints(
+            utm=frame.utm_from_enu(move.act(points.xyz), epsg),
+            rgb=points.rgb,
+            track_length=points.track_length,
+            error_px=points.error_px,
+            covariance=moved_covariances(points.covariance, move),
+        ),
+        observations=unplaced.observations,
+        placement=placement,
+        extractor_fingerprint=unplaced.extractor_fingerprint,
+        source=unplaced.source,
+        licence=unplaced.licence,
+        provenance=unplaced.provenance,
     )
 
 

@@ -5,17 +5,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress, TaskID
 
+from featuredb.cli.common import count_bars
 from ingest.executor import Progress as ProgressCallback
 
 _TITLES = {
@@ -30,25 +22,13 @@ _TITLES = {
 @contextmanager
 def progress_bars(quiet: bool = False) -> Iterator[ProgressCallback]:
     """Yields a callback progress(stage, done, total) that draws on stderr."""
-    console = Console(stderr=True)
     if quiet:
         yield lambda stage, done, total: None
-    elif console.is_terminal:
-        with _bars(console) as bars:
+    elif (counting := count_bars()).console.is_terminal:
+        with counting as bars:
             yield _drawn(bars)
     else:
         yield _logged()
-
-
-def _bars(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
 
 
 def _drawn(bars: Progress) -> ProgressCallback:

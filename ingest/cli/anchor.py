@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import add_command, open_database
+
 if TYPE_CHECKING:
     from featuredb.store import Database
     from ingest.anchoring import AnchorRequest
@@ -18,17 +20,16 @@ x, y, easting, northing, height: full-size pixels and metres. See docs/anchoring
 
 def register(subparsers: Any) -> None:
     """Add `anchor` to the parser of `featuredb`."""
-    from featuredb.cli.common import add_database_argument
-
-    anchor = subparsers.add_parser(
+    anchor = add_command(
+        subparsers,
         "anchor",
-        help="place a map by a LiDAR scan",
+        run_anchor,
+        "place a map by a LiDAR scan",
         description="Register frames of a map to a scan of the database, and place the map by them. The old "
         "placement stays reachable: `featuredb rollback`.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_database_argument(anchor)
     anchor.add_argument("map_id", metavar="MAP", help="id of the map; its first letters are enough")
     anchor.add_argument(
         "--photos", type=Path, required=True, metavar="FOLDER", help="the photos that the map was made of"
@@ -62,12 +63,10 @@ def register(subparsers: Any) -> None:
     page.add_argument("--port", type=int, default=0, help="of the page; default: a free one")
     page.add_argument("--no-browser", action="store_true", help="print the address only")
     anchor.add_argument("--quiet", action="store_true", help="no progress bars")
-    anchor.set_defaults(run=run_anchor)
 
 
 def run_anchor(args: argparse.Namespace) -> int:
     """Anchor; 0 if the map was placed or frames were proposed, 1 if not, with the reason."""
-    from featuredb.cli.common import open_database
     from ingest.anchoring import anchor
     from ingest.api.anchor_words import anchoring_text
     from ingest.api.progress_bars import progress_bars

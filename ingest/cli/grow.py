@@ -7,6 +7,8 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import add_command, add_database_argument, format_table, open_database
+
 if TYPE_CHECKING:
     from featuredb.store.canaries import KnownPose
     from ingest.growing import GrowingOptions
@@ -21,15 +23,14 @@ def register(subparsers: Any) -> None:
 
 
 def _register_grow(subparsers: Any) -> None:
-    from featuredb.cli.common import add_database_argument
-
-    grow = subparsers.add_parser(
+    grow = add_command(
+        subparsers,
         "grow",
-        help="let contributed photos become maps, and maps without a place find theirs",
+        run_grow,
+        "let contributed photos become maps, and maps without a place find theirs",
         description="Place the photos that wait, and the maps without a place, by the maps there are. New "
         "maps stay in quarantine until photos of someone else confirm them; see docs/growth.md.",
     )
-    add_database_argument(grow)
     when = grow.add_mutually_exclusive_group()
     when.add_argument("--once", action="store_true", help="one run (the default)")
     when.add_argument("--watch", action="store_true", help="run whenever photos arrive, until Ctrl-C")
@@ -48,28 +49,23 @@ def _register_grow(subparsers: Any) -> None:
     grow.add_argument("--work", type=Path, metavar="DIR", help="default: DB/_work")
     grow.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
     grow.add_argument("--json", action="store_true", help="print the report as JSON")
-    grow.set_defaults(run=run_grow)
 
 
 def _register_promote(subparsers: Any) -> None:
-    from featuredb.cli.common import add_database_argument
-
-    promote = subparsers.add_parser(
+    promote = add_command(
+        subparsers,
         "promote",
-        help="take a quarantined map into service by hand",
+        run_promote,
+        "take a quarantined map into service by hand",
         description="Promote a map without confirmation. Canaries are asked, and refuse it where one "
         "regresses, unless --force is given. `featuredb retire` takes it back.",
     )
-    add_database_argument(promote)
     promote.add_argument("map_id", metavar="MAP")
     promote.add_argument("--reason", required=True, help="kept with the map")
     promote.add_argument("--force", action="store_true", help="even if canaries regress")
-    promote.set_defaults(run=run_promote)
 
 
 def _register_canary(subparsers: Any) -> None:
-    from featuredb.cli.common import add_database_argument
-
     canary = subparsers.add_parser("canary", help="known queries that are asked before every promotion")
     add_database_argument(canary)
     kinds = canary.add_subparsers(title="what to do", metavar="ACTION", required=True)
@@ -101,7 +97,6 @@ def _register_canary(subparsers: Any) -> None:
 
 def run_grow(args: argparse.Namespace) -> int:
     """Grow once or until stopped; 0."""
-    from featuredb.cli.common import open_database
     from featuredb.stop_signals import on_stop_signals
     from ingest.growing import grow_candidates, watch_and_grow
 
@@ -144,7 +139,6 @@ def _options(args: argparse.Namespace) -> "GrowingOptions":
 
 def run_promote(args: argparse.Namespace) -> int:
     """Promote by hand; 0, or 1 where canaries refuse."""
-    from featuredb.cli.common import open_database
     from ingest.growth.trust.promotion import promote_by_hand
 
     outcome = promote_by_hand(open_database(args), args.map_id, args.reason, force=args.force)
@@ -155,7 +149,6 @@ def run_promote(args: argparse.Namespace) -> int:
 
 def run_canary_add(args: argparse.Namespace) -> int:
     """Add a known query; its answer is given, or is what the database answers now."""
-    from featuredb.cli.common import open_database
     from featuredb.errors import InvalidValueError
     from featuredb.store.canaries import Origin, add_canary
     from ingest.growth.trust.canaries import answer_now
@@ -200,7 +193,6 @@ def _pose(args: argparse.Namespace) -> "KnownPose":
 
 
 def run_canary_list(args: argparse.Namespace) -> int:
-    from featuredb.cli.common import format_table, open_database
     from featuredb.store.canaries import list_canaries
 
     rows = [
@@ -215,7 +207,6 @@ def run_canary_list(args: argparse.Namespace) -> int:
 
 
 def run_canary_remove(args: argparse.Namespace) -> int:
-    from featuredb.cli.common import open_database
     from featuredb.store.canaries import remove_canary
 
     remove_canary(open_database(args), args.name)
@@ -225,7 +216,6 @@ def run_canary_remove(args: argparse.Namespace) -> int:
 
 def run_canary_run(args: argparse.Namespace) -> int:
     """Ask all known queries of the active maps; 1 if one is not answered rightly."""
-    from featuredb.cli.common import format_table, open_database
     from featuredb.store.canaries import list_canaries
     from ingest.growth.trust.canaries import check_known
     from reloc.localiser import Localiser

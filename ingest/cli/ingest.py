@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import add_command, place_for_database, storage_options
 from ingest.cli.register import add_control_arguments, sigmas_m
 
 if TYPE_CHECKING:
@@ -16,17 +17,16 @@ _STAGES = ("scan", "extract", "match", "reconstruct", "build")
 
 def register(subparsers: Any) -> None:
     """Add `ingest` to the parser of `featuredb`."""
-    from featuredb.cli.common import add_database_argument
-
     ingest = subparsers.add_parser("ingest", help="make maps of photos")
     kinds = ingest.add_subparsers(title="what to ingest", metavar="KIND", required=True)
-    photos = kinds.add_parser(
+    photos = add_command(
+        kinds,
         "photos",
-        help="a folder of photos with GPS, or a table of photos",
+        run_photos,
+        "a folder of photos with GPS, or a table of photos",
         description="Reconstruct photos, place them by their GPS and commit the maps. A killed ingest goes "
         "on where it was when the same command runs again.",
     )
-    add_database_argument(photos)
     photos.add_argument(
         "folder",
         metavar="PATH",
@@ -38,44 +38,41 @@ def register(subparsers: Any) -> None:
     _add_making(photos)
     _add_control(photos)
     _add_running(photos)
-    photos.set_defaults(run=run_photos)
     _register_video(kinds)
     _register_model(kinds)
 
 
 def _register_model(kinds: Any) -> None:
-    from featuredb.cli.common import add_database_argument
     from ingest.cli.model import add_model_arguments, run_model
 
-    model = kinds.add_parser(
+    model = add_command(
+        kinds,
         "model",
-        help="a model of COLMAP, OpenSfM or ODM, geo-referenced or of photos with GPS",
+        run_model,
+        "a model of COLMAP, OpenSfM or ODM, geo-referenced or of photos with GPS",
         description="Import a model of COLMAP, OpenSfM or OpenDroneMap as a map: as `featuredb export` "
         "wrote it, aligned to a known place, or of photos with GPS.",
     )
-    add_database_argument(model)
     add_model_arguments(model)
-    model.set_defaults(run=run_model)
 
 
 def _register_video(kinds: Any) -> None:
-    from featuredb.cli.common import add_database_argument
     from ingest.cli.video import add_video_arguments, run_video
 
-    video = kinds.add_parser(
+    video = add_command(
+        kinds,
         "video",
-        help="films and folders of them, with or without telemetry",
+        run_video,
+        "films and folders of them, with or without telemetry",
         description="Split films into shots, choose keyframes by the picture's motion, reconstruct those of "
         "all films together, place them by the telemetry where there is some, and commit the maps. Goes on "
         "where it was when it was killed.",
     )
-    add_database_argument(video)
     add_video_arguments(video)
     _add_selection(video)
     _add_making(video)
     _add_control(video)
     _add_running(video)
-    video.set_defaults(run=run_video)
 
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:
@@ -189,7 +186,6 @@ def ingest_folder(args: argparse.Namespace, folder: Path, films: Sequence["FilmO
         args: of `featuredb ingest photos` or `video`.
         films: whose keyframes the folder holds, a folder for each.
     """
-    from featuredb.cli.common import place_for_database, storage_options
     from featuredb.store import Database
     from ingest.api.ingesting import IngestChoices, ingest, ingest_options, summary
     from ingest.photos.scan import require_photos

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from featuredb.cli.common import place_for_database, storage_options
 from ingest.cli.register import sigmas_m
 
 if TYPE_CHECKING:
@@ -70,7 +71,6 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_model(args: argparse.Namespace) -> int:
     """Import, commit, and say in a line what came of it."""
-    from featuredb.cli.common import place_for_database, storage_options
     from featuredb.maps.unplaced_map import UnplacedMap
     from featuredb.store import Database
     from ingest.models_in.model_map import ModelOptions, map_of_model

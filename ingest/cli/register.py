@@ -5,19 +5,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from featuredb.cli.common import add_command, open_database
+
 
 def register(subparsers: Any) -> None:
     """Add `register` to the parser of `featuredb`."""
-    from featuredb.cli.common import add_database_argument
-
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "register",
-        help="place a map by ground control points",
+        run_register,
+        "place a map by ground control points",
         description="Place a map by ground control points, one without a place, too: similarity, "
         "adjustment with the points as control, residuals, wrong marks named. The new placement is a new "
         "commit; `featuredb rollback` and --as-of reach the map as it was.",
     )
-    add_database_argument(parser)
     parser.add_argument("map_id", metavar="MAP", help="id of the map, see `featuredb maps`")
     parser.add_argument(
         "--gcp", type=Path, required=True, metavar="FILE", help="control points, OpenDroneMap's gcp_list.txt"
@@ -31,7 +32,6 @@ def register(subparsers: Any) -> None:
     )
     parser.add_argument("--report", type=Path, metavar="DIR", help="write control.html, .json and .png there")
     parser.add_argument("--dry-run", action="store_true", help="show the residuals and commit nothing")
-    parser.set_defaults(run=run_register)
 
 
 def add_control_arguments(parser: Any) -> None:
@@ -55,7 +55,6 @@ def add_control_arguments(parser: Any) -> None:
 
 def run_register(args: argparse.Namespace) -> int:
     """Place, print the residuals, commit; 0 if the map has its new place, 1 if it was refused."""
-    from featuredb.cli.common import open_database
     from ingest.api.registering import place_by_control
     from ingest.register.control.placement import GcpOptions
 

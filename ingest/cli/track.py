@@ -4,24 +4,21 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from featuredb.geometry.camera import Camera
-    from featuredb.maps.feature_map import GeoPrior
+from featuredb.cli.common import add_command, open_database
 
 
 def register(subparsers: Any) -> None:
     """Add `track` to the parser of `featuredb`."""
-    from featuredb.cli.common import add_database_argument
-
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "track",
-        help="the pose of every frame of a video",
+        run_track,
+        "the pose of every frame of a video",
         description="Follow a video by the active maps, by a LiDAR scan, or by both. Each frame has a pose "
         "with its uncertainty, or is said to be lost. See docs/video.md.",
     )
-    add_database_argument(parser)
     parser.add_argument("video", metavar="VIDEO", help="film, folder of pictures, or an address (rtsp://...)")
     parser.add_argument(
         "--out",
@@ -75,7 +72,6 @@ def register(subparsers: Any) -> None:
         "--max-side", type=int, default=1280, metavar="PX", help="frames are tracked at; default 1280"
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    parser.set_defaults(run=run_track)
 
 
 def run_track(args: argparse.Namespace) -> int:
@@ -84,12 +80,14 @@ def run_track(args: argparse.Namespace) -> int:
     Raises:
         InvalidValueError, VideoError, StoreError, ServiceError, RegistrationError, ScanNotFoundError
     """
-    from featuredb.cli.common import open_database
     from ingest.api.tracking import track_film
     from ingest.track.finders import FilmGround
+    from reloc.answered_view import camera_of, geo_prior
+    from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.tracking.track_video import TrackVideoOptions
     from reloc.tracking.trajectory.outputs import exit_code
 
+    camera, prior = parse_camera(args.camera), parse_prior(args.prior)
     done = track_film(
         open_database(args),
         args.video,
@@ -101,37 +99,11 @@ def run_track(args: argparse.Namespace) -> int:
             scans=tuple(args.scan) if args.scan else None,
             pose_file=args.pose,
         ),
-        camera=_camera(args.camera),
-        prior=_prior(args.prior),
+        camera=None if camera is None else camera_of(camera),
+        prior=None if prior is None else geo_prior(prior),
         options=TrackVideoOptions(
             max_side_px=args.max_side, start_s=args.start, end_s=args.end, fps=args.fps
         ),
     )
     sys.stdout.write(json.dumps(done.summary()) + "\n" if args.json else done.as_text())
     return exit_code(done.outputs, done.video.trajectory)
-
-
-def _camera(text: str | None) -> "Camera | None":
-    from featuredb.geometry.camera import Camera
-    from reloc.cli.query_arguments import parse_camera
-
-    asked = parse_camera(text)
-    if asked is None:
-        return None
-    return Camera(model=asked.model, width=asked.width, height=asked.height, params=asked.params)
-
-
-def _prior(text: str | None) -> "GeoPrior | None":
-    from featuredb.maps.feature_map import GeoPrior
-    from reloc.cli.query_arguments import parse_prior
-
-    asked = parse_prior(text)
-    if asked is None:
-        return None
-    return GeoPrior(
-        latitude_deg=asked.lat,
-        longitude_deg=asked.lon,
-        height_m=None,
-        sigma_horizontal_m=asked.sigma_m,
-        sigma_vertical_m=asked.sigma_vertical_m,
-    )

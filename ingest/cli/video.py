@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from featuredb.cli.common import place_for_database
+
 if TYPE_CHECKING:
     from featuredb.video.telemetry.values import Telemetry
     from ingest.video.films import Films
@@ -65,7 +67,6 @@ def run_video(args: argparse.Namespace) -> int:
         VideoError: no film can be read, or they show too little motion.
         TelemetryError, IngestError, StoreError, InvalidValueError
     """
-    from featuredb.cli.common import place_for_database
     from featuredb.geo.heights import HEIGHT_DATUMS
     from ingest.api.progress_bars import progress_bars
     from ingest.cli.ingest import ingest_folder

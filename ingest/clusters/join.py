@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from ingest.colmap.bridge import Model
-from ingest.register.structure.similarity import similarities
+from ingest.register.structure.similarity import ransac_similarity
 from ingest.sfm.links import tied_parts
 
 _LOG = logging.getLogger(__name__)
@@ -36,8 +37,6 @@ class JoinOptions:
             the same points differ by at a few percent of uncertain depth.
         max_rotation_deg: between a photo's two orientations.
         max_center_over_depth: between a photo's two centres, over the distance to its points.
-        samples: of three pairs; with half of them wrong, 300 miss all-inlier samples once in 10^17.
-        seed: of the samples.
     """
 
     min_photos: int = 3
@@ -46,8 +45,6 @@ class JoinOptions:
     max_error_over_depth: float = 0.03
     max_rotation_deg: float = 2.0
     max_center_over_depth: float = 0.05
-    samples: int = 300
-    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,7 +101,7 @@ def find_joint(
         return None
     target, source = a.xyz[point_a], b.xyz[point_b]
     tolerance = options.max_error_over_depth * depth
-    sim = _robust_similarity(source, target, tolerance, options)
+    sim = _robust_similarity(source, target, tolerance)
     if sim is None:
         return None
     inliers = int((np.linalg.norm(target - sim.act(source), axis=1) <= tolerance).sum())
@@ -133,30 +130,14 @@ def common_points(a: Model, b: Model) -> tuple[NDArray[np.int64], NDArray[np.int
     return pairs[:, 0], pairs[:, 1], depth
 
 
-def _robust_similarity(
-    source: FloatArray, target: FloatArray, tolerance: FloatArray, options: JoinOptions
-) -> Sim3 | None:
+def _robust_similarity(source: FloatArray, target: FloatArray, tolerance: FloatArray) -> Sim3 | None:
     """RANSAC over three pairs, then least squares over the inliers until they settle."""
-    generator = np.random.default_rng(options.seed)
-    samples = generator.integers(0, len(source), (options.samples, 3))
-    scale, rotation, translation, usable = similarities(source[samples], target[samples])
-    best, best_cost = None, np.inf
-    for k in np.flatnonzero(usable):
-        sim = Sim3(scale=float(scale[k]), rotation=rotation[k], translation=translation[k])
-        error = np.linalg.norm(target - sim.act(source), axis=1) / tolerance
-        cost = float(np.minimum(error, 1.0).sum())
-        if cost < best_cost:
-            best, best_cost = sim, cost
+    best = ransac_similarity(source, target, tolerance)
     for _ in range(5):
         if best is None:
             return None
         inliers = np.linalg.norm(target - best.act(source), axis=1) <= tolerance
-        if inliers.sum() < 3:
-            return None
-        scale, rotation, translation, usable = similarities(source[inliers][None], target[inliers][None])
-        if not usable[0]:
-            return None
-        best = Sim3(scale=float(scale[0]), rotation=rotation[0], translation=translation[0])
+        best = similarity_closed_form(source[inliers], target[inliers]) if inliers.sum() >= 3 else None
     return best
 
 

@@ -127,12 +127,10 @@ class Anchored:
     Attributes:
         model: poses, lenses and free points; observations that fit, points with at least two of them.
         fixed_kept: (m,) observations of fixed points that fit.
-        old_point: (n,) row of the given model's points that each point was.
     """
 
     model: Model
     fixed_kept: NDArray[np.bool_]
-    old_point: NDArray[np.int64]
 
 
 def adjust_anchored(
@@ -141,28 +139,27 @@ def adjust_anchored(
     fixed: FixedPoints,
     lenses: Lenses,
     options: AnchoredOptions,
-    *,
-    held_photos: Sequence[int] = (),
-    held_points: Sequence[int] = (),
 ) -> Anchored:
-    """Adjust poses, free points and whole lenses.
-
-    Without fixed points and held photos the first photo's pose stays.
+    """Adjust poses, free points and whole lenses; without fixed points the first photo's pose stays.
 
     Args:
         keypoints: pixels (n, 2) of each photo of the model, in the order of its rows.
-        held_photos: rows of the model's photos whose poses stay. held_points: of its points.
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
-    if not len(held_photos) and not len(fixed.point_of):
-        held_photos = (0,)
     priors = lenses.priors(model.cameras, options)
     state = model
-    variance_px2 = options.keypoint_px(model.cameras) ** 2  # until the model has settled
+    keypoint_px = options.keypoint_px(model.cameras)
+    variance_px2 = keypoint_px**2  # until the model has settled
     for _ in range(options.rounds):
-        block, marks = block_and_marks(state, observation, keypoints, fixed, kept, held_points, held_photos)
-        terms = terms_of(block, marks, priors, options, variance_px2, held_photos)
+        block, marks = block_and_marks(state, observation, keypoints, fixed, kept)
+        terms = Terms(
+            keypoint_px=keypoint_px,
+            dilution=options.mapping.dilution * variance_px2 / keypoint_px**2,
+            lenses=priors,
+            marks=replace(marks, sigma_px=keypoint_px),
+            held_photos=() if len(fixed.point_of) else (0,),
+        )
         problem = Problem(block, terms, options.mapping.threads)
         problem.solve(options.mapping.max_iterations, _FUNCTION_TOLERANCE)
         found = problem.block()
@@ -176,11 +173,7 @@ def adjust_anchored(
         )
         observation, kept = _fitting(state, keypoints, fixed, options)
         observation &= _in_tracks(state, observation)
-    return Anchored(
-        model=with_observations(state, observation),
-        fixed_kept=kept,
-        old_point=np.unique(state.point_of[observation]),
-    )
+    return Anchored(model=with_observations(state, observation), fixed_kept=kept)
 
 
 def block_and_marks(
@@ -189,51 +182,21 @@ def block_and_marks(
     keypoints: Sequence[FloatArray],
     fixed: FixedPoints,
     kept: NDArray[np.bool_],
-    held_points: Sequence[int] = (),
-    held_photos: Sequence[int] = (),
 ) -> tuple[Block, Marks]:
     """The model with whole lenses, and what its free photos see of points that stay.
 
     Args:
         observation: (m,) those of the model that take part. kept: those of the fixed points.
-        held_points: of the model, those that stay.
     """
-    held = np.isin(np.arange(len(model.xyz)), held_points)
     xy = model.pixels(keypoints)
-    free = np.flatnonzero(observation & ~held[model.point_of])
-    stays = np.flatnonzero(observation & held[model.point_of] & ~np.isin(model.photo_of, held_photos))
     block = replace(
-        model.block(xy), point_of=model.point_of[free], photo_of=model.photo_of[free], xy=xy[free]
+        model.block(xy),
+        point_of=model.point_of[observation],
+        photo_of=model.photo_of[observation],
+        xy=xy[observation],
     )
-    marks = Marks(
-        xyz=np.concatenate([fixed.xyz[fixed.point_of[kept]], model.xyz[model.point_of[stays]]]),
-        photo_of=np.concatenate([fixed.photo_of[kept], model.photo_of[stays]]),
-        xy=np.concatenate([fixed.pixels[kept], xy[stays]]),
-    )
+    marks = Marks(xyz=fixed.xyz[fixed.point_of[kept]], photo_of=fixed.photo_of[kept], xy=fixed.pixels[kept])
     return whole_lens(block), marks
-
-
-def terms_of(
-    block: Block,
-    marks: Marks,
-    lenses: tuple[LensPrior | None, ...],
-    options: AnchoredOptions,
-    variance_px2: float,
-    held_photos: Sequence[int] = (),
-) -> Terms:
-    """Marks and lenses; observations count as they do where reconstructions are made.
-
-    Args:
-        variance_px2: of the residuals, with what neighbours share.
-    """
-    keypoint_px = options.keypoint_px(block.cameras)
-    return Terms(
-        keypoint_px=keypoint_px,
-        dilution=options.mapping.dilution * variance_px2 / keypoint_px**2,
-        lenses=lenses,
-        marks=replace(marks, sigma_px=keypoint_px),
-        held_photos=tuple(held_photos),
-    )
 
 
 def _fitting(

@@ -31,7 +31,6 @@ class TwoView:
         inliers: (m, 2) uint32, rows of the keypoints of both photos.
         config: COLMAP's kind of geometry (calibrated, uncalibrated, planar ...).
         essential, fundamental, homography: (3, 3), zeros where COLMAP estimated none.
-        candidates: number of matches before verification.
     """
 
     inliers: NDArray[np.uint32]
@@ -39,7 +38,6 @@ class TwoView:
     essential: FloatArray
     fundamental: FloatArray
     homography: FloatArray
-    candidates: NDArray[np.int64]
 
     @property
     def is_watermark(self) -> bool:
@@ -155,7 +153,6 @@ def verify_pair(
         essential=_matrix(geometry.E),
         fundamental=_matrix(geometry.F),
         homography=_matrix(geometry.H),
-        candidates=np.array(len(matches), dtype=np.int64),
     )
 
 

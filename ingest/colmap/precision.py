@@ -16,7 +16,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import skew
 
-_RELATIVE_STEP = 1e-6  # of central differences: error about 1e-10 of the derivative in float64
 _MAX_SIGMA_M = 1e4  # points on nearly parallel rays; keeps the matrix invertible and float32
 
 
@@ -60,7 +59,7 @@ def linearise(
     for index, camera in enumerate(cameras):
         rows = np.flatnonzero(camera_of[photo_of] == index)
         projected[rows] = camera.project(in_camera[rows])
-        by_camera_point[rows] = _projection_jacobian(camera, in_camera[rows])
+        by_camera_point[rows] = camera.projection_jacobian(in_camera[rows])
     by_pose = np.zeros((len(xy), 2, 6))
     by_pose[:, :, :3] = -by_camera_point @ skew(in_camera)
     by_pose[:, :, 3:] = by_camera_point
@@ -134,13 +133,3 @@ def upper_triangle(covariances: FloatArray) -> NDArray[np.float32]:
     """(n, 6) float32 xx, xy, xz, yy, yz, zz of (n, 3, 3)."""
     rows, columns = np.triu_indices(3)
     return covariances[:, rows, columns].astype(np.float32)
-
-
-def _projection_jacobian(camera: Camera, in_camera: FloatArray) -> FloatArray:
-    """(m, 2, 3) derivative of the projection by points in the camera frame, by central differences."""
-    step = _RELATIVE_STEP * in_camera[:, 2:3]
-    columns = [
-        (camera.project(in_camera + step * axis) - camera.project(in_camera - step * axis)) / (2 * step)
-        for axis in np.eye(3)
-    ]
-    return np.stack(columns, axis=2)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from featuredb.errors import CandidateNotFoundError, InvalidValueError
+from featuredb.errors import CandidateNotFoundError
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.store import Database
 from featuredb.store.candidates.photos import list_candidates, load_images
@@ -15,6 +15,8 @@ from ingest.executor import Progress, no_progress
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.workspace import atomic_file
+from reloc.answered_view import geo_prior
+from reloc.wire.query import PriorRequest
 
 _FOLDER = "candidates"
 _HEX = re.compile(r"[0-9a-f]{32}")
@@ -109,15 +111,7 @@ def _with_query(photo: Photo, candidate: Candidate) -> Photo:
 
 def _prior(asked: Any) -> GeoPrior | None:
     """The position of a wire request, as it was stored; None where it has none or a broken one."""
-    if not isinstance(asked, dict):
-        return None
     try:
-        return GeoPrior(
-            latitude_deg=float(asked["lat"]),
-            longitude_deg=float(asked["lon"]),
-            height_m=None if asked.get("h") is None else float(asked["h"]),
-            sigma_horizontal_m=float(asked["sigma_m"]),
-            sigma_vertical_m=float(asked.get("sigma_vertical_m") or 100.0),
-        )
-    except (KeyError, TypeError, ValueError, InvalidValueError):
+        return geo_prior(PriorRequest.model_validate(asked))
+    except ValueError:
         return None

@@ -3,14 +3,12 @@
 import numpy as np
 
 from featuredb.errors import RegistrationError
-from featuredb.geo.local_frame import LocalFrame
-from featuredb.geo.utm import utm_epsg
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints, Placement
-from featuredb.maps.move import moved_covariances, moved_image
+from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
+from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
@@ -22,42 +20,6 @@ _MIN_POINTS = (
     20  # of the photo's map points that must meet the scan; their median then has a fifth of its spread
 )
 _MIN_SCALE_SIGMA = 0.02  # the lens of a reconstruction is known to that, and so is its depth
-
-
-def placed_map(
-    unplaced: UnplacedMap, placement: Placement, frame: LocalFrame, height_datum: str
-) -> FeatureMap:
-    """The map where `placement.local_from_sfm` takes its own frame; ids, lenses and descriptors stay.
-
-    Args:
-        placement: its similarity leads from the map's own frame to `frame`, metres.
-    """
-    move = placement.local_from_sfm
-    epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
-    points = unplaced.points
-    return FeatureMap(
-        map_id=unplaced.map_id,
-        name=unplaced.name,
-        epsg=epsg,
-        height_datum=height_datum,
-        frame=frame,
-        cameras=unplaced.cameras,
-        camera_keys=unplaced.camera_keys,
-        images=tuple(moved_image(image, move) for image in unplaced.images),
-        points=MapPoints(
-            utm=frame.utm_from_enu(move.act(points.xyz), epsg),
-            rgb=points.rgb,
-            track_length=points.track_length,
-            error_px=points.error_px,
-            covariance=moved_covariances(points.covariance, move),
-        ),
-        observations=unplaced.observations,
-        placement=placement,
-        extractor_fingerprint=unplaced.extractor_fingerprint,
-        source=unplaced.source,
-        licence=unplaced.licence,
-        provenance=unplaced.provenance,
-    )
 
 
 def place_by_photo(

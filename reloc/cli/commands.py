@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import add_command, open_database
 from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
 from reloc.wire.endpoints import DEFAULT_ENDPOINT
 
@@ -25,7 +26,6 @@ _NOT_LOCALISED = 1  # exit code: everything worked, and the answer is no
 
 def register(subparsers: Any) -> None:
     """Add the subcommands to the parser of `featuredb`."""
-    from featuredb.cli.common import add_database_argument
     from reloc.cli.live import register as register_live
     from reloc.cli.serve import register as register_serve
 
@@ -52,15 +52,15 @@ def register(subparsers: Any) -> None:
 
     register_live(subparsers)
 
-    localise = subparsers.add_parser(
+    localise = add_command(
+        subparsers,
         "localise",
-        help="localise photos without a server",
+        _localise,
+        "localise photos without a server",
         description="The same as `query`, with the database opened here.",
     )
-    add_database_argument(localise)
     localise.add_argument("image", nargs="+", metavar="IMAGE", help="image file")
     _add_query_arguments(localise)
-    localise.set_defaults(run=_localise)
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:
@@ -160,7 +160,6 @@ def _query(args: argparse.Namespace) -> int:
 
 
 def _localise(args: argparse.Namespace) -> int:
-    from featuredb.cli.common import open_database
     from reloc.answered_view import AnsweredView
     from reloc.overlay import map_points_in_view
 

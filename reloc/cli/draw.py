@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import open_database
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -46,7 +47,6 @@ def register(subparsers: Any) -> None:
 
 
 def _draw(args: argparse.Namespace) -> int:
-    from featuredb.cli.common import open_database
     from reloc.cli.locate import check_output
     from reloc.pixels.layer import read_layer
 
@@ -101,7 +101,6 @@ def _check_shape(camera: "Camera", width: int, height: int) -> None:
 def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
     import numpy as np
 
-    from featuredb.cli.common import open_database
     from featuredb.video.frames import open_video
     from featuredb.video.writer import VideoWriter
     from reloc.answered_view import AnsweredView, camera_of

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import open_database
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -84,7 +85,6 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
 def _locate(args: argparse.Namespace) -> int:
     import json
 
-    from featuredb.cli.common import open_database
     from reloc.cli.commands import require_an_image
     from reloc.pixels.boxes import as_json, geojson
     from reloc.pixels.locate import locate

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from featuredb.cli.common import add_command, open_database
 from reloc.wire.endpoints import DEFAULT_ENDPOINT
 
 logger = logging.getLogger(__name__)
@@ -13,12 +14,13 @@ logger = logging.getLogger(__name__)
 
 def register(subparsers: Any) -> None:
     """Add the subcommand to the parser of `featuredb`."""
-    from featuredb.cli.common import add_database_argument
-
-    serve = subparsers.add_parser(
-        "serve", help="answer queries over Zenoh", description="Answer queries over Zenoh until stopped."
+    serve = add_command(
+        subparsers,
+        "serve",
+        _serve,
+        "answer queries over Zenoh",
+        description="Answer queries over Zenoh until stopped.",
     )
-    add_database_argument(serve)
     serve.add_argument(
         "--listen",
         action="append",
@@ -76,11 +78,9 @@ def register(subparsers: Any) -> None:
     serve.add_argument(
         "--metrics-port", type=int, metavar="PORT", help="serve http://127.0.0.1:PORT/metrics for Prometheus"
     )
-    serve.set_defaults(run=_serve)
 
 
 def _serve(args: argparse.Namespace) -> int:
-    from featuredb.cli.common import open_database
     from reloc.service.logs import fields, log_to
 
     database = open_database(args)

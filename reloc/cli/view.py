@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import add_as_of_argument, add_command, open_database, progress_of_maps
 from featuredb.errors import ExportError
 from featuredb.extras import require
 
@@ -16,16 +17,16 @@ if TYPE_CHECKING:
 
 def register(subparsers: Any) -> None:
     """Add the subcommand to the parser of `featuredb`."""
-    from featuredb.cli.common import add_as_of_argument, add_database_argument
     from featuredb.cli.export import add_selection_arguments
 
-    view = subparsers.add_parser(
+    view = add_command(
+        subparsers,
         "view",
-        help="look at a database in a browser",
+        _run,
+        "look at a database in a browser",
         description="Open a page on this machine: maps, photos, scans, lineage, tracks of films, and where a "
         "photo that is dropped on it was taken. Nothing is loaded from the network.",
     )
-    add_database_argument(view)
     view.add_argument(
         "--photos",
         type=Path,
@@ -53,11 +54,9 @@ def register(subparsers: Any) -> None:
     view.add_argument("--no-browser", action="store_true", help="print the address only")
     add_selection_arguments(view)
     add_as_of_argument(view)
-    view.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
-    from featuredb.cli.common import open_database, progress_of_maps
     from reloc.tracking.trajectory.read import read_trajectory_csv
     from reloc.viewer.photos import Pictures
     from reloc.viewer.scene import DEFAULT_POINTS, ViewerSceneOptions, build_scene

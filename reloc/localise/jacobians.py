@@ -1,4 +1,4 @@
-"""Derivatives of pixels by points and pose, through any camera model, by central differences."""
+"""Derivatives of pixels by points and pose, through any camera model."""
 
 import numpy as np
 
@@ -17,15 +17,7 @@ def pixel_jacobians(
         axes (rad), then a displacement of its centre (m): R_true = R(dtheta) R, C_true = C + dC for
         local_from_cam = (R, C).
     """
-    in_camera = cam_from_local.act(points)
-    step = 1e-5 * np.maximum(in_camera[:, 2], 1e-3)
-    by_camera = np.empty((len(points), 2, 3))
-    for axis in range(3):
-        offset = np.zeros_like(in_camera)
-        offset[:, axis] = step
-        by_camera[:, :, axis] = (camera.project(in_camera + offset) - camera.project(in_camera - offset)) / (
-            2.0 * step[:, None]
-        )
+    by_camera = camera.projection_jacobian(cam_from_local.act(points))
     return chain_to_pose(by_camera, cam_from_local, points)
 
 

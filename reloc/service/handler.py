@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import (
-    FeatureDbError,
     ImageError,
     IncompatibleExtractorError,
     InvalidValueError,
@@ -15,9 +14,8 @@ from featuredb.features.decode import DecodeLimits, decode_gray
 from featuredb.features.exif.read import read_exif
 from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
-from featuredb.maps.feature_map import GeoPrior
 from featuredb.stage_clock import StageClock
-from reloc.answered_view import camera_of
+from reloc.answered_view import camera_of, geo_prior
 from reloc.localise.lens_prior import QueryLensPrior, known_within
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
@@ -27,7 +25,6 @@ from reloc.wire.query import (
     ErrorCode,
     LocaliseReply,
     LocaliseWireRequest,
-    PriorRequest,
     RequestError,
 )
 
@@ -128,21 +125,3 @@ def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | No
         return known_within(camera, sigmas)
     except InvalidValueError as error:
         raise RequestError(ErrorCode.BAD_REQUEST, f"camera.sigmas: {error}") from error
-
-
-def geo_prior(prior: PriorRequest) -> GeoPrior:
-    """A prior off the wire.
-
-    Raises:
-        RequestError: BAD_REQUEST, it is none.
-    """
-    try:
-        return GeoPrior(
-            latitude_deg=prior.lat,
-            longitude_deg=prior.lon,
-            height_m=prior.h,
-            sigma_horizontal_m=prior.sigma_m,
-            sigma_vertical_m=prior.sigma_vertical_m,
-        )
-    except FeatureDbError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, f"prior: {error}") from error

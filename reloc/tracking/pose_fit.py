@@ -23,7 +23,6 @@ class FittedPose:
     Attributes:
         cam_from_local: the pose.
         inlier: (n,) bool, pixels within the tolerance.
-        residual_px: (n, 2) of all.
         focal_px, focal_rel: focal length, and the standard deviation of its logarithm; 0 where it was given.
         covariance: (6, 6) of the camera's rotation about the local axes (rad) before the displacement of its
             centre (m), as in `reloc.localise.result`; of independent pixels, scaled by their residuals, and
@@ -32,7 +31,6 @@ class FittedPose:
 
     cam_from_local: Rigid3
     inlier: NDArray[np.bool_]
-    residual_px: FloatArray
     covariance: FloatArray
     focal_px: float
     focal_rel: float
@@ -121,7 +119,6 @@ def fit_pose(
     return FittedPose(
         cam_from_local=pose,
         inlier=inlier,
-        residual_px=np.ascontiguousarray(residual.T),
         covariance=of_camera(pose, covariance[:6, :6]),
         focal_px=focal * float(np.exp(zoom)),
         focal_rel=float(np.sqrt(covariance[6, 6])) if count == 7 else 0.0,

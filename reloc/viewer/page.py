@@ -33,9 +33,14 @@ class Asset:
 
 def assets() -> dict[str, Asset]:
     """All files that the page loads, by their path below /assets/."""
-    root = resources.files("reloc.viewer") / "assets"
+    return assets_of("reloc.viewer", "", "js", "vendor")
+
+
+def assets_of(package: str, *folders: str) -> dict[str, Asset]:
+    """All files but the page in folders of a package's `assets`, by their path there."""
+    root = resources.files(package) / "assets"
     found = {}
-    for folder in ("", "js", "vendor"):
+    for folder in folders:
         for file in (root / folder).iterdir():
             if file.is_file() and file.name != _TEMPLATE:
                 name = f"{folder}/{file.name}" if folder else file.name

@@ -8,7 +8,7 @@ opened on which a map is placed, only with a media type that a browser does not 
 import asyncio
 import logging
 import socket
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 
 from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
-from reloc.viewer.page import assets, content_policy, page
+from reloc.viewer.page import Asset, assets, content_policy, page
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import LIMITS, Queries
@@ -55,24 +55,9 @@ def create_app(
         queries: answers photos that are dropped on the page.
         pages: on which maps are placed; None: the page shows the command only.
     """
-    app = FastAPI(title="featuredb viewer", docs_url=None, redoc_url=None, openapi_url=None)
     # Pictures and queries are decoded beside the event loop; a query takes its own turn inside.
-    threads = ThreadPoolExecutor(4, thread_name_prefix="viewer")
-    files, html, policy = assets(), page(), content_policy()
+    app, in_thread = local_app("featuredb viewer", page(), content_policy(), assets())
     document = {**scene.document, "queries": True, "placing": pages is not None}
-
-    async def in_thread(work: Callable[[], Any]) -> Any:
-        return await asyncio.get_running_loop().run_in_executor(threads, work)
-
-    @app.get("/")
-    async def index() -> Response:
-        return Response(html, media_type="text/html", headers={"Content-Security-Policy": policy})
-
-    @app.get("/assets/{name:path}")
-    async def asset(name: str) -> Response:
-        if name not in files:
-            raise HTTPException(404, f"no file {name[:100]!r}")
-        return Response(files[name].data, media_type=files[name].media_type)
 
     @app.get("/api/scene")
     async def scene_document() -> Response:
@@ -112,8 +97,37 @@ def create_app(
         return JSONResponse({"url": await in_thread(partial(pages.open, map, key))})
 
     _add_failures(app)
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
     return app
+
+
+def local_app(
+    title: str, html: str, policy: str, files: Mapping[str, Asset], prefix: str = ""
+) -> tuple[FastAPI, Callable[[Callable[[], Any]], Awaitable[Any]]]:
+    """An application for this machine, and what runs a function beside its event loop.
+
+    Args:
+        html: the page, at `prefix`/, and `policy`, its Content-Security-Policy.
+        files: by their path below `prefix`/assets/.
+    """
+    app = FastAPI(title=title, docs_url=None, redoc_url=None, openapi_url=None)
+    threads = ThreadPoolExecutor(4, thread_name_prefix=title)
+    headers = {"Content-Security-Policy": policy, "Referrer-Policy": "no-referrer"}
+
+    async def in_thread(work: Callable[[], Any]) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(threads, work)
+
+    @app.get(f"{prefix}/")
+    async def index() -> Response:
+        return Response(html, media_type="text/html", headers=headers)
+
+    @app.get(f"{prefix}/assets/{{name:path}}")
+    async def asset(name: str) -> Response:
+        if name not in files:
+            raise HTTPException(404, f"no file {name[:100]!r}")
+        return Response(files[name].data, media_type=files[name].media_type)
+
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
+    return app, in_thread
 
 
 def listen(port: int) -> socket.socket:

@@ -9,6 +9,7 @@ import pytest
 
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import Placement
+from featuredb.maps.move import placed_map
 from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from featuredb.store import Database
@@ -17,7 +18,6 @@ from ingest.growth.run import grow
 from ingest.growth.unplaced import left_over, place_unplaced_maps
 from ingest.growth.values import GrowthOptions, no_photos
 from ingest.map_builder import MapOptions, build_unplaced_map
-from ingest.register.place_map import placed_map
 from reloc.localiser import Localiser
 from tests.support.growth_box import DESCRIPTORS, FRAME, KEY, POINTS, existing, walk
 from tests.support.new_photos import identity, take_photos

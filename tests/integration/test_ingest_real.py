@@ -22,7 +22,7 @@ def test_strangers_photos_without_exif(shared_data: Path, tmp_path: Path) -> Non
     found = []
     for again in (False, True):
         options = MapMakingOptions(sfm=SfmOptions(focal_from_view_graph=again))
-        workspace = Workspace(root=tmp_path, job_id=str(again))
+        workspace = Workspace(root=tmp_path)
         done = reconstruct_photos(photos, workspace, options, InProcessExecutor())
         found.append(max((len(model.rows) for model in done.reconstruction.models()), default=0))
     assert found[0] < 3

@@ -13,7 +13,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
-from featuredb.render.levels import build_cloud
 from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.laser.airborne import scan_town
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
@@ -22,6 +21,7 @@ from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior
+from tools.worlds.clouds import build_cloud
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=800, height=600, params=(640.0, 398.0, 303.0, 0.02))
 OPTIONS = FrameOptions(threads=1)

@@ -13,7 +13,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import rotation_angle, so3_exp
 from featuredb.render.cloud import PointCloud
-from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
 from ingest.register.frame.dense.confirmation import confirm_pose
 from ingest.register.frame.elsewhere import agreement_elsewhere
@@ -21,6 +20,7 @@ from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameViews, first_look
 from ingest.register.frame_registration import FramePrior
+from tools.worlds.clouds import build_cloud
 
 CAMERA = Camera(
     model="SIMPLE_RADIAL", width=320, height=240, params=(300.0, 163.0, 118.0, -0.06)

@@ -1,7 +1,5 @@
 """Levels of detail for any cloud: a permutation, nodes that hold what they say, levels with their spacing."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,19 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from scipy.spatial import cKDTree
 
-from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.render import levels
-from featuredb.render.levels import build_cloud, point_spacing
+from featuredb.render.spacing import point_spacing
+from tools.worlds.clouds import build_cloud
 
 FRAME = LocalFrame(latitude_deg=-33.0, longitude_deg=151.0, height_m=20.0)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def many_levels() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(levels, "_COARSEST_POINTS", 20)
-        yield
 
 
 @settings(deadline=None, max_examples=40)
@@ -87,17 +77,3 @@ def test_point_spacing_is_that_of_the_surface(step: float) -> None:
     spacing = point_spacing(np.concatenate([floor, wall]))
     assert np.median(spacing[:n]) == pytest.approx(step, rel=0.2)
     assert np.median(spacing[n:]) == pytest.approx(0.9 * 4 * step, rel=0.3)
-
-
-@pytest.mark.parametrize(
-    ("xyz", "words"),
-    [(np.zeros((0, 3)), "n >= 1"), (np.zeros((5, 2)), "points"), (np.full((4, 3), np.nan), "finite")],
-)
-def test_what_is_no_cloud_is_refused(xyz: np.ndarray, words: str) -> None:  # type: ignore[type-arg]
-    with pytest.raises(InvalidValueError, match=words):
-        build_cloud(FRAME, "unknown", xyz)
-
-
-def test_wrong_attributes_are_refused() -> None:
-    with pytest.raises(InvalidValueError, match="intensity"):
-        build_cloud(FRAME, "unknown", np.zeros((5, 3)), intensity=np.zeros(5, np.uint16))

@@ -13,13 +13,13 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
-from featuredb.render.levels import build_cloud
 from ingest.register.anchor.files import load_proposals, save_proposals
 from ingest.register.anchor.pictures import FramePicture, edges_of, flick_page, overlay_rgb, scan_view
 from ingest.register.anchor.proposals import propose_frames, small_camera
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from ingest.register.structure.map_move import map_move, map_residuals, viewing_distance_m
 from tests.support.maps import random_map
+from tools.worlds.clouds import build_cloud
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=800, height=600, params=(700.0, 400.0, 300.0, 0.0))
 

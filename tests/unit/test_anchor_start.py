@@ -13,7 +13,6 @@ from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.render.levels import build_cloud
 from ingest.register.anchor.start.files import read_picks, read_pose
 from ingest.register.anchor.start.picks import Picks, pose_from_picks
 from ingest.register.anchor.start.priors import (
@@ -27,6 +26,7 @@ from ingest.register.anchor.start.priors import (
     prior_from_rough_pose,
 )
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
+from tools.worlds.clouds import build_cloud
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=1600, height=1200, params=(1300.0, 800.0, 600.0, 0.02))
 

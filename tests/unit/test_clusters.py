@@ -237,7 +237,7 @@ def _two_towns(work: Path) -> Reconstruction:
         [(CAMERA, True)],
         views,
         {},
-        Workspace(root=work, job_id="towns"),
+        Workspace(root=work),
         SfmOptions(),
         InProcessExecutor(),
         joining=JoinOptions(),

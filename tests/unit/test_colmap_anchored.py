@@ -145,7 +145,7 @@ def test_points_of_known_poses(scene: tuple[NewPhotos, FloatArray]) -> None:
     geometries = {}
     for a in range(4):
         for b in range(a + 1, 4):
-            shared, at_a, at_b = np.intersect1d(new.world_of[a], new.world_of[b], return_indices=True)
+            _, at_a, at_b = np.intersect1d(new.world_of[a], new.world_of[b], return_indices=True)
             pairs = np.stack([at_a, at_b], axis=1).astype(np.uint32)
             geometries[a, b] = TwoView(
                 inliers=pairs,
@@ -153,7 +153,6 @@ def test_points_of_known_poses(scene: tuple[NewPhotos, FloatArray]) -> None:
                 essential=_essential(new.poses[a], new.poses[b]),
                 fundamental=np.zeros((3, 3)),
                 homography=np.zeros((3, 3)),
-                candidates=np.array(len(shared), dtype=np.int64),
             )
     model = triangulate_posed([CAMERA] * 4, photos, new.poses, geometries)
     assert len(model.rows) == 4
@@ -229,29 +228,3 @@ def test_a_wrong_focal_length_of_exif_loses_to_photos_that_know() -> None:
     )
     wrong = Lenses(focal_px={0: 1.3 * CAMERA.focal_px})
     assert focal_after(new, 1.05 * CAMERA.focal_px, wrong) == pytest.approx(CAMERA.focal_px, rel=0.005)
-
-
-def test_points_of_the_model_that_are_held_count_and_stay(scene: tuple[NewPhotos, FloatArray]) -> None:
-    """They place the photos that are free, whatever the photo that is held says of them."""
-    new, points = scene
-    model = new.model
-    world = np.array([new.world_of[k][f] for k, f in zip(model.photo_of, model.keypoint_of, strict=True)])
-    xyz = model.xyz.copy()
-    xyz[model.point_of] = points[world]
-    poses = (new.poses[0], *model.cam_from_sfm[1:])
-    known = replace(model, xyz=xyz, cam_from_sfm=poses)
-    held = np.unique(model.point_of[world < 40])
-    done = adjust_anchored(
-        known,
-        list(new.keypoints().values()),
-        FixedPoints.none(),
-        HELD,
-        OPTIONS,
-        held_photos=[0],
-        held_points=held.tolist(),
-    )
-    assert np.abs(done.model.cam_from_sfm[0].matrix() - new.poses[0].matrix()).max() < 1e-9
-    stayed = np.isin(done.old_point, held)
-    assert stayed.sum() > 30
-    np.testing.assert_array_equal(done.model.xyz[stayed], xyz[done.old_point[stayed]])
-    assert centers_off(done.model, new).max() < 0.03

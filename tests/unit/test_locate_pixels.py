@@ -13,13 +13,13 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
-from featuredb.render.levels import build_cloud
 from reloc.answered_view import AnsweredView
 from reloc.pixels.boxes import geojson, read_coco
 from reloc.pixels.locate import locate
 from reloc.pixels.patch import fit_patch
 from reloc.pixels.surfaces import MapSurface, ScanSurface, resampled, window_camera
 from tests.support.scanned_map import EPSG, FRAME
+from tools.worlds.clouds import build_cloud
 
 LENS = Camera(
     model="OPENCV", width=800, height=600, params=(700.0, 705.0, 402.0, 297.0, 0.03, -0.02, 1e-3, 2e-3)

@@ -16,7 +16,6 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
 from featuredb.render.lens import lens_numbers
-from featuredb.render.levels import build_cloud
 from featuredb.render.loops.draw_loops import project
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.shading import shaded_relief
@@ -25,6 +24,7 @@ from featuredb.simworld.camera.raster import render as cast_rays
 from featuredb.simworld.camera.shot import look_pose
 from featuredb.simworld.town.scene import Ellipsoids, Faces
 from featuredb.simworld.town.solids import box, face
+from tools.worlds.clouds import build_cloud
 
 FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=11.0, height_m=500.0)
 CAMERA = Camera(model="OPENCV", width=320, height=240, params=(240, 242, 163, 118, -0.08, 0.03, 1e-3, -7e-4))

@@ -79,7 +79,7 @@ def test_ransac_finds_the_similarity_among_two_thirds_outliers() -> None:
     target = pairs.target.copy()
     wrong = rng.permutation(300)[:200]
     target[wrong] += rng.normal(0, 20, (200, 3))
-    found = ransac_similarity(replace(pairs, target=target), np.full(300, 0.3))
+    found = ransac_similarity(pairs.source, target, np.full(300, 0.3))
     assert found is not None
     right = np.setdiff1d(np.arange(300), wrong)
     assert np.linalg.norm(found.act(pairs.source[right]) - pairs.target[right], axis=1).mean() < 0.3
@@ -87,7 +87,7 @@ def test_ransac_finds_the_similarity_among_two_thirds_outliers() -> None:
 
 def test_ransac_needs_three_pairs() -> None:
     pairs = _pairs(np.random.default_rng(0), 2)
-    assert ransac_similarity(pairs, np.full(2, 1.0)) is None
+    assert ransac_similarity(pairs.source, pairs.target, np.full(2, 1.0)) is None
 
 
 def test_exact_pairs_give_the_exact_similarity() -> None:

@@ -58,16 +58,14 @@ def write_map(folder: Path, feature_map: AnyMap, *, text: bool = False) -> None:
 class KeypointRows:
     """Which observations are the keypoints of each image, in the order of model and database alike.
 
-    Those with a descriptor come first: an image's first `described` rows have one, the rest have zeros.
+    Those with a descriptor come first, the rest have zeros.
 
     Attributes:
         rows: for each image, rows (k,) of the map's observations.
-        described: (images,) how many of them have a descriptor.
         point2d: (m,) for each observation, its row among its image's keypoints.
     """
 
     rows: list[NDArray[np.int64]]
-    described: NDArray[np.int64]
     point2d: NDArray[np.int64]
 
 
@@ -82,8 +80,7 @@ def keypoint_rows(feature_map: AnyMap) -> KeypointRows:
     point2d = np.empty(len(seen), dtype=np.int64)
     for of_image in rows:
         point2d[of_image] = np.arange(len(of_image))
-    described = np.bincount(image[seen.has_descriptor], minlength=len(feature_map.images))
-    return KeypointRows(rows=rows, described=described, point2d=point2d)
+    return KeypointRows(rows=rows, point2d=point2d)
 
 
 def image_names(feature_map: AnyMap) -> list[str]:

@@ -112,7 +112,7 @@ def close_holes(
                 wide[left] = x
                 left += 1
                 continue
-            own, own_apart = np.float64(nearness[y, x]), np.float64(apart_m[y, x])
+            own = np.float64(nearness[y, x])
             share = 1.0 / _COUNT[bits]
             found, apart = values[x] * share, aparts[x] * share
             # Where points are about a pixel apart, a slope between two pixels is not worth its price.
@@ -124,7 +124,7 @@ def close_holes(
                     *(x + 0.5 - (column + 0.5) * side, y + 0.5 - (row + 0.5) * side),
                     *(off_x, off_y, found, apart, focal),
                 )
-            if _closes(own, own_apart, found, apart, level[x], radii[k], focal, reach_per_spacing):
+            if _closes(own, found, apart, level[x], radii[k], focal, reach_per_spacing):
                 depth[y, x] = 1.0 / found
                 index[y, x] = -1
                 finished[y, x] = _mean_paint(even[x], odd[x], share)
@@ -287,7 +287,7 @@ def _search_rings(
                         *(x + 0.5 - (column + 0.5) * side, y + 0.5 - (row + 0.5) * side),
                         *(off_x * share, off_y * share, found, apart, focal),
                     )
-                if _closes(own, own_apart, found, apart, level, radii[k], focal, reach_per_spacing):
+                if _closes(own, found, apart, level, radii[k], focal, reach_per_spacing):
                     depth[y, x] = 1.0 / found
                     index[y, x] = -1
                     finished[y, x] = _mean_paint(even, odd, share)
@@ -323,7 +323,6 @@ def _change(
 @compiled
 def _closes(
     own: float,
-    own_apart: float,
     found: float,
     apart: float,
     level: float,

@@ -7,6 +7,10 @@ from featuredb.render.compiled import compiled
 
 Int64 = NDArray[np.int64]
 
+# In a cell that tells a point's spacing: fewer make it uncertain by more than a third, more blur the step
+# from a dense roof to a sparse wall.
+_NEIGHBOURS = 8
+
 
 @compiled
 def _spread(value: int) -> int:
@@ -116,10 +120,10 @@ def node_runs(
 
 
 @compiled
-def spacing_of_codes(codes: Int64, cell_m: float, enough: int) -> NDArray[np.float32]:
+def spacing_of_codes(codes: Int64, cell_m: float) -> NDArray[np.float32]:
     """(n,) metres between neighbours, for points sorted by code.
 
-    Each point takes the smallest cell around it that holds `enough` points, as if they lay on a surface
+    Each point takes the smallest cell around it that holds `_NEIGHBOURS` points, as if they lay on a surface
     through it. Points without so many around them keep the widest spacing.
     """
     spacing = np.zeros(len(codes), np.float32)
@@ -132,7 +136,7 @@ def spacing_of_codes(codes: Int64, cell_m: float, enough: int) -> NDArray[np.flo
             while end < len(codes) and codes[end] >> (3 * level) == cell:
                 end += 1
             value = edge / np.sqrt(end - first)
-            if end - first >= enough or level == 20:
+            if end - first >= _NEIGHBOURS or level == 20:
                 for i in range(first, end):
                     if spacing[i] == 0.0:
                         spacing[i] = value
@@ -142,20 +146,3 @@ def spacing_of_codes(codes: Int64, cell_m: float, enough: int) -> NDArray[np.flo
         if not open_points:
             break
     return spacing
-
-
-@compiled
-def node_boxes(
-    xyz: NDArray[np.float32], start: Int64, count: Int64
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lower and upper corners (k, 3) of the boxes around runs of points."""
-    low = np.empty((len(start), 3), np.float32)
-    high = np.empty((len(start), 3), np.float32)
-    for k in range(len(start)):
-        for a in range(3):
-            low[k, a] = high[k, a] = xyz[start[k], a]
-        for i in range(start[k], start[k] + count[k]):
-            for a in range(3):
-                low[k, a] = min(low[k, a], xyz[i, a])
-                high[k, a] = max(high[k, a], xyz[i, a])
-    return low, high

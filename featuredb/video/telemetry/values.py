@@ -122,11 +122,6 @@ class Telemetry(TelemetrySamples):
                 'expected "none" exactly where there are none'
             )
 
-    @property
-    def span_s(self) -> float:
-        """Seconds from the first sample to the last."""
-        return float(self.times_s[-1] - self.times_s[0])
-
     def at(self, times_s: ArrayLike) -> TelemetrySamples:
         """Samples at other times, each column by itself.
 

@@ -103,7 +103,7 @@ class GraphSolution:
             empty where there is a reason.
         covariance: (7, 7) of each new place on Earth.
         covariance_relative: (7, 7) relative to the anchors, as if those were the truth; zero for anchors.
-        chi_square, degrees: of the fit; `variance_factor` is their ratio where it was needed, else 1.
+        chi_square, degrees: of the fit; covariances are widened by their ratio where that is needed.
         edges: all of them, those left out too.
     """
 
@@ -114,7 +114,6 @@ class GraphSolution:
     covariance_relative: Mapping[str, FloatArray] = field(default_factory=dict)
     chi_square: float = 0.0
     degrees: int = 0
-    variance_factor: float = 1.0
     edges: tuple[EdgeFit, ...] = ()
 
     @property
@@ -283,7 +282,6 @@ def _solution(fitted: _Fit, fits: tuple[EdgeFit, ...]) -> GraphSolution:
         message=figures,
         chi_square=fitted.chi_square,
         degrees=fitted.degrees,
-        variance_factor=factor,
         edges=fits,
     )
     if factor > _MOST_VARIANCE_FACTOR:

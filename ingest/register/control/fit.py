@@ -92,14 +92,12 @@ class ControlFit:
 
     Attributes:
         local_from_block: the similarity.
-        residuals_m: (n, 3) surveyed minus found; up NaN where unknown.
         inliers: (n,) points that take part.
         chosen: of each point.
         sigma_m: robust standard deviation of a coordinate.
     """
 
     local_from_block: Sim3
-    residuals_m: FloatArray
     inliers: NDArray[np.bool_]
     chosen: tuple[Hypothesis, ...]
     sigma_m: float
@@ -182,7 +180,6 @@ def fit_similarity(
     rest = surveyed - sim.act(xyz[chosen])
     return ControlFit(
         local_from_block=sim,
-        residuals_m=rest,
         inliers=np.linalg.norm(np.nan_to_num(rest), axis=1) <= _OUTLIER_SIGMAS * sigma,
         chosen=tuple(found[int(i)] for i in chosen),
         sigma_m=sigma,

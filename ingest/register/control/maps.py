@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from featuredb.adjust.block import Block
 from featuredb.geo.datum import check_datum
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
+from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import UnplacedMap
 from ingest.colmap.bridge import Model
 from ingest.photos.photo import Photo
@@ -23,7 +23,6 @@ from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control, control_frame, meet
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
 from ingest.register.gps import GpsPlacement
-from ingest.register.place_map import placed_map
 from ingest.sfm.extract import PhotoFeatures
 
 # A local frame is good for tens of kilometres; a new one further away keeps coordinates small.
@@ -238,7 +237,7 @@ def place_by_survey(
     return ControlledPlacement(
         placement=placement,
         control=control,
-        model=_adjusted_model(model, block, placement),
+        model=_adjusted_model(model, placement),
         frame=where,
         map_placement=_map_placement(placement, evidence),
         file=survey.file,
@@ -246,7 +245,7 @@ def place_by_survey(
     )
 
 
-def _adjusted_model(model: Model, block: Block, placement: GcpPlacement) -> Model:
+def _adjusted_model(model: Model, placement: GcpPlacement) -> Model:
     if placement.reason is not None or placement.block is None or placement.local_from_block is None:
         return model
     return model_of_block(model, placement.block.moved(placement.local_from_block.inverse()))

@@ -4,24 +4,20 @@ The socket is bound to 127.0.0.1, names other than that are refused by the Host 
 below a random token that other web pages cannot know: none can read or post here.
 """
 
-import asyncio
 import secrets
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib import resources
-from typing import Any
 
-from fastapi import APIRouter, FastAPI, HTTPException, Request, Response
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from featuredb.errors import FeatureDbError
 from ingest.register.picks_page.session import PickedSpot, PickSession
-from reloc.viewer.server import HOST
+from reloc.viewer.page import assets_of
+from reloc.viewer.server import local_app
 
-_MEDIA_TYPES = {"js": "text/javascript", "css": "text/css"}
+_PACKAGE = "ingest.register.picks_page"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -52,26 +48,9 @@ def new_token() -> str:
 
 def create_app(session: PickSession, token: str) -> FastAPI:
     """The application; everything lies below /TOKEN/."""
-    app = FastAPI(title="featuredb picks", docs_url=None, redoc_url=None, openapi_url=None)
-    threads = ThreadPoolExecutor(3, thread_name_prefix="picks")
-    root = resources.files("ingest.register.picks_page") / "assets"
-    files = {file.name: file.read_bytes() for file in root.iterdir() if file.is_file()}
+    html = (resources.files(_PACKAGE) / "assets" / "index.html").read_text(encoding="utf-8")
+    app, in_thread = local_app("featuredb picks", html, _POLICY, assets_of(_PACKAGE, ""), f"/{token}")
     below = APIRouter(prefix=f"/{token}")
-
-    async def in_thread(work: Callable[[], Any]) -> Any:
-        return await asyncio.get_running_loop().run_in_executor(threads, work)
-
-    @below.get("/")
-    async def index() -> Response:
-        headers = {"Content-Security-Policy": _POLICY, "Referrer-Policy": "no-referrer"}
-        return Response(files["index.html"], media_type="text/html", headers=headers)
-
-    @below.get("/assets/{name}")
-    async def asset(name: str) -> Response:
-        kind = _MEDIA_TYPES.get(name.rsplit(".", 1)[-1])
-        if name not in files or kind is None:
-            raise HTTPException(404, f"no file {name[:100]!r}")
-        return Response(files[name], media_type=kind)
 
     @below.get("/api/state")
     async def state() -> Response:
@@ -106,5 +85,4 @@ def create_app(session: PickSession, token: str) -> FastAPI:
         return JSONResponse({"message": str(error)}, 400)
 
     app.include_router(below)
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
     return app

@@ -98,7 +98,7 @@ def project_structure(
         return StructurePlacement(reason="TOO_FEW_PAIRS", message=words, pairs=pairs, inliers=none)
     distances = _distances(pairs, registered)
     tolerance = np.maximum(_MIN_TOLERANCE_M, _TOLERANCE_REL * distances)
-    start = ransac_similarity(pairs, tolerance)
+    start = ransac_similarity(pairs.source, pairs.target, tolerance)
     if start is None:
         words = "the pairs lie on a line or coincide"
         return StructurePlacement(reason="NO_SIMILARITY", message=words, pairs=pairs, inliers=none)

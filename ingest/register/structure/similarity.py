@@ -80,29 +80,29 @@ class SimilarityFit:
     neighbours_factor: float
 
 
-def ransac_similarity(pairs: Pairs, tolerance_m: FloatArray) -> Sim3 | None:
+def ransac_similarity(source: FloatArray, target: FloatArray, tolerance: FloatArray) -> Sim3 | None:
     """The similarity of three pairs with the smallest truncated sum of squared distances, or None.
 
     Args:
-        tolerance_m: (n,) distance beyond which a pair does not count.
+        source, target: (n, 3). tolerance: (n,) distance beyond which a pair does not count.
     """
-    n = len(pairs)
+    n = len(source)
     if n < 3:
         return None
     generator = np.random.default_rng(_SEED)
     samples = generator.integers(0, n, (_SAMPLES, 3))
     samples = samples[(np.diff(np.sort(samples, axis=1), axis=1) > 0).all(axis=1)]
-    scale, rotation, translation, usable = similarities(pairs.source[samples], pairs.target[samples])
+    scale, rotation, translation, usable = similarities(source[samples], target[samples])
     if not usable.any():
         return None
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
     rows = np.arange(n) if n <= _SCORE_PAIRS else generator.choice(n, _SCORE_PAIRS, replace=False)
-    off = (scale[:, None, None] * rotation).reshape(-1, 3) @ pairs.source[rows].T  # (3 k, n)
+    off = (scale[:, None, None] * rotation).reshape(-1, 3) @ source[rows].T  # (3 k, n)
     off += translation.reshape(-1, 1)
     off = off.reshape(-1, 3, len(rows))
-    off -= pairs.target[rows].T
+    off -= target[rows].T
     off *= off
-    cost = np.minimum(off.sum(axis=1) / tolerance_m[rows] ** 2, 1.0).sum(axis=1)
+    cost = np.minimum(off.sum(axis=1) / tolerance[rows] ** 2, 1.0).sum(axis=1)
     best = int(np.argmin(cost))
     return Sim3(scale=float(scale[best]), rotation=rotation[best], translation=translation[best])
 

@@ -17,10 +17,9 @@ from featuredb.features.decode import decode_gray
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from featuredb.video.film import fitted_size
-from reloc.answered_view import camera_of
+from reloc.answered_view import camera_of, geo_prior
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.service.handler import geo_prior
 from reloc.service.live.options import LiveOptions
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.pose_message import pose_message

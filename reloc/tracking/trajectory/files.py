@@ -18,7 +18,7 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose_documents import irregular_series
-from reloc.tracking.trajectory.own_frame_files import own_format
+from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS
 from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPoint
 
 _POSE = (
@@ -43,7 +43,7 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     Raises:
         InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
     """
-    made = (own_format(path) if trajectory.is_in_map else _format(path))(trajectory)
+    made = _format(path, trajectory.is_in_map)(trajectory)
     content = made if isinstance(made, bytes) else made.encode()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
@@ -239,12 +239,15 @@ _FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {
 }
 
 
-def _format(path: Path) -> Callable[[Trajectory], str | bytes]:
-    if path.suffix.lower() not in _FORMATS:
+def _format(path: Path, is_in_map: bool = False) -> Callable[[Trajectory], str | bytes]:
+    formats, why = _FORMATS, ""
+    if is_in_map:
+        formats, why = OWN_FORMATS, "the track is in the frame of a map without a place: "
+    if path.suffix.lower() not in formats:
         raise InvalidValueError(
-            f"{path.name}: expected a name that ends in {', '.join(_FORMATS)}, found {path.suffix!r}"
+            f"{path.name}: {why}expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
         )
-    return _FORMATS[path.suffix.lower()]
+    return formats[path.suffix.lower()]
 
 
 def _known(trajectory: Trajectory, what: str) -> Sequence[tuple[TrajectoryPoint, EarthPose]]:

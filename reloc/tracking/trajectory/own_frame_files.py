@@ -7,9 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Callable
-from pathlib import Path
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.rotation import quaternion_from_matrix
 from reloc.localise.result import OwnPose
 from reloc.tracking.trajectory.values import Trajectory
@@ -72,21 +70,7 @@ def own_json_text(trajectory: Trajectory) -> str:
     return json.dumps(about | {"frames": frames}, indent=1) + "\n"
 
 
-def own_format(path: Path) -> Callable[[Trajectory], str]:
-    """What writes a file of that name.
-
-    Raises:
-        InvalidValueError: it is a format of places on Earth, or none.
-    """
-    if path.suffix.lower() not in OWN_FORMATS:
-        raise InvalidValueError(
-            f"{path.name}: the track is in the frame of a map without a place: expected a name that ends in "
-            f"{' or '.join(OWN_FORMATS)}, found {path.suffix!r}"
-        )
-    return OWN_FORMATS[path.suffix.lower()]
-
-
-OWN_FORMATS: dict[str, Callable[[Trajectory], str]] = {".csv": own_csv_text, ".json": own_json_text}
+OWN_FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {".csv": own_csv_text, ".json": own_json_text}
 
 
 def _cells(pose: OwnPose) -> list[str]:

@@ -17,14 +17,10 @@ _LOST, _BOUND = "#f3d6d6", 1.96
 _DPI = 110
 
 
-def plot_png(trajectory: Trajectory, errors: FloatArray | None = None) -> bytes:
-    """The way from above; beside it what each axis is uncertain by, or off by where that is known.
+def plot_png(trajectory: Trajectory) -> bytes:
+    """The way from above; beside it what each axis is uncertain by.
 
     Lost stretches are shaded. Positions are metres in the zone of the first pose, about its place.
-
-    Args:
-        errors: (n, 6) of the frames, true east-north-up: rotation (rad) before displacement (m); NaN where
-            there is none. Their 95 % bounds are drawn around them. None: the bounds alone.
 
     Raises:
         InvalidValueError: no frame has a pose, or poses are of several zones.
@@ -47,13 +43,10 @@ def plot_png(trajectory: Trajectory, errors: FloatArray | None = None) -> bytes:
         ((slice(3, 6), "m", 1.0), (slice(0, 3), "degrees", 180.0 / np.pi))
     ):
         axes = figure.add_subplot(grid[row, 1])
-        off = None if errors is None else factor * errors[:, part]
-        _draw_axes(axes, times, factor * bounds[:, part], off, lost)
+        _draw_axes(axes, times, factor * bounds[:, part], lost)
         what = "position" if row == 0 else "rotation about"
         axes.set(ylabel=f"{what}, {unit}", xlabel="time, s")
-        axes.set_title(
-            "95 % bounds" if errors is None else "errors, and their 95 % bounds (thin)", fontsize=9
-        )
+        axes.set_title("95 % bounds", fontsize=9)
         axes.legend(loc="upper right", fontsize=8, ncols=3)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=_DPI, metadata={"Software": "featuredb"})
@@ -78,16 +71,9 @@ def _poses(trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
     return places, bounds
 
 
-def _draw_axes(
-    axes: Any, times: FloatArray, bounds: FloatArray, off: FloatArray | None, lost: NDArray[np.bool_]
-) -> None:
+def _draw_axes(axes: Any, times: FloatArray, bounds: FloatArray, lost: NDArray[np.bool_]) -> None:
     for k, (name, colour) in enumerate(_AXES):
-        if off is None:
-            axes.plot(times, bounds[:, k], lw=1.0, color=colour, label=name)
-            continue
-        axes.plot(times, off[:, k], lw=1.0, color=colour, label=name)
-        for sign in (-1.0, 1.0):
-            axes.plot(times, sign * bounds[:, k], lw=0.5, ls=":", color=colour)
+        axes.plot(times, bounds[:, k], lw=1.0, color=colour, label=name)
     # A lost frame is shaded as long as it lasts.
     edges = np.concatenate([times, [2.0 * times[-1] - times[-2] if len(times) > 1 else times[-1] + 1.0]])
     for row in np.flatnonzero(lost):

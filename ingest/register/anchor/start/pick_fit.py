@@ -6,7 +6,7 @@ squared normalised residuals is likely for its redundancy, and a pick is called 
 without it and no other pick's removal does nearly as well.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -16,8 +16,8 @@ from scipy.stats import chi2
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp
 from reloc.localise.jacobians import pixel_jacobians
+from reloc.localise.self_calibration import pose_step
 
 _STARTS = 60  # triples that P3P is asked for
 _REFINED = 6  # of their poses, best first, that are refined
@@ -230,17 +230,11 @@ def _rough_cost(problem: _Problem, pose: Rigid3, camera: Camera) -> float:
 
 
 def _best(problem: _Problem, starts: list[tuple[Rigid3, Camera]], rows: list[int]) -> _State | None:
-    """Refined from the starts that suit these picks best."""
-    few = starts[: 2 * _REFINED]
-    sub = _Problem(
-        pixels=problem.pixels[rows],
-        points=problem.points[rows],
-        camera=problem.camera,
-        focal_sigma_rel=problem.focal_sigma_rel,
+    """Refined from the start that suits these picks best."""
+    chosen = replace(problem, pixels=problem.pixels[rows], points=problem.points[rows])
+    return _refined(
+        problem, *min(starts[: 2 * _REFINED], key=lambda start: _rough_cost(chosen, *start)), rows
     )
-    ranked = sorted(few, key=lambda start: _rough_cost(sub, *start))[:1]
-    states = [s for s in (_refined(problem, *start, rows) for start in ranked) if s is not None]
-    return min(states, key=lambda s: s.cost, default=None)
 
 
 def _refined(problem: _Problem, pose: Rigid3, camera: Camera, rows: list[int]) -> _State | None:
@@ -255,7 +249,7 @@ def _refined(problem: _Problem, pose: Rigid3, camera: Camera, rows: list[int]) -
         step = np.linalg.lstsq(
             state.information + damping * np.diag(np.diag(state.information)), gradient, rcond=None
         )[0]
-        new_pose = _moved(state.pose, step)
+        new_pose = pose_step(state.pose, step[:6])
         new_camera = problem.camera.with_focal(
             state.camera.focal_px * float(np.exp(np.clip(step[6], -0.5, 0.5)))
         )
@@ -282,12 +276,6 @@ def _state(problem: _Problem, pose: Rigid3, camera: Camera, rows: list[int]) -> 
     cost = float(np.einsum("ni,nij,nj->", residual, weight, residual))
     cost += (problem.focal_off(camera) / problem.focal_sigma_rel) ** 2
     return _State(pose=pose, camera=camera, cost=cost, information=information)
-
-
-def _moved(pose: Rigid3, step: FloatArray) -> Rigid3:
-    """The camera turned about the local axes and displaced: R_true = R(dtheta) R, C_true = C + dC."""
-    rotation = pose.rotation @ so3_exp(step[:3]).T
-    return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + step[3:6]))
 
 
 def _normalised(problem: _Problem, state: _State, kept: list[int]) -> FloatArray:
