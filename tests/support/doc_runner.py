@@ -18,12 +18,12 @@ from tests.support.doc_commands import Command, call_of
 from tests.support.doc_folder import placeholders
 
 # Commands that serve until they are stopped, and how they show that they do: the port on which they answer,
-# what they write, or None where they show nothing.
-_SERVING: dict[tuple[str, ...], int | str | None] = {
+# or what they write.
+_SERVING: dict[tuple[str, ...], int | str] = {
     ("featuredb", "serve"): '"event": "serving"',  # it listens before it answers
     ("featuredb", "gateway"): 8080,
     ("featuredb", "view"): "http://127.0.0.1:",
-    ("featuredb", "grow", "--watch"): None,
+    ("featuredb", "grow", "--watch"): "watching ",
     ("featuredb", "anchor", "--page"): "http://127.0.0.1:",
     ("dask", "scheduler"): 8786,
     ("dask", "worker"): "Registered to:",
@@ -139,15 +139,16 @@ class PageRun:
                 preexec_fn=_on_one_core if call.program == "dask" else None,
             )
         kind = _kind(command)
-        sign = _SERVING[kind] if kind is not None else None
+        assert kind is not None
+        sign = _SERVING[kind]
 
         def ready() -> bool:
             if isinstance(sign, int):
                 return not is_free(sign)
-            return sign is not None and sign in path.read_text()
+            return sign in path.read_text()
 
-        _wait(lambda: process.poll() is not None or ready(), 1.0 if sign is None else _READY_S)
-        if process.poll() is not None or not (sign is None or ready()):
+        _wait(lambda: process.poll() is not None or ready(), _READY_S)
+        if process.poll() is not None or not ready():
             _, output = self._stop(process)
             raise CommandFailedError(f"{command}\ndoes not serve\n{output}")
         self._processes.append((command, process))
