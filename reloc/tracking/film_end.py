@@ -60,10 +60,12 @@ class _Stop:
 @contextmanager
 def _last_frame_by_sigint() -> Iterator[_Stop]:
     stop = _Stop()
-    if threading.current_thread() is not threading.main_thread():  # which is where Ctrl-C goes
+    before = signal.getsignal(signal.SIGINT)
+    # Ctrl-C goes to the main thread, and not to what a shell has put into the background.
+    if threading.current_thread() is not threading.main_thread() or before == signal.SIG_IGN:
         yield stop
         return
-    before = signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGINT, stop)
     try:
         yield stop
     finally:

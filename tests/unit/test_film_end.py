@@ -9,6 +9,14 @@ from featuredb.errors import VideoError
 from reloc.tracking.film_end import until_it_ends
 
 
+@pytest.fixture(autouse=True)
+def foreground() -> Iterator[None]:
+    """As in a terminal, wherever the tests run."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def film(end: BaseException | None = None) -> Iterator[int]:
     yield from range(3)
     if end is not None:
@@ -42,14 +50,13 @@ def _raising() -> Iterator[int]:
 
 def test_a_frame_in_hand_is_the_last_one_after_ctrl_c() -> None:
     trouble: list[str] = []
-    before = signal.getsignal(signal.SIGINT)
     worked = []
     for frame in until_it_ends(film(), trouble):
         if frame == 1:
             signal.raise_signal(signal.SIGINT)
         worked.append(frame)
     assert (worked, trouble) == ([0, 1], ["stopped by hand"])
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_second_ctrl_c_does_not_wait_for_the_frame_in_hand() -> None:
@@ -60,6 +67,13 @@ def test_a_second_ctrl_c_does_not_wait_for_the_frame_in_hand() -> None:
         signal.raise_signal(signal.SIGINT)
     frames.close()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_where_ctrl_c_is_ignored_it_stays_so() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for _ in until_it_ends(film(), []):
+        signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def test_ctrl_c_ends_a_wait_for_a_frame() -> None:
