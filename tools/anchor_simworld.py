@@ -1,6 +1,6 @@
 """The simulated world end to end: photos, scan, anchoring without a person, queries against the truth.
 
-    python -m tools.anchor_simworld --work DIR [--inputs DIR]
+    python -m tools.anchor_simworld --work DIR [--inputs DIR] [--seed N]
 
 1. `featuredb simworld --lidar` writes photos whose GPS has a drone's errors, an airborne scan with
    intensities only, an ortho image of another day, and the same of another town at the same place.
@@ -35,9 +35,11 @@ _ROOT = Path(__file__).resolve().parent.parent
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+    parser = study_parser(__doc__, "--work", "--inputs")
+    parser.add_argument("--seed", type=int, default=1, help="of the world; default: 1")
+    args = parser.parse_args(argv)
     work: Path = args.work
-    world = make_scan_world(args.inputs or work)
+    world = make_scan_world(args.inputs or work, args.seed)
     mapped = work / "mapped"
     if not mapped.exists():
         featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")

@@ -6,13 +6,13 @@ import logging
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,7 @@ _MAKING = MapMakingOptions(
     extractor=ExtractorOptions(max_features=8000), maps=MapOptions(height_datum="ellipsoidal")
 )
 GROWING = GrowingOptions(making=_MAKING, workers=_WORKERS)
+W = TypeVar("W")
 _UNSAID_M = 30.0  # accuracy of a geotag that names none
 
 
@@ -112,16 +113,25 @@ class Verdict:
     holds: bool
 
 
-def out_folder(doc: str | None, argv: Sequence[str] | None) -> Path:
-    """The folder that a program of a made world is told, made; `doc`: of its module."""
+def world_told(
+    doc: str | None, argv: Sequence[str] | None, seed: int, sizes: Mapping[str, Callable[..., W]]
+) -> tuple[Path, W]:
+    """The folder that a program of a made world is told, made, and the world.
+
+    Args:
+        doc: of the program's module. seed: where none is told.
+        sizes: worlds by seed, by name; the first where none is told.
+    """
+    usual = next(iter(sizes))
     parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="where all is kept")
+    parser.add_argument("--out", type=Path, required=True, help="where all is kept: a folder for each world")
+    parser.add_argument("--size", choices=tuple(sizes), default=usual, help=f"of the world; default: {usual}")
+    parser.add_argument("--seed", type=int, default=seed, help=f"of the world; default: {seed}")
     parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
     args = parser.parse_args(argv)
     log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
-    out: Path = args.out
-    return out
+    return args.out, sizes[args.size](seed=args.seed)
 
 
 def say(text: str) -> None:

@@ -1,6 +1,6 @@
 """Poison: look-alike blocks, mirrors, liars and forgers send photos. Is anything wrong promoted?
 
-    python -m tools.growth_poison --out DIR
+    python -m tools.growth_poison --out DIR [--size full] [--seed N]
 
 The world is that of `tools.worlds.poison_world`. The survey is ingested, honest photos are grown, and
 held-out photos become canaries with their true poses. Then a copy of that database gets all kinds of poison
@@ -50,11 +50,11 @@ from tools.growth_common import (
     made,
     newest_copy,
     none_failed,
-    out_folder,
     recording,
     registered,
     say,
     tell,
+    world_told,
 )
 from tools.worlds.poison_world import POISONS, PoisonOptions, poison_album
 
@@ -88,7 +88,7 @@ class PoisonOutcome:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = out_folder(__doc__, argv), PoisonOptions()
+    out, world = world_told(__doc__, argv, 4, {"short": PoisonOptions, "full": PoisonOptions.full})
     album = made(poison_album, out / "world", world)
     base = honest_base(out / "db", album)
     clean = max(off_shares(base, album, world).values(), default=0.0)

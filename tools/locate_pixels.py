@@ -26,7 +26,7 @@ from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.town.scene import Scene, texture_index
 from featuredb.simworld.truth import TrueImage, Truth
-from featuredb.simworld.world import town_of
+from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.answered_view import AnsweredView
@@ -37,7 +37,7 @@ from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored, featuredb
 from tools.figures import study_parser, write_figures
-from tools.worlds.scan_world import SCAN_WORLD, make_scan_world
+from tools.worlds.scan_world import make_scan_world
 
 _SEED = 1
 _PIXELS, _DRAWS = 60, 16  # of each photo: pixels, and draws of a pose and a lens
@@ -57,11 +57,11 @@ class Miss:
 def main(argv: Sequence[str] | None = None) -> int:
     args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
     work: Path = args.work
-    world = make_scan_world(args.inputs or work)
+    world = make_scan_world(args.inputs or work, _SEED)
     featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
     path = anchored(work, work / "mapped", world, other=False)[0]
     database = Database.open(path)
-    scene, truth = town_of(SCAN_WORLD), world.world.truth
+    scene, truth = town_of(WorldOptions.short(_SEED)), world.world.truth
     rng = np.random.default_rng(_SEED)
     localiser = Localiser.open(database)
     answered: list[Miss] = []

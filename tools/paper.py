@@ -48,7 +48,7 @@ def film(args: argparse.Namespace) -> dict[str, Any]:
     """A film that says nothing of its place, placed by one frame, tracked from end to end."""
     inputs = args.inputs or args.out
     world = make_scan_world(inputs)
-    folder = write_film(inputs / f"film-smooth-{_FRAMES}", film_options("smooth", _FRAMES))
+    folder = write_film(inputs / f"film-smooth-{_FRAMES}-1", film_options("smooth", _FRAMES))
     truth = read_film_truth(folder)
     work = args.out / "film"
     if not (work / _PLACED).exists():

@@ -1,6 +1,6 @@
 """How right tracked films are: flights over the simulated town, anchored on its scan, against true poses.
 
-    python -m tools.track_evaluation --out DIR [--films smooth jerky cut]
+    python -m tools.track_evaluation --out DIR [--films smooth jerky cut] [--seed N]
 
 1. The world of `tools.worlds.scan_world`: `featuredb ingest photos` maps the drone's photos,
    `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
@@ -29,7 +29,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
 from featuredb.lidar.load import load_cloud
-from featuredb.simworld.world import town_of
+from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from ingest.register.frame_registration import FramePrior
@@ -45,9 +45,8 @@ from tools.figures import write_figures
 from tools.growth_common import say
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
 from tools.worlds.flight_path import FlightStyle, PathOptions
-from tools.worlds.scan_world import SCAN_WORLD, make_scan_world
+from tools.worlds.scan_world import make_scan_world
 
-_SEED = 1
 _FILMS = ("smooth", "jerky", "cut")
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
 _END = 200  # frames at each end whose errors are compared; of short films, a half each
@@ -97,15 +96,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.out
-    database = anchored_map(args.out, inputs)
+    database = anchored_map(args.out, inputs, args.seed)
     results: dict[str, Tracked] = {}
     drawn: dict[str, DrawnMarks] = {}
     for name in args.films:
-        options = film_options(name, args.frames)
-        film = inputs / f"film-{name}-{args.frames}"
+        options = film_options(name, args.frames, args.seed)
+        film = inputs / f"film-{name}-{args.frames}-{args.seed}"
         folder = write_film(film, options, 0, _progress(name))
         truth = read_film_truth(folder)
-        finder = finder_on(args.on, database, truth)
+        finder = finder_on(args.on, database, truth, args.seed)
         tracked = track_video(folder / FILM_FILE, finder, camera=truth.camera)
         load = os.getloadavg()[0]
         results[name] = judge_film(tracked, truth, load)
@@ -120,9 +119,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def anchored_map(out: Path, inputs: Path) -> Path:
+def anchored_map(out: Path, inputs: Path, seed: int) -> Path:
     """A database with the map of the drone's photos, placed on the scan; kept in `out`."""
-    world = make_scan_world(inputs)
+    world = make_scan_world(inputs, seed)
     done = out / "anchored.txt"
     if not done.exists():
         mapped = out / "mapped"
@@ -134,7 +133,7 @@ def anchored_map(out: Path, inputs: Path) -> Path:
     return out / done.read_text()
 
 
-def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
+def finder_on(what: str, database: Path, truth: FilmTruth, seed: int) -> Finder:
     """What a film is tracked by: its map, or its scan from a coarse first pose."""
     maps = Localiser.open(Database.open(database)).areas
     if what == "map":
@@ -143,12 +142,12 @@ def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
     cloud = load_cloud(Database.open(database), truth.frame, scan_ids=[scan.scan_id])
     first = truth.cam_from_local[0]
     assert first is not None
-    return ScanFinder(cloud, scan.scan_id, truth.epsg, coarse_start(first))
+    return ScanFinder(cloud, scan.scan_id, truth.epsg, coarse_start(first, seed))
 
 
-def coarse_start(pose: Rigid3) -> FramePrior:
+def coarse_start(pose: Rigid3, seed: int) -> FramePrior:
     """A pose that is off by 10 m to some side and 5 degrees about some axis, and says so."""
-    rng = np.random.default_rng((_SEED, 5))
+    rng = np.random.default_rng((seed, 5))
     side, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     rotation = so3_exp(np.radians(_START_DEG) * axis) @ pose.rotation
     return FramePrior(
@@ -160,12 +159,12 @@ def coarse_start(pose: Rigid3) -> FramePrior:
     )
 
 
-def film_options(name: str, frames: int) -> FilmOptions:
+def film_options(name: str, frames: int, seed: int = 1) -> FilmOptions:
     style: FlightStyle = "jerky" if name == "jerky" else "smooth"
-    path = PathOptions(seed=_SEED, style=style, half_extent_m=(32.0, 26.0))
+    path = PathOptions(seed=seed, style=style, half_extent_m=(32.0, 26.0))
     cut = tuple(round(share * frames) for share in _CUT) if name == "cut" else None
     return FilmOptions(
-        world=SCAN_WORLD,
+        world=WorldOptions.short(seed),
         path=path,
         frames=frames,
         cut=None if cut is None else (cut[0], cut[1]),
@@ -261,6 +260,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=1200)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
+    parser.add_argument("--seed", type=int, default=1, help="of world and films; default: 1")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
     parser.add_argument("--inputs", type=Path, default=None, help="keep world and films there, not in --out")
     return parser.parse_args(argv)

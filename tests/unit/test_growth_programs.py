@@ -10,10 +10,25 @@ import pytest
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.simworld.truth import Truth
 from tools import growth_community, growth_poison, growth_walk
-from tools.growth_common import Album, Registered, Verdict
+from tools.growth_common import Album, Registered, Verdict, world_told
 from tools.growth_poison import PoisonOutcome
 from tools.growth_walk import Probe, Step, worst_map
 from tools.worlds.album_files import AlbumFact
+from tools.worlds.community import CommunityOptions
+from tools.worlds.walk_world import WalkOptions
+
+WALK = WalkOptions()
+
+
+def test_another_seed_and_the_full_size_are_other_worlds(tmp_path: Path) -> None:
+    def told(*words: str) -> CommunityOptions:
+        return world_told("", ["--out", str(tmp_path / "kept"), *words], 1, growth_community._SIZES)[1]
+
+    assert told() == CommunityOptions(seed=1)
+    assert told("--seed", "7", "--size", "full") == CommunityOptions.full(7)
+    assert CommunityOptions.full(7).photos == 300
+    assert told("--size", "alike").zipf is None
+    assert (tmp_path / "kept").is_dir()
 
 
 def fact(i: int, kind: str = "drone") -> AlbumFact:
@@ -96,21 +111,21 @@ def steps(ratio: float = 0.5, stopped: int = 0, reach: float = 700.0, drift: flo
 
 def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
     good = steps(stopped=9)
-    assert all(holding(growth_walk.judge(good, good[0], 1)).values())
+    assert all(holding(growth_walk.judge(good, good[0], 1, WALK)).values())
     near = steps(reach=100.0, stopped=9)
-    assert not holding(growth_walk.judge(near, good[0], 1))["coverage follows"]
-    assert not holding(growth_walk.judge(steps(stopped=0), good[0], 1))["budget"]
+    assert not holding(growth_walk.judge(near, good[0], 1, WALK))["coverage follows"]
+    assert not holding(growth_walk.judge(steps(stopped=0), good[0], 1, WALK))["budget"]
     far = steps(ratio=1.2)
-    assert not holding(growth_walk.judge(far, good[0], 1))["true error inside the bound"]
+    assert not holding(growth_walk.judge(far, good[0], 1, WALK))["true error inside the bound"]
     over = steps(drift=0.6, stopped=9)
-    assert not holding(growth_walk.judge(over, good[0], 1))["budget"]
-    assert not holding(growth_walk.judge(good, good[0], 2))["second anchor"]
+    assert not holding(growth_walk.judge(over, good[0], 1, WALK))["budget"]
+    assert not holding(growth_walk.judge(good, good[0], 2, WALK))["second anchor"]
     off = replace(good[0], probes=(replace(good[0].probes[0], error_m=0.31, normalised=20.0),))
-    assert not holding(growth_walk.judge(good, off, 1))["second anchor"]
-    assert not holding(growth_walk.judge([off], good[0], 1))["probes inside their 95 %"]
+    assert not holding(growth_walk.judge(good, off, 1, WALK))["second anchor"]
+    assert not holding(growth_walk.judge([off], good[0], 1, WALK))["probes inside their 95 %"]
     # One wrong answer at one early step, among any number of right ones.
     astray = replace(good[0], probes=(replace(good[0].probes[0], error_m=2.1), *good[0].probes))
-    assert not holding(growth_walk.judge([astray, *good], good[0], 1))["no wrong answer"]
+    assert not holding(growth_walk.judge([astray, *good], good[0], 1, WALK))["no wrong answer"]
 
 
 def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:

@@ -7,6 +7,7 @@ other_town; copy (a re-upload by somebody else); indoor, portrait (belong nowher
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 
@@ -32,9 +33,6 @@ from tools.worlds.surveyed import (
 )
 
 _OTHER_SEED = 1000
-# How much more people visit the first sights (`plan_visits`). Photo sites show a few landmarks: the paper's
-# 120,000 photos were of seven, and in every town one place leads.
-_ZIPF = 1.0
 _TAGGED_HERE, _TAGGED_THERE = (
     0.6,
     0.8,
@@ -50,7 +48,10 @@ class CommunityOptions:
         flight: the anchored survey, of most of what people visit.
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
-        sights: places that people visit. width: of the widest camera, pixels.
+        sights: places that people visit.
+        zipf: how much more they visit the first ones (`plan_visits`). Photo sites show a few landmarks: the
+            paper's 120,000 photos were of seven, and in every town one place leads. None: nearly alike.
+        width: of the widest camera, pixels.
         geotags: how wrong they are.
         texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
     """
@@ -68,6 +69,7 @@ class CommunityOptions:
     indoor: int = 2
     portraits: int = 2
     sights: int = 6
+    zipf: float | None = 1.0
     width: int = 1200
     geotags: GeotagOptions = field(default_factory=GeotagOptions)
     texel_m: float = 0.06
@@ -78,6 +80,30 @@ class CommunityOptions:
             raise InvalidValueError(f"CommunityOptions: expected numbers >= 0, found {self}")
         if not (self.sights > 0 and self.width >= 64):
             raise InvalidValueError(f"CommunityOptions: value out of range in {self}")
+
+    @classmethod
+    def full(cls, seed: int) -> Self:
+        """A town with 300 photos of it."""
+        return cls(
+            seed=seed,
+            town_size_m=(440.0, 350.0),
+            flight=FlightOptions(
+                lines=9, per_line=13, height_m=100.0, oblique=14, gps_error="rtk", center_m=(-50.0, 15.0)
+            ),
+            photos=300,
+            other_town=100,
+            copies=40,
+            indoor=12,
+            portraits=12,
+            sights=12,
+            width=1600,
+            pieces=16,
+        )
+
+    @classmethod
+    def alike(cls, seed: int) -> Self:
+        """The full world, whose thirty sights are visited nearly alike."""
+        return replace(cls.full(seed), sights=30, zipf=None)
 
     def scene(self, key: str) -> Scene:
         """Scenes "home/light/week" and "away/light/week"."""
@@ -111,7 +137,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
     home, away = options.scene("home/0/000"), options.scene("away/0/000")
     people = community(options.width)
     places = find_sights(home, options.sights, options.seed, options.flight.center_m)
-    mine = plan_visits(home, people, places, options.photos, options.seed, "home", zipf=_ZIPF)
+    mine = plan_visits(home, people, places, options.photos, options.seed, "home", zipf=options.zipf)
     places = find_sights(away, options.sights, options.seed + 1)
     theirs = plan_visits(
         away,
@@ -122,7 +148,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
         "away",
         first_visit=10_000,
         kind="other_town",
-        zipf=_ZIPF,
+        zipf=options.zipf,
     )
     rng = np.random.default_rng((options.seed, 58))
     mine = tagged(home, mine, people, options.geotags, rng)

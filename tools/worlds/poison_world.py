@@ -17,7 +17,7 @@ stands there mirrored. Kinds of photos:
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -80,6 +80,22 @@ class PoisonOptions:
     def __post_init__(self) -> None:
         if min(self.honest, self.late, self.canaries, self.per_poison) < 0 or self.sights < 1:
             raise InvalidValueError(f"PoisonOptions: value out of range in {self}")
+
+    @classmethod
+    def full(cls, seed: int) -> Self:
+        """A larger town and three times the photos."""
+        return cls(
+            seed=seed,
+            town_size_m=(560.0, 260.0),
+            flight=FlightOptions(lines=6, per_line=12, oblique=8, gps_error="rtk", center_m=(-130.0, 0.0)),
+            honest=60,
+            late=40,
+            canaries=20,
+            per_poison=30,
+            sights=14,
+            width=1440,
+            pieces=16,
+        )
 
     def scene(self, key: str) -> Scene:
         """Scenes "home/...", "forged/..." and "away/light/week"."""

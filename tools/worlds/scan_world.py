@@ -6,7 +6,6 @@ from pathlib import Path
 from featuredb.simworld.scan_world import OTHER_SCAN_FILE, SCAN_FILE, write_lidar
 from featuredb.simworld.world import World, WorldOptions, open_world, write_world
 
-SCAN_WORLD = WorldOptions.short(1)
 _DONE = "scan_world.done"
 
 
@@ -25,11 +24,11 @@ class ScanWorld:
     other_scan: Path
 
 
-def make_scan_world(inputs: Path) -> ScanWorld:
+def make_scan_world(inputs: Path, seed: int = 1) -> ScanWorld:
     """The world that `featuredb simworld --lidar --size short` writes, in a folder of `inputs`, made once."""
-    folder = inputs / "scan-world"
+    folder, options = inputs / f"scan-world-{seed}", WorldOptions.short(seed)
     if not (folder / _DONE).exists():
-        write_lidar(folder, SCAN_WORLD)
-        write_world(folder, SCAN_WORLD)
+        write_lidar(folder, options)
+        write_world(folder, options)
         (folder / _DONE).touch()
     return ScanWorld(world=open_world(folder), scan=folder / SCAN_FILE, other_scan=folder / OTHER_SCAN_FILE)

@@ -8,6 +8,7 @@ survey_far/. Kinds: survey, survey_far, walk, probe.
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 
@@ -79,6 +80,19 @@ class WalkOptions:
     def __post_init__(self) -> None:
         if not (self.start_m < self.end_m and self.step_m > 0 and self.per_step > 0 and self.probes >= 0):
             raise InvalidValueError(f"WalkOptions: value out of range in {self}")
+
+    @classmethod
+    def full(cls, seed: int) -> Self:
+        """A walk of 690 m between the surveys."""
+        return cls(
+            seed=seed,
+            town_size_m=(1020.0, 210.0),
+            flight=FlightOptions(lines=5, per_line=8, oblique=6, gps_error="rtk"),
+            start_m=-430.0,
+            end_m=410.0,
+            width=1440,
+            pieces=16,
+        )
 
     @property
     def steps(self) -> int:
