@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from reloc.wire.endpoints import DEFAULT_ENDPOINT
+
 
 def run(*argv: str, **environment: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
@@ -46,3 +48,16 @@ def test_the_environment_says_which_server_is_asked(tmp_path: Path) -> None:
     done = run("query", str(photo), "--timeout", "1", FEATUREDB_CONNECT="tcp/127.0.0.1:9")
     assert done.returncode == 2
     assert "tcp/127.0.0.1:9" in done.stderr
+
+
+def test_an_empty_variable_says_nothing() -> None:
+    code = (
+        "import argparse; from reloc.cli.commands import add_server_arguments as add\n"
+        "parser = argparse.ArgumentParser(); add(parser); args = parser.parse_args([]); "
+        "print(args.connect, args.database)"
+    )
+    environment = {**os.environ, "FEATUREDB_CONNECT": "", "FEATUREDB_DATABASE": ""}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == [DEFAULT_ENDPOINT, "None"]

@@ -185,3 +185,35 @@ def test_what_was_found_before_a_store_failed_is_said(monkeypatch: pytest.Monkey
     monkeypatch.setattr("featuredb.store.verify._read_all", denied)
     with pytest.raises(StoreError, match=r"access denied; found before.*points: a file is gone"):
         verify(Stored())  # type: ignore[arg-type]  # it is asked for nothing else
+
+
+def test_what_was_found_is_said_when_the_store_fails_at_the_second_look(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Stored:
+        url, storage_options = "s3://bucket/maps", None
+
+    looks = iter([VerifyReport(problems=(DatabaseProblem(where="points", what="a file is gone"),))])
+
+    def look(database: object) -> VerifyReport:
+        for report in looks:
+            return report
+        raise StoreError("no answer")
+
+    monkeypatch.setattr("featuredb.store.verify._verify", look)
+    monkeypatch.setattr("featuredb.store.verify._read_all", lambda place: None)
+    with pytest.raises(StoreError, match=r"no answer; found before.*points: a file is gone"):
+        verify(Stored())  # type: ignore[arg-type]  # it is asked for nothing else
+
+
+def test_a_commit_whose_checkpoint_fails_is_done(
+    database: Database, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 1)
+    monkeypatch.setattr(local, "publish_checkpoint", full)
+    assert database.retire("map-1", "wrong") == ("map-1",)
+    assert database.snapshot().maps() == []
+    assert "no checkpoint" in caplog.text

@@ -15,7 +15,7 @@ from featuredb.geometry.similarity import similarity_closed_form
 from ingest.own_frame import held_of
 from ingest.positions.position_noise import Held
 from ingest.register.gps import GpsPlacement, place_by_gps
-from ingest.report.gps_figures import FIGURES
+from ingest.report.gps_figures import FIGURES, figure_rows
 from tests.support.gps_flights import OPTIONS, TRUE, flight, place
 
 
@@ -307,3 +307,13 @@ def test_a_wide_strip_is_no_line() -> None:
     placed = place(positions, rng.normal(0, 0.5, (12, 3)), np.full((12, 3), 1.0))
     assert placed.reason is None
     assert placed.provisional == ""
+
+
+def test_figures_of_heights_that_nobody_told_are_not_known() -> None:
+    positions, sigmas = flight(30), np.tile([4.0, 4.0, np.inf], (30, 1))
+    noise = np.random.default_rng(1).normal(0, 1, (30, 3))
+    figures = place(positions, noise, sigmas).figures
+    assert [value is None for value in figures["noise_m"]] == [False, True]
+    assert [value is None for value in figures["bias_sigma_m"]] == [False, False, True]
+    (row,) = [value for name, value, _ in figure_rows(figures) if name == "noise_m"]
+    assert row.endswith(", not known")

@@ -1,0 +1,27 @@
+"""The end of a process that serves."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_an_end_leaves_no_temporary_folder(tmp_path: Path) -> None:
+    code = (
+        "from reloc.service.workers.process import prepare_workers\n"
+        "from featuredb.stop_signals import end_process\n"
+        "import multiprocessing.util\n"
+        "prepare_workers(); print(multiprocessing.util.get_temp_dir(), flush=True); end_process(3)"
+    )
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60.0,
+    )
+    assert done.returncode == 3
+    assert Path(done.stdout.strip()).parent == tmp_path
+    assert list(tmp_path.iterdir()) == []
