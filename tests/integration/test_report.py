@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
@@ -14,9 +15,11 @@ import pytest
 from PIL import Image
 
 from featuredb.errors import InvalidValueError
+from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.place_bounds import PlaceBounds
 from ingest.api.ingesting import summary
 from ingest.plot_parts import nice_length, residual_exaggeration
+from ingest.report.outcomes import _gps_used
 from ingest.report.page import write_report
 from ingest.report.plots import histograms_png, plan_png
 from ingest.report.values import (
@@ -292,3 +295,13 @@ def test_pictures_that_are_sheared_are_warned_of() -> None:
     sheared = MapOutcome(map_id="m1", name="n", status="committed", picture_shear=2e-4)
     assert any("rolling shutter" in text and "0.020%" in text for text in sheared.warnings)
     assert not MapOutcome(map_id="m2", name="n", status="committed", picture_shear=5e-5).warnings
+
+
+def test_positions_that_control_points_outdo_contradict_nobody() -> None:
+    placed = SimpleNamespace(local_from_sfm=Sim3.identity(), inliers=[True, False])
+    by_gps = SimpleNamespace(control=None, placement=placed, with_gps=(0, 2))
+    assert _gps_used(by_gps) == {0: True, 2: False}  # type: ignore[arg-type]
+    by_control = SimpleNamespace(control=object(), placement=placed, with_gps=(0, 2))
+    assert _gps_used(by_control) == {}  # type: ignore[arg-type]
+    too_few = SimpleNamespace(local_from_sfm=None, inliers=[False])
+    assert _gps_used(SimpleNamespace(control=None, placement=too_few, with_gps=(0,))) == {}  # type: ignore[arg-type]
