@@ -20,6 +20,7 @@ from featuredb.store import Database
 from reloc.authority.folder import Authority
 from reloc.client import Client, LocaliseReply
 from tools.figures import study_parser
+from tools.proxy_process import proxied
 from tools.serve_process import CommandProcess, ServeProcess
 
 HONEST, ATTACKER, WEB = ("alice", "bob", "carol"), "mallory", "web"
@@ -90,7 +91,7 @@ class Service:
     """A server with keys, and a gateway before it.
 
     Attributes:
-        keys: folder of the authority. port: of the server.
+        keys: folder of the authority. port: of the proxy before the server.
     """
 
     server: ServeProcess
@@ -104,14 +105,23 @@ class Service:
 
 @contextmanager
 def running_service(database: Path, work: Path) -> Iterator[Service]:
-    """As `featuredb keys` ships it; both end by SIGTERM."""
-    port, keys = free_port(), work / f"keys-{time.time_ns()}"
+    """As `featuredb keys` ships it, behind the proxy of `deploy/`; all end by SIGTERM."""
+    port, behind, keys = free_port(), free_port(), work / f"keys-{time.time_ns()}"
     authority = Authority.create(keys, port=port)
     for name in (*HONEST, ATTACKER, WEB):
         authority.add_client(name)
     with ExitStack() as stack:
-        server = ServeProcess(database, "--config", keys / "server.json5", "--deadline", DEADLINE_S)
+        server = ServeProcess(
+            database,
+            "--config",
+            keys / "server.json5",
+            "--listen",
+            f"tls/127.0.0.1:{behind}",
+            "--deadline",
+            DEADLINE_S,
+        )
         stack.callback(server.stop)
+        stack.enter_context(proxied(port, behind))
         gateway = CommandProcess(
             "gateway",
             "--config",

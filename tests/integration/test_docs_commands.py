@@ -42,6 +42,8 @@ NOT_RUN = {
     "featuredb live /dev/video0": "needs a camera; tests/unit/test_bridge.py sends what it would",
     "featuredb demo": "tests/integration/test_demo.py runs it",
     "tools/check.py": "it runs these tests",
+    "haproxy": "tests/integration/test_proxy.py runs it",
+    "apt-get install": "installs; .ci/run does",
     "pip install": "installs; the extra is looked up",
     "uv sync": "installs; these tests run in what it makes",
     "source": "these tests run in what it activates",
