@@ -24,7 +24,7 @@ def at_stand_in(unplaced: UnplacedMap) -> FeatureMap:
     placement = Placement(
         method="map", local_from_sfm=Sim3.identity(), covariance=np.zeros((7, 7)), residual_rms_m=0.0
     )
-    return placed_map(replace(unplaced, provenance={}), placement, _STAND_IN, "unknown")
+    return placed_map(unplaced, placement, _STAND_IN, "unknown")
 
 
 def in_own_frame(result: LocaliseResult, unplaced: UnplacedMap) -> LocaliseResult:

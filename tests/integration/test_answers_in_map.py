@@ -9,8 +9,10 @@ import pytest
 from pydantic import ValidationError
 
 from featuredb.errors import MapNotFoundError, UnplacedBesideOthersError
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.error_modes import LENS_SIZE, ErrorModes
 from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store import Database
 from reloc.gateway.geopose import NotLocalisedError, response_of
@@ -48,10 +50,28 @@ def _without_place() -> UnplacedMap:
     )
 
 
+def _that_may_be_bent() -> UnplacedMap:
+    """The same, whose images may all be off by half a percent of their distance, forth or back."""
+    made = _without_place()
+    poses = np.zeros((len(made.images), 6, 1))
+    poses[:, 5] = 5e-3
+    modes = ErrorModes(
+        image_id=np.array([image.image_id for image in made.images]),
+        poses=poses,
+        lenses=np.zeros((len(made.cameras), LENS_SIZE, 1)),
+    )
+    lens = Camera(
+        model="OPENCV", width=CAMERA.width, height=CAMERA.height, params=(*CAMERA.params, 0.0, 0.0, 0.0, 0.0)
+    )
+    return replace(made, map_id="bent", provenance=modes.as_provenance(), cameras=(lens,) * len(made.cameras))
+
+
 @pytest.fixture(scope="module")
 def localiser(tmp_path_factory: pytest.TempPathFactory) -> Localiser:
     database = Database.create(tmp_path_factory.mktemp("adrift") / "db")
-    database.commit_maps([_without_place(), planar_map(texture_seed=2, map_id="placed")])
+    database.commit_maps(
+        [_without_place(), _that_may_be_bent(), planar_map(texture_seed=2, map_id="placed")]
+    )
     return Localiser.open(database)
 
 
@@ -72,6 +92,17 @@ def test_the_pose_is_right_in_the_maps_own_frame(reply: LocaliseReply) -> None:
     )  # a decimetre of the field
     sigma = np.sqrt(np.trace(np.array(reply.in_map.covariance)[3:, 3:]))
     assert np.linalg.norm(np.array(reply.in_map.center) - truth.center) < 5.0 * sigma
+
+
+def test_what_the_map_may_be_off_by_is_in_the_answer(localiser: Localiser) -> None:
+    photo = render(field_texture(1), POSE, seed=5)
+    variance = {}
+    for map_id in ("adrift", "bent"):
+        found = localiser.localise(photo, LocaliseRequest(camera=CAMERA, map_ids=(map_id,))).in_map
+        assert found is not None
+        variance[map_id] = float(np.trace(found.covariance[3:, 3:]))
+    distance = 3.0 * 40.0  # of the camera above the field, in the own frame
+    assert variance["bent"] - variance["adrift"] == pytest.approx((5e-3 * distance) ** 2, rel=0.3)
 
 
 def test_only_the_query_that_names_it_is_answered_by_it(localiser: Localiser) -> None:
