@@ -1,9 +1,7 @@
 """A live session's frames in its worker process: decode, track, word the answer."""
 
 import os
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, InvalidValueError
-from featuredb.features.decode import decode_gray
+from featuredb.features.decode import decode_gray, probe
+from featuredb.features.image_header import ImageHeader
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from featuredb.video.film import fitted_size
@@ -28,8 +27,8 @@ from reloc.tracking.trajectory.values import point_of
 from reloc.wire.query import CameraRequest, ErrorCode, RequestError
 from reloc.wire.track import TrackOpenRequest, TrackPose
 
-# A 4K JPEG takes 0.04 s of a core, a PNG of 16 million pixels in 16 bits 0.35 s.
-_HEAVY_S = 0.2
+# Pixels to decode that 4K video has at most. Frames of more are served behind queries.
+_VIDEO_PIXELS = 4096 * 2160
 _YIELDING = 10  # niceness: a ninth of the processor that a query gets beside it
 
 
@@ -99,8 +98,9 @@ class FrameAnswerer:
     def _decoded(self, data: bytes) -> NDArray[np.uint8]:
         limits = self._options.limits
         try:
-            with _yielding_where_heavy():
-                gray = decode_gray(data, limits)
+            if _is_heavy(probe(data, limits)):
+                _yield_to_queries()
+            gray = decode_gray(data, limits)
         except ImageError as error:
             code = ErrorCode.TOO_LARGE if error.code == "too_large" else ErrorCode.BAD_IMAGE
             raise RequestError(code, f"image: {error}") from error
@@ -148,22 +148,22 @@ class FrameAnswerer:
             ) from error
 
 
-@contextmanager
-def _yielding_where_heavy() -> Iterator[None]:
-    """Where a picture takes longer than frames of cameras do, this process works behind queries from then on.
+def _is_heavy(header: ImageHeader) -> bool:
+    return header.width * header.height * header.scans > _VIDEO_PIXELS
+
+
+def _yield_to_queries() -> None:
+    """This process works behind queries from now on.
 
     A session's process is its own; a priority that was given up does not come back. Linux has priorities by
     thread: all that are there get it, and those to come inherit it.
     """
-    start = time.thread_time()
-    try:
-        yield
-    finally:
-        if time.thread_time() - start > _HEAVY_S and os.nice(0) < _YIELDING:
-            tasks = Path("/proc/self/task")
-            for task in [int(one.name) for one in tasks.iterdir()] if tasks.exists() else [0]:
-                with suppress(OSError):  # it has ended meanwhile
-                    os.setpriority(os.PRIO_PROCESS, task, _YIELDING)
+    if os.nice(0) >= _YIELDING:
+        return
+    tasks = Path("/proc/self/task")
+    for task in [int(one.name) for one in tasks.iterdir()] if tasks.exists() else [0]:
+        with suppress(OSError):  # it has ended meanwhile
+            os.setpriority(os.PRIO_PROCESS, task, _YIELDING)
 
 
 def _smaller(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
