@@ -10,6 +10,10 @@ from featuredb.cli.common import add_command, open_database
 if TYPE_CHECKING:
     from featuredb.store import Database
     from ingest.anchoring import AnchorRequest
+    from ingest.register.anchor.start.first_place import Circle
+
+_MOST_LAT, _MOST_LON = 84.0, 180.0  # UTM ends there
+_RADIUS_M, _LEAST_RADIUS_M, _MOST_RADIUS_M = 250.0, 10.0, 1000.0
 
 _EPILOG = """\
 Without --auto and --confirm nothing is changed: the frames that register best are shown, with the command
@@ -53,6 +57,12 @@ def register(subparsers: Any) -> None:
     helping = anchor.add_argument_group("where a registration starts, instead of the map's placement")
     helping.add_argument("--pose", type=Path, metavar="FILE", help="a rough pose, JSON")
     helping.add_argument("--picks", type=Path, metavar="FILE", help="picked points, CSV")
+    helping.add_argument(
+        "--near",
+        type=_circle,
+        metavar="LAT,LON[,RADIUS_M]",
+        help="look for a map without a place there, its heading and size unknown; default radius: 250 m",
+    )
     helping.add_argument("--image", metavar="NAME", help="photo of --pose or --picks")
     page = anchor.add_argument_group("picking in a page")
     page.add_argument(
@@ -63,6 +73,24 @@ def register(subparsers: Any) -> None:
     page.add_argument("--port", type=int, default=0, help="of the page; default: a free one")
     page.add_argument("--no-browser", action="store_true", help="print the address only")
     anchor.add_argument("--quiet", action="store_true", help="no progress bars")
+
+
+def _circle(text: str) -> "Circle":
+    from ingest.register.anchor.start.first_place import Circle
+
+    try:
+        lat, lon, *rest = (float(part) for part in text.split(","))
+        (radius_m,) = rest or [_RADIUS_M]
+    except ValueError:
+        lat = lon = radius_m = float("nan")
+    if not (
+        abs(lat) <= _MOST_LAT and abs(lon) <= _MOST_LON and _LEAST_RADIUS_M <= radius_m <= _MOST_RADIUS_M
+    ):
+        raise argparse.ArgumentTypeError(
+            f"expected LAT,LON or LAT,LON,RADIUS_M, WGS84 degrees and {_LEAST_RADIUS_M:.0f} to "
+            f"{_MOST_RADIUS_M:.0f} metres, such as 46.8450,-91.9942,250, found {text!r}"
+        )
+    return Circle(lat=lat, lon=lon, radius_m=radius_m)
 
 
 def run_anchor(args: argparse.Namespace) -> int:
@@ -106,7 +134,9 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
     from ingest.anchoring import AnchorRequest
     from ingest.register.anchor.start.first_place import StartFiles
 
-    if args.page and (args.auto or args.confirm or args.pose or args.picks):
+    if args.near and (args.pose or args.picks):
+        raise InvalidValueError("expected --near, or --pose and --picks, found both")
+    if args.page and (args.auto or args.confirm or args.pose or args.picks or args.near):
         raise InvalidValueError("--page asks a person for everything; expected it alone")
     if args.auto and args.confirm:
         raise InvalidValueError("expected --auto or --confirm, found both")
@@ -122,6 +152,6 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
         frames=args.frames,
         auto=args.auto,
         confirm=tuple(args.confirm),
-        start=StartFiles(pose=args.pose, picks=args.picks, image=args.image),
+        start=StartFiles(pose=args.pose, picks=args.picks, image=args.image, near=args.near),
         storage_options=tuple(args.storage_option),
     )
