@@ -10,10 +10,6 @@ from featuredb.cli.common import add_command, open_database
 if TYPE_CHECKING:
     from featuredb.store import Database
     from ingest.anchoring import AnchorRequest
-    from ingest.register.anchor.start.first_place import Circle
-
-_MOST_LAT, _MOST_LON = 84.0, 180.0  # UTM ends there
-_RADIUS_M, _LEAST_RADIUS_M, _MOST_RADIUS_M = 250.0, 10.0, 1000.0
 
 _EPILOG = """\
 Without --auto and --confirm nothing is changed: the frames that register best are shown, with the command
@@ -59,7 +55,6 @@ def register(subparsers: Any) -> None:
     helping.add_argument("--picks", type=Path, metavar="FILE", help="picked points, CSV")
     helping.add_argument(
         "--near",
-        type=_circle,
         metavar="LAT,LON[,RADIUS_M]",
         help="look for a map without a place there, its heading and size unknown; default radius: 250 m",
     )
@@ -73,24 +68,6 @@ def register(subparsers: Any) -> None:
     page.add_argument("--port", type=int, default=0, help="of the page; default: a free one")
     page.add_argument("--no-browser", action="store_true", help="print the address only")
     anchor.add_argument("--quiet", action="store_true", help="no progress bars")
-
-
-def _circle(text: str) -> "Circle":
-    from ingest.register.anchor.start.first_place import Circle
-
-    try:
-        lat, lon, *rest = (float(part) for part in text.split(","))
-        (radius_m,) = rest or [_RADIUS_M]
-    except ValueError:
-        lat = lon = radius_m = float("nan")
-    if not (
-        abs(lat) <= _MOST_LAT and abs(lon) <= _MOST_LON and _LEAST_RADIUS_M <= radius_m <= _MOST_RADIUS_M
-    ):
-        raise argparse.ArgumentTypeError(
-            f"expected LAT,LON or LAT,LON,RADIUS_M, WGS84 degrees and {_LEAST_RADIUS_M:.0f} to "
-            f"{_MOST_RADIUS_M:.0f} metres, such as 46.8450,-91.9942,250, found {text!r}"
-        )
-    return Circle(lat=lat, lon=lon, radius_m=radius_m)
 
 
 def run_anchor(args: argparse.Namespace) -> int:
@@ -132,7 +109,7 @@ def _page(database: "Database", request: "AnchorRequest", args: argparse.Namespa
 def _request(args: argparse.Namespace) -> "AnchorRequest":
     from featuredb.errors import InvalidValueError
     from ingest.anchoring import AnchorRequest
-    from ingest.register.anchor.start.first_place import StartFiles
+    from ingest.register.anchor.start.first_place import Circle, StartFiles
 
     if args.near and (args.pose or args.picks):
         raise InvalidValueError("expected --near, or --pose and --picks, found both")
@@ -144,6 +121,7 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
         raise InvalidValueError("--image names the photo of --pose or --picks; give one of them")
     if args.frames is not None and args.frames < 1:
         raise InvalidValueError(f"--frames: expected a number > 0, found {args.frames}")
+    near = None if args.near is None else Circle.parse(args.near)
     return AnchorRequest(
         map_id=args.map_id,
         photos=args.photos,
@@ -152,6 +130,6 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
         frames=args.frames,
         auto=args.auto,
         confirm=tuple(args.confirm),
-        start=StartFiles(pose=args.pose, picks=args.picks, image=args.image, near=args.near),
+        start=StartFiles(pose=args.pose, picks=args.picks, image=args.image, near=near),
         storage_options=tuple(args.storage_option),
     )

@@ -3,10 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
-from featuredb.errors import RegistrationError
+from featuredb.errors import InvalidValueError, RegistrationError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -27,16 +28,43 @@ from ingest.register.place_map import place_by_photo
 # Scan around a map's points and cameras that may be seen, metres: errors of GPS, and what frames show beside
 # the map's points.
 MARGIN_M = 60.0
+_MOST_LAT, _MOST_LON = 84.0, 180.0  # UTM ends there
+_LEAST_RADIUS_M, _MOST_RADIUS_M = 10.0, 1000.0
+_CIRCLE = (
+    f"LAT,LON or LAT,LON,RADIUS_M in WGS84 degrees and {_LEAST_RADIUS_M:.0f} to {_MOST_RADIUS_M:.0f} metres, "
+    "such as 46.8450,-91.9942,250"
+)
 _FIRST_REACH_M = 300.0  # scan around the picks of the first photo: what a drone's photo shows
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Circle:
-    """Where a map lies, roughly: WGS84 degrees and metres."""
+    """Where a map lies, roughly: WGS84 degrees and metres.
+
+    Raises:
+        InvalidValueError: no place of a UTM zone, or a radius that is not searched.
+    """
 
     lat: float
     lon: float
-    radius_m: float
+    radius_m: float = 250.0
+
+    def __post_init__(self) -> None:
+        on_earth = abs(self.lat) <= _MOST_LAT and abs(self.lon) <= _MOST_LON
+        if not (on_earth and _LEAST_RADIUS_M <= self.radius_m <= _MOST_RADIUS_M):
+            raise InvalidValueError(f"near: expected {_CIRCLE}, found {self}")
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """`LAT,LON` or `LAT,LON,RADIUS_M`.
+
+        Raises:
+            InvalidValueError: it is neither.
+        """
+        try:
+            return cls(*(float(part) for part in text.split(",")))
+        except (TypeError, ValueError) as error:
+            raise InvalidValueError(f"--near: expected {_CIRCLE}, found {text!r}") from error
 
     def __str__(self) -> str:
         return f"{self.lat:.7f},{self.lon:.7f},{self.radius_m:g}"
