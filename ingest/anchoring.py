@@ -149,7 +149,7 @@ def anchor(
     notes += _about_photos(job, tried)
     result: AnchorResult | None = None
     if request.auto or request.confirm:
-        supervised = bool(request.confirm or request.start.pose or request.start.picks)
+        supervised = bool(request.confirm or request.start)
         result = place_map(
             job.feature_map, job.cloud, tried, job.gray, job.options,
             confirmed=bool(request.confirm), supervised=supervised, progress=progress,
@@ -226,6 +226,11 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
         feature_map, cloud, scan_ids = first.feature_map, first.cloud, first.scan_ids
     else:
         assert isinstance(summary, MapSummary)
+        if request.start.near is not None:
+            raise RegistrationError(
+                f"--near looks for maps without a place; map {summary.map_id} has one. If that is wrong, say "
+                "where one photo is: --pose FILE or --picks FILE"
+            )
         feature_map = loaded
         scan_ids = request.scan_ids or _scans_around(database, feature_map, summary)
         cloud = load_cloud(database, feature_map.frame, plan_box(feature_map), scan_ids=scan_ids)

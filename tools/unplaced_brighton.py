@@ -28,7 +28,7 @@ from tools.picked import Scan, picks, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
-_HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
+HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
 _MADE = "made.json"  # what came of the photos; who starts again goes on from there
 _WRONG_M = 1.0
 _DRAWS, _SEED = 20, 1
@@ -39,17 +39,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = scan_parser(__doc__, "--work").parse_args(argv)
     truth = scan_truth(args)
     scan = read_scan(args.scan, truth.frame, truth.epsg)
-    names = [name for name in photo_names(args.photos) if name not in _HELD_OUT]
-    figures: dict[str, object] = {"photos": len(names), "draws": _DRAWS}
     placed: list[dict[str, float]] = []
     work: Path = args.work
-    if not (work / _MADE).exists():
-        photos = copied(args.photos, names, work / "photos", strip=True)
-        copied(args.photos, _HELD_OUT, work / "asked", strip=True)
-        made = make(work / "db", "photos", photos, len(names))
+    figures: dict[str, object] = {"draws": _DRAWS, **unplaced_map(args.photos, work)}
+    if not (work / "scanned").exists():
         featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
-        write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
-    figures |= json.loads((work / _MADE).read_text(encoding="utf-8"))
+        (work / "scanned").touch()
     (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
     for number in range(_DRAWS):
         done = work / f"draw-{number}.json"
@@ -74,12 +69,31 @@ def _draw(number: int, work: Path, map_id: str, scan: Scan, truth: ScanTruth) ->
     database = work / "placed"
     shutil.rmtree(database, ignore_errors=True)
     shutil.copytree(work / "db", database)
-    words = ("anchor", str(database), map_id, "--photos", str(photos), "--picks", str(file))
-    out = ("--image", image, "--out", str(work / f"anchor-{number}"), "--auto", "--quiet")
-    # 1: the map is not placed by them. 2: picks that leave the pose open, before anything is tried.
+    return placed_by(database, map_id, work, truth, "--picks", str(file), "--image", image)
+
+
+def unplaced_map(photos: Path, work: Path) -> dict[str, object]:
+    """Photos but the held-out ones, without positions, as a map in `work`/db; how many maps came."""
+    names = [name for name in photo_names(photos) if name not in HELD_OUT]
+    if not (work / _MADE).exists():
+        without = copied(photos, names, work / "photos", strip=True)
+        copied(photos, HELD_OUT, work / "asked", strip=True)
+        made = make(work / "db", "photos", without, len(names))
+        write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
+    told: dict[str, object] = json.loads((work / _MADE).read_text(encoding="utf-8"))
+    return {"photos": len(names), **told}
+
+
+def placed_by(
+    database: Path, map_id: str, work: Path, truth: ScanTruth, *start: str
+) -> dict[str, float] | None:
+    """Place the map by `featuredb anchor` and its arguments: errors of the held-out photos; None: refused."""
+    words = ("anchor", str(database), map_id, "--photos", str(work / "photos"), *start)
+    # 1: the map is not placed. 2: where it starts from is open, before anything is tried.
+    out = ("--out", str(database.parent / "anchor"), "--auto", "--quiet")
     if featuredb(*words, *out, may_refuse=True, refusals=(1, 2)) != 0:
         return None
-    asked = ask_poses(Database.open(database), work / "asked", _HELD_OUT, truth.frame, truth.poses)
+    asked = ask_poses(Database.open(database), work / "asked", HELD_OUT, truth.frame, truth.poses)
     return error_figures(asked)
 
 

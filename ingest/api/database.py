@@ -22,7 +22,7 @@ from ingest.api.results import Aligned, FilmTrack, Grown, Ingested, ListedMaps
 from ingest.api.tracking import track_film
 from ingest.growing import GrowingOptions, grow_candidates
 from ingest.photos.scan import require_photos
-from ingest.register.anchor.start.first_place import StartFiles
+from ingest.register.anchor.start.first_place import Circle, StartFiles
 from ingest.track.finders import FilmBy, FilmGround
 from reloc.asking import Image, PhotoAnswer, PhotoAsker
 from reloc.tracking.track_video import TrackVideoOptions
@@ -108,6 +108,7 @@ class FeatureDatabase:
         picks: PathLike | None = None,
         pose: PathLike | None = None,
         image: str | None = None,
+        near: tuple[float, ...] | None = None,
         out: PathLike | None = None,
         by_maps: bool = False,
         quiet: bool = False,
@@ -122,6 +123,8 @@ class FeatureDatabase:
             auto: place it by the scan if every gate is passed; else frames are only proposed.
             confirm: names of proposed frames by which it is placed.
             picks, pose: file of picked points, or of a rough pose, of the photo `image`.
+            near: (latitude, longitude) or (latitude, longitude, radius_m): where a map without a place is
+                looked for on the scans.
             out: folder of pictures and report; default: ./anchor-MAP.
             by_maps: a map without a place is placed by the maps that show the same, as `featuredb grow`,
                 which takes all that wait.
@@ -153,7 +156,12 @@ class FeatureDatabase:
             out=None if out is None else Path(out),
             auto=auto,
             confirm=tuple(confirm),
-            start=StartFiles(pose=_path(pose), picks=_path(picks), image=image),
+            start=StartFiles(
+                pose=_path(pose),
+                picks=_path(picks),
+                image=image,
+                near=None if near is None else Circle(*near),
+            ),
         )
         with progress_bars(quiet) as progress:
             anchored = anchor(self.store, request, progress)

@@ -53,6 +53,11 @@ def register(subparsers: Any) -> None:
     helping = anchor.add_argument_group("where a registration starts, instead of the map's placement")
     helping.add_argument("--pose", type=Path, metavar="FILE", help="a rough pose, JSON")
     helping.add_argument("--picks", type=Path, metavar="FILE", help="picked points, CSV")
+    helping.add_argument(
+        "--near",
+        metavar="LAT,LON[,RADIUS_M]",
+        help="look for a map without a place there, its heading and size unknown; default radius: 250 m",
+    )
     helping.add_argument("--image", metavar="NAME", help="photo of --pose or --picks")
     page = anchor.add_argument_group("picking in a page")
     page.add_argument(
@@ -104,9 +109,11 @@ def _page(database: "Database", request: "AnchorRequest", args: argparse.Namespa
 def _request(args: argparse.Namespace) -> "AnchorRequest":
     from featuredb.errors import InvalidValueError
     from ingest.anchoring import AnchorRequest
-    from ingest.register.anchor.start.first_place import StartFiles
+    from ingest.register.anchor.start.first_place import Circle, StartFiles
 
-    if args.page and (args.auto or args.confirm or args.pose or args.picks):
+    if args.near and (args.pose or args.picks):
+        raise InvalidValueError("expected --near, or --pose and --picks, found both")
+    if args.page and (args.auto or args.confirm or args.pose or args.picks or args.near):
         raise InvalidValueError("--page asks a person for everything; expected it alone")
     if args.auto and args.confirm:
         raise InvalidValueError("expected --auto or --confirm, found both")
@@ -114,6 +121,7 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
         raise InvalidValueError("--image names the photo of --pose or --picks; give one of them")
     if args.frames is not None and args.frames < 1:
         raise InvalidValueError(f"--frames: expected a number > 0, found {args.frames}")
+    near = None if args.near is None else Circle.parse(args.near)
     return AnchorRequest(
         map_id=args.map_id,
         photos=args.photos,
@@ -122,6 +130,6 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
         frames=args.frames,
         auto=args.auto,
         confirm=tuple(args.confirm),
-        start=StartFiles(pose=args.pose, picks=args.picks, image=args.image),
+        start=StartFiles(pose=args.pose, picks=args.picks, image=args.image, near=near),
         storage_options=tuple(args.storage_option),
     )

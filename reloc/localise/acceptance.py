@@ -45,7 +45,9 @@ class AcceptanceOptions:
     settled_log_nfa: float = 48.0
 
 
-def log_nfa(matches: int, inliers: int, tolerance_px: float, width: int, height: int, sample: int) -> float:
+def log_nfa(
+    matches: int, inliers: int, tolerance_px: float, width: float, height: float, sample: int
+) -> float:
     """-log10 of the number of false alarms (Moisan and Stival 2004; Moulon et al., AC-RANSAC, 2012).
 
     NFA = (n - s) C(n, k) C(k, s) p^(k - s): the number of poses with k inliers that one expects among all

@@ -37,6 +37,7 @@ NOT_RUN = {
     "featuredb ingest video film.db": _BY_HAND,
     "featuredb lidar add film.db": _BY_HAND,
     "featuredb anchor film.db": _BY_HAND,
+    "featuredb anchor my.db MAP --photos ~/photos/park --near": "tests/integration/test_anchor_near.py does",
     "featuredb track film.db": _BY_HAND,
     "featuredb localise film.db": _BY_HAND,
     "featuredb live /dev/video0": "needs a camera; tests/unit/test_bridge.py sends what it would",

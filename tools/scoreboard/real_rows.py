@@ -133,6 +133,20 @@ REAL: tuple[Row, ...] = (
         minutes=40,
     ),
     _row(
+        name="brighton-near",
+        claim="`brighton` without GPS: a map of 14 photos, looked for within 250 m of a point 100 m off; ten "
+        "points each with the scan's colours, with grey values as intensities, and on a mirrored scan",
+        commands=f"tools.unplaced_near --photos {BRIGHTON} --scan {SCAN} "
+        f"--poses {POSES} --work {{work}}/near {OUT}",
+        text="{colour_placed} and {intensity_placed} of {draws} placed, {colour_wrong} and {intensity_wrong} "
+        "wrong; the 4 others median {colour_median_m:.2f} and {intensity_median_m:.2f} m, "
+        "{colour_median_deg:.2f} and {intensity_median_deg:.2f} degrees; mirrored: {mirrored_placed}",
+        limits="7 <= colour_placed, 7 <= intensity_placed, colour_wrong <= 0, intensity_wrong <= 0, "
+        "mirrored_placed <= 0, colour_median_m <= 0.25, colour_median_deg <= 0.25",
+        resumes=True,
+        minutes=40,
+    ),
+    _row(
         name="brighton-grown",
         claim="`brighton`: every second photo a map by GPS, the others without GPS placed by it, ten "
         "photos of `lewis` not; against scan poses laid on the first map",

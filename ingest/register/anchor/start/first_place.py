@@ -3,20 +3,23 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
-from featuredb.errors import RegistrationError
+from featuredb.errors import InvalidValueError, RegistrationError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import load_cloud
-from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
+from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, list_scans
 from ingest.register.anchor.start.files import read_picks, read_pose
+from ingest.register.anchor.start.from_above import found_from_above
 from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks
 from ingest.register.anchor.start.priors import RoughPose, image_named, prior_from_rough_pose
 from ingest.register.frame_registration import FramePrior
@@ -25,21 +28,69 @@ from ingest.register.place_map import place_by_photo
 # Scan around a map's points and cameras that may be seen, metres: errors of GPS, and what frames show beside
 # the map's points.
 MARGIN_M = 60.0
+_MOST_LAT, _MOST_LON = 84.0, 180.0  # UTM ends there
+_LEAST_RADIUS_M, _MOST_RADIUS_M = 10.0, 1000.0
+_CIRCLE = (
+    f"LAT,LON or LAT,LON,RADIUS_M in WGS84 degrees and {_LEAST_RADIUS_M:.0f} to {_MOST_RADIUS_M:.0f} metres, "
+    "such as 46.8450,-91.9942,250"
+)
 _FIRST_REACH_M = 300.0  # scan around the picks of the first photo: what a drone's photo shows
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """Where a map lies, roughly: WGS84 degrees and metres.
+
+    Raises:
+        InvalidValueError: no place of a UTM zone, or a radius that is not searched.
+    """
+
+    lat: float
+    lon: float
+    radius_m: float = 250.0
+
+    def __post_init__(self) -> None:
+        on_earth = abs(self.lat) <= _MOST_LAT and abs(self.lon) <= _MOST_LON
+        if not (on_earth and _LEAST_RADIUS_M <= self.radius_m <= _MOST_RADIUS_M):
+            raise InvalidValueError(f"near: expected {_CIRCLE}, found {self}")
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """`LAT,LON` or `LAT,LON,RADIUS_M`.
+
+        Raises:
+            InvalidValueError: it is neither.
+        """
+        try:
+            return cls(*(float(part) for part in text.split(",")))
+        except (TypeError, ValueError) as error:
+            raise InvalidValueError(f"--near: expected {_CIRCLE}, found {text!r}") from error
+
+    def __str__(self) -> str:
+        return f"{self.lat:.7f},{self.lon:.7f},{self.radius_m:g}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartFiles:
-    """Files by which a person helps, and the photo that they speak of where they do not say it."""
+    """Files by which a person helps, and the photo that they speak of where they do not say it.
+
+    Attributes:
+        near: instead of files: where the map is looked for.
+    """
 
     pose: Path | None = None
     picks: Path | None = None
     image: str | None = None
+    near: Circle | None = None
+
+    def __bool__(self) -> bool:
+        """Whether a person says where the map is."""
+        return any(said is not None for said in (self.pose, self.picks, self.near))
 
     def words(self) -> list[str]:
-        """As arguments of the command."""
-        named = (("--pose", self.pose), ("--picks", self.picks), ("--image", self.image))
-        return [word for option, value in named if value is not None for word in (option, str(value))]
+        """As arguments of the command; with an equals sign, since latitudes may be negative."""
+        named = (("pose", self.pose), ("picks", self.picks), ("image", self.image), ("near", self.near))
+        return [f"--{option}={value}" for option, value in named if value is not None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,11 +105,11 @@ class StartedImage:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FirstPlace:
-    """A map without a place, put where a person's first photo says.
+    """A map without a place, put where a person's first photo says, or where it was found.
 
     Attributes:
         feature_map: the map there; a start, not a placement. cloud: the scan around it, in its frame.
-        starts: priors of the person's photos by image id. notes: a line on each.
+        starts: priors of the person's photos by image id. notes: a line on each, or on how it was found.
         files: that said it.
     """
 
@@ -115,17 +166,21 @@ def by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) ->
 def first_place(
     database: Database, unplaced: UnplacedMap, files: StartFiles, scan_ids: Sequence[str]
 ) -> FirstPlace:
-    """Put a map without a place where a person's photo says, on the scans of the database.
+    """Put a map without a place where a person's photo says, or where it is found near, on the scans.
 
     Raises:
-        RegistrationError: nothing says where, or the photo does not see the scan from there.
+        RegistrationError: nothing says where, the photo does not see the scan from there, or the map is not
+            found.
     """
-    if files.pose is None and files.picks is None:
+    if not files:
         raise RegistrationError(
-            f"map {unplaced.map_id} has no place ({unplaced.no_place.reason}); say where one photo is: "
-            "--page (click the same spots in photo and scan), --picks FILE or --pose FILE"
+            f"map {unplaced.map_id} has no place ({unplaced.no_place.reason}); say where it is: "
+            "--near LAT,LON (looks for it within 250 m), --page (click the same spots in photo and scan), "
+            "--picks FILE or --pose FILE"
         )
     scans = chosen_scans(database, scan_ids)
+    if files.near is not None:
+        return _found_near(database, unplaced, files, files.near, tuple(scan.scan_id for scan in scans))
     epsg = scans[0].epsg
     utm = _spoken_of(files)
     east, north, up = (float(v) for v in np.median(utm, axis=0))
@@ -133,6 +188,49 @@ def first_place(
     started = started_images(unplaced, files, frame, epsg)
     ids = tuple(scan.scan_id for scan in scans)
     return placed_by_start(database, unplaced, started, frame, ids, files)
+
+
+def _found_near(
+    database: Database,
+    unplaced: UnplacedMap,
+    files: StartFiles,
+    near: Circle,
+    scan_ids: tuple[str, ...],
+) -> FirstPlace:
+    frame = LocalFrame(latitude_deg=near.lat, longitude_deg=near.lon, height_m=0.0)
+    reach = near.radius_m
+    cloud = load_cloud(database, frame, (-reach, -reach, reach, reach), scan_ids=scan_ids)
+    if not len(cloud):
+        raise RegistrationError(
+            f"no scan of {database.url} lies within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}; "
+            "`featuredb lidar list` tells where scans lie"
+        )
+    found = found_from_above(unplaced, cloud)
+    if found is None or not found.sure:
+        said = (
+            "nothing of it matches the scan" if found is None else f"{found.words()}, which chance gives, too"
+        )
+        raise RegistrationError(
+            f"map {unplaced.map_id} is not found within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}: "
+            f"{said}. A smaller radius shows the scan finer (--near LAT,LON,RADIUS_M), colours show more "
+            "than intensities; or say where one photo is: --page, --picks FILE, --pose FILE"
+        )
+    placement = Placement(
+        method="lidar",
+        local_from_sfm=found.local_from_own,
+        covariance=found.covariance,
+        residual_rms_m=0.0,
+        evidence={"start": {"near": str(near), "no_place": unplaced.no_place.reason_code}},
+    )
+    feature_map = placed_map(unplaced, placement, cloud.frame, cloud.height_datum)
+    return FirstPlace(
+        feature_map=feature_map,
+        cloud=load_cloud(database, frame, plan_box(feature_map), scan_ids=scan_ids),
+        scan_ids=scan_ids,
+        starts={},
+        notes=(f"found near {near.lat:.6f}, {near.lon:.6f}: {found.words()}",),
+        files=files,
+    )
 
 
 def placed_by_start(

@@ -1,0 +1,206 @@
+"""A map without a place, found on a scan of some hundred metres by what both show from above.
+
+The scan is drawn from above, side by side. Features of these pictures have places on the scan, those of the
+map have points of its frame: where they match, a similarity takes the one to the other. SIFT minds neither
+the heading nor the size, so neither needs to be known, nor which way is up. All photos decide together.
+
+How sure that is: the expected number of similarities that as many chance matches would fit as well
+(a-contrario; Moulon, Monasse, Marlet 2012), matches with one point of the map or one spot of the scan being
+one.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.similarity import refined_similarity
+from featuredb.index.nearest import nearest
+from featuredb.maps.unplaced_map import UnplacedMap
+from featuredb.render.cloud import PointCloud
+from featuredb.render.renderer import render
+from featuredb.render.rendering import Rendering
+from ingest.register.frame.candidates import available_sources
+from ingest.register.frame.features.matching import pool_features
+from ingest.register.frame.verdict import MIN_COVER
+from ingest.register.frame.views import SPACING_PX
+from ingest.register.frame_registration import RenderSource
+from ingest.register.structure.similarity import similarities
+from reloc.localise.acceptance import log_nfa
+
+_SIDE_PX = 1000  # of a picture from above; the next one overlaps it by half
+_VIEWS = (
+    8  # along a side, at most: a picture shows a quarter of a side, or what the scan's points are fine for
+)
+_FEATURES = 3000  # of each
+_MOST_DESCRIPTORS = 30_000  # of the map: more say the same again, and take longer
+_NEIGHBOURS = 8  # one point of the map has a descriptor in each photo: the next point must be among them
+_MAX_RATIO = 0.85  # as localisation has it
+_SAMPLE = 3
+_BATCH, _BATCHES = 2000, 50  # samples of three: with 5 % of right matches a dozen of them is all right
+_MISSED = 1e-3  # chance that no sample was all right, below which no more are drawn
+_SCORED = 300  # matches that score a sample
+_TOLERANCES_PX = (8.0, 16.0, 32.0)  # of the pictures; the one that says most is taken, and three are paid for
+_MIN_LOG_NFA = 3.0  # one map of a thousand would be proposed where it is not
+_ROUNDS = 5  # of matches within the tolerance and the similarity that fits them
+_CORRELATED = 4.0  # matches that are worth one independent: neighbours share relief and the map's bend
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FoundFromAbove:
+    """Where a map lies on a scan; a start for the registration of its photos.
+
+    Attributes:
+        local_from_own: similarity. covariance: (7, 7) of its left perturbation.
+        matches: distinct ones. fitting: how many of them the similarity takes within `tolerance_m`.
+        log_nfa: minus the decimal logarithm of the number of as good ones that chance gives.
+        source: what of the scan was drawn.
+    """
+
+    local_from_own: Sim3
+    covariance: FloatArray
+    matches: int
+    fitting: int
+    tolerance_m: float
+    log_nfa: float
+    source: RenderSource
+
+    @property
+    def sure(self) -> bool:
+        """Whether chance seldom gives as much."""
+        return self.log_nfa >= _MIN_LOG_NFA
+
+    def words(self) -> str:
+        return (
+            f"{self.fitting} of {self.matches} matches with the scan's {self.source} fit one place to within "
+            f"{self.tolerance_m:.1f} m"
+        )
+
+
+def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundFromAbove | None:
+    """The best place of a map on a scan; None where nothing of both matches.
+
+    Args:
+        cloud: all of the scan on which the map may lie.
+    """
+    found = [_found(unplaced, cloud, source) for source in available_sources(cloud) if source != "shaded"]
+    return max((one for one in found if one is not None), key=lambda one: one.log_nfa, default=None)
+
+
+def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> FoundFromAbove | None:
+    wide_m = _wide_m(cloud)
+    pools = [pool_features(view, source, False, _FEATURES) for view in _views(cloud, wide_m)]
+    if not pools:
+        return None
+    places = np.concatenate([pool.points for pool in pools])
+    point, place = _matched(unplaced, np.concatenate([pool.descriptors for pool in pools]))
+    if len(point) <= _SAMPLE:
+        return None
+    own, local = unplaced.points.xyz[point], places[place]
+    area_m2 = float(np.prod(np.ptp(places[:, :2], axis=0)))
+    judged = [
+        _judged(_most_fitting(own, local, tolerance), own, local, point, tolerance, area_m2, source)
+        for tolerance in (px * wide_m / _SIDE_PX for px in _TOLERANCES_PX)
+    ]
+    return max((one for one in judged if one is not None), key=lambda one: one.log_nfa, default=None)
+
+
+def _wide_m(cloud: PointCloud) -> float:
+    """What a picture shows: as fine as the scan's points are dense, and no more than so many pictures."""
+    plan = np.ptp(cloud.xyz[:, :2], axis=0)
+    spacing = float(np.sqrt(np.prod(plan) / len(cloud)))
+    return max(_SIDE_PX * spacing / SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
+
+
+def _views(cloud: PointCloud, wide_m: float) -> Iterator[Rendering]:
+    """The scan from above, north up, from as high as it is wide."""
+    camera = Camera.from_focal(_SIDE_PX, _SIDE_PX, float(_SIDE_PX), model="PINHOLE")
+    rotation = np.diag([1.0, -1.0, -1.0])
+    low, high = (np.asarray(of, dtype=np.float64) for of in (cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)))
+    top = float(np.median(cloud.xyz[:, 2])) + wide_m
+    for east in np.arange(low[0], high[0] + wide_m / 2, wide_m / 2):
+        for north in np.arange(low[1], high[1] + wide_m / 2, wide_m / 2):
+            center = np.array([east, north, top])
+            pose = Rigid3(rotation=rotation, translation=-rotation @ center)
+            view = render(cloud, camera, pose)
+            if view.valid.mean() >= MIN_COVER:
+                yield view
+
+
+def _matched(
+    unplaced: UnplacedMap, descriptors: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Points of the map and rows of `descriptors` (n, 128) that match: the next point looks less like it."""
+    observations = unplaced.observations
+    step = -(-len(observations.point_index) // _MOST_DESCRIPTORS)
+    squared, row = nearest(descriptors, observations.descriptors[::step], _NEIGHBOURS)
+    point = observations.point_index[::step][row]
+    others = (point != point[:, :1]) & (row >= 0)
+    other = squared[np.arange(len(row)), np.where(others.any(axis=1), others.argmax(axis=1), -1)]
+    kept = np.flatnonzero((squared[:, 0] < _MAX_RATIO**2 * other) & (row[:, 0] >= 0))
+    return point[kept, 0].astype(np.int64), kept
+
+
+def _most_fitting(own: FloatArray, local: FloatArray, tolerance_m: float) -> Sim3 | None:
+    """Of similarities of three matches that which takes most of own (n, 3) to local (n, 3)."""
+    rng = np.random.default_rng(0)
+    scored = rng.permutation(len(own))[:_SCORED]
+    best, most = None, 0
+    for batch in range(1, _BATCHES + 1):
+        rows = rng.integers(0, len(own), (_BATCH, _SAMPLE))
+        scale, rotation, translation, usable = similarities(own[rows], local[rows])
+        if usable.any():
+            scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
+            off = (scale[:, None, None] * rotation).reshape(-1, 3) @ own[scored].T + translation.reshape(
+                -1, 1
+            )
+            off = off.reshape(-1, 3, len(scored)) - local[scored].T
+            fitting = (np.square(off).sum(axis=1) <= tolerance_m**2).sum(axis=1)
+            k = int(fitting.argmax())
+            if fitting[k] > most:
+                most = int(fitting[k])
+                best = Sim3(scale=float(scale[k]), rotation=rotation[k], translation=translation[k])
+        right = (most / len(scored)) ** _SAMPLE
+        if batch * _BATCH * np.log1p(-min(right, 1.0 - 1e-12)) < np.log(_MISSED):
+            break
+    return best
+
+
+def _judged(
+    sim: Sim3 | None,
+    own: FloatArray,
+    local: FloatArray,
+    point: NDArray[np.int64],
+    tolerance_m: float,
+    area_m2: float,
+    source: RenderSource,
+) -> FoundFromAbove | None:
+    """Fitted to the matches within the tolerance, with how sure that is; None where too few are."""
+    if sim is None:
+        return None
+    for _ in range(_ROUNDS):
+        fits = np.linalg.norm(sim.act(own) - local, axis=1) <= tolerance_m
+        if fits.sum() <= _SAMPLE:
+            return None
+        sim = refined_similarity(sim, own[fits], local[fits], 1.0)
+    placed = sim.act(own[fits])
+    variance = float(np.square(placed - local[fits]).sum()) / (3.0 * int(fits.sum()) - 7.0)
+    jacobian = point_jacobian(placed).reshape(-1, 7)
+    matches = len(np.unique(point))
+    spots = np.unique(np.floor(local[fits, :2] / tolerance_m), axis=0)
+    fitting = min(len(np.unique(point[fits])), len(spots))
+    evidence = log_nfa(matches, fitting, tolerance_m, area_m2, 1.0, _SAMPLE)
+    return FoundFromAbove(
+        local_from_own=sim,
+        covariance=np.asarray(_CORRELATED * variance * np.linalg.inv(jacobian.T @ jacobian)),
+        matches=matches,
+        fitting=fitting,
+        tolerance_m=tolerance_m,
+        log_nfa=evidence - float(np.log10(len(_TOLERANCES_PX))),
+        source=source,
+    )
