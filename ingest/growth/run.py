@@ -148,7 +148,7 @@ class _Round:
                 self._try_model(part, _SPLIT_LINKS)
         left = {row: photo for row, photo in self.localised.items() if row not in run.map_of}
         lone = with_shared_lenses(left, {row: shared_key(new.photos[row], "shared") for row in left})
-        groups, waiting = lone_groups(lone, new.features_of)
+        groups, waiting = lone_groups(lone, new.features_of, new.overlaps, new.geometry_of)
         self.posed |= lone
         for group in groups:
             self._try_model(group, ())

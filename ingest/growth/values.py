@@ -14,7 +14,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap.bridge import Model
+from ingest.colmap.bridge import Model, TwoView
 from ingest.growth.gates import Gate
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
@@ -164,20 +164,21 @@ class GrowthPhotos:
     Attributes:
         models: their reconstructions, called once a round; rows of a model are rows of `photos`.
         candidate_ids: of contributed photos, by row.
-        overlaps: pairs of rows whose matches were verified; None: not known.
+        overlaps: pairs of rows whose matches were verified. geometry_of: of such a pair.
     """
 
     photos: Sequence[Photo]
     features_of: FeaturesOf
     models: Callable[[], Iterable[Model]]
+    overlaps: Collection[Pair]
+    geometry_of: Callable[[Pair], TwoView]
     candidate_ids: Mapping[int, str] = field(default_factory=dict)
-    overlaps: Collection[Pair] | None = None
 
 
 def no_photos() -> GrowthPhotos:
     """Nothing new: old quarantined maps are examined, and new anchors looked for."""
 
-    def none(row: int) -> PhotoFeatures:
-        raise IndexError(f"there is no photo {row}")
+    def none(rows: object) -> Any:
+        raise IndexError(f"there is no photo {rows}")
 
-    return GrowthPhotos(photos=(), features_of=none, models=lambda: ())
+    return GrowthPhotos(photos=(), features_of=none, models=lambda: (), overlaps=(), geometry_of=none)

@@ -38,6 +38,8 @@ from tests.support.scenes import (
 )
 from tools.growth_gates import read_judgements, recorded
 
+_PAIRS = [(0, 1), (0, 2), (1, 2)]
+
 
 @pytest.fixture(scope="module")
 def area() -> IndexedArea:
@@ -310,7 +312,7 @@ def test_overlaps_with_two_maps_tell_how_these_differ(new: NewPhotos) -> None:
 def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> None:
     """No reconstruction at all: localised photos whose matches fit their poses become a map."""
     found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
-    (group,), waiting = lone_groups(found, new.features_of)
+    (group,), waiting = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
     assert not waiting
     made = grow_component(group, new.photos, new.features_of, found, [area], identity())
     assert isinstance(made, GrownMap), made
@@ -321,7 +323,7 @@ def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> 
 
 def test_a_lone_photo_waits(new: NewPhotos, area: IndexedArea) -> None:
     found, _ = localise_photos(new.photos, [0], new.features_of, [area])
-    groups, waiting = lone_groups(found, new.features_of)
+    groups, waiting = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
     assert not groups
     assert waiting[0].startswith("ALONE")
 
@@ -334,7 +336,7 @@ def test_lone_photos_whose_matches_contradict_their_poses_wait(new: NewPhotos, a
         cam_from_local=away.act_on_pose(found[1].cam_from_local),
         points=away.act(found[1].points),
     )
-    (group,), _ = lone_groups(found, new.features_of)
+    (group,), _ = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
     refused = grow_component(group, new.photos, new.features_of, found, [area], identity())
     assert isinstance(refused, Refused)
     assert refused.reason == "TOO_FEW_AGREE"

@@ -1,5 +1,6 @@
 """A reconstruction that look-alikes have joined from two places becomes two maps."""
 
+import itertools
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -82,7 +83,20 @@ def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path) -> GrowthReport:
     database = Database.create(folder / "db")
     database.commit_map(existing())
     model = _joined(south.model, north.model)
-    new = GrowthPhotos(photos=photos, features_of=features.__getitem__, models=lambda: [model])
+    everyone = NewPhotos(
+        photos=photos,
+        features=features,
+        poses=[*south.poses, *north.poses],
+        model=model,
+        world_of=[*south.world_of, *north.world_of],
+    )
+    new = GrowthPhotos(
+        photos=photos,
+        features_of=everyone.features_of,
+        models=lambda: [model],
+        overlaps=list(itertools.combinations(range(len(photos)), 2)),
+        geometry_of=everyone.geometry_of,
+    )
     return grow(database, new, folder / "work")
 
 

@@ -32,21 +32,19 @@ class NewPhotos:
         localised: those that the active maps localise, by row.
         heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
             map is examined again whenever another one changes, and its own photos are the same.
-        overlaps: pairs of `photos` that show the same, as their matches say; None: not known. Of a map that
-            is made of `photos`, those are asked that overlap with one of its own.
+        overlaps: pairs of `photos` that show the same, as their matches say. Of a map that is made of
+            `photos`, those are asked that overlap with one of its own.
     """
 
     photos: Sequence[Photo]
     rows: Sequence[int]
     features_of: FeaturesOf
     localised: dict[int, LocalisedPhoto]
+    overlaps: Collection[Pair]
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
-    overlaps: Collection[Pair] | None = None
 
     def that_may_see(self, feature_map: FeatureMap) -> list[int]:
         """Rows of those that may be asked about a map."""
-        if self.overlaps is None:
-            return list(self.rows)
         names = {image.sha256 for image in feature_map.images}
         own = {row for row, photo in enumerate(self.photos) if photo.sha256 in names}
         if len(own) < len(names):  # whose matches with these photos nobody has looked at
