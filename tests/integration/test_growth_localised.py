@@ -83,12 +83,12 @@ def test_what_a_photo_sees_of_a_map_is_asked_once(new: NewPhotos) -> None:
     )
     here, sources = existing(), Sources(trusted=("somebody",))
     first = corroborate(here, [], asked, sources, write_id="w1")
-    assert {w.name for w in first.corroborating} == {photo.name for photo in photos}
+    assert {w.name for w in first} == {photo.name for photo in photos}
     assert set(asked.heard) == {("w1", row) for row in range(len(photos))}
     asked.heard.update(dict.fromkeys(asked.heard, None))
-    assert not corroborate(here, [], asked, sources, write_id="w1").corroborating
+    assert not corroborate(here, [], asked, sources, write_id="w1")
     # Written anew, the map may show something else.
-    assert corroborate(here, [], asked, sources, write_id="w2").corroborating
+    assert corroborate(here, [], asked, sources, write_id="w2")
 
 
 def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> None:
@@ -110,7 +110,7 @@ def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> No
     heard = corroborate(of_photos, [], asked, Sources(trusted=("somebody",)), write_id="w1")
     assert {name for name, _ in asked.heard} == {"w1"}
     assert {row for _, row in asked.heard} == {2, 3}
-    assert {w.name for w in heard.corroborating} <= {photos[2].name, photos[3].name}
+    assert {w.name for w in heard} <= {photos[2].name, photos[3].name}
 
 
 def _of_image(feature_map: FeatureMap, image_id: int) -> MapObservations:

@@ -27,7 +27,7 @@ from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.map_images import model_of
 from ingest.growth.map_places import drift_m, growth_of, places_of
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
-from ingest.growth.trust.confirmation import CorroboratingImage, Source, answering_with, confirmed_points
+from ingest.growth.trust.confirmation import OutsidePhoto, Source, answering_with, confirm
 from ingest.growth.trust.promotion import Promotion
 from ingest.growth.values import Edge
 from ingest.sfm.links import keep_photos
@@ -210,7 +210,7 @@ def test_only_points_of_two_sources_answer() -> None:
     parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
     poisoned = replace(feature_map, observations=type(seen)(**parts))
     known = ("anna", "ben", "eve")
-    points = confirmed_points(poisoned, sources_of(poisoned, on_record=known))
+    points = confirm(poisoned, sources_of(poisoned, on_record=known)).points
     assert not points[fake].any()
     assert points[~fake].mean() > 0.9
     part = answering_with(poisoned, points)
@@ -221,21 +221,21 @@ def test_only_points_of_two_sources_answer() -> None:
     # Where all is seen by two, nothing changes; a trusted owner's points need nobody.
     clean = strip_map("m", 40.0, owners=["anna", "ben"])
     assert answering_with(clean, np.ones(len(clean.points), dtype=bool)) is clean
-    trusted = confirmed_points(poisoned, sources_of(poisoned, trusted=("eve",)))
+    trusted = confirm(poisoned, sources_of(poisoned, trusted=("eve",))).points
     assert trusted[fake].mean() > 0.5
     # Whose word does not count yet takes no part.
-    assert not confirmed_points(poisoned, sources_of(poisoned, on_record=["eve"])).any()
+    assert not confirm(poisoned, sources_of(poisoned, on_record=["eve"])).points.any()
 
 
 def test_a_witness_makes_points_answer() -> None:
     feature_map = strip_map("m", 40.0, owners=["anna"])
     rows = np.arange(100, dtype=np.int64)
-    outside = CorroboratingImage(
+    outside = OutsidePhoto(
         name="w", source=Source(owner="ben", proven=True), center=np.array([0.0, -60.0, 20.0]), points=rows
     )
     sources = sources_of(feature_map)
-    alone = confirmed_points(feature_map, sources)
-    found = confirmed_points(feature_map, sources, [outside])
+    alone = confirm(feature_map, sources).points
+    found = confirm(feature_map, sources, [outside]).points
     assert not alone.any()
     assert found[rows].mean() > 0.9
     assert not found[100:].any()

@@ -2,17 +2,17 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.states import OPERATOR
 from ingest.growth.gates import SIGMAS
 from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, NEAR_M, features_and_points
 from ingest.growth.place.localised import in_frame, localise_photos
 from ingest.growth.place.overlaps import indexed_area, localise_image
-from ingest.growth.trust.confirmation import CorroboratingImage, Source, Sources
+from ingest.growth.trust.confirmation import OutsidePhoto, Source, Sources
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photos.photo import Photo
 from ingest.sfm.pairs import Pair
@@ -53,14 +53,6 @@ class NewPhotos:
         return [row for row in self.rows if row in beside]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Corroboration:
-    """Photos from outside that see the map's points; sources of those that contradict it, with sentences."""
-
-    corroborating: tuple[CorroboratingImage, ...]
-    contradictions: tuple[tuple[Source, str], ...]
-
-
 def corroborate(
     feature_map: FeatureMap,
     others: Sequence[FeatureMap],
@@ -69,44 +61,42 @@ def corroborate(
     *,
     write_id: str,
     threads: int = 1,
-) -> Corroboration:
-    """Localise photos of other owners than the map's, whose word counts, in the map alone.
+) -> list[OutsidePhoto]:
+    """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 
     Args:
         others: maps around it, active or quarantined.
         write_id: of the map as it is.
     """
-    indexed = indexed_area(feature_map)
-    corroborating: list[CorroboratingImage] = []
-    against: list[tuple[Source, str]] = []
-    if len(indexed.area.points):
-        own = set(sources.of_map(feature_map))
-        heard = list(_of_maps(feature_map, others, indexed, own, sources))
-        if new is not None:
-            heard += _of_new(feature_map, write_id, indexed, new, own, sources, threads)
-        for one in heard:
-            if one.apart_m > max(_LEAST_M, SIGMAS * float(np.sqrt(one.variance_m2))):
-                against.append((one.source, f"{one.name} is {one.apart_m:.2f} m from where the map has it"))
-                continue
-            corroborating.append(
-                CorroboratingImage(
-                    name=one.name,
-                    source=one.source,
-                    center=one.found.cam_from_local.center,
-                    points=np.unique(one.found.point_of),
-                )
-            )
-    return Corroboration(corroborating=tuple(corroborating), contradictions=tuple(against))
+    indexed, own = indexed_area(feature_map), set(sources.of_map(feature_map))
+    if not len(indexed.area.points):
+        return []
+    heard = list(_of_maps(feature_map, others, indexed, own, sources))
+    if new is not None:
+        heard += _of_new(feature_map, write_id, indexed, new, own, sources, threads)
+    return heard
 
 
-class _Heard(NamedTuple):
-    """A photo localised in the map, in its frame; how far from its known place, and the variance of that."""
+def _heard(
+    feature_map: FeatureMap,
+    found: LocalisedPhoto,
+    source: Source,
+    name: str,
+    known: tuple[FloatArray, float] | None,
+) -> OutsidePhoto:
+    """A photo that the map localises.
 
-    found: LocalisedPhoto
-    source: Source
-    name: str
-    apart_m: float
-    variance_m2: float
+    Args:
+        known: its centre (3,) by others, in the map's frame, and the variance of that, square metres.
+    """
+    here = in_frame(found, feature_map.frame)
+    center, contradicts = here.cam_from_local.center, ""
+    if known is not None:
+        apart_m = float(np.linalg.norm(known[0] - center))
+        if apart_m > max(_LEAST_M, SIGMAS * float(np.sqrt(_spread(here) + known[1]))):
+            contradicts = f"{name} is {apart_m:.2f} m from where the map has it"
+    points = np.unique(here.point_of)
+    return OutsidePhoto(name=name, source=source, center=center, points=points, contradicts=contradicts)
 
 
 def _of_maps(
@@ -115,16 +105,14 @@ def _of_maps(
     indexed: IndexedArea,
     own: set[Source],
     sources: Sources,
-) -> Iterator[_Heard]:
+) -> Iterator[OutsidePhoto]:
     names = {image.sha256 for image in feature_map.images}
     for other, image, source in _images_around(feature_map, others, own, sources):
         found = None if image.sha256 in names else localise_image(other, image, 0, [indexed])
         if found is not None:
-            found = in_frame(found, feature_map.frame)
-            known = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
-            apart = float(np.linalg.norm(known.center - found.cam_from_local.center))
-            variance = _spread(found) + _center_variance(other, image)
-            yield _Heard(found, source, f"{image.name} of map {other.map_id}", apart, variance)
+            pose = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
+            known = pose.center, _center_variance(other, image)
+            yield _heard(feature_map, found, source, f"{image.name} of map {other.map_id}", known)
 
 
 def _of_new(
@@ -135,7 +123,7 @@ def _of_new(
     own: set[Source],
     sources: Sources,
     threads: int,
-) -> Iterator[_Heard]:
+) -> Iterator[OutsidePhoto]:
     names = {image.sha256 for image in feature_map.images}
     asked: dict[int, Source] = {}
     for row in new.that_may_see(feature_map):
@@ -146,16 +134,13 @@ def _of_new(
     said = localise_photos(new.photos, unheard, new.features_of, [indexed], threads)[0]
     new.heard.update({(write_id, row): said.get(row) for row in unheard})
     for row, source in asked.items():
-        heard = new.heard[write_id, row]
-        if heard is None:
+        found, known = new.heard[write_id, row], None
+        if found is None:
             continue
-        found = in_frame(heard, feature_map.frame)
-        apart, variance = 0.0, _spread(found)
         if row in new.localised:
             there = in_frame(new.localised[row], feature_map.frame)
-            apart = float(np.linalg.norm(there.cam_from_local.center - found.cam_from_local.center))
-            variance += _spread(there)
-        yield _Heard(found, source, new.photos[row].name, apart, variance)
+            known = there.cam_from_local.center, _spread(there)
+        yield _heard(feature_map, found, source, new.photos[row].name, known)
 
 
 def _spread(photo: LocalisedPhoto) -> float:

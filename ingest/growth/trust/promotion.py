@@ -18,13 +18,7 @@ from ingest.growth import gates
 from ingest.growth.gates import Gate
 from ingest.growth.place.localised import QUERY
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import (
-    Confirmation,
-    Sources,
-    answering_with,
-    confirm,
-    confirmed_points,
-)
+from ingest.growth.trust.confirmation import Confirmation, Sources, answering_with, confirm
 from ingest.growth.trust.corroboration import NewPhotos, corroborate
 from ingest.growth.trust.examined import recall, remember
 from ingest.growth.values import Refused
@@ -193,14 +187,13 @@ def _examine(
     """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
     feature_map, others = snapshot.load_map(summary.map_id), _others(summary, snapshot)
     heard = corroborate(feature_map, others, new, sources, write_id=summary.write_id, threads=threads)
-    confirmation = confirm(feature_map, sources, heard.corroborating, heard.contradictions)
+    confirmation = confirm(feature_map, sources, heard)
     if not confirmation.gate.passes:
         return Refused.by(confirmation.gate)
-    points = confirmed_points(feature_map, sources, heard.corroborating)
     contributed = sources.owners.made_of.get(feature_map.map_id, frozenset())
     earned = {i.sha256[:32] for i in feature_map.images if i.image_id in confirmation.earned}
     return ExaminedMap(
-        feature_map=answering_with(feature_map, points),
+        feature_map=answering_with(feature_map, confirmation.points),
         confirmation=confirmation,
         write_id=summary.write_id,
         earned=frozenset(earned & contributed),
