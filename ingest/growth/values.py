@@ -36,11 +36,6 @@ LEAST_VIEWS = 3  # of points that are asked for what is there; two leave them al
 TOLERANCE_PX = 8.0
 
 
-def pixel_scale(*cameras: Camera) -> float:
-    """Pixels of the longest side for one of an image of 1600, on which SIFT locates keypoints; at least 1."""
-    return max(1.0, max(max(camera.width, camera.height) for camera in cameras) / 1600.0)
-
-
 def tied_together(nodes: Sequence[Hashable], pairs: Iterable[tuple[Hashable, Hashable]]) -> list[int]:
     """For each node the number of its group: of those that a chain of pairs ties together."""
     row = {node: k for k, node in enumerate(nodes)}

@@ -13,10 +13,10 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored, triangulate_posed
+from ingest.colmap.anchored import FixedPoints, Lenses, adjust_anchored, pixel_scale, triangulate_posed
 from ingest.colmap.bridge import Model, SfmPhoto, TwoView
 from ingest.growth.place.localised import in_frame
-from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, pixel_scale, tied_together
+from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, tied_together
 from ingest.sfm.pairs import Pair
 
 _LEAST_FITTING = 0.7  # share of a pair's verified matches that must fit the poses
@@ -128,5 +128,5 @@ def _triangulated(
     )
     keypoints = [sfm[int(k)].keypoints.astype(np.float64) for k in model.rows]
     lenses = Lenses(held=range(len(model.cameras)))
-    free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses, AnchoredOptions()).model
+    free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses).model
     return replace(free, rows=np.array([rows[int(k)] for k in model.rows], dtype=np.int64))

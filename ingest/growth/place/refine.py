@@ -15,13 +15,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
-from ingest.colmap.anchored import (
-    Anchored,
-    AnchoredOptions,
-    FixedPoints,
-    Lenses,
-    adjust_anchored,
-)
+from ingest.colmap.anchored import Anchored, FixedPoints, Lenses, adjust_anchored, pixel_scale
 from ingest.colmap.bridge import Model, with_observations
 from ingest.growth import gates
 from ingest.growth.map_places import SIGMAS_95
@@ -35,7 +29,7 @@ from ingest.growth.place.drift import (
 )
 from ingest.growth.place.placement import MapsPlacement, edges_of
 from ingest.growth.place.similarity_fit import Correspondences, fit_similarity
-from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused, pixel_scale
+from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from ingest.sfm.links import bottleneck_share, select_photos
 
@@ -48,7 +42,6 @@ _ELSEWHERE = "the photo by itself sees existing points elsewhere than the others
 # 0.14. Those wait, and are localised by themselves once their neighbours are in an active map.
 _LEAST_LINK = 0.25
 _ROUNDS = 4  # of leaving photos out; the others are adjusted without them
-_ADJUST = AnchoredOptions()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,7 +96,7 @@ def adopt_lenses(
     if not lent:
         return model, lenses
     given = replace(model, cameras=tuple(lent.get(c, own) for c, own in enumerate(model.cameras)))
-    return adjust_anchored(given, keypoints, FixedPoints.none(), lenses, _ADJUST).model, lenses
+    return adjust_anchored(given, keypoints, FixedPoints.none(), lenses).model, lenses
 
 
 def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:
@@ -153,7 +146,7 @@ def refine_placed(
         )
         good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)
         adjusted, fixed = _refined(placed, outside, good, lenses, keypoints)
-        spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses, _ADJUST)
+        spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
         fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
         inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
@@ -267,7 +260,7 @@ def _refined(
     size = int(max(model.keypoint_of.max(initial=0), held.feature.max(initial=0))) + 1
     taken = np.isin(model.photo_of * size + model.keypoint_of, held.photo_of * size + held.feature)
     free = ~np.isin(model.photo_of, outside) & ~taken
-    return adjust_anchored(with_observations(model, free), keypoints, fixed, lenses, _ADJUST), fixed
+    return adjust_anchored(with_observations(model, free), keypoints, fixed, lenses), fixed
 
 
 def _sigma_px(model: Model, correspondences: Correspondences) -> FloatArray:
