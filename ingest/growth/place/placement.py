@@ -27,8 +27,7 @@ from ingest.growth.place.contradictions import center_variance_m2
 from ingest.growth.place.similarity_fit import (
     Correspondences,
     FittedSimilarity,
-    agreeing_photos,
-    best_proposal,
+    agreed_similarity,
     fit_similarity,
     tolerances_px,
 )
@@ -104,7 +103,7 @@ def place_by_maps(
         areas: that hold the existing maps.
     """
     own = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
-    found = _agreed(model, own, correspondences)
+    found = agreed_similarity(model, own, correspondences)
     edges: tuple[Edge, ...] = ()
     if found is not None:
         fit, agree = found
@@ -165,33 +164,6 @@ def place_by_maps(
 
 def _rows(model: Model, photos: Collection[int]) -> tuple[int, ...]:
     return tuple(int(model.rows[k]) for k in sorted(photos))
-
-
-def _agreed(
-    model: Model, own: Mapping[int, LocalisedPhoto], correspondences: Correspondences
-) -> tuple[FittedSimilarity, set[int]] | None:
-    """The fit to the photos that agree with it, and these; None where no photo does."""
-    best = best_proposal(model, own, correspondences)
-    if best is None or not len(best[1]):
-        return None
-    tolerance = tolerances_px(model, correspondences)
-    sim, chosen, fit = best[0], set(best[1].tolist()), None
-    for _ in range(5):  # the set of photos settles in two or three rounds
-        near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
-        if fit is not None:
-            near &= fit.errors_px < 2.0 * tolerance
-        if near.sum() < 4:
-            return None
-        fit = fit_similarity(model, sim, correspondences, near)
-        sim = fit.local_from_sfm
-        again = set(agreeing_photos(fit.errors_px, tolerance, correspondences).tolist()) & own.keys()
-        if not again:
-            return None
-        if again == chosen:
-            break
-        chosen = again
-    assert fit is not None
-    return fit, chosen
 
 
 def _against_positions(
