@@ -11,6 +11,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.move import move_map
 from ingest.colmap.anchored import with_observations
 from ingest.colmap.bridge import Model
+from ingest.growth.graph.map_graph import grow_within_budget
 from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos
@@ -138,7 +139,7 @@ def test_what_no_step_foresaw_costs_this_reconstruction_only(
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr("ingest.growth.place.component.place_by_maps", singular)
-    refused = grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
+    refused = grow_within_budget(new.model, new.photos, new.features_of, localised, [area], {}, 0.5)
     assert isinstance(refused, Refused)
     assert (refused.reason, refused.rows) == ("FAILED", tuple(range(len(new.photos))))
     assert "LinAlgError: Singular matrix" in refused.message

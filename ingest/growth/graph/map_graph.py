@@ -6,7 +6,8 @@ its digest of place differs, and the edge has to be measured again.
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,9 +26,14 @@ from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.graph.pose_graph import GraphEdge, GraphNode, GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
-from ingest.growth.place.component import GrownMap
-from ingest.growth.values import LEAST_PHOTOS, Edge, Refused, tied_together
+from ingest.growth.place.component import GrownMap, grow_component
+from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
+from ingest.map_builder import MapIdentity
+from ingest.photos.photo import Photo
 from ingest.sfm.links import keep_photos
+from reloc.localise.candidates import IndexedArea
+
+_LOG = logging.getLogger(__name__)
 
 _TRIES = 3  # the part within the budget may lie otherwise, and be cut again
 OWN = "own_placement"  # key of an anchor's evidence of growth, once a graph has moved it
@@ -209,16 +215,30 @@ def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
 
 def grow_within_budget(
     model: Model,
-    grow: Callable[[Model], GrownMap | Refused],
+    photos: Sequence[Photo],
+    features_of: FeaturesOf,
+    localised: Mapping[int, LocalisedPhoto],
+    areas: Sequence[IndexedArea],
     maps: Mapping[str, PlacedMap],
     budget_m: float,
+    identity: MapIdentity | None = None,
 ) -> GrownMap | Refused:
-    """The map, by `grow`, of a reconstruction with its drift, or of the part that is within the budget."""
+    """`grow_component` of a reconstruction, or of the part of it that is within the budget.
+
+    Returns:
+        The map with its drift, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this
+        reconstruction and not the others of the run, nor the next run.
+    """
     part, everything = model, tuple(model.rows.tolist())
     beyond: dict[int, tuple[str, str]] = {}
     refused = Refused(reason="", message="")
     for _ in range(_TRIES):
-        grown = grow(part)
+        try:
+            grown = grow_component(part, photos, features_of, localised, areas, identity, budget_m)
+        except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
+            _LOG.exception("a reconstruction of %d photos", len(everything))
+            text = f"{type(error).__name__}: {error}; the log tells where. Please report it"
+            grown = Refused(reason="FAILED", message=text)
         if isinstance(grown, Refused):
             return replace(grown, rows=everything)
         feature_map, drift, relative = with_drift(grown, maps, budget_m)

@@ -1,6 +1,6 @@
 """Photos that look at a quarantined map from outside, localised in it alone: of other maps, and new ones."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,9 +13,7 @@ from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, NEAR_M, featur
 from ingest.growth.place.localised import in_frame, localise_photos
 from ingest.growth.place.overlaps import indexed_area, localise_image
 from ingest.growth.trust.confirmation import OutsidePhoto, Source, Sources
-from ingest.growth.values import FeaturesOf, LocalisedPhoto
-from ingest.photos.photo import Photo
-from ingest.sfm.pairs import Pair
+from ingest.growth.values import GrowthPhotos, LocalisedPhoto
 from reloc.localise.candidates import IndexedArea
 
 # A photo whose place is known contradicts the map if the map has it further away than that, and than `SIGMAS`
@@ -28,28 +26,28 @@ class NewPhotos:
     """New photos that may corroborate.
 
     Attributes:
-        rows: of `photos` that may be asked.
+        rows: of the given photos that may be asked.
         localised: those that the active maps localise, by row.
         heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
             map is examined again whenever another one changes, and its own photos are the same.
-        overlaps: pairs of `photos` that show the same, as their matches say. Of a map that is made of
-            `photos`, those are asked that overlap with one of its own.
     """
 
-    photos: Sequence[Photo]
+    given: GrowthPhotos
     rows: Sequence[int]
-    features_of: FeaturesOf
-    localised: dict[int, LocalisedPhoto]
-    overlaps: Collection[Pair]
+    localised: Mapping[int, LocalisedPhoto]
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
 
     def that_may_see(self, feature_map: FeatureMap) -> list[int]:
-        """Rows of those that may be asked about a map."""
+        """Rows of those that may be asked about a map.
+
+        Of a map that is made of the given photos, those that overlap with one of its own.
+        """
         names = {image.sha256 for image in feature_map.images}
-        own = {row for row, photo in enumerate(self.photos) if photo.sha256 in names}
+        own = {row for row, photo in enumerate(self.given.photos) if photo.sha256 in names}
         if len(own) < len(names):  # whose matches with these photos nobody has looked at
             return list(self.rows)
-        beside = {j for i, j in self.overlaps if i in own} | {i for i, j in self.overlaps if j in own}
+        pairs = self.given.overlaps
+        beside = {j for i, j in pairs if i in own} | {i for i, j in pairs if j in own}
         return [row for row in self.rows if row in beside]
 
 
@@ -124,14 +122,14 @@ def _of_new(
     sources: Sources,
     threads: int,
 ) -> Iterator[OutsidePhoto]:
-    names = {image.sha256 for image in feature_map.images}
+    names, photos = {image.sha256 for image in feature_map.images}, new.given.photos
     asked: dict[int, Source] = {}
     for row in new.that_may_see(feature_map):
-        source = sources.of_owner(new.photos[row].contributor or OPERATOR)
-        if new.photos[row].sha256 not in names and source.speaks_to(own):
+        source = sources.of_owner(photos[row].contributor or OPERATOR)
+        if photos[row].sha256 not in names and source.speaks_to(own):
             asked[row] = source
     unheard = [row for row in asked if (write_id, row) not in new.heard]
-    said = localise_photos(new.photos, unheard, new.features_of, [indexed], threads)[0]
+    said = localise_photos(photos, unheard, new.given.features_of, [indexed], threads)[0]
     new.heard.update({(write_id, row): said.get(row) for row in unheard})
     for row, source in asked.items():
         found, known = new.heard[write_id, row], None
@@ -140,7 +138,7 @@ def _of_new(
         if row in new.localised:
             there = in_frame(new.localised[row], feature_map.frame)
             known = there.cam_from_local.center, _spread(there)
-        yield _heard(feature_map, found, source, new.photos[row].name, known)
+        yield _heard(feature_map, found, source, photos[row].name, known)
 
 
 def _spread(photo: LocalisedPhoto) -> float:

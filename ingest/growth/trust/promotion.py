@@ -13,15 +13,14 @@ from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.owners import read_owners
 from featuredb.store.candidates.photos import mark_confirmed
 from featuredb.store.changes import is_imported
-from ingest.fingerprint import digest, options_fingerprint
+from ingest.fingerprint import digest
 from ingest.growth import gates
+from ingest.growth.asked_before import recall, remember
 from ingest.growth.gates import Gate
-from ingest.growth.place.localised import QUERY
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import Confirmation, Sources, answering_with, confirm
 from ingest.growth.trust.corroboration import NewPhotos, corroborate
-from ingest.growth.trust.examined import recall, remember
-from ingest.growth.values import Refused
+from ingest.growth.values import GrowthOptions, Refused
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
@@ -66,29 +65,20 @@ class Promotion:
 
 
 def promote_confirmed(
-    database: Database,
-    localiser: Localiser,
-    trusted: Sequence[str] = (),
-    new: NewPhotos | None = None,
-    *,
-    budget_m: float,
-    work: Path | None = None,
-    threads: int = 1,
+    database: Database, localiser: Localiser, options: GrowthOptions, work: Path, new: NewPhotos | None = None
 ) -> list[Promotion]:
-    """Try every quarantined map that growth has made.
+    """Try every quarantined map that growth has made; those that have drifted beyond the budget stay.
 
     Args:
         localiser: of the active maps of the newest snapshot.
-        trusted: identities that the operator vouches for.
-        new: photos that may corroborate a map, beside the images of other maps.
-        budget_m: maps that have drifted further stay.
         work: work folder, where it is kept what was found out: without anything new nothing is asked again.
+        new: photos that may corroborate a map, beside the images of other maps.
 
     Raises:
         StoreError
     """
     snapshot = database.snapshot()
-    sources = Sources(owners=read_owners(database, snapshot), trusted=tuple(trusted))
+    sources = Sources(owners=read_owners(database, snapshot), trusted=options.trusted)
     asked = _question(database, snapshot, sources, new)
     open_maps: list[MapSummary] = []
     ready: list[ExaminedMap] = []
@@ -96,23 +86,25 @@ def promote_confirmed(
     for summary in snapshot.maps():
         if summary.status != "quarantined" or summary.method != "map":
             continue
-        why = _held_back(summary, snapshot, budget_m) or recall(work, summary.map_id, asked)
+        known = recall(work, "maps", summary.map_id, asked)
+        why = _held_back(summary, snapshot, options.drift_budget_m)
+        why = why or (Refused.from_json(known) if known else None)
         if why is None:
             open_maps.append(summary)
         else:
             outcomes.append(_stays(summary.map_id, why))
-    found = _examined(open_maps, snapshot, sources, new, threads)
+    found = _examined(open_maps, snapshot, sources, new, options.threads)
     for summary, one in zip(open_maps, found, strict=True):
         if isinstance(one, ExaminedMap):
             ready.append(_committed(database, summary, one))
         else:
             outcomes.append(_stays(summary.map_id, one))
-            remember(work, summary.map_id, asked, one)
+            remember(work, "maps", summary.map_id, one.as_json(), asked)
 
     def by_itself(was: ExaminedMap) -> ExaminedMap | Refused:
         summary = snapshot.get(was.feature_map.map_id)
         as_is = replace(sources, owners=read_owners(database, database.snapshot()))
-        (one,) = _examined([summary], snapshot, as_is, new, threads)
+        (one,) = _examined([summary], snapshot, as_is, new, options.threads)
         there = replace(summary, write_id=was.write_id, descriptors=_descriptors(was.feature_map))
         return _committed(database, there, one) if isinstance(one, ExaminedMap) else one
 
@@ -123,7 +115,7 @@ def promote_confirmed(
         for outcome in decided:
             if not outcome.promoted and outcome.reason_code != "CONFLICT":
                 why = Refused(reason=outcome.reason_code, message=outcome.reason, gates=outcome.gates)
-                remember(work, outcome.map_id, after, why)
+                remember(work, "maps", outcome.map_id, why.as_json(), after)
         outcomes += decided
     return outcomes
 
@@ -152,11 +144,10 @@ def _question(database: Database, snapshot: Snapshot, sources: Sources, new: New
     """Digest of all that an examination depends on: live maps, canaries, photos, whose word counts."""
     maps = sorted(f"{m.write_id} {m.status}" for m in snapshot.maps())
     canaries = [f"{c.name} {c.created_at.isoformat()}" for c in list_canaries(database)]
-    photos = [] if new is None else [new.photos[row].sha256 for row in new.rows]
+    photos = [] if new is None else [new.given.photos[row].sha256 for row in new.rows]
     records = [f"{owner} is on record" for owner in sources.owners.on_record]
     trusted = [f"{owner} is trusted" for owner in sources.trusted]
-    asks = options_fingerprint(QUERY)
-    return digest(asks, *maps, "|", *canaries, "|", *sorted([*photos, *records, *trusted]))
+    return digest(*maps, "|", *canaries, "|", *sorted([*photos, *records, *trusted]))
 
 
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
