@@ -108,7 +108,7 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
         reason=solution.reason,
         message=solution.message,
         measured=notes,
-        left_out=tuple(str(fit.edge) for fit in solution.left_out),
+        left_out=tuple(map(str, solution.left_out)),
     )
     if solution.reason is not None:
         return told
@@ -207,7 +207,7 @@ def _moved(
             moved[map_id] = there if before.is_anchor else inflated(there)
         corrections[map_id] = own
     places = {m: place_of(moved[m]) if m in moved else maps[m].place for m in solution.corrections}
-    contradicting = {(fit.edge.a, fit.edge.b) for fit in solution.left_out}
+    contradicting = {(edge.a, edge.b) for edge in solution.left_out}
     new, reports = [], []
     for map_id, feature_map in moved.items():
         before = maps[map_id]
