@@ -56,7 +56,6 @@ class GrownEntry:
     points: int = 0
     parents: tuple[str, ...] = ()
     generation: int = 0
-    steps: int | None = None
     drift_m: float | None = None
     budget_m: float | None = None
     gates: Mapping[str, Any] = field(default_factory=dict)
@@ -129,9 +128,9 @@ def _entry_line(entry: GrownEntry) -> str:
     drift = ""
     if entry.drift_m is not None and entry.budget_m is not None:
         drift = f", {entry.drift_m:.2f} of {entry.budget_m:.2f} m"
-    steps = (
-        "" if entry.steps is None else f", {entry.steps} step{'s' if entry.steps != 1 else ''} from an anchor"
-    )
+    steps = ""
+    if entry.generation:
+        steps = f", {entry.generation} step{'s' if entry.generation != 1 else ''} from an anchor"
     code = f"{entry.reason_code}: " if entry.reason_code else ""
     return (
         f"map {entry.map_id or '-'}: {entry.status}, {len(entry.photos)} photos, {entry.points} points{steps}"
@@ -167,7 +166,6 @@ def grown_entry(feature_map: FeatureMap) -> GrownEntry:
         points=len(feature_map.points),
         parents=feature_map.parents,
         generation=feature_map.generation,
-        steps=growth.get("steps"),
         drift_m=growth.get("drift_m"),
         budget_m=growth.get("budget_m"),
         gates=growth.get("gates", {}),

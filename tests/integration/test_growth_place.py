@@ -12,6 +12,7 @@ from featuredb.maps.move import move_map
 from ingest.colmap.anchored import with_observations
 from ingest.colmap.bridge import Model
 from ingest.growth.graph.map_graph import grow_within_budget
+from ingest.growth.map_places import drift_m, places_of
 from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos
@@ -86,9 +87,9 @@ def test_a_reconstruction_is_placed_and_becomes_a_map(
     assert feature_map.placement.method == "map"
     assert feature_map.height_datum == "ellipsoidal"
     growth = feature_map.placement.evidence["growth"]
-    assert growth["steps"] == 1
     assert all(gate["passes"] for gate in growth["gates"].values())
-    assert 0.0 < growth["drift_m"] < 0.5
+    relative = np.reshape(growth["covariance_relative"], (7, 7))
+    assert 0.0 < drift_m(relative, places_of(feature_map)) < 0.5
     # On Earth it is as uncertain as its parent, and a little more.
     earth = np.sqrt(np.diag(feature_map.placement.covariance)[4:])
     assert (earth > 0.5).all()

@@ -264,7 +264,7 @@ def test_a_report_tells_all_in_both_forms() -> None:
         maps=(
             GrownEntry(
                 map_id="m", status="active", reason_code="", reason="2 sources", photos=("p",), points=9,
-                steps=1, drift_m=0.31, budget_m=0.5,
+                generation=1, drift_m=0.31, budget_m=0.5,
             ),
         ),
         promotions=(

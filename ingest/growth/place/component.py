@@ -14,7 +14,6 @@ from featuredb.maps.lineage import GROWTH
 from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.growth import gates
-from ingest.growth.map_places import growth_of
 from ingest.growth.place.localised import in_frame, with_lens
 from ingest.growth.place.placement import MapsPlacement, parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
@@ -140,7 +139,6 @@ def _assembled(
             gates=placement.gates,
         )
     growth = {
-        "steps": 1 + max(int(growth_of(m.placement.evidence).get("steps", 0)) for m, _ in parents),
         "covariance_relative": to_anchors.ravel().tolist(),
         "gates": gates.figures(placement.gates),
         "bending_m": refined.bending_m,
