@@ -110,7 +110,8 @@ def test_the_bound_of_drift_holds(area: IndexedArea) -> None:
         found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
         grown = grow_component(new.model, new.photos, new.features_of, found, [area], identity())
         assert isinstance(grown, GrownMap)
-        bound = grown.feature_map.placement.evidence["growth"]["drift_m"]
+        growth = grown.feature_map.placement.evidence["growth"]
+        bound = drift_m(np.reshape(growth["covariance_relative"], (7, 7)), places_of(grown.feature_map))
         beyond += int(centers_error(grown, new).max() > bound)
     assert beyond <= 1
 

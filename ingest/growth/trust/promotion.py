@@ -30,7 +30,7 @@ PARENT_MOVED = "was placed anew"  # said of maps whose parent was, see featuredb
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ExaminedMap:
-    """A map that others confirm, and the write id of its state in the database.
+    """A map that others confirm, as `summary` has it in the database.
 
     Attributes:
         feature_map: with descriptors where they confirm it: a photo that is altered in one part brings that
@@ -38,9 +38,9 @@ class ExaminedMap:
         earned: candidate ids of its photos that make a record for their owners.
     """
 
+    summary: MapSummary
     feature_map: FeatureMap
     confirmation: Confirmation
-    write_id: str
     earned: frozenset[str]
 
 
@@ -96,17 +96,14 @@ def promote_confirmed(
     found = _examined(open_maps, snapshot, sources, new, options.threads)
     for summary, one in zip(open_maps, found, strict=True):
         if isinstance(one, ExaminedMap):
-            ready.append(_committed(database, summary, one))
+            ready.append(one)
         else:
             outcomes.append(_stays(summary.map_id, one))
             remember(work, "maps", summary.map_id, one.as_json(), asked)
 
     def by_itself(was: ExaminedMap) -> ExaminedMap | Refused:
-        summary = snapshot.get(was.feature_map.map_id)
         as_is = replace(sources, owners=read_owners(database, database.snapshot()))
-        (one,) = _examined([summary], snapshot, as_is, new, options.threads)
-        there = replace(summary, write_id=was.write_id, descriptors=_descriptors(was.feature_map))
-        return _committed(database, there, one) if isinstance(one, ExaminedMap) else one
+        return _examined([was.summary], snapshot, as_is, new, options.threads)[0]
 
     if ready:
         decided = _promote(database, localiser, ready, by_itself)
@@ -184,9 +181,9 @@ def _examine(
     contributed = sources.owners.made_of.get(feature_map.map_id, frozenset())
     earned = {i.sha256[:32] for i in feature_map.images if i.image_id in confirmation.earned}
     return ExaminedMap(
+        summary=summary,
         feature_map=answering_with(feature_map, confirmation.points),
         confirmation=confirmation,
-        write_id=summary.write_id,
         earned=frozenset(earned & contributed),
     )
 
@@ -227,18 +224,14 @@ def _others(me: MapSummary, snapshot: Snapshot) -> list[FeatureMap]:
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
 
-def _committed(database: Database, summary: MapSummary, found: ExaminedMap) -> ExaminedMap:
-    """The map with the descriptors that it will answer with, still in quarantine; the same place."""
-    if _descriptors(found.feature_map) == summary.descriptors:
-        return replace(found, write_id=summary.write_id)
-    result = database.commit_map(
-        found.feature_map, replaces=summary.map_id, based_on=summary.write_id, moves=False
-    )
-    return replace(found, write_id=result.write_id)
-
-
-def _descriptors(feature_map: FeatureMap) -> int:
-    return int(feature_map.observations.has_descriptor.sum())
+def _committed(database: Database, found: ExaminedMap) -> str:
+    """The map with the descriptors that it will answer with, still in quarantine; its write id."""
+    described = int(found.feature_map.observations.has_descriptor.sum())
+    write_id = found.summary.write_id
+    if described == found.summary.descriptors:
+        return write_id
+    map_id = found.summary.map_id
+    return database.commit_map(found.feature_map, replaces=map_id, based_on=write_id, moves=False).write_id
 
 
 def _promote(
@@ -272,7 +265,8 @@ def _promote(
 
 
 def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) -> CanaryRun:
-    after = Localiser.open(database, previous=before, also=[m.map_id for m in maps])
+    instead = {m.map_id: m for m in maps}
+    after = Localiser.open(database, previous=before, also=instead.keys(), instead=instead)
     return run_canaries(database, before, after, maps)
 
 
@@ -285,10 +279,10 @@ def _decide(
     confirmed = "; ".join(dict.fromkeys(found.confirmation.message for found in ready))
     reason = f"{confirmed}; {run.message}"
     active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
-    based_on = {found.feature_map.map_id: found.write_id for found in ready}
     for found in ready:
         mark_confirmed(database, found.earned, found.feature_map.map_id)
     try:
+        based_on = {found.feature_map.map_id: _committed(database, found) for found in ready}
         database.set_status(list(asked), "active", reason, based_on=based_on, active=active)
     except ConflictError as error:
         _LOG.info("promotion of %s waits: %s", list(asked), error)
