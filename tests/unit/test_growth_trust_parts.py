@@ -18,7 +18,7 @@ from ingest.growth.graph.map_graph import (
     graph_edges,
     graph_nodes,
     no_surer_than,
-    place_of,
+    place_key,
     solve_with_new,
 )
 from ingest.growth.graph.pose_graph import solve_pose_graph
@@ -36,6 +36,10 @@ from tests.support.scene_strip import EDGE, FRAME, east, sources_of, strip_map
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])
 
 
+def _place_of(feature_map: FeatureMap) -> str:
+    return place_key(feature_map.frame, feature_map.placement)
+
+
 def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
     growth = growth_of(feature_map.placement.evidence)
     return PlacedMap(
@@ -46,11 +50,10 @@ def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
         generation=feature_map.generation,
         parents=feature_map.parents,
         frame=feature_map.frame,
-        covariance=feature_map.placement.covariance,
-        place=place_of(feature_map),
+        placement=feature_map.placement,
+        place=_place_of(feature_map),
         corners=places_of(feature_map),
         edges=tuple(Edge.from_json(e) for e in growth.get("edges", ())),
-        evidence=feature_map.placement.evidence,
     )
 
 
@@ -67,8 +70,8 @@ def test_an_edge_survives_json() -> None:
 
 def test_a_map_that_moves_has_another_place() -> None:
     moved = strip_map("A", 20.0, owners=["survey"], move=east(0.01))
-    assert place_of(_ANCHOR) == place_of(strip_map("A", 20.0, owners=["else"]))
-    assert place_of(moved) != place_of(_ANCHOR)
+    assert _place_of(_ANCHOR) == _place_of(strip_map("A", 20.0, owners=["else"]))
+    assert _place_of(moved) != _place_of(_ANCHOR)
 
 
 def test_drift_of_a_chain_grows_with_its_steps() -> None:
@@ -116,7 +119,7 @@ def test_an_anchor_that_another_one_moved_does_not_count_their_overlap_twice() -
     gps, child = strip_map("gps", 20.0, covariance=loose), strip_map("m", 45.0, parents=[_ANCHOR])
     to_gps = Edge(
         map_id="gps",
-        place=place_of(gps),
+        place=_place_of(gps),
         other_from_map=east(2.0),
         covariance=EDGE,
         shared_points=9,
@@ -129,7 +132,8 @@ def test_an_anchor_that_another_one_moved_does_not_count_their_overlap_twice() -
     moved = first.corrections["gps"]
     assert np.linalg.norm(moved.translation) > 1.5
     own = {"covariance": loose.ravel().tolist(), "present_from_own": moved.log().tolist()}
-    there = replace(maps["gps"], covariance=first.covariance["gps"], evidence={"growth": {OWN: own}})
+    anew = replace(gps.placement, covariance=first.covariance["gps"], evidence={"growth": {OWN: own}})
+    there = replace(maps["gps"], placement=anew)
     agreeing = moved @ to_gps.other_from_map @ first.corrections["m"].inverse()
     edges = (maps["m"].edges[0], replace(to_gps, other_from_map=agreeing))
     maps |= {"gps": there, "m": replace(maps["m"], edges=edges)}

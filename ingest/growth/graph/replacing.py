@@ -25,7 +25,7 @@ from ingest.growth.graph.map_graph import (
     graph_nodes,
     holds,
     in_graph,
-    place_of,
+    place_key,
     placed_maps,
 )
 from ingest.growth.graph.pose_graph import GraphSolution, solve_pose_graph
@@ -206,7 +206,8 @@ def _moved(
             there = move_map(snapshot.load_map(map_id), own, covariance=covariance)
             moved[map_id] = there if before.is_anchor else inflated(there)
         corrections[map_id] = own
-    places = {m: place_of(moved[m]) if m in moved else maps[m].place for m in solution.corrections}
+    places = {m: maps[m].place for m in solution.corrections}
+    places |= {m: place_key(there.frame, there.placement) for m, there in moved.items()}
     contradicting = {(edge.a, edge.b) for edge in solution.left_out}
     new, reports = [], []
     for map_id, feature_map in moved.items():
@@ -221,7 +222,7 @@ def _moved(
         again = PARENT_MOVED in before.status_reason and drift <= budget_m
         active = before.status == "active" or again
         new.append(replace(finished, status="active" if active else "quarantined"))
-        drifted = growth_of(before.evidence).get("drift_m")
+        drifted = growth_of(before.placement.evidence).get("drift_m")
         reports.append(
             MovedMap(
                 map_id=map_id, move_m=round(ways[map_id], 4), drift_before_m=drifted, drift_m=round(drift, 4)
