@@ -18,6 +18,7 @@ from ingest.colmap.bridge import Model, SfmPhoto, TwoView
 from ingest.growth.place.localised import in_frame
 from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, tied_together
 from ingest.sfm.pairs import Pair
+from reloc.localise.pose import reprojection_errors
 
 _LEAST_FITTING = 0.7  # share of a pair's verified matches that must fit the poses
 # Median between the rays. Below, any two photos from one spot fit, and two copies of one picture.
@@ -68,8 +69,8 @@ def poses_fit(a: LocalisedPhoto, b: LocalisedPhoto, pixels_a: FloatArray, pixels
     points, angle = intersections(a.camera, a.cam_from_local, pixels_a, b.camera, b.cam_from_local, pixels_b)
     fits = np.ones(len(points), dtype=np.bool_)
     for photo, pixels in ((a, pixels_a), (b, pixels_b)):
-        error = np.linalg.norm(photo.camera.project(photo.cam_from_local.act(points)) - pixels, axis=1)
-        fits &= np.nan_to_num(error, nan=np.inf) < TOLERANCE_PX * pixel_scale(photo.camera)
+        errors = reprojection_errors(pixels, points, photo.camera, photo.cam_from_local)
+        fits &= errors < TOLERANCE_PX * pixel_scale(photo.camera)
     enough = fits.sum() >= _LEAST_FITTING * len(fits)
     return bool(enough and np.degrees(np.median(angle[fits])) >= _LEAST_ANGLE_DEG)
 

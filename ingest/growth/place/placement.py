@@ -36,12 +36,10 @@ from ingest.photos.photo import Photo
 from reloc.localise.acceptance import agreement
 from reloc.localise.matching import EXPECTED_DEG, visible_points
 
-_LEAST_PHOTOS = 2  # of the new ones that must see an existing map for it to be a parent
 # Least share of the parts that should show points of existing maps or of the photo's own reconstruction. A
 # re-upload 13.3 m off showed 0.17; right photos of that database 0.32 and more, of the one that grew with
 # this limit 0.23 and more.
 _LEAST_SHOWN = 0.25
-_LEAST_POINTS = 30  # a photo that should see fewer says nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -195,7 +193,7 @@ def edges_of(
         mine = used & (correspondences.map_of == m)
         points = len(np.unique(correspondences.point_of[mine]))
         photos = len(np.unique(correspondences.photo_of[mine]))
-        if points < LEAST_SHARED_POINTS or photos < _LEAST_PHOTOS:
+        if points < LEAST_SHARED_POINTS or photos < gates.LEAST_AGREEING:
             continue
         alone = fit_similarity(model, fit.local_from_sfm, correspondences, mine)
         found.append(
@@ -261,7 +259,7 @@ def _shown_parts(
         seen_own = model.point_of[(model.photo_of == k) & often[model.point_of]]
         for row in range(2):
             should = np.concatenate(expected)
-            if len(should) >= _LEAST_POINTS:
+            if len(should) >= LEAST_SHARED_POINTS:
                 shares[row, k] = agreement(np.concatenate(seen), should, camera.width, camera.height)
             expected.append(camera.project(pose.act(model.xyz[own])))
             seen.append(camera.project(pose.act(model.xyz[seen_own])))

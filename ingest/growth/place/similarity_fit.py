@@ -23,6 +23,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto
+from reloc.localise.pose import reprojection_errors
 
 _CHI2_2_MEDIAN = 1.386  # of the squared length of two normal coordinates
 _CHI2_2_95 = 5.991
@@ -260,9 +261,11 @@ def correspondence_errors(model: Model, sim: Sim3, correspondences: Corresponden
     for k in np.unique(correspondences.photo_of):
         rows = np.flatnonzero(correspondences.photo_of == k)
         camera = model.cameras[int(model.camera_of[k])]
-        pixels = camera.project(model.cam_from_sfm[k].act(into_sfm.act(correspondences.points[rows])))
-        errors[rows] = np.linalg.norm(pixels - correspondences.pixels[rows], axis=1)
-    return np.where(np.isfinite(errors), errors, np.inf)
+        points = into_sfm.act(correspondences.points[rows])
+        errors[rows] = reprojection_errors(
+            correspondences.pixels[rows], points, camera, model.cam_from_sfm[k]
+        )
+    return errors
 
 
 def tolerances_px(

@@ -18,16 +18,17 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import Gate
+from ingest.growth.place.localised import QUERY
 
 # A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
 # photo in common count as one, three photos that confirm each other as one and a half.
 _ONE_PAIR = 1.0
-# Common points of the map from which on two photos confirm each other. An accepted pose has at least so many
-# inliers (reloc.localise.options), and chance gives a few.
-_LEAST_SHARED_POINTS = 15
 # Distance of two cameras over their distance from what both see. The same picture given by two people, cut or
 # compressed anew, shows no parallax; poses of one place are good to some thousandths.
 _LEAST_PARALLAX = 0.01
+# Common points of the map from which on two photos confirm each other: an accepted pose has so many, chance
+# gives a few.
+_LEAST_SHARED_POINTS = QUERY.acceptance.min_inliers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,12 +13,8 @@ from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, NEAR_M, featur
 from ingest.growth.place.localised import in_frame, localise_photos
 from ingest.growth.place.overlaps import indexed_area, localise_image
 from ingest.growth.trust.confirmation import OutsidePhoto, Source, Sources
-from ingest.growth.values import GrowthPhotos, LocalisedPhoto
+from ingest.growth.values import DRIFT_BUDGET_M, GrowthPhotos, LocalisedPhoto
 from reloc.localise.candidates import IndexedArea
-
-# A photo whose place is known contradicts the map if the map has it further away than that, and than `SIGMAS`
-# standard deviations of both.
-_LEAST_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,7 +87,8 @@ def _heard(
     center, contradicts = here.cam_from_local.center, ""
     if known is not None:
         apart_m = float(np.linalg.norm(known[0] - center))
-        if apart_m > max(_LEAST_M, SIGMAS * float(np.sqrt(_spread(here) + known[1]))):
+        # What is nearer than a map may drift contradicts nothing.
+        if apart_m > max(DRIFT_BUDGET_M, SIGMAS * float(np.sqrt(_spread(here) + known[1]))):
             contradicts = f"{name} is {apart_m:.2f} m from where the map has it"
     points = np.unique(here.point_of)
     return OutsidePhoto(name=name, source=source, center=center, points=points, contradicts=contradicts)
