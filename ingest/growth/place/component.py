@@ -79,7 +79,7 @@ def grow_component(
     frame, near = _meeting_place(mine, areas)
     mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
-    model, lenses = adopt_lenses(model, mine, photos, near, keypoints)
+    model, lenses = adopt_lenses(model, photos, near, keypoints)
     camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
     mine = {r: with_lens(photo, model.cameras[camera_of[r]]) for r, photo in mine.items()}
     correspondences = find_correspondences(model, mine, dict(zip(rows, keypoints, strict=True)))
@@ -95,13 +95,14 @@ def grow_component(
 def _meeting_place(
     localised: Mapping[int, LocalisedPhoto], areas: Sequence[IndexedArea]
 ) -> tuple[LocalFrame, list[Area]]:
-    """The frame of the area with most inliers, and the areas whose heights have the same datum."""
+    """The frame of the area with most inliers; this area and then others whose heights have its datum."""
     inliers: dict[LocalFrame, int] = {}
     for photo in localised.values():
         inliers[photo.frame] = inliers.get(photo.frame, 0) + len(photo.pixels)
     frame = max(inliers, key=lambda f: inliers[f])
     datum = next(a.area for a in areas if a.area.frame == frame).maps[0].height_datum
-    return frame, [a.area for a in areas if a.area.maps[0].height_datum == datum]
+    near = [a.area for a in areas if a.area.maps[0].height_datum == datum]
+    return frame, sorted(near, key=lambda area: area.frame != frame)
 
 
 def _assembled(

@@ -5,7 +5,6 @@ after, that hang on the others by little, and that may be further off than allow
 without them, and say anew how sure they are.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -67,25 +66,23 @@ class Refinement:
 
 
 def adopt_lenses(
-    model: Model,
-    localised: Mapping[int, LocalisedPhoto],
-    photos: Sequence[Photo],
-    areas: Sequence[Area],
-    keypoints: Sequence[FloatArray],
+    model: Model, photos: Sequence[Photo], areas: Sequence[Area], keypoints: Sequence[FloatArray]
 ) -> tuple[Model, Lenses]:
     """The model adjusted, in its own frame, around the lenses that existing maps have for its cameras.
 
     Args:
         photos: all, rows as in the model.
-        areas: where it may lie; they lend lenses to cameras none of whose photos is localised, too.
+        areas: where it may lie; the first one that has a lens for a camera's EXIF key lends it.
         keypoints: pixels of all features of the model's photos, in the order of its rows.
     """
     lent: dict[int, Camera] = {}
     focals: dict[int, float] = {}
     for c, camera in enumerate(model.cameras):
         rows = model.rows[model.camera_of == c].tolist()
-        lens = _lens_of_maps([localised[r] for r in rows if r in localised])
-        lens = lens or _lens_for_key({photos[r].camera_key for r in rows}, areas)
+        keys = {photos[r].camera_key for r in rows}
+        key = keys.pop() if len(keys) == 1 else ""
+        known = (area.camera_for_key(key) for area in areas) if key else iter(())
+        lens = next((camera for camera in known if camera is not None), None)
         if lens is not None and (lens.width, lens.height) == (camera.width, camera.height):
             lent[c] = lens
         told = {photos[r].focal_px for r in rows}
@@ -97,19 +94,6 @@ def adopt_lenses(
         return model, lenses
     given = replace(model, cameras=tuple(lent.get(c, own) for c, own in enumerate(model.cameras)))
     return adjust_anchored(given, keypoints, FixedPoints.none(), lenses).model, lenses
-
-
-def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:
-    """The lens that a map lent to most of these photos; None where none did."""
-    lent = Counter(p.camera for p in photos if p.result.pose and p.result.pose.camera_source == "map")
-    return lent.most_common(1)[0][0] if lent else None
-
-
-def _lens_for_key(keys: set[str], areas: Sequence[Area]) -> Camera | None:
-    """The lens that the areas have for a camera's EXIF key, the first area's first."""
-    key = keys.pop() if len(keys) == 1 else ""
-    found = (area.camera_for_key(key) for area in areas) if key else iter(())
-    return next((camera for camera in found if camera is not None), None)
 
 
 def refine_placed(
