@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.geometry.sim3 import Sim3
-from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, features_and_points, model_of
 from ingest.growth.place.localised import in_frame, localise_photo
@@ -39,7 +37,7 @@ def measure_overlap(
     if feature_map.height_datum != other.height_datum:
         return Refused(reason="NO_OVERLAP", message="heights of different datums")
     images = _images_near(feature_map, other) if images is None else images
-    indexed = indexed_area(other)
+    indexed = IndexedArea.of([other])
     localised: dict[int, LocalisedPhoto] = {}
     for row, image in enumerate(images):
         found = localise_image(feature_map, image, row, [indexed])
@@ -90,12 +88,6 @@ def _fitted(
         shared_points=points,
         photos=len(agree),
     )
-
-
-def indexed_area(*maps: FeatureMap) -> IndexedArea:
-    """Maps alone, ready to be asked."""
-    area = build_area(maps)
-    return IndexedArea(area=area, index=build_index(area.descriptors))
 
 
 def localise_image(

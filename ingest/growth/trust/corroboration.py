@@ -11,7 +11,7 @@ from featuredb.store.candidates.states import OPERATOR
 from ingest.growth.gates import SIGMAS
 from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, NEAR_M, features_and_points
 from ingest.growth.place.localised import in_frame, localise_photos
-from ingest.growth.place.overlaps import indexed_area, localise_image
+from ingest.growth.place.overlaps import localise_image
 from ingest.growth.trust.confirmation import OutsidePhoto, Source, Sources
 from ingest.growth.values import DRIFT_BUDGET_M, GrowthPhotos, LocalisedPhoto
 from reloc.localise.candidates import IndexedArea
@@ -62,7 +62,7 @@ def corroborate(
         others: maps around it, active or quarantined.
         write_id: of the map as it is.
     """
-    indexed, own = indexed_area(feature_map), set(sources.of_map(feature_map))
+    indexed, own = IndexedArea.of([feature_map]), set(sources.of_map(feature_map))
     if not len(indexed.area.points):
         return []
     heard = list(_of_maps(feature_map, others, indexed, own, sources))
