@@ -88,7 +88,8 @@ def reconstructed_photos(done: Reconstructed, candidate_ids: Mapping[int, str] |
         features_of=done.features.__getitem__,
         models=done.reconstruction.models,
         candidate_ids=candidate_ids or {},
-        overlaps=done.inliers.keys(),
+        overlaps=done.matched.inliers.keys(),
+        geometry_of=done.matched.geometry,
     )
 
 

@@ -147,8 +147,8 @@ def ingest_photos(
         started=started,
         options=dataclasses.asdict(dataclasses.replace(options, survey=None, vocabulary=None)),
         versions=library_versions(),
-        pairs=len(result.pairs),
-        verified_pairs=len(result.inliers),
+        pairs=len(result.matched.files),
+        verified_pairs=len(result.matched.inliers),
         stages=tuple(StageTiming(name=n, seconds=s, **clock.counts[n]) for n, s in clock.seconds.items()),
         photos=photo_outcomes(scanned.photos, result, registered, options.stop_after),
         maps=outcomes,
@@ -158,7 +158,7 @@ def ingest_photos(
             *_quarantine_note(quarantined),
             *(
                 f"Matching of {lost.task} is lost: {lost.reason}"
-                for lost in result.lost_matches[:_MOST_NOTES]
+                for lost in result.matched.lost[:_MOST_NOTES]
             ),
         ),
     )
@@ -329,9 +329,10 @@ def _warnings(
     if options.stop_after is not None:
         return (f"Stopped after {options.stop_after}, as asked; nothing beyond it was done.",)
     if not outcomes:
+        verified, tried = len(result.matched.inliers), len(result.matched.files)
         return (
-            f"No reconstruction: {len(result.inliers)} of {len(result.pairs)} pairs of photos have enough "
-            "verified matches. Photos of one place must overlap by more than half.",
+            f"No reconstruction: {verified} of {tried} pairs of photos have enough verified matches. Photos "
+            "of one place must overlap by more than half.",
         )
     if options.survey is not None and any(o.status == "already_there" for o in outcomes):
         return (

@@ -19,7 +19,7 @@ from featuredb.stage_clock import StageClock
 from ingest.clusters.graph import ClusterOptions, find_clusters
 from ingest.clusters.join import JoinOptions
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
-from ingest.executor import Executor, Lost, Progress, no_progress
+from ingest.executor import Executor, Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapOptions
 from ingest.photos.duplicates import copies_of
@@ -77,11 +77,9 @@ class Reconstructed:
         reconstruction: models on disk.
         unreadable: photos by name whose pixels could not be read, with the reason.
         lost: photos by name whose tasks ended every worker that ran them, with the reason.
-        lost_matches: tasks of matching that did so; their pairs count as not overlapping.
         copies: photos by name that show the picture of another owner's, with that one's name.
         features_per_photo: number of features by photo name.
-        pairs: pairs tried, by row.
-        inliers: verified matches of the pairs that have enough of them.
+        matched: pairs of rows, tried and verified; those of lost tasks count as not overlapping.
         matches_per_photo: verified matches by photo name, summed over its pairs.
     """
 
@@ -90,11 +88,9 @@ class Reconstructed:
     reconstruction: Reconstruction = field(default_factory=Reconstruction)
     unreadable: dict[str, str] = field(default_factory=dict)
     lost: dict[str, str] = field(default_factory=dict)
-    lost_matches: tuple[Lost, ...] = ()
     copies: dict[str, str] = field(default_factory=dict)
     features_per_photo: dict[str, int] = field(default_factory=dict)
-    pairs: tuple[Pair, ...] = ()
-    inliers: dict[Pair, int] = field(default_factory=dict)
+    matched: Matched = field(default_factory=lambda: Matched(inliers={}, files={}))
     matches_per_photo: dict[str, int] = field(default_factory=dict)
 
 
@@ -156,22 +152,20 @@ def reconstruct_photos(
         features_per_photo={
             p.name: len(read_keypoints(f)) for p, f in zip(usable, features.paths, strict=True)
         },
-        pairs=tuple(matched.files),
-        lost_matches=matched.lost,
-        inliers=matched.inliers,
+        matched=matched,
         matches_per_photo=_matches_per_photo(usable, matched.inliers),
     )
     if stop_after == "match":
         return done
 
     with clock.stage("reconstruct") as counts:
-        made = _reconstruct(done, matched, workspace, options, executor, progress)
+        made = _reconstruct(done, workspace, options, executor, progress)
         keys = zoomed_keys(made.models(), usable, features)
         if keys:
             logger.info("%d photos of shots whose lens zooms: they are reconstructed again", len(keys))
             usable = tuple(replace(p, camera_key=keys.get(p.name, p.camera_key)) for p in usable)
             done = replace(done, usable=usable)
-            made = _reconstruct(done, matched, workspace, options, executor, progress)
+            made = _reconstruct(done, workspace, options, executor, progress)
         counts |= {"reused": made.reused, "total": made.blocks}
     lost = {usable[row].name: reason for row, reason in made.lost.items()}
     return replace(done, reconstruction=made, lost=lost)
@@ -179,13 +173,12 @@ def reconstruct_photos(
 
 def _reconstruct(
     done: Reconstructed,
-    matched: Matched,
     workspace: Workspace,
     options: MapMakingOptions,
     executor: Executor,
     progress: Progress,
 ) -> Reconstruction:
-    photos, smallest = done.usable, options.sfm.min_model_photos
+    photos, matched, smallest = done.usable, done.matched, options.sfm.min_model_photos
     cameras, camera_rows = photo_cameras(photos, options.cameras, options.sfm.camera_model)
     clusters = find_clusters(len(photos), matched.inliers, smallest, options.clusters)
     views: list[SfmView] = [

@@ -22,8 +22,6 @@ from featuredb.errors import (
     UnplacedBesideOthersError,
 )
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
@@ -253,19 +251,14 @@ class Localiser:
         return replace(result, pose=replace(result.pose, lineage=tuple(told)))
 
 
-def _indexed(maps: Sequence[FeatureMap]) -> IndexedArea:
-    area = build_area(maps)
-    return IndexedArea(area=area, index=build_index(area.descriptors))
-
-
 def _area_of_one(snapshot: Snapshot, map_id: str) -> IndexedArea:
-    return _indexed([snapshot.load_map(map_id)])
+    return IndexedArea.of([snapshot.load_map(map_id)])
 
 
 def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
     """A map without a place, and its area at the stand-in."""
     unplaced = snapshot.load_unplaced(map_id)
-    indexed = _indexed([at_stand_in(unplaced)])
+    indexed = IndexedArea.of([at_stand_in(unplaced)])
     return replace(unplaced, observations=unplaced.observations.none()), indexed
 
 
@@ -275,7 +268,7 @@ def _load(
     key: tuple[str, ...],
     instead: Mapping[str, FeatureMap],
 ) -> _Loaded:
-    indexed = _indexed([instead.get(m.map_id) or snapshot.load_map(m.map_id) for m in group])
+    indexed = IndexedArea.of([instead.get(m.map_id) or snapshot.load_map(m.map_id) for m in group])
     points, images = len(indexed.area.points), len(indexed.area.image_map)
     _LOG.info("area of %d maps: %d points, %d images", len(group), points, images)
     return _Loaded(key=key, map_ids=frozenset(m.map_id for m in group), indexed=indexed)

@@ -41,8 +41,6 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.similarity import similarity_closed_form
-from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
@@ -184,8 +182,7 @@ def drawn(seed: int, sigma_m: float) -> list[AnswerErrors]:
     made = _map_of(scene, poses, frame, sigma_m)
     if made is None:
         return []
-    area = build_area([made])
-    indexed = [IndexedArea(area=area, index=build_index(area.descriptors))]
+    indexed = [IndexedArea.of([made])]
     answers = []
     request = LocaliseRequest(camera_key=_KEY, exif_focal_px=_FOCAL_PX)
     for _ in range(_QUERIES):

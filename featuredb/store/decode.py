@@ -55,7 +55,7 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
             height_datum=row["height_datum"],
             frame=frame_of(row),
             points=MapPoints(utm=points.pop("coordinates"), **points),
-            placement=_decode_placement(row),
+            placement=placement_of(row),
             generation=row["generation"],
             **shared,
         )
@@ -89,7 +89,8 @@ def _coordinate_columns(row: Row) -> tuple[str, ...]:
     return ("easting", "northing", "height") if has_place(row) else OWN_COORDINATES
 
 
-def _decode_placement(row: Row) -> Placement:
+def placement_of(row: Row) -> Placement:
+    """Of a map with a place."""
     return Placement(
         method=row["method"],
         local_from_sfm=Sim3(

@@ -30,41 +30,22 @@ from ingest.colmap.bridge import (
 )
 
 _FUNCTION_TOLERANCE = 1e-6  # relative
+_ROUNDS = 3  # of adjusting and dropping
+# Of the Cauchy loss, and of observations that are dropped between rounds, at images of 1600: a SIFT keypoint
+# is good to about half a pixel of the image that it was found on, and reconstruction itself allows four.
+_LOSS_PX, _MAX_ERROR_PX = 0.5, 4.0
+# Of a lens that a map lends, against that map's points. They were made with that very lens: what it trades
+# for height, they trade alike. Photos were localised with it, so it is no mistake that photos could find out,
+# and its prior never lets go. Of the coefficients of a lens that is not whole no more is known than of any.
+_LENT = LensWidths(focal_rel=0.003, aspect_rel=0.0005, center_rel=0.001, radial=0.0005, tangential=0.0005)
+# What is known of other lenses, what observations count against it, and the solver: as where reconstructions
+# are made.
+MAPPING = AdjustOptions()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnchoredOptions:
-    """The adjustment.
-
-    Attributes:
-        loss_scale_px: of the Cauchy loss, at `error_reference_side_px`: a SIFT keypoint is good to about
-            half a pixel of the image that it was found on.
-        max_error_px: observations further off are dropped between rounds, at the same size; what
-            reconstruction itself allows.
-        error_reference_side_px: keypoints are located on images of about this size.
-        rounds: of adjusting and dropping.
-        lent: of a lens that a map lends, against that map's points. They were made with that very lens: what
-            it trades for height, they trade alike. Photos were localised with it, so it is no mistake that
-            photos could find out, and its prior never lets go. Of the coefficients of a lens that is not
-            whole no more is known than of any lens.
-        mapping: what is known of other lenses, what observations count against it, and the solver, all as
-            where reconstructions are made.
-    """
-
-    loss_scale_px: float = 0.5
-    max_error_px: float = 4.0
-    error_reference_side_px: int = 1600
-    rounds: int = 3
-    lent: LensWidths = field(
-        default_factory=lambda: LensWidths(
-            focal_rel=0.003, aspect_rel=0.0005, center_rel=0.001, radial=0.0005, tangential=0.0005
-        )
-    )
-    mapping: AdjustOptions = field(default_factory=AdjustOptions)
-
-    def keypoint_px(self, cameras: Sequence[Camera]) -> float:
-        """`loss_scale_px` at the size of these cameras' pictures."""
-        return self.loss_scale_px * max(1.0, longest_side(cameras) / self.error_reference_side_px)
+def pixel_scale(*cameras: Camera) -> float:
+    """Pixels of the longest side for one of an image of 1600, on which SIFT locates keypoints; at least 1."""
+    return max(1.0, longest_side(cameras) / 1600.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,19 +62,19 @@ class Lenses:
     lent: Mapping[int, Camera] = field(default_factory=dict)
     focal_px: Mapping[int, float] = field(default_factory=dict)
 
-    def priors(self, cameras: Sequence[Camera], options: AnchoredOptions) -> tuple[LensPrior | None, ...]:
+    def priors(self, cameras: Sequence[Camera]) -> tuple[LensPrior | None, ...]:
         """Of whole lenses; None for those that are held."""
 
         def prior(c: int, camera: Camera) -> LensPrior | None:
             if c in self.held:
                 return None
             if c in self.lent:
-                lens, widths = whole_camera(self.lent[c]), options.lent
+                lens, widths = whole_camera(self.lent[c]), _LENT
                 if lens != self.lent[c]:  # the map did not ask for the other coefficients
-                    any_lens = options.mapping.lens
+                    any_lens = MAPPING.lens
                     widths = replace(widths, radial=any_lens.radial, tangential=any_lens.tangential)
                 return lens_prior(lens, widths, robust=False)
-            return lens_prior_of(whole_camera(camera), self.focal_px.get(c), options.mapping)
+            return lens_prior_of(whole_camera(camera), self.focal_px.get(c), MAPPING)
 
         return tuple(prior(c, camera) for c, camera in enumerate(cameras))
 
@@ -134,11 +115,7 @@ class Anchored:
 
 
 def adjust_anchored(
-    model: Model,
-    keypoints: Sequence[FloatArray],
-    fixed: FixedPoints,
-    lenses: Lenses,
-    options: AnchoredOptions,
+    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints, lenses: Lenses
 ) -> Anchored:
     """Adjust poses, free points and whole lenses; without fixed points the first photo's pose stays.
 
@@ -147,21 +124,21 @@ def adjust_anchored(
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
-    priors = lenses.priors(model.cameras, options)
+    priors = lenses.priors(model.cameras)
     state = model
-    keypoint_px = options.keypoint_px(model.cameras)
+    keypoint_px = _LOSS_PX * pixel_scale(*model.cameras)
     variance_px2 = keypoint_px**2  # until the model has settled
-    for _ in range(options.rounds):
+    for _ in range(_ROUNDS):
         block, marks = block_and_marks(state, observation, keypoints, fixed, kept)
         terms = Terms(
             keypoint_px=keypoint_px,
-            dilution=options.mapping.dilution * variance_px2 / keypoint_px**2,
+            dilution=MAPPING.dilution * variance_px2 / keypoint_px**2,
             lenses=priors,
             marks=replace(marks, sigma_px=keypoint_px),
             held_photos=() if len(fixed.point_of) else (0,),
         )
-        problem = Problem(block, terms, options.mapping.threads)
-        problem.solve(options.mapping.max_iterations, _FUNCTION_TOLERANCE)
+        problem = Problem(block, terms, MAPPING.threads)
+        problem.solve(MAPPING.max_iterations, _FUNCTION_TOLERANCE)
         found = problem.block()
         variance_px2 = block_variance_px2(found, marks)
         cameras = zip(model.cameras, found.cameras, priors, strict=True)
@@ -171,7 +148,7 @@ def adjust_anchored(
             cam_from_sfm=found.cam_from_block,
             xyz=found.xyz,
         )
-        observation, kept = _fitting(state, keypoints, fixed, options)
+        observation, kept = _fitting(state, keypoints, fixed)
         observation &= _in_tracks(state, observation)
     return Anchored(model=with_observations(state, observation), fixed_kept=kept)
 
@@ -200,16 +177,14 @@ def block_and_marks(
 
 
 def _fitting(
-    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints, options: AnchoredOptions
+    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which observations of free and of fixed points lie within the tolerance."""
     free = np.zeros(len(model.point_of), dtype=np.bool_)
     held = np.zeros(len(fixed.point_of), dtype=np.bool_)
     for k, pose in enumerate(model.cam_from_sfm):
         camera = model.cameras[int(model.camera_of[k])]
-        limit = options.max_error_px * max(
-            1.0, max(camera.width, camera.height) / options.error_reference_side_px
-        )
+        limit = _MAX_ERROR_PX * pixel_scale(camera)
         mine = np.flatnonzero(model.photo_of == k)
         pixels = camera.project(pose.act(model.xyz[model.point_of[mine]]))
         free[mine] = np.linalg.norm(pixels - keypoints[k][model.keypoint_of[mine]], axis=1) < limit
@@ -251,7 +226,7 @@ def triangulate_posed(
         settings.triangulation.ignore_two_view_tracks = False
         settings.num_threads = 1
         settings.random_seed = 0
-        error_px = 4.0 * max(1.0, longest_side(cameras) / AnchoredOptions().error_reference_side_px)
+        error_px = _MAX_ERROR_PX * pixel_scale(*cameras)
         settings.triangulation.create_max_angle_error = 2.0
         settings.mapper.filter_max_reproj_error = error_px
         settings.triangulation.complete_max_reproj_error = error_px

@@ -1,4 +1,4 @@
-"""What a run of growth has come to, and its report: photos by outcome and reason, maps; JSON and text."""
+"""The report of a run of growth: photos by outcome and reason, maps; JSON and text."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -6,16 +6,12 @@ from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
-from featuredb.store import Snapshot
-from featuredb.store.candidates.states import OPERATOR
+from featuredb.maps.feature_map import FeatureMap
 from ingest.growth.gates import figures
 from ingest.growth.graph.replacing import Replacement
 from ingest.growth.map_places import growth_of
-from ingest.growth.not_found import NotFoundRows
-from ingest.growth.place.component import GrownMap
 from ingest.growth.trust.promotion import Promotion
-from ingest.growth.values import GrowthPhotos, LocalisedPhoto, Refused
-from ingest.photos.photo import Photo
+from ingest.growth.values import Refused
 
 PhotoOutcome = Literal["promoted", "quarantined", "waiting", "refused"]
 _WORDS: tuple[tuple[PhotoOutcome, str], ...] = (
@@ -60,7 +56,6 @@ class GrownEntry:
     points: int = 0
     parents: tuple[str, ...] = ()
     generation: int = 0
-    steps: int | None = None
     drift_m: float | None = None
     budget_m: float | None = None
     gates: Mapping[str, Any] = field(default_factory=dict)
@@ -133,9 +128,9 @@ def _entry_line(entry: GrownEntry) -> str:
     drift = ""
     if entry.drift_m is not None and entry.budget_m is not None:
         drift = f", {entry.drift_m:.2f} of {entry.budget_m:.2f} m"
-    steps = (
-        "" if entry.steps is None else f", {entry.steps} step{'s' if entry.steps != 1 else ''} from an anchor"
-    )
+    steps = ""
+    if entry.generation:
+        steps = f", {entry.generation} step{'s' if entry.generation != 1 else ''} from an anchor"
     code = f"{entry.reason_code}: " if entry.reason_code else ""
     return (
         f"map {entry.map_id or '-'}: {entry.status}, {len(entry.photos)} photos, {entry.points} points{steps}"
@@ -159,77 +154,38 @@ def _replacement_lines(replacements: Sequence[Replacement]) -> list[str]:
     return lines
 
 
-@dataclass(slots=True, kw_only=True)
-class Run:
-    """What a run has come to; rows of the new photos."""
-
-    map_of: dict[int, str] = field(default_factory=dict)
-    why: dict[int, tuple[str, str]] = field(default_factory=dict)
-    entries: dict[str, GrownEntry] = field(default_factory=dict)
-    refused: list[GrownEntry] = field(default_factory=list)
-    unplaced: list[GrownEntry] = field(default_factory=list)
-    promotions: dict[str, Promotion] = field(default_factory=dict)
-    replacements: list[Replacement] = field(default_factory=list)
-    notes: dict[str, None] = field(default_factory=dict)
-    heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
-    lost: NotFoundRows
-    rounds: int = 0
-
-    def note_refusal(self, refused: Refused, photos: Sequence[Photo]) -> None:
-        rows = [r for r in refused.rows if r not in self.map_of]
-        self.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
-        self.refused.append(
-            GrownEntry(
-                map_id="",
-                status="refused",
-                reason_code=refused.reason,
-                reason=refused.message,
-                photos=tuple(photos[r].name for r in rows),
-                gates=figures(refused.gates),
-            )
-        )
-
-
-def grown_entry(grown: GrownMap, status: str = "quarantined", code: str = "", reason: str = "") -> GrownEntry:
-    feature_map = grown.feature_map
+def grown_entry(feature_map: FeatureMap) -> GrownEntry:
+    """Of a map that was committed, in quarantine."""
     growth = growth_of(feature_map.placement.evidence)
     return GrownEntry(
         map_id=feature_map.map_id,
-        status=status,
-        reason_code=code,
-        reason=reason,
+        status="quarantined",
+        reason_code="",
+        reason="",
         photos=tuple(image.name for image in feature_map.images),
         points=len(feature_map.points),
         parents=feature_map.parents,
         generation=feature_map.generation,
-        steps=growth.get("steps"),
         drift_m=growth.get("drift_m"),
         budget_m=growth.get("budget_m"),
         gates=growth.get("gates", {}),
     )
 
 
-def fates_of(new: GrowthPhotos, run: Run, snapshot: Snapshot) -> tuple[PhotoFate, ...]:
-    active = {m.map_id for m in snapshot.maps() if m.status == "active"}
-    fates = []
-    for row, photo in enumerate(new.photos):
-        map_id = run.map_of.get(row, "")
-        code, reason = run.why.get(row, ("", ""))
-        if map_id and not code and map_id not in active and map_id in run.promotions:
-            code, reason = run.promotions[map_id].reason_code, run.promotions[map_id].reason
-        fates.append(
-            PhotoFate(
-                name=new.candidate_ids.get(row, photo.name),
-                owner=photo.contributor or OPERATOR,
-                outcome="waiting" if not map_id else "promoted" if map_id in active else "quarantined",
-                map_id=map_id,
-                reason_code=code,
-                reason=reason,
-            )
-        )
-    return tuple(fates)
-
-
-def split_reason(reason: str) -> tuple[str, str]:
-    code, _, text = reason.partition(": ")
-    return code, text or code
+def refused_entry(
+    refused: Refused,
+    status: str = "refused",
+    *,
+    map_id: str = "",
+    photos: tuple[str, ...] = (),
+    points: int = 0,
+) -> GrownEntry:
+    return GrownEntry(
+        map_id=map_id,
+        status=status,
+        reason_code=refused.reason,
+        reason=refused.message,
+        photos=photos,
+        points=points,
+        gates=figures(refused.gates),
+    )

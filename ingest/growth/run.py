@@ -15,29 +15,26 @@ from pathlib import Path
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.store import Database, Snapshot
 from featuredb.store.candidates.photos import mark_used
+from featuredb.store.candidates.states import OPERATOR
 from ingest.colmap.bridge import Model
-from ingest.fingerprint import digest
+from ingest.growth.asked_before import recall, remember
 from ingest.growth.gates import figures
 from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
-from ingest.growth.graph.replacing import replace_descendants
-from ingest.growth.growth_report import GrowthReport, Run, fates_of, grown_entry, split_reason
-from ingest.growth.not_found import NotFound, NotFoundRows
-from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, grow_component, split
+from ingest.growth.graph.replacing import Replacement, replace_descendants
+from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate, grown_entry, refused_entry
+from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, split
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
 from ingest.growth.trust.corroboration import NewPhotos
-from ingest.growth.trust.promotion import promote_confirmed
+from ingest.growth.trust.promotion import Promotion, promote_confirmed
 from ingest.growth.trust.scan_check import checked_by_scan
 from ingest.growth.unplaced import place_unplaced_maps
 from ingest.growth.values import GrowthOptions, GrowthPhotos, LocalisedPhoto, Refused
-from ingest.map_builder import MapIdentity
-from ingest.photos.photo import Photo, shared_key
+from ingest.photos.photo import shared_key
 from ingest.sfm.links import keep_photos
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
-# Part of every grown map's id; raised when the same photos would give another map.
-_VERSION = "grown-1"
 _MOST_ROUNDS = 10  # a bound on one run; each round needs a promotion
 # A reconstruction whose photos are at several places is split where its photos share less than the first of
 # these of their points, its parts at the second, and so on. 194 photos of a simulated town that look-alikes
@@ -65,120 +62,132 @@ def grow(
         ConflictError: others changed the same maps too often; what is committed stands.
         StoreError
     """
-    options = options or GrowthOptions()
     started, clock = datetime.now(UTC), time.perf_counter()
-    run, localiser = Run(lost=NotFoundRows(new.photos, new.features_of, work)), None
+    run = _Run(database=database, new=new, work=work, options=options or GrowthOptions())
+    run.recall_lost()
     for _ in range(_MOST_ROUNDS):
-        run.rounds += 1
-        replaced = replace_descendants(database, work, budget_m=options.drift_budget_m)
-        if replaced is not None:
-            run.replacements.append(replaced)
-        localiser = Localiser.open(database, previous=localiser)
-        placed, run.unplaced, notes = place_unplaced_maps(database, localiser.areas, work, options)
-        run.entries.update({entry.map_id: entry for entry in placed})
-        run.notes |= dict.fromkeys(notes)
-        this = _Round(database=database, new=new, work=work, options=options, run=run, localiser=localiser)
-        this.localise()
-        this.place()
-        if not this.promote():
+        run.start_round()
+        run.localise()
+        run.place()
+        if not run.promote():
             break
-    return GrowthReport(
-        database=database.url,
-        started=started,
-        seconds=time.perf_counter() - clock,
-        rounds=run.rounds,
-        version=database.poll_version(),
-        photos=fates_of(new, run, database.snapshot()),
-        maps=(*run.entries.values(), *run.refused, *run.unplaced),
-        promotions=tuple(run.promotions.values()),
-        replacements=tuple(run.replacements),
-        notes=tuple(run.notes),
-    )
+    return run.report(started, time.perf_counter() - clock)
 
 
 @dataclass(slots=True, kw_only=True)
-class _Round:
-    """One round; `localised` photos are in no map; `posed`: those, lone ones of a camera with one lens."""
+class _Run:
+    """A run as far as it has come; rows are those of the new photos.
+
+    Attributes:
+        localiser: of the maps that are active in this round.
+        localised: photos that are in no map, as these maps see them; `posed`: the same, lone ones of a camera
+            with one lens.
+        lost: write ids of the maps where a photo was looked for in vain (one that was moved is another), and
+            the reason.
+        map_of: maps that photos are in; why: code and reason of those that are in none.
+        entries: maps that this run has made; refused, unplaced: what this round could not place.
+    """
 
     database: Database
     new: GrowthPhotos
     work: Path
     options: GrowthOptions
-    run: Run
-    localiser: Localiser
+    rounds: int = 0
+    extractor: str = ""
+    localiser: Localiser = field(init=False)
     localised: dict[int, LocalisedPhoto] = field(default_factory=dict)
     posed: dict[int, LocalisedPhoto] = field(default_factory=dict)
+    lost: dict[int, tuple[frozenset[str], str]] = field(default_factory=dict)
+    heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
+    map_of: dict[int, str] = field(default_factory=dict)
+    why: dict[int, tuple[str, str]] = field(default_factory=dict)
+    entries: dict[str, GrownEntry] = field(default_factory=dict)
+    refused: list[GrownEntry] = field(default_factory=list)
+    unplaced: list[GrownEntry] = field(default_factory=list)
+    promotions: dict[str, Promotion] = field(default_factory=dict)
+    replacements: list[Replacement] = field(default_factory=list)
+    notes: dict[str, None] = field(default_factory=dict)
+
+    def recall_lost(self) -> None:
+        """Which photos earlier runs have looked for in vain."""
+        if self.new.photos:
+            self.extractor = self.new.features_of(0).features.fingerprint  # of all of them
+        for row in range(len(self.new.photos)):
+            known = recall(self.work, "photos", self._about(row))
+            if known is not None:
+                self.lost[row] = frozenset(known["maps"]), known["reason"]
+
+    def start_round(self) -> None:
+        """New anchors move what was grown, and maps without a place are tried."""
+        self.rounds += 1
+        replaced = replace_descendants(self.database, self.work, budget_m=self.options.drift_budget_m)
+        if replaced is not None:
+            self.replacements.append(replaced)
+        self.localiser = Localiser.open(self.database, previous=self.localiser if self.rounds > 1 else None)
+        placed, self.unplaced, notes = place_unplaced_maps(
+            self.database, self.localiser.areas, self.work, self.options
+        )
+        self.entries.update({entry.map_id: entry for entry in placed})
+        self.notes |= dict.fromkeys(notes)
 
     def localise(self) -> None:
-        """Photos that maps did not show before are looked for in new maps only."""
-        new, run, threads = self.new, self.run, self.options.threads
+        """Photos that maps did not show before are looked for in new maps, and if one shows them, in all."""
+        new, threads = self.new, self.options.threads
         served = {m.map_id for indexed in self.localiser.areas for m in indexed.area.maps}
         write_ids = {m.write_id: m.map_id for m in self.database.snapshot().maps() if m.map_id in served}
-        rows = self._open_rows()
+        rows, everywhere = self._open_rows(), frozenset(write_ids)
         worth: list[int] = []
-        again: dict[frozenset[str], list[int]] = {}
+        asked: dict[frozenset[str], list[int]] = {}
         for row in rows:
-            before = run.lost.known.get(row)
-            if before is None or not before.maps <= write_ids.keys():
-                worth.append(row)
-            else:
-                again.setdefault(frozenset(write_ids.keys() - before.maps), []).append(row)
-        for fresh, asked in again.items():
-            if fresh:
+            before = self.lost[row][0] if row in self.lost else frozenset()
+            asked.setdefault(everywhere - before if before <= everywhere else everywhere, []).append(row)
+        for fresh, again in asked.items():
+            if fresh == everywhere:
+                worth += again
+            elif fresh:
                 areas = self.localiser.areas_of(tuple(sorted(write_ids[w] for w in fresh)))
-                seen, _ = localise_photos(new.photos, asked, new.features_of, areas, threads)
-                worth.extend(seen)
+                worth += localise_photos(new.photos, again, new.features_of, areas, threads)[0]
         self.localised, reasons = localise_photos(
             new.photos, sorted(worth), new.features_of, self.localiser.areas, threads
         )
         for row in rows:
             if row not in self.localised:
-                reason = reasons.get(row) or run.lost.known[row].reason
-                run.lost.note(row, NotFound(maps=frozenset(write_ids), reason=reason))
-                run.why[row] = split_reason(reason)
+                reason = reasons.get(row) or self.lost[row][1]
+                self.why[row] = _split_reason(reason)
+                if self.lost.get(row) != (everywhere, reason):
+                    self.lost[row] = everywhere, reason
+                    remember(
+                        self.work, "photos", self._about(row), {"maps": sorted(everywhere), "reason": reason}
+                    )
 
     def place(self) -> None:
         """Reconstructions and lone photos; what passes is committed."""
-        new, run = self.new, self.run
+        new = self.new
         self.posed = dict(self.localised)
-        run.refused.clear()
+        self.refused.clear()
         for model in new.models():
-            part = keep_photos(model, [int(r) for r in model.rows if int(r) not in run.map_of])
+            part = keep_photos(model, [int(r) for r in model.rows if int(r) not in self.map_of])
             if part is not None and any(int(r) in self.localised for r in part.rows):
                 self._try_model(part, _SPLIT_LINKS)
-        left = {row: photo for row, photo in self.localised.items() if row not in run.map_of}
+        left = {row: photo for row, photo in self.localised.items() if row not in self.map_of}
         lone = with_shared_lenses(left, {row: shared_key(new.photos[row], "shared") for row in left})
-        groups, waiting = lone_groups(lone, new.features_of)
+        groups, waiting = lone_groups(lone, new.features_of, new.overlaps, new.geometry_of)
         self.posed |= lone
         for group in groups:
             self._try_model(group, ())
-        run.why.update({row: split_reason(reason) for row, reason in waiting.items()})
+        self.why.update({row: _split_reason(reason) for row, reason in waiting.items()})
 
     def promote(self) -> bool:
         """Confirm and promote; whether anything was."""
-        new, run = self.new, self.run
         outside = NewPhotos(
-            photos=new.photos,
-            rows=self._open_rows(),
-            features_of=new.features_of,
-            localised=self.localised,
-            heard=run.heard,
-            overlaps=new.overlaps,
+            given=self.new, rows=self._open_rows(), localised=self.localised, heard=self.heard
         )
-        outcomes = promote_confirmed(
-            self.database,
-            self.localiser,
-            self.options.trusted,
-            outside,
-            budget_m=self.options.drift_budget_m,
-            work=self.work,
-            threads=self.options.threads,
-        )
+        outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside)
         for outcome in outcomes:
-            run.promotions[outcome.map_id] = outcome
-            entry = run.entries.get(outcome.map_id)
+            self.promotions[outcome.map_id] = outcome
+            entry = self.entries.get(outcome.map_id)
             if entry is not None:
-                run.entries[outcome.map_id] = replace(
+                self.entries[outcome.map_id] = replace(
                     entry,
                     status="active" if outcome.promoted else "quarantined",
                     reason_code=outcome.reason_code,
@@ -187,9 +196,44 @@ class _Round:
                 )
         return any(outcome.promoted for outcome in outcomes)
 
+    def report(self, started: datetime, seconds: float) -> GrowthReport:
+        active = {m.map_id for m in self.database.snapshot().maps() if m.status == "active"}
+        return GrowthReport(
+            database=self.database.url,
+            started=started,
+            seconds=seconds,
+            rounds=self.rounds,
+            version=self.database.poll_version(),
+            photos=tuple(self._fate(row, active) for row in range(len(self.new.photos))),
+            maps=(*self.entries.values(), *self.refused, *self.unplaced),
+            promotions=tuple(self.promotions.values()),
+            replacements=tuple(self.replacements),
+            notes=tuple(self.notes),
+        )
+
+    def _fate(self, row: int, active: set[str]) -> PhotoFate:
+        photo, map_id = self.new.photos[row], self.map_of.get(row, "")
+        code, reason = self.why.get(row, ("", ""))
+        if map_id and not code and map_id not in active and map_id in self.promotions:
+            code, reason = self.promotions[map_id].reason_code, self.promotions[map_id].reason
+        return PhotoFate(
+            name=self.new.candidate_ids.get(row, photo.name),
+            owner=photo.contributor or OPERATOR,
+            outcome="waiting" if not map_id else "promoted" if map_id in active else "quarantined",
+            map_id=map_id,
+            reason_code=code,
+            reason=reason,
+        )
+
+    def _about(self, row: int) -> str:
+        """A photo with all by which it is looked for."""
+        photo = self.new.photos[row]
+        told = photo.gps, photo.focal_px, photo.camera_key
+        return f"{photo.sha256} {told!r} {self.extractor}"
+
     def _open_rows(self) -> list[int]:
         """Photos that are in no map yet."""
-        return [row for row in range(len(self.new.photos)) if row not in self.run.map_of]
+        return [row for row in range(len(self.new.photos)) if row not in self.map_of]
 
     def _try_model(self, model: Model, links: Sequence[float]) -> None:
         """Place one reconstruction; where it reaches beyond the drift budget, the part of it that does not.
@@ -199,71 +243,58 @@ class _Round:
         Args:
             links: at which it may be split, weakest first.
         """
-        outcome = self._grown(model)
-        if isinstance(outcome, GrownMap):
-            self._take(outcome)
+        new, areas = self.new, self.localiser.areas
+        maps, budget_m = placed_maps(self.database.snapshot()), self.options.drift_budget_m
+        grown = grow_within_budget(model, new.photos, new.features_of, self.posed, areas, maps, budget_m)
+        refused = self._take(grown) if isinstance(grown, GrownMap) else grown
+        if refused is None:
             return
-        part = keep_photos(model, list(outcome.rows)) if outcome.reason in AT_SEVERAL_PLACES else None
+        part = keep_photos(model, list(refused.rows)) if refused.reason in AT_SEVERAL_PLACES else None
         pieces = None if part is None else split(part, links)
         if pieces is None:
-            self.run.note_refusal(outcome, self.new.photos)
+            self._note(refused)
             return
         level, parts = pieces
-        count, message = len(outcome.rows), outcome.message
+        count, message = len(refused.rows), refused.message
         _LOG.info("%d photos are at several places: %s; apart at links of %g", count, message, level)
         for piece in parts:
             rows = tuple(int(r) for r in piece.rows)
             if self.posed.keys() & rows:
                 self._try_model(piece, [link for link in links if link > level])
             else:
-                self.run.note_refusal(replace(outcome, rows=rows), self.new.photos)
+                self._note(replace(refused, rows=rows))
 
-    def _grown(self, model: Model) -> GrownMap | Refused:
-        """The map of a reconstruction within the drift budget."""
-        new, budget_m = self.new, self.options.drift_budget_m
-
-        def grown(part: Model) -> GrownMap | Refused:
-            identity = _identity([new.photos[int(r)] for r in part.rows])
-            return grow_component(
-                part, new.photos, new.features_of, self.posed, self.localiser.areas, identity, budget_m
-            )
-
-        return grow_within_budget(model, grown, placed_maps(self.database.snapshot()), budget_m)
-
-    def _take(self, grown: GrownMap) -> None:
+    def _take(self, grown: GrownMap) -> Refused | None:
         """Commit a grown map in quarantine, unless a scan or a person who retired it are against it."""
-        database, new, run = self.database, self.new, self.run
-        rows = [int(r) for r in grown.model.rows]
-        feature_map, scan, unasked = checked_by_scan(database, grown.feature_map)
-        grown = replace(grown, feature_map=feature_map)
-        run.notes |= {unasked: None} if unasked else {}
-        why = None if scan is None or scan.passes else (scan.reason, scan.message)
-        known = {m.map_id: m for m in database.snapshot().maps(include_retired=True)}.get(feature_map.map_id)
-        if why is None and known is not None and known.status == "retired":
-            why = "RETIRED_MAP", f"map {known.map_id} of these photos was retired: {known.status_reason}"
-        if why is not None:
-            run.refused.append(grown_entry(grown, "refused", *why))
-            run.why.update(dict.fromkeys(rows, why))
-            return
-        used = [new.candidate_ids[r] for r in rows if r in new.candidate_ids]
+        checked, note = checked_by_scan(self.database, grown)
+        self.notes |= {note: None} if note else {}
+        if isinstance(checked, Refused):
+            return checked
+        feature_map, rows = checked.feature_map, [int(r) for r in checked.model.rows]
+        every = {m.map_id: m for m in self.database.snapshot().maps(include_retired=True)}
+        known = every.get(feature_map.map_id)
+        if known is not None and known.status == "retired":
+            message = f"map {known.map_id} of these photos was retired: {known.status_reason}"
+            return Refused(reason="RETIRED_MAP", message=message, rows=tuple(rows))
+        used = [self.new.candidate_ids[r] for r in rows if r in self.new.candidate_ids]
         if used:
-            mark_used(database, used, feature_map.map_id)
-        database.commit_map(feature_map)
-        run.map_of.update(dict.fromkeys(rows, feature_map.map_id))
+            mark_used(self.database, used, feature_map.map_id)
+        self.database.commit_map(feature_map)
+        self.map_of.update(dict.fromkeys(rows, feature_map.map_id))
         for row in rows:
-            run.why.pop(row, None)
-        run.why.update({row: why for row, why in grown.left_out.items() if row not in run.map_of})
-        run.entries[feature_map.map_id] = grown_entry(grown)
+            self.why.pop(row, None)
+        self.why.update({row: why for row, why in grown.left_out.items() if row not in self.map_of})
+        self.entries[feature_map.map_id] = grown_entry(feature_map)
         _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
+        return None
+
+    def _note(self, refused: Refused) -> None:
+        """What became of nothing, and why."""
+        rows = [r for r in refused.rows if r not in self.map_of]
+        self.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
+        self.refused.append(refused_entry(refused, photos=tuple(self.new.photos[r].name for r in rows)))
 
 
-def _identity(photos: Sequence[Photo]) -> MapIdentity:
-    """A map is named by its photos: the same photos give the same map."""
-    key = digest(_VERSION, *sorted(p.sha256 for p in photos))[:20]
-    return MapIdentity(
-        map_id=f"g{key}",
-        name=f"grown {key[:6]}",
-        source="growth",
-        licence=", ".join(sorted({p.licence for p in photos if p.licence})),
-        provenance={"version": _VERSION, "photos": len(photos)},
-    )
+def _split_reason(reason: str) -> tuple[str, str]:
+    code, _, text = reason.partition(": ")
+    return code, text or code

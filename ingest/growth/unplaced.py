@@ -19,15 +19,13 @@ from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from featuredb.store import Database, Snapshot
 from featuredb.store.snapshot import UnplacedSummary
-from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.growth.gates import figures
+from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
-from ingest.growth.growth_report import GrownEntry, grown_entry
+from ingest.growth.growth_report import GrownEntry, grown_entry, refused_entry
 from ingest.growth.map_images import model_of, observed_features, observed_rows
-from ingest.growth.place.component import GrownMap, grow_component
-from ingest.growth.place.localised import QUERY, localise_photos
-from ingest.growth.trust.examined import recall, remember
+from ingest.growth.place.component import GrownMap
+from ingest.growth.place.localised import localise_photos
 from ingest.growth.trust.scan_check import NOT_ASKED, checked_by_scan
 from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, Refused
 from ingest.map_builder import MapIdentity
@@ -52,33 +50,23 @@ def place_unplaced_maps(
     snapshot = database.snapshot()
     waiting = snapshot.unplaced_maps() if areas else []
     active = sorted({m.map_id for indexed in areas for m in indexed.area.maps})
-    write_ids = [snapshot.get(m).write_id for m in active] if waiting else []
-    asks = options_fingerprint(QUERY, replace(options, threads=1))
+    write_ids = sorted(snapshot.get(m).write_id for m in active) if waiting else []
+    asks = options_fingerprint(replace(options, threads=1))
     placed: list[GrownEntry] = []
     unplaced: list[GrownEntry] = []
     notes: list[str] = []
     for summary in waiting:
-        asked = digest(asks, summary.write_id, *sorted(write_ids))
-        refused = recall(work, summary.map_id, asked)
-        if refused is None:
-            done = _place(database, snapshot, summary, areas, options, notes)
-            if isinstance(done, GrownEntry):
-                placed.append(done)
-                continue
-            refused = done
-            if refused.reason not in ("CONFLICT", NOT_ASKED):
-                remember(work, summary.map_id, asked, refused)
-        unplaced.append(
-            GrownEntry(
-                map_id=summary.map_id,
-                status="unplaced",
-                reason_code=refused.reason,
-                reason=refused.message,
-                photos=(),
-                points=summary.points,
-                gates=figures(refused.gates),
-            )
+        asked = digest(asks, summary.write_id, *write_ids)
+        known = recall(work, "maps", summary.map_id, asked)
+        outcome = (
+            Refused.from_json(known) if known else _place(database, snapshot, summary, areas, options, notes)
         )
+        if isinstance(outcome, FeatureMap):
+            placed.append(grown_entry(outcome))
+            continue
+        if known is None and outcome.reason not in ("CONFLICT", NOT_ASKED):
+            remember(work, "maps", summary.map_id, outcome.as_json(), asked)
+        unplaced.append(refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points))
     return placed, unplaced, notes
 
 
@@ -89,16 +77,19 @@ def _place(
     areas: Sequence[IndexedArea],
     options: GrowthOptions,
     notes: list[str],
-) -> GrownEntry | Refused:
+) -> FeatureMap | Refused:
     """Place and commit one map; `notes` gets what a person should know besides."""
     unplaced = snapshot.load_unplaced(summary.map_id)
-    grown = _within_budget(snapshot, unplaced, areas, options)
+    grown = _grown(snapshot, unplaced, areas, options)
+    if isinstance(grown, GrownMap):
+        grown, note = checked_by_scan(database, grown)
+        notes += [note] if note else []
     if isinstance(grown, Refused):
         return grown
-    feature_map, scan, unasked = checked_by_scan(database, grown.feature_map)
-    notes += [unasked] if unasked else []
-    if scan is not None and not scan.passes:
-        return Refused.by(scan, *grown.placement.gates)
+    # Without descriptors where the map without a place had none: those are all zeros.
+    seen = grown.feature_map.observations
+    real = seen.has_descriptor & seen.descriptors.any(axis=1)
+    feature_map = replace(grown.feature_map, observations=replace(seen, has_descriptor=real))
     rest = left_over(unplaced, feature_map, grown.left_out)
     try:
         database.commit_maps(
@@ -110,13 +101,13 @@ def _place(
     except ConflictError as error:
         return Refused(reason="CONFLICT", message=str(error))
     _LOG.info("map %s: placed by %s", summary.map_id, ", ".join(feature_map.parents))
-    return grown_entry(replace(grown, feature_map=feature_map))
+    return feature_map
 
 
-def _within_budget(
+def _grown(
     snapshot: Snapshot, unplaced: UnplacedMap, areas: Sequence[IndexedArea], options: GrowthOptions
 ) -> GrownMap | Refused:
-    """The map where the others put it; where it reaches beyond the drift budget, the part that does not."""
+    """The map where the others put it, by what it keeps of its photos."""
     rows = [observed_rows(unplaced, image, described=False) for image in unplaced.images]
     photos = [_photo(unplaced, image) for image in unplaced.images]
     identity = MapIdentity(
@@ -144,20 +135,9 @@ def _within_budget(
         for photo, image in zip(photos, unplaced.images, strict=True)
     ]
     localised, _ = localise_photos(hinted, range(len(hinted)), described_of, areas, options.threads)
-
-    def grown(part: Model) -> GrownMap | Refused:
-        found = grow_component(part, photos, features_of, localised, areas, identity, options.drift_budget_m)
-        if isinstance(found, Refused):
-            return found
-        # Without descriptors where the map without a place had none: those are all zeros.
-        seen = found.feature_map.observations
-        real = seen.has_descriptor & seen.descriptors.any(axis=1)
-        bare = replace(found.feature_map, observations=replace(seen, has_descriptor=real))
-        return replace(found, feature_map=bare)
-
-    maps, budget_m = placed_maps(snapshot), options.drift_budget_m
     model = model_of(unplaced, unplaced.points.xyz, unplaced.images, described=False)
-    return grow_within_budget(model, grown, maps, budget_m)
+    maps, budget_m = placed_maps(snapshot), options.drift_budget_m
+    return grow_within_budget(model, photos, features_of, localised, areas, maps, budget_m, identity)
 
 
 def left_over(

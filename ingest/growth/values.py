@@ -1,7 +1,7 @@
 """The values that pass between the steps of growth: new photos, localised ones, overlaps, refusals."""
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap.bridge import Model
+from ingest.colmap.bridge import Model, TwoView
 from ingest.growth.gates import Gate
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
@@ -34,11 +34,6 @@ LEAST_VIEWS = 3  # of points that are asked for what is there; two leave them al
 # At images of 1600: twice the inlier tolerance of a pose, for two poses, or reconstructions of few photos
 # that are bent.
 TOLERANCE_PX = 8.0
-
-
-def pixel_scale(*cameras: Camera) -> float:
-    """Pixels of the longest side for one of an image of 1600, on which SIFT locates keypoints; at least 1."""
-    return max(1.0, max(max(camera.width, camera.height) for camera in cameras) / 1600.0)
 
 
 def tied_together(nodes: Sequence[Hashable], pairs: Iterable[tuple[Hashable, Hashable]]) -> list[int]:
@@ -140,6 +135,16 @@ class Refused:
         """By a gate, after others that were asked."""
         return cls(reason=gate.reason, message=gate.message, rows=rows, gates=(*before, gate))
 
+    def as_json(self) -> dict[str, Any]:
+        """Without the rows, which are those of one run."""
+        gates = [{**asdict(g), "passes": bool(g.passes), "figure": float(g.figure)} for g in self.gates]
+        return {"reason": self.reason, "message": self.message, "gates": gates}
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> "Refused":
+        gates = tuple(Gate(**gate) for gate in value["gates"])
+        return cls(reason=value["reason"], message=value["message"], gates=gates)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GrowthOptions:
@@ -164,20 +169,21 @@ class GrowthPhotos:
     Attributes:
         models: their reconstructions, called once a round; rows of a model are rows of `photos`.
         candidate_ids: of contributed photos, by row.
-        overlaps: pairs of rows whose matches were verified; None: not known.
+        overlaps: pairs of rows whose matches were verified. geometry_of: of such a pair.
     """
 
     photos: Sequence[Photo]
     features_of: FeaturesOf
     models: Callable[[], Iterable[Model]]
+    overlaps: Collection[Pair]
+    geometry_of: Callable[[Pair], TwoView]
     candidate_ids: Mapping[int, str] = field(default_factory=dict)
-    overlaps: Collection[Pair] | None = None
 
 
 def no_photos() -> GrowthPhotos:
     """Nothing new: old quarantined maps are examined, and new anchors looked for."""
 
-    def none(row: int) -> PhotoFeatures:
-        raise IndexError(f"there is no photo {row}")
+    def none(rows: object) -> Any:
+        raise IndexError(f"there is no photo {rows}")
 
-    return GrowthPhotos(photos=(), features_of=none, models=lambda: ())
+    return GrowthPhotos(photos=(), features_of=none, models=lambda: (), overlaps=(), geometry_of=none)

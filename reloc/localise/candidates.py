@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
-from featuredb.index.area import Area
-from featuredb.index.descriptor_index import DescriptorIndex
-from featuredb.maps.feature_map import GeoPrior
+from featuredb.index.area import Area, build_area
+from featuredb.index.descriptor_index import DescriptorIndex, build_index
+from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from reloc.localise.options import CandidateOptions
 
 # A place this far under the frame's horizon is more than 1,100 km away.
@@ -23,6 +23,12 @@ class IndexedArea:
 
     area: Area
     index: DescriptorIndex
+
+    @classmethod
+    def of(cls, maps: Sequence[FeatureMap]) -> "IndexedArea":
+        """Maps of one extractor and height datum, laid out in one frame and ready to be asked."""
+        area = build_area(maps)
+        return cls(area=area, index=build_index(area.descriptors))
 
     def only(self, map_ids: Collection[str]) -> "IndexedArea":
         """The same area and index, of which only these maps are searched."""

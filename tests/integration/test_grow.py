@@ -118,7 +118,7 @@ def test_two_owners_at_once_are_promoted_in_one_run(grown: tuple[Path, GrowthRep
     assert report.count("promoted") == 6
     assert report.rounds == 2
     entry = report.maps[0]
-    assert (entry.status, entry.steps) == ("active", 1)
+    assert (entry.status, entry.generation) == ("active", 1)
     assert all(gate["passes"] for gate in entry.gates.values())
     assert {"agreement", "residuals", "visibility", "drift", "confirmation", "canaries"} <= set(entry.gates)
     evidence = database.snapshot().load_map(entry.map_id).placement.evidence["growth"]

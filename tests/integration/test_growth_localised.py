@@ -20,7 +20,7 @@ from ingest.growth.place.localised import (
 from ingest.growth.trust.confirmation import Sources
 from ingest.growth.trust.corroboration import NewPhotos as CorroboratingPhotos
 from ingest.growth.trust.corroboration import corroborate
-from ingest.growth.values import LocalisedPhoto
+from ingest.growth.values import LocalisedPhoto, no_photos
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import Localised
 from reloc.localise.options import LocaliseOptions
@@ -78,17 +78,16 @@ def test_two_threads_localise_as_one_does(
 def test_what_a_photo_sees_of_a_map_is_asked_once(new: NewPhotos) -> None:
     """Photos of another owner, whose word counts, see the map; the second time the answers are the same."""
     photos = [replace(photo, contributor="somebody") for photo in new.photos]
-    asked = CorroboratingPhotos(
-        photos=photos, rows=range(len(photos)), features_of=new.features_of, localised={}
-    )
+    given = replace(no_photos(), photos=photos, features_of=new.features_of)
+    asked = CorroboratingPhotos(given=given, rows=range(len(photos)), localised={})
     here, sources = existing(), Sources(trusted=("somebody",))
     first = corroborate(here, [], asked, sources, write_id="w1")
-    assert {w.name for w in first.corroborating} == {photo.name for photo in photos}
+    assert {w.name for w in first} == {photo.name for photo in photos}
     assert set(asked.heard) == {("w1", row) for row in range(len(photos))}
     asked.heard.update(dict.fromkeys(asked.heard, None))
-    assert not corroborate(here, [], asked, sources, write_id="w1").corroborating
+    assert not corroborate(here, [], asked, sources, write_id="w1")
     # Written anew, the map may show something else.
-    assert corroborate(here, [], asked, sources, write_id="w2").corroborating
+    assert corroborate(here, [], asked, sources, write_id="w2")
 
 
 def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> None:
@@ -96,22 +95,17 @@ def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> No
     photos = [replace(photo, contributor="somebody") for photo in new.photos]
     made_of = [replace(image, sha256=photos[0].sha256) for image in existing().images[:1]]
     here = replace(existing(), images=(*made_of, *existing().images[1:]))
-    asked = CorroboratingPhotos(
-        photos=photos,
-        rows=range(1, len(photos)),
-        features_of=new.features_of,
-        localised={},
-        overlaps={(0, 2), (0, 3), (1, 4)},
-    )
+    overlaps = {(0, 2), (0, 3), (1, 4)}
+    given = replace(no_photos(), photos=photos, features_of=new.features_of, overlaps=overlaps)
+    asked = CorroboratingPhotos(given=given, rows=range(1, len(photos)), localised={})
     # Other images of the map are not among the photos: nobody knows what overlaps with them.
     assert asked.that_may_see(here) == list(asked.rows)
     of_photos = replace(here, images=tuple(made_of), observations=_of_image(here, made_of[0].image_id))
     assert asked.that_may_see(of_photos) == [2, 3]
-    assert replace(asked, overlaps=None).that_may_see(of_photos) == list(asked.rows)
     heard = corroborate(of_photos, [], asked, Sources(trusted=("somebody",)), write_id="w1")
     assert {name for name, _ in asked.heard} == {"w1"}
     assert {row for _, row in asked.heard} == {2, 3}
-    assert {w.name for w in heard.corroborating} <= {photos[2].name, photos[3].name}
+    assert {w.name for w in heard} <= {photos[2].name, photos[3].name}
 
 
 def _of_image(feature_map: FeatureMap, image_id: int) -> MapObservations:

@@ -1,6 +1,7 @@
 """Whose word counts: owners by identity, what makes their record, and how a community begins."""
 
 import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from featuredb.store.changes import IMPORTED
 from featuredb.store.verify import verify
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
+from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
 from tests.support.scene_strip import FRAME, note_contributed, put_on_record, strip_map
 
@@ -41,7 +43,8 @@ def _add(database: Database, feature_map: FeatureMap, owner: str = "") -> None:
 
 
 def _promoted(database: Database, *trusted: str) -> dict[str, Promotion]:
-    found = promote_confirmed(database, Localiser.open(database), trusted, budget_m=0.5)
+    work = Path(tempfile.mkdtemp(dir=database.url))
+    found = promote_confirmed(database, Localiser.open(database), GrowthOptions(trusted=trusted), work)
     return {outcome.map_id: outcome for outcome in found}
 
 

@@ -11,6 +11,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.move import move_map
 from ingest.colmap.anchored import with_observations
 from ingest.colmap.bridge import Model
+from ingest.growth.graph.map_graph import grow_within_budget
+from ingest.growth.map_places import drift_m, places_of
 from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos
@@ -37,6 +39,8 @@ from tests.support.scenes import (
     scene_map,
 )
 from tools.growth_gates import read_judgements, recorded
+
+_PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +87,9 @@ def test_a_reconstruction_is_placed_and_becomes_a_map(
     assert feature_map.placement.method == "map"
     assert feature_map.height_datum == "ellipsoidal"
     growth = feature_map.placement.evidence["growth"]
-    assert growth["steps"] == 1
     assert all(gate["passes"] for gate in growth["gates"].values())
-    assert 0.0 < growth["drift_m"] < 0.5
+    relative = np.reshape(growth["covariance_relative"], (7, 7))
+    assert 0.0 < drift_m(relative, places_of(feature_map)) < 0.5
     # On Earth it is as uncertain as its parent, and a little more.
     earth = np.sqrt(np.diag(feature_map.placement.covariance)[4:])
     assert (earth > 0.5).all()
@@ -106,7 +110,8 @@ def test_the_bound_of_drift_holds(area: IndexedArea) -> None:
         found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
         grown = grow_component(new.model, new.photos, new.features_of, found, [area], identity())
         assert isinstance(grown, GrownMap)
-        bound = grown.feature_map.placement.evidence["growth"]["drift_m"]
+        growth = grown.feature_map.placement.evidence["growth"]
+        bound = drift_m(np.reshape(growth["covariance_relative"], (7, 7)), places_of(grown.feature_map))
         beyond += int(centers_error(grown, new).max() > bound)
     assert beyond <= 1
 
@@ -136,7 +141,7 @@ def test_what_no_step_foresaw_costs_this_reconstruction_only(
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr("ingest.growth.place.component.place_by_maps", singular)
-    refused = grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
+    refused = grow_within_budget(new.model, new.photos, new.features_of, localised, [area], {}, 0.5)
     assert isinstance(refused, Refused)
     assert (refused.reason, refused.rows) == ("FAILED", tuple(range(len(new.photos))))
     assert "LinAlgError: Singular matrix" in refused.message
@@ -310,7 +315,7 @@ def test_overlaps_with_two_maps_tell_how_these_differ(new: NewPhotos) -> None:
 def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> None:
     """No reconstruction at all: localised photos whose matches fit their poses become a map."""
     found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
-    (group,), waiting = lone_groups(found, new.features_of)
+    (group,), waiting = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
     assert not waiting
     made = grow_component(group, new.photos, new.features_of, found, [area], identity())
     assert isinstance(made, GrownMap), made
@@ -321,7 +326,7 @@ def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> 
 
 def test_a_lone_photo_waits(new: NewPhotos, area: IndexedArea) -> None:
     found, _ = localise_photos(new.photos, [0], new.features_of, [area])
-    groups, waiting = lone_groups(found, new.features_of)
+    groups, waiting = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
     assert not groups
     assert waiting[0].startswith("ALONE")
 
@@ -334,7 +339,7 @@ def test_lone_photos_whose_matches_contradict_their_poses_wait(new: NewPhotos, a
         cam_from_local=away.act_on_pose(found[1].cam_from_local),
         points=away.act(found[1].points),
     )
-    (group,), _ = lone_groups(found, new.features_of)
+    (group,), _ = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
     refused = grow_component(group, new.photos, new.features_of, found, [area], identity())
     assert isinstance(refused, Refused)
     assert refused.reason == "TOO_FEW_AGREE"

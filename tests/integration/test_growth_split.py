@@ -1,5 +1,6 @@
 """A reconstruction that look-alikes have joined from two places becomes two maps."""
 
+import itertools
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -8,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ingest.growth.run as grow_module
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.store import Database
 from ingest.colmap.bridge import Model
+from ingest.growth.graph import map_graph
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.place.component import AT_SEVERAL_PLACES
 from ingest.growth.run import grow
@@ -82,7 +83,20 @@ def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path) -> GrowthReport:
     database = Database.create(folder / "db")
     database.commit_map(existing())
     model = _joined(south.model, north.model)
-    new = GrowthPhotos(photos=photos, features_of=features.__getitem__, models=lambda: [model])
+    everyone = NewPhotos(
+        photos=photos,
+        features=features,
+        poses=[*south.poses, *north.poses],
+        model=model,
+        world_of=[*south.world_of, *north.world_of],
+    )
+    new = GrowthPhotos(
+        photos=photos,
+        features_of=everyone.features_of,
+        models=lambda: [model],
+        overlaps=list(itertools.combinations(range(len(photos)), 2)),
+        geometry_of=everyone.geometry_of,
+    )
     return grow(database, new, folder / "work")
 
 
@@ -109,14 +123,14 @@ def test_geotags_that_contradict_are_not_cut_away(
 
     What is left are photos that are localised one by one, and stand where each of them is.
     """
-    real, reasons = grow_module.grow_component, []
+    real, reasons = map_graph.grow_component, []
 
     def noted(*args: Any) -> Any:
         outcome = real(*args)
         reasons.append(outcome.reason if isinstance(outcome, Refused) else None)
         return outcome
 
-    monkeypatch.setattr(grow_module, "grow_component", noted)
+    monkeypatch.setattr(map_graph, "grow_component", noted)
     with caplog.at_level(logging.INFO, "ingest.growth"):
         report = _grown(_groups(7, 3, tagged=True), tmp_path)
     assert reasons == ["CONTRADICTS_GPS", None]  # the group of the lone photos
@@ -131,14 +145,14 @@ def test_what_is_refused_as_a_whole_is_tried_in_parts_if_places_may_be_mixed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: str
 ) -> None:
     """The first answer is that of a gate; the parts are placed as they are."""
-    real, asked = grow_module.grow_component, []
+    real, asked = map_graph.grow_component, []
 
     def refused_first(model: Model, *args: Any) -> Any:
         asked.append(len(model.rows))
         rows = tuple(int(r) for r in model.rows)
         return Refused(reason=reason, message="as told", rows=rows) if len(asked) == 1 else real(model, *args)
 
-    monkeypatch.setattr(grow_module, "grow_component", refused_first)
+    monkeypatch.setattr(map_graph, "grow_component", refused_first)
     report = _grown(_groups(5, 5), tmp_path)
     # What is not split is in a group of lone photos afterwards.
     assert asked == ([10, 5, 5] if reason in AT_SEVERAL_PLACES else [10, 10])

@@ -1,6 +1,7 @@
 """Promotion, canaries and re-placement on databases of small maps whose truth is known."""
 
 import hashlib
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from ingest.growth.map_images import features_and_points
 from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, own_canaries, run_canaries
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
-from ingest.growth.values import Edge, Refused
+from ingest.growth.values import Edge, GrowthOptions, Refused
 from reloc.localise.localise import localise_features
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
@@ -61,8 +62,8 @@ def _add(database: Database, feature_map: FeatureMap) -> None:
 
 
 def _promoted(database: Database, trusted: tuple[str, ...] = ()) -> dict[str, Promotion]:
-    localiser = Localiser.open(database)
-    found = promote_confirmed(database, localiser, trusted, budget_m=_BUDGET_M)
+    work = Path(tempfile.mkdtemp(dir=database.url))
+    found = promote_confirmed(database, Localiser.open(database), GrowthOptions(trusted=trusted), work)
     return {outcome.map_id: outcome for outcome in found}
 
 
@@ -106,7 +107,7 @@ def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytes
     put_on_record(database, "anna")
 
     def ask() -> Promotion:
-        return promote_confirmed(database, Localiser.open(database), budget_m=_BUDGET_M, work=work)[0]
+        return promote_confirmed(database, Localiser.open(database), GrowthOptions(), work)[0]
 
     first = ask()
     with monkeypatch.context() as patch:

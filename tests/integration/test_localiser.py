@@ -115,8 +115,8 @@ def test_naming_maps_of_an_area_builds_nothing_and_leaves_the_others_out(
     def built(*_: object) -> None:
         raise AssertionError("something was built for a query")
 
-    monkeypatch.setattr("reloc.localiser.build_area", built)
-    monkeypatch.setattr("reloc.localiser.build_index", built)
+    monkeypatch.setattr("reloc.localise.candidates.build_area", built)
+    monkeypatch.setattr("reloc.localise.candidates.build_index", built)
     for named, east_m in (("field", 0.0), ("beside", 100.0), ("loose", 9000.0)):
         pose = localiser.localise(photo, replace(KNOWN, map_ids=(named,))).pose
         assert pose is not None

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 import featuredb
-import reloc.localiser
+import reloc.localise.candidates
 from featuredb.cli.main import main
 from featuredb.errors import (
     DatabaseNotFoundError,
@@ -83,8 +83,8 @@ def test_the_index_is_kept_until_the_database_changes(
     url: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     built: list[int] = []
-    build = reloc.localiser.build_index
-    monkeypatch.setattr(reloc.localiser, "build_index", lambda d: built.append(len(d)) or build(d))
+    build = reloc.localise.candidates.build_index
+    monkeypatch.setattr(reloc.localise.candidates, "build_index", lambda d: built.append(len(d)) or build(d))
     db = featuredb.open(url)
     for _ in range(3):
         assert db.localise(photo).localised

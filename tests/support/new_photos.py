@@ -14,10 +14,11 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import GeoPrior
-from ingest.colmap.bridge import Model
+from ingest.colmap.bridge import Model, TwoView, verify_pair
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.pairs import Pair
 from tests.support.scenes import CAMERA, pixels_inside, query_features
 
 FINGERPRINT = ExtractorOptions().fingerprint
@@ -43,6 +44,13 @@ class NewPhotos:
 
     def features_of(self, row: int) -> PhotoFeatures:
         return self.features[row]
+
+    def geometry_of(self, pair: Pair) -> TwoView:
+        """The verified geometry of what two photos see in common."""
+        (i, j), (a, b) = pair, (self.features[row].features for row in pair)
+        _, in_a, in_b = np.intersect1d(self.world_of[i], self.world_of[j], return_indices=True)
+        matches, known = np.stack([in_a, in_b], axis=1).astype(np.uint32), self.model.cameras[0]
+        return verify_pair(known, a.xy, known, b.xy, matches, focal_known=True, max_error_px=4.0, seed=0)
 
     def keypoints(self) -> dict[int, FloatArray]:
         return {r: f.features.xy.astype(np.float64) for r, f in enumerate(self.features)}

@@ -19,7 +19,7 @@ from featuredb.store import Database
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.photos import contribute, mark_confirmed, mark_used
 from featuredb.store.candidates.states import Contribution
-from ingest.growth.graph.map_graph import place_of
+from ingest.growth.graph.map_graph import place_key
 from ingest.growth.trust.confirmation import Sources
 from ingest.growth.values import Edge
 from tests.support.scenes import (
@@ -102,8 +102,8 @@ def grown(feature_map: FeatureMap, parents: Sequence[FeatureMap], drift_m: float
     """The map as if these had placed it where it is."""
     edges = [
         Edge(
-            map_id=parent.map_id, place=place_of(parent), other_from_map=Sim3.identity(), covariance=EDGE,
-            shared_points=500, photos=8,
+            map_id=parent.map_id, place=place_key(parent.frame, parent.placement),
+            other_from_map=Sim3.identity(), covariance=EDGE, shared_points=500, photos=8,
         )
         for parent in parents
     ]  # fmt: skip

@@ -11,7 +11,6 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from ingest.colmap.anchored import (
-    AnchoredOptions,
     FixedPoints,
     Lenses,
     adjust_anchored,
@@ -22,8 +21,14 @@ from ingest.colmap.bridge import Model, SfmPhoto, TwoView
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors, ring
 
-OPTIONS, HELD = AnchoredOptions(), Lenses(held=[0])
+HELD = Lenses(held=[0])
 UNMOVED = Sim3.identity()
+
+
+@pytest.fixture
+def wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lenses start far off, so that nothing would fit at first."""
+    monkeypatch.setattr("ingest.colmap.anchored._MAX_ERROR_PX", 60.0)
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +82,7 @@ def test_fixed_points_hold_poses_and_points(scene: tuple[NewPhotos, FloatArray])
     new, points = scene
     keypoints = list(new.keypoints().values())
     before = centers_off(new.model, new)
-    done = adjust_anchored(
-        without(new, 40), keypoints, fixed_of(new, points, 40, (0, 1, 2, 3)), HELD, OPTIONS
-    )
+    done = adjust_anchored(without(new, 40), keypoints, fixed_of(new, points, 40, (0, 1, 2, 3)), HELD)
     assert before.max() > 0.15
     assert centers_off(done.model, new).max() < 0.03
     assert done.fixed_kept.all()
@@ -96,7 +99,7 @@ def test_points_that_one_photo_sees_hold_it_too(scene: tuple[NewPhotos, FloatArr
         fixed, point_of=fixed.point_of[own], photo_of=fixed.photo_of[own], pixels=fixed.pixels[own]
     )
     assert np.bincount(alone.point_of).max() == 1
-    done = adjust_anchored(without(new, 40), list(new.keypoints().values()), alone, HELD, OPTIONS)
+    done = adjust_anchored(without(new, 40), list(new.keypoints().values()), alone, HELD)
     assert centers_off(done.model, new).max() < 0.08
 
 
@@ -106,28 +109,28 @@ def test_fixed_points_that_do_not_fit_are_dropped(scene: tuple[NewPhotos, FloatA
     wrong = fixed.point_of < 5
     pixels = fixed.pixels + np.where(wrong[:, None], 50.0, 0.0)
     done = adjust_anchored(
-        without(new, 40), list(new.keypoints().values()), replace(fixed, pixels=pixels), HELD, OPTIONS
+        without(new, 40), list(new.keypoints().values()), replace(fixed, pixels=pixels), HELD
     )
     assert not done.fixed_kept[wrong].any()
     assert done.fixed_kept[~wrong].mean() > 0.95
     assert centers_off(done.model, new).max() < 0.05
 
 
+@pytest.mark.usefixtures("wide")
 def test_a_free_lens_is_found_and_a_constant_one_stays(scene: tuple[NewPhotos, FloatArray]) -> None:
     new, points = scene
     off = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(870.0, 500.0, 400.0, 0.0))
     model = replace(without(new, 40), cameras=(off,))
     fixed = fixed_of(new, points, 40, (0, 1, 2, 3))
     keypoints = list(new.keypoints().values())
-    wide = replace(OPTIONS, max_error_px=40.0)
-    free = adjust_anchored(model, keypoints, fixed, Lenses(), wide).model.cameras[0]
+    free = adjust_anchored(model, keypoints, fixed, Lenses()).model.cameras[0]
     assert free.focal_px == pytest.approx(CAMERA.focal_px, abs=2.0)
-    assert adjust_anchored(model, keypoints, fixed, HELD, wide).model.cameras[0] == off
+    assert adjust_anchored(model, keypoints, fixed, HELD).model.cameras[0] == off
 
 
 def test_without_fixed_points_the_first_photo_stays(scene: tuple[NewPhotos, FloatArray]) -> None:
     new, _ = scene
-    done = adjust_anchored(new.model, list(new.keypoints().values()), FixedPoints.none(), HELD, OPTIONS)
+    done = adjust_anchored(new.model, list(new.keypoints().values()), FixedPoints.none(), HELD)
     first, before = done.model.cam_from_sfm[0], new.model.cam_from_sfm[0]
     assert np.abs((first @ before.inverse()).log()).max() < 1e-9
     truth = np.array([p.center for p in new.poses])
@@ -194,12 +197,12 @@ def nadir_line(seed: int) -> NewPhotos:
 
 def focal_after(new: NewPhotos, start_px: float, lenses: Lenses) -> float:
     camera = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(start_px, 500.0, 400.0, 0.0))
-    wide = replace(OPTIONS, max_error_px=60.0)
     model = replace(new.model, cameras=(camera,))
-    done = adjust_anchored(model, list(new.keypoints().values()), FixedPoints.none(), lenses, wide)
+    done = adjust_anchored(model, list(new.keypoints().values()), FixedPoints.none(), lenses)
     return done.model.cameras[0].focal_px
 
 
+@pytest.mark.usefixtures("wide")
 @pytest.mark.parametrize("known", [Lenses(focal_px={0: CAMERA.focal_px}), Lenses(lent={0: CAMERA})])
 def test_over_flat_ground_what_is_known_of_a_lens_decides(known: Lenses) -> None:
     for seed in range(2):
@@ -210,6 +213,7 @@ def test_over_flat_ground_what_is_known_of_a_lens_decides(known: Lenses) -> None
         assert abs(free / CAMERA.focal_px - 1.0) > 4.0 * abs(held / CAMERA.focal_px - 1.0)
 
 
+@pytest.mark.usefixtures("wide")
 def test_a_wrong_focal_length_of_exif_loses_to_photos_that_know() -> None:
     """Photos from many directions tell the focal length; EXIF names that of another mode of the camera."""
     rng = np.random.default_rng(4)

@@ -10,7 +10,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.trust.confirmation import (
     Confirmation,
-    CorroboratingImage,
+    OutsidePhoto,
     Source,
     confirm,
     independent,
@@ -31,14 +31,18 @@ def _owned(owners: Sequence[str], **more: object) -> FeatureMap:
 
 def _confirm(
     feature_map: FeatureMap,
-    corroborating: Sequence[CorroboratingImage] = (),
+    corroborating: Sequence[OutsidePhoto] = (),
     *,
     on_record: Sequence[str] = _KNOWN,
     trusted: Sequence[str] = (),
     against: Sequence[tuple[Source, str]] = (),
 ) -> Confirmation:
     sources = sources_of(feature_map, on_record=on_record, trusted=trusted)
-    return confirm(feature_map, sources, corroborating, against)
+    contradicting = [
+        OutsidePhoto(name="w", source=s, center=np.zeros(3), points=np.arange(200), contradicts=said)
+        for s, said in against
+    ]
+    return confirm(feature_map, sources, [*corroborating, *contradicting])
 
 
 def test_two_owners_on_record_confirm_each_other() -> None:
@@ -157,8 +161,8 @@ def test_one_photo_confirms_nothing_alone() -> None:
     assert _confirm(one, trusted=("anna",)).gate.passes
 
 
-def _outside(feature_map: FeatureMap, owner: str, points: int = 200) -> CorroboratingImage:
-    return CorroboratingImage(
+def _outside(feature_map: FeatureMap, owner: str, points: int = 200) -> OutsidePhoto:
+    return OutsidePhoto(
         name="w",
         source=sources_of(on_record=_KNOWN).of_owner(owner),
         center=np.array([20.0, -50.0, 30.0]),
@@ -173,7 +177,6 @@ def test_two_witnesses_of_other_owners_confirm_and_one_does_not() -> None:
     assert _confirm(feature_map, two).gate.passes
     found = _confirm(feature_map, [_outside(feature_map, "anna")])
     assert _reason(found) == "ONE_SOURCE"
-    assert found.corroborating == ()
     few = _confirm(feature_map, [_outside(feature_map, "ben", points=5)])
     assert not few.gate.passes
 

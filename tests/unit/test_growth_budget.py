@@ -65,7 +65,7 @@ def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) ->
 
     placement = MapsPlacement(reason=None, message="", frame=bent([None]).frame)
 
-    def grown(part: Any) -> GrownMap:
+    def grown(part: Any, *_: object) -> GrownMap:
         left_out = {3: ("WEAK_LINK", "little")} if 3 in part.rows else {}
         return GrownMap(feature_map=part, placement=placement, model=part, left_out=left_out)
 
@@ -78,7 +78,8 @@ def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) ->
     )
     monkeypatch.setattr(map_graph, "rows_within", lambda *_: [0, 1, 2, 4])
     monkeypatch.setattr(map_graph, "keep_photos", cut)
-    found = map_graph.grow_within_budget(whole, grown, {}, BUDGET_M)  # type: ignore[arg-type]
+    monkeypatch.setattr(map_graph, "grow_component", grown)
+    found = map_graph.grow_within_budget(whole, [], {}.get, {}, [], {}, BUDGET_M)  # type: ignore[arg-type]
     assert isinstance(found, GrownMap)
     codes = {row: code for row, (code, _) in found.left_out.items()}
     assert codes == {3: "WEAK_LINK", 4: "DRIFT_BUDGET", 5: "DRIFT_BUDGET"}

@@ -12,7 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored
+from ingest.colmap.anchored import FixedPoints, Lenses, adjust_anchored
 from ingest.colmap.bridge import Model, with_observations
 from ingest.growth.place import drift
 from ingest.growth.place.drift import (
@@ -72,7 +72,7 @@ def spread_of(
     kept: NDArray[np.bool_],
     lenses: Lenses,
 ) -> PhotoSpread:
-    return photo_covariances(model, keypoints, fixed, kept, lenses, AnchoredOptions())
+    return photo_covariances(model, keypoints, fixed, kept, lenses)
 
 
 def mean_turn(found: Sequence[Rigid3], true: Sequence[Rigid3], lens: Camera = CAMERA) -> FloatArray:
@@ -97,7 +97,7 @@ def test_centres_and_directions_are_off_as_far_as_is_said() -> None:
         )
         free = with_observations(model, (world >= COUNT) | (model.photo_of > 1))
         keypoints = list(new.keypoints().values())
-        done = adjust_anchored(free, keypoints, fixed, SURE, AnchoredOptions())
+        done = adjust_anchored(free, keypoints, fixed, SURE)
         said = spread_of(done.model, keypoints, fixed, done.fixed_kept, SURE)
         spread = center_covariances(done.model, said.poses)
         off = done.model.centers() - np.array([p.center for p in new.poses])
@@ -186,7 +186,7 @@ def test_what_a_lens_has_changed_by_since_it_was_lent_is_not_shared() -> None:
         new, _, fixed = walk(seed)
         model = new.model
         true = whole_camera(CAMERA)
-        (prior,) = Lenses(lent={0: true}).priors((true,), AnchoredOptions())
+        (prior,) = Lenses(lent={0: true}).priors((true,))
         assert prior is not None
         off = np.random.default_rng(100 + seed).multivariate_normal(np.zeros(8), prior.covariance)
         lent = Lenses(lent={0: replace(true, params=tuple(np.array(true.params) + off))})
@@ -200,7 +200,7 @@ def test_what_a_lens_has_changed_by_since_it_was_lent_is_not_shared() -> None:
             replace(model, cameras=(lent.lent[0],)), (world >= COUNT) | (model.photo_of > 1)
         )
         keypoints = list(new.keypoints().values())
-        done = adjust_anchored(free, keypoints, fixed, lent, AnchoredOptions())
+        done = adjust_anchored(free, keypoints, fixed, lent)
         said = spread_of(done.model, keypoints, fixed, done.fixed_kept, lent)
         alone = said.turns[-1] - said.lens_turns[-1]
         assert np.trace(said.lens_turns[-1]) > 0.0

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.growth.place.groups import PairCheck, intersections
+from ingest.growth.place.groups import intersections, poses_fit
+from tests.support.localised_photos import localised_photo
 from tests.support.scenes import CAMERA, box_points, ring
 
 
@@ -33,14 +34,17 @@ def test_rays_from_one_spot_have_no_angle() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verified", "fitting", "angle_deg", "agrees"),
+    ("wrong", "apart", "agrees"),
     [
-        (60, 0.9, 5.0, True),
-        (19, 0.9, 5.0, False),  # too few matches
-        (60, 0.6, 5.0, False),  # the matches say otherwise than the poses
-        (60, 0.9, 0.5, False),  # one spot, or one picture twice
+        (5, True, True),
+        (25, True, False),  # the matches say otherwise than the poses
+        (0, False, False),  # one spot, or one picture twice
     ],
 )
-def test_when_a_pair_agrees(verified: int, fitting: float, angle_deg: float, agrees: bool) -> None:
-    check = PairCheck(verified=verified, fitting=fitting, angle_deg=angle_deg)
-    assert check.agrees is agrees
+def test_when_matches_bear_two_poses_out(wrong: int, apart: bool, agrees: bool) -> None:
+    """Of fifty matches the wrong ones are of other points."""
+    points = box_points(np.random.default_rng(1), 50)
+    a, b = ring(8)[:2] if apart else ring(8)[:1] * 2
+    pixels = CAMERA.project(a.act(points))
+    others = CAMERA.project(b.act(np.concatenate([np.roll(points[:wrong], 1, axis=0), points[wrong:]])))
+    assert poses_fit(localised_photo(0, a), localised_photo(1, b), pixels, others) is agrees

@@ -18,7 +18,7 @@ from ingest.growth.graph.map_graph import (
     graph_edges,
     graph_nodes,
     no_surer_than,
-    place_of,
+    place_key,
     solve_with_new,
 )
 from ingest.growth.graph.pose_graph import solve_pose_graph
@@ -27,13 +27,17 @@ from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.map_images import model_of
 from ingest.growth.map_places import drift_m, growth_of, places_of
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
-from ingest.growth.trust.confirmation import CorroboratingImage, Source, answering_with, confirmed_points
+from ingest.growth.trust.confirmation import OutsidePhoto, Source, answering_with, confirm
 from ingest.growth.trust.promotion import Promotion
 from ingest.growth.values import Edge
 from ingest.sfm.links import keep_photos
 from tests.support.scene_strip import EDGE, FRAME, east, sources_of, strip_map
 
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])
+
+
+def _place_of(feature_map: FeatureMap) -> str:
+    return place_key(feature_map.frame, feature_map.placement)
 
 
 def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
@@ -46,11 +50,10 @@ def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
         generation=feature_map.generation,
         parents=feature_map.parents,
         frame=feature_map.frame,
-        covariance=feature_map.placement.covariance,
-        place=place_of(feature_map),
+        placement=feature_map.placement,
+        place=_place_of(feature_map),
         corners=places_of(feature_map),
         edges=tuple(Edge.from_json(e) for e in growth.get("edges", ())),
-        evidence=feature_map.placement.evidence,
     )
 
 
@@ -67,8 +70,8 @@ def test_an_edge_survives_json() -> None:
 
 def test_a_map_that_moves_has_another_place() -> None:
     moved = strip_map("A", 20.0, owners=["survey"], move=east(0.01))
-    assert place_of(_ANCHOR) == place_of(strip_map("A", 20.0, owners=["else"]))
-    assert place_of(moved) != place_of(_ANCHOR)
+    assert _place_of(_ANCHOR) == _place_of(strip_map("A", 20.0, owners=["else"]))
+    assert _place_of(moved) != _place_of(_ANCHOR)
 
 
 def test_drift_of_a_chain_grows_with_its_steps() -> None:
@@ -116,7 +119,7 @@ def test_an_anchor_that_another_one_moved_does_not_count_their_overlap_twice() -
     gps, child = strip_map("gps", 20.0, covariance=loose), strip_map("m", 45.0, parents=[_ANCHOR])
     to_gps = Edge(
         map_id="gps",
-        place=place_of(gps),
+        place=_place_of(gps),
         other_from_map=east(2.0),
         covariance=EDGE,
         shared_points=9,
@@ -129,7 +132,8 @@ def test_an_anchor_that_another_one_moved_does_not_count_their_overlap_twice() -
     moved = first.corrections["gps"]
     assert np.linalg.norm(moved.translation) > 1.5
     own = {"covariance": loose.ravel().tolist(), "present_from_own": moved.log().tolist()}
-    there = replace(maps["gps"], covariance=first.covariance["gps"], evidence={"growth": {OWN: own}})
+    anew = replace(gps.placement, covariance=first.covariance["gps"], evidence={"growth": {OWN: own}})
+    there = replace(maps["gps"], placement=anew)
     agreeing = moved @ to_gps.other_from_map @ first.corrections["m"].inverse()
     edges = (maps["m"].edges[0], replace(to_gps, other_from_map=agreeing))
     maps |= {"gps": there, "m": replace(maps["m"], edges=edges)}
@@ -210,7 +214,7 @@ def test_only_points_of_two_sources_answer() -> None:
     parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
     poisoned = replace(feature_map, observations=type(seen)(**parts))
     known = ("anna", "ben", "eve")
-    points = confirmed_points(poisoned, sources_of(poisoned, on_record=known))
+    points = confirm(poisoned, sources_of(poisoned, on_record=known)).points
     assert not points[fake].any()
     assert points[~fake].mean() > 0.9
     part = answering_with(poisoned, points)
@@ -221,21 +225,21 @@ def test_only_points_of_two_sources_answer() -> None:
     # Where all is seen by two, nothing changes; a trusted owner's points need nobody.
     clean = strip_map("m", 40.0, owners=["anna", "ben"])
     assert answering_with(clean, np.ones(len(clean.points), dtype=bool)) is clean
-    trusted = confirmed_points(poisoned, sources_of(poisoned, trusted=("eve",)))
+    trusted = confirm(poisoned, sources_of(poisoned, trusted=("eve",))).points
     assert trusted[fake].mean() > 0.5
     # Whose word does not count yet takes no part.
-    assert not confirmed_points(poisoned, sources_of(poisoned, on_record=["eve"])).any()
+    assert not confirm(poisoned, sources_of(poisoned, on_record=["eve"])).points.any()
 
 
 def test_a_witness_makes_points_answer() -> None:
     feature_map = strip_map("m", 40.0, owners=["anna"])
     rows = np.arange(100, dtype=np.int64)
-    outside = CorroboratingImage(
+    outside = OutsidePhoto(
         name="w", source=Source(owner="ben", proven=True), center=np.array([0.0, -60.0, 20.0]), points=rows
     )
     sources = sources_of(feature_map)
-    alone = confirmed_points(feature_map, sources)
-    found = confirmed_points(feature_map, sources, [outside])
+    alone = confirm(feature_map, sources).points
+    found = confirm(feature_map, sources, [outside]).points
     assert not alone.any()
     assert found[rows].mean() > 0.9
     assert not found[100:].any()
@@ -264,7 +268,7 @@ def test_a_report_tells_all_in_both_forms() -> None:
         maps=(
             GrownEntry(
                 map_id="m", status="active", reason_code="", reason="2 sources", photos=("p",), points=9,
-                steps=1, drift_m=0.31, budget_m=0.5,
+                generation=1, drift_m=0.31, budget_m=0.5,
             ),
         ),
         promotions=(

@@ -12,7 +12,6 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.growth.graph.pose_graph import (
     GraphEdge,
     GraphNode,
-    equivalent_sigmas,
     left_jacobian,
     small_adjoint,
     solve_pose_graph,
@@ -57,7 +56,6 @@ def test_a_chain_of_n_edges_has_n_times_the_covariance() -> None:
         np.testing.assert_allclose(found.covariance_relative[f"m{k}"], (k + 1) * _EDGE, rtol=1e-6, atol=1e-15)
         np.testing.assert_allclose(found.covariance[f"m{k}"], (k + 1) * _EDGE + _TIGHT, rtol=1e-4, atol=1e-12)
     assert found.degrees == 0
-    assert all(fit.redundancy == 0 and np.isnan(fit.sigmas) for fit in found.edges)
 
 
 def test_an_anchor_at_the_far_end_halves_the_middle() -> None:
@@ -147,8 +145,7 @@ def _square(wrong: tuple[float, ...]) -> tuple[list[GraphNode], list[GraphEdge]]
 def test_an_edge_that_contradicts_the_rest_is_named_and_left_out() -> None:
     found = solve_pose_graph(*_square(_east(5.0)))
     assert found.reason is None
-    assert [str(fit.edge) for fit in found.left_out] == ["m3 - m1"]
-    assert found.left_out[0].sigmas > 10
+    assert [str(edge) for edge in found.left_out] == ["m3 - m1"]
     for m in ("m1", "m2", "m3"):
         np.testing.assert_allclose(found.corrections[m].log(), np.zeros(7), atol=1e-6)
 
@@ -228,12 +225,6 @@ def test_a_large_graph_takes_the_sparse_way_to_the_same_answer() -> None:
     edges = [_edge(b, a) for a, b in itertools.pairwise(names)]
     found = solve_pose_graph(nodes, edges)
     np.testing.assert_allclose(found.covariance_relative["m100"], 50 * _EDGE, rtol=1e-5, atol=1e-14)
-
-
-def test_equivalent_sigmas() -> None:
-    assert equivalent_sigmas(9.0, 1) == pytest.approx(3.0, rel=1e-9)
-    assert np.isnan(equivalent_sigmas(0.0, 0))
-    assert equivalent_sigmas(1e6, 7) == pytest.approx(1e3, rel=0.01)
 
 
 def test_unknown_and_repeated_maps_are_refused() -> None:

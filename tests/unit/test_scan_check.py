@@ -13,9 +13,13 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.render.cloud import PointCloud
 from ingest.growth.gates import Gate
+from ingest.growth.map_images import model_of
 from ingest.growth.map_places import growth_of
+from ingest.growth.place.component import GrownMap
+from ingest.growth.place.placement import MapsPlacement
 from ingest.growth.trust import scan_check
 from ingest.growth.trust.scan_check import checked_by_scan, cloud_gate
+from ingest.growth.values import Refused
 from tests.support.scanned_map import ground_points, plain_cloud, scan, scanned_map
 
 pytest.importorskip("small_gicp")
@@ -91,18 +95,23 @@ def test_where_there_is_no_scan_nothing_is_said(cloud: PointCloud) -> None:
 def test_without_the_extra_a_map_with_a_scan_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     world = scanned_map(placed_by=Sim3.identity())
     known = replace(world.feature_map, height_datum=world.cloud.height_datum)
+    placement = MapsPlacement(reason=None, message="", frame=known.frame)
+    grown = GrownMap(
+        feature_map=known,
+        placement=placement,
+        model=model_of(known, known.points_local(), known.images, described=False),
+    )
     database: Any = None
     monkeypatch.setattr(scan_check, "has_scans", lambda _: True)
     monkeypatch.setattr(scan_check, "load_cloud", lambda *_: world.cloud)
-    gate = checked_by_scan(database, known)[1]
-    assert gate is not None
-    assert gate.passes
+    checked, why = checked_by_scan(database, grown)
+    assert isinstance(checked, GrownMap)
+    assert growth_of(checked.feature_map.placement.evidence)["gates"]["scan"]["passes"]
     monkeypatch.setitem(sys.modules, "small_gicp", None)
-    checked, gate, why = checked_by_scan(database, known)
-    assert gate is not None
-    assert not gate.passes
-    assert (gate.reason, why) == ("SCAN_NOT_ASKED", "")
-    assert "featuredb[lidar]" in gate.message
-    assert not growth_of(checked.placement.evidence)["gates"]["scan"]["passes"]
+    refused, why = checked_by_scan(database, grown)
+    assert isinstance(refused, Refused)
+    assert (refused.reason, why) == ("SCAN_NOT_ASKED", "")
+    assert "featuredb[lidar]" in refused.message
+    assert [gate.passes for gate in refused.gates] == [False]
     monkeypatch.setattr(scan_check, "load_cloud", lambda *_: SimpleNamespace(xyz=()))
-    assert checked_by_scan(database, known)[1] is None
+    assert checked_by_scan(database, grown) == (grown, "")

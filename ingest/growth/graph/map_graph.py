@@ -5,29 +5,34 @@ its digest of place differs, and the edge has to be measured again.
 """
 
 import hashlib
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.move import covariance_in_frame, in_frame
 from featuredb.store import Snapshot
 from featuredb.store.changes import is_imported
+from featuredb.store.decode import frame_of, placement_of
 from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.graph.pose_graph import GraphEdge, GraphNode, GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
-from ingest.growth.place.component import GrownMap
-from ingest.growth.values import LEAST_PHOTOS, Edge, Refused, tied_together
+from ingest.growth.place.component import GrownMap, grow_component
+from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
+from ingest.map_builder import MapIdentity
+from ingest.photos.photo import Photo
 from ingest.sfm.links import keep_photos
+from reloc.localise.candidates import IndexedArea
+
+_LOG = logging.getLogger(__name__)
 
 _TRIES = 3  # the part within the budget may lie otherwise, and be cut again
 OWN = "own_placement"  # key of an anchor's evidence of growth, once a graph has moved it
@@ -50,11 +55,10 @@ class PlacedMap:
     generation: int
     parents: tuple[str, ...]
     frame: LocalFrame
-    covariance: FloatArray
+    placement: Placement
     place: str
     corners: FloatArray
     edges: tuple[Edge, ...]
-    evidence: Mapping[str, Any]
 
     @property
     def is_anchor(self) -> bool:
@@ -63,9 +67,9 @@ class PlacedMap:
     @property
     def own_placement(self) -> tuple[FloatArray, Sim3]:
         """Covariance (7, 7) of an anchor's placement before others moved it, and that move; its frame."""
-        own = growth_of(self.evidence).get(OWN)
+        own = growth_of(self.placement.evidence).get(OWN)
         if own is None:
-            return self.covariance, Sim3.identity()
+            return self.placement.covariance, Sim3.identity()
         return np.asarray(own["covariance"], dtype=np.float64).reshape(7, 7), Sim3.exp(
             own["present_from_own"]
         )
@@ -78,17 +82,7 @@ def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
 
 
 def _placed(row: Row) -> PlacedMap:
-    evidence = json.loads(row["placement_evidence"] or "{}")
-    frame = LocalFrame(
-        latitude_deg=row["origin_latitude_deg"],
-        longitude_deg=row["origin_longitude_deg"],
-        height_m=row["origin_height_m"],
-    )
-    placed_at = Sim3(
-        scale=row["local_from_sfm_scale"],
-        rotation=np.asarray(row["local_from_sfm_rotation"]).reshape(3, 3),
-        translation=np.asarray(row["local_from_sfm_translation"]),
-    )
+    frame, placement = frame_of(row), placement_of(row)
     return PlacedMap(
         map_id=row["map_id"],
         write_id=row["write_id"],
@@ -97,11 +91,10 @@ def _placed(row: Row) -> PlacedMap:
         generation=row["generation"],
         parents=tuple(row["parents"]),
         frame=frame,
-        covariance=np.asarray(row["placement_covariance"], dtype=np.float64).reshape(7, 7),
-        place=place_key(frame, placed_at, row["placement_covariance"]),
+        placement=placement,
+        place=place_key(frame, placement),
         corners=_corners(row, frame),
-        edges=tuple(Edge.from_json(edge) for edge in growth_of(evidence).get("edges", ())),
-        evidence=evidence,
+        edges=tuple(Edge.from_json(edge) for edge in growth_of(placement.evidence).get("edges", ())),
     )
 
 
@@ -113,17 +106,12 @@ def _corners(row: Row, frame: LocalFrame) -> FloatArray:
     return frame.enu_from_utm(np.stack([box[picks[:, k], k] for k in range(3)], axis=1), row["epsg"])
 
 
-def place_key(frame: LocalFrame, local_from_sfm: Sim3, covariance: Iterable[float]) -> str:
+def place_key(frame: LocalFrame, placement: Placement) -> str:
     """A digest of where a map lies, and how surely: 16 hex digits, others once the map is placed anew."""
-    numbers = [frame.latitude_deg, frame.longitude_deg, frame.height_m, local_from_sfm.scale]
-    numbers += [*local_from_sfm.rotation.ravel().tolist(), *local_from_sfm.translation.tolist(), *covariance]
+    at = placement.local_from_sfm
+    numbers = [frame.latitude_deg, frame.longitude_deg, frame.height_m, at.scale, *at.rotation.ravel()]
+    numbers += [*at.translation, *placement.covariance.ravel()]
     return hashlib.sha256(np.array(numbers, dtype="<f8").tobytes()).hexdigest()[:16]
-
-
-def place_of(feature_map: FeatureMap) -> str:
-    """`place_key` of a loaded map."""
-    placement = feature_map.placement
-    return place_key(feature_map.frame, placement.local_from_sfm, placement.covariance.ravel().tolist())
 
 
 def family(maps: Mapping[str, PlacedMap], edges: Iterable[tuple[str, str]], start: Iterable[str]) -> set[str]:
@@ -209,16 +197,30 @@ def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
 
 def grow_within_budget(
     model: Model,
-    grow: Callable[[Model], GrownMap | Refused],
+    photos: Sequence[Photo],
+    features_of: FeaturesOf,
+    localised: Mapping[int, LocalisedPhoto],
+    areas: Sequence[IndexedArea],
     maps: Mapping[str, PlacedMap],
     budget_m: float,
+    identity: MapIdentity | None = None,
 ) -> GrownMap | Refused:
-    """The map, by `grow`, of a reconstruction with its drift, or of the part that is within the budget."""
+    """`grow_component` of a reconstruction, or of the part of it that is within the budget.
+
+    Returns:
+        The map with its drift, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this
+        reconstruction and not the others of the run, nor the next run.
+    """
     part, everything = model, tuple(model.rows.tolist())
     beyond: dict[int, tuple[str, str]] = {}
     refused = Refused(reason="", message="")
     for _ in range(_TRIES):
-        grown = grow(part)
+        try:
+            grown = grow_component(part, photos, features_of, localised, areas, identity, budget_m)
+        except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
+            _LOG.exception("a reconstruction of %d photos", len(everything))
+            text = f"{type(error).__name__}: {error}; the log tells where. Please report it"
+            grown = Refused(reason="FAILED", message=text)
         if isinstance(grown, Refused):
             return replace(grown, rows=everything)
         feature_map, drift, relative = with_drift(grown, maps, budget_m)

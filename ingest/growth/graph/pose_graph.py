@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
@@ -82,15 +82,11 @@ class EdgeFit:
     Attributes:
         chi_square: by how much the graph's chi-square falls without the edge.
         redundancy: number of its seven directions that others check, 0 to 7.
-        sigmas: of a normal error that is as unlikely; NaN where nothing checks it.
-        left_out: whether it contradicts the rest, and was left out.
     """
 
     edge: GraphEdge
     chi_square: float
     redundancy: int
-    sigmas: float
-    left_out: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,7 +100,7 @@ class GraphSolution:
         covariance: (7, 7) of each new place on Earth.
         covariance_relative: (7, 7) relative to the anchors, as if those were the truth; zero for anchors.
         chi_square, degrees: of the fit; covariances are widened by their ratio where that is needed.
-        edges: all of them, those left out too.
+        left_out: edges that contradict the rest.
     """
 
     reason: str | None
@@ -114,11 +110,7 @@ class GraphSolution:
     covariance_relative: Mapping[str, FloatArray] = field(default_factory=dict)
     chi_square: float = 0.0
     degrees: int = 0
-    edges: tuple[EdgeFit, ...] = ()
-
-    @property
-    def left_out(self) -> tuple[EdgeFit, ...]:
-        return tuple(fit for fit in self.edges if fit.left_out)
+    left_out: tuple[GraphEdge, ...] = ()
 
 
 class _Fit:
@@ -179,7 +171,7 @@ class _Fit:
         """What each edge takes of chi-square, and in how many directions others check it."""
         tests = [self._test(k, (self._rows[e.a], self._rows[e.b])) for k, e in enumerate(self.edges)]
         return tuple(
-            EdgeFit(edge=edge, chi_square=chi, redundancy=rank, sigmas=equivalent_sigmas(chi, rank))
+            EdgeFit(edge=edge, chi_square=chi, redundancy=rank)
             for edge, (chi, rank) in zip(self.edges, tests, strict=True)
         )
 
@@ -255,38 +247,31 @@ def solve_pose_graph(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> 
         raise InvalidValueError(f"pose graph: edges name unknown maps {sorted(unknown)}")
     if broken := [str(e) for e in edges if not np.isfinite(e.covariance).all()]:
         raise InvalidValueError(f"pose graph: covariances that are not finite: {broken}")
-    left_out: list[EdgeFit] = []
+    left_out: list[GraphEdge] = []
     remaining = list(edges)
-    anchored_first = _anchored(nodes, remaining)
+    reached = _anchored(nodes, remaining)
+    if not reached:
+        return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
     while True:
-        reached = _anchored(nodes, remaining)
-        if not reached:
-            return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
         fitted = _Fit([n for n in nodes if n.map_id in reached], remaining)
         fits = fitted.edges_judged()
         worst = _contradicting(fitted, fits)
-        if worst is None or _anchored(nodes, [e for e in remaining if e is not worst.edge]) != anchored_first:
+        if worst is None or _anchored(nodes, [e for e in remaining if e is not worst]) != reached:
             break
-        left_out.append(replace(worst, left_out=True))
-        remaining.remove(worst.edge)
-    return _solution(fitted, (*fits, *left_out))
+        left_out.append(worst)
+        remaining.remove(worst)
+    return replace(_solution(fitted, fits), left_out=tuple(left_out))
 
 
-def _solution(fitted: _Fit, fits: tuple[EdgeFit, ...]) -> GraphSolution:
+def _solution(fitted: _Fit, fits: Sequence[EdgeFit]) -> GraphSolution:
     factor = 1.0
     if fitted.degrees > 0 and not _likely(fitted.chi_square, fitted.degrees):
         factor = max(1.0, fitted.chi_square / fitted.degrees)
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
-    found = GraphSolution(
-        reason=None,
-        message=figures,
-        chi_square=fitted.chi_square,
-        degrees=fitted.degrees,
-        edges=fits,
-    )
+    found = GraphSolution(reason=None, message=figures, chi_square=fitted.chi_square, degrees=fitted.degrees)
     if factor > _MOST_VARIANCE_FACTOR:
-        worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:_NAMED]
-        named = "; ".join(f"{f.edge} by {f.sigmas:.1f} sigma" for f in worst)
+        worst = sorted((f for f in fits if f.redundancy), key=lambda f: -f.chi_square)[:_NAMED]
+        named = "; ".join(f"{f.edge} by {f.chi_square:.1f}" for f in worst)
         text = f"the overlaps contradict each other and no single one stands out ({figures}): {named}"
         return replace(found, reason="CONTRADICTION", message=text)
     return replace(
@@ -301,7 +286,7 @@ def _likely(chi_square: float, degrees: int) -> bool:
     return bool(chi2.sf(chi_square, degrees) >= _CHANCE)
 
 
-def _contradicting(fitted: _Fit, fits: Sequence[EdgeFit]) -> EdgeFit | None:
+def _contradicting(fitted: _Fit, fits: Sequence[EdgeFit]) -> GraphEdge | None:
     """The edge that alone explains why the graph does not fit, if there is one."""
     checked = sorted((f for f in fits if f.redundancy), key=lambda f: -f.chi_square)
     if fitted.degrees == 0 or _likely(fitted.chi_square, fitted.degrees) or not checked:
@@ -314,7 +299,7 @@ def _contradicting(fitted: _Fit, fits: Sequence[EdgeFit]) -> EdgeFit | None:
     alone = all(worst.chi_square > _CLEAR_LEAD * other for other in rivals)
     clean = _likely(fitted.chi_square - worst.chi_square, max(fitted.degrees - worst.redundancy, 1))
     others_clean = any(_likely(fitted.chi_square - other, max(fitted.degrees - 7, 1)) for other in rivals)
-    return worst if alone or (clean and not others_clean) else None
+    return worst.edge if alone or (clean and not others_clean) else None
 
 
 def _anchored(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> set[str]:
@@ -322,15 +307,6 @@ def _anchored(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> set[str
     labels = tied_together([node.map_id for node in nodes], [(e.a, e.b) for e in edges])
     held = {label for node, label in zip(nodes, labels, strict=True) if node.prior is not None}
     return {node.map_id for node, label in zip(nodes, labels, strict=True) if label in held}
-
-
-def equivalent_sigmas(chi_square: float, degrees: int) -> float:
-    """The normal error, in standard deviations, that is as unlikely as a chi-square; NaN without degrees."""
-    if degrees == 0:
-        return float("nan")
-    log_p = float(chi2.logsf(chi_square, degrees))
-    # Beyond what float64 holds the tail is that of a normal error to within a few per cent.
-    return float(norm.isf(0.5 * np.exp(log_p))) if log_p > -700.0 else float(np.sqrt(chi_square))
 
 
 def _inverse_blocks(

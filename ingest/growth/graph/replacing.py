@@ -16,7 +16,7 @@ from featuredb.maps.move import covariance_in_frame, in_frame, move_map
 from featuredb.store import Database, Snapshot
 from featuredb.store.canaries import list_canaries
 from featuredb.store.commits import write_time
-from ingest.fingerprint import digest, options_fingerprint
+from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import (
     OWN,
     PlacedMap,
@@ -25,24 +25,21 @@ from ingest.growth.graph.map_graph import (
     graph_nodes,
     holds,
     in_graph,
-    place_of,
+    place_key,
     placed_maps,
 )
 from ingest.growth.graph.pose_graph import GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
-from ingest.growth.place.localised import QUERY
 from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun, check_known
 from ingest.growth.trust.promotion import PARENT_MOVED
 from ingest.growth.values import Edge
-from ingest.workspace import read_json, write_json
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
 _GAP_M = 5.0  # boxes of a grown map and a new anchor that come this close are looked at for an overlap
 _LEAST_MOVE_M = 0.01  # anchors that would move by less stay where they are
 _SAME_M = 1e-6  # an answer that moves by less was not touched
-_VERSION = "2"  # raised when overlaps are measured otherwise
 
 Edges = Mapping[str, Sequence[Edge]]
 """New overlaps, by the map whose evidence will have them."""
@@ -111,7 +108,7 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
         reason=solution.reason,
         message=solution.message,
         measured=notes,
-        left_out=tuple(str(fit.edge) for fit in solution.left_out),
+        left_out=tuple(map(str, solution.left_out)),
     )
     if solution.reason is not None:
         return told
@@ -164,21 +161,19 @@ def _measured(
     edges: dict[str, list[Edge]] = {}
     notes: list[str] = []
     for map_id, other_id in wanted:
-        asked = options_fingerprint(QUERY)
-        key = digest(_VERSION, asked, map_id, maps[map_id].place, other_id, maps[other_id].place)
-        cache = work / "overlaps" / f"{key[:24]}.json"
-        if not cache.is_file():
+        about, places = f"{map_id} {other_id}", f"{maps[map_id].place} {maps[other_id].place}"
+        said = recall(work, "overlaps", about, places)
+        if said is None:
             for m in (map_id, other_id):
                 loaded[m] = loaded.get(m) or snapshot.load_map(m)
             found = measure_overlap(loaded[map_id], loaded[other_id])
-            known: dict[str, Any] = {"edge": None}
+            said = {"edge": None}
             if isinstance(found, Edge):
-                known["edge"] = replace(found, place=maps[other_id].place).as_json()
-                known["note"] = f"{found.photos} images and {found.shared_points} points in common"
+                said["edge"] = replace(found, place=maps[other_id].place).as_json()
+                said["note"] = f"{found.photos} images and {found.shared_points} points in common"
             else:
-                known["note"] = found.message
-            write_json(cache, known)
-        said = read_json(cache)
+                said["note"] = found.message
+            remember(work, "overlaps", about, said, places)
         notes.append(f"{map_id} - {other_id}: {said['note']}")
         if said["edge"] is not None:
             edges.setdefault(map_id, []).append(Edge.from_json(said["edge"]))
@@ -211,8 +206,9 @@ def _moved(
             there = move_map(snapshot.load_map(map_id), own, covariance=covariance)
             moved[map_id] = there if before.is_anchor else inflated(there)
         corrections[map_id] = own
-    places = {m: place_of(moved[m]) if m in moved else maps[m].place for m in solution.corrections}
-    contradicting = {(fit.edge.a, fit.edge.b) for fit in solution.left_out}
+    places = {m: maps[m].place for m in solution.corrections}
+    places |= {m: place_key(there.frame, there.placement) for m, there in moved.items()}
+    contradicting = {(edge.a, edge.b) for edge in solution.left_out}
     new, reports = [], []
     for map_id, feature_map in moved.items():
         before = maps[map_id]
@@ -226,7 +222,7 @@ def _moved(
         again = PARENT_MOVED in before.status_reason and drift <= budget_m
         active = before.status == "active" or again
         new.append(replace(finished, status="active" if active else "quarantined"))
-        drifted = growth_of(before.evidence).get("drift_m")
+        drifted = growth_of(before.placement.evidence).get("drift_m")
         reports.append(
             MovedMap(
                 map_id=map_id, move_m=round(ways[map_id], 4), drift_before_m=drifted, drift_m=round(drift, 4)

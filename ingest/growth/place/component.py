@@ -1,6 +1,5 @@
 """From a reconstruction of new photos to a map that existing maps have placed, or to the reason why not."""
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -13,8 +12,8 @@ from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import GROWTH
 from ingest.colmap.bridge import Model
+from ingest.fingerprint import digest
 from ingest.growth import gates
-from ingest.growth.map_places import drift_m, growth_of, places_of
 from ingest.growth.place.localised import in_frame, with_lens
 from ingest.growth.place.placement import MapsPlacement, parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
@@ -25,8 +24,8 @@ from ingest.photos.photo import Photo
 from ingest.sfm.links import connected_parts, keep_photos
 from reloc.localise.candidates import IndexedArea
 
-_LOG = logging.getLogger(__name__)
-
+# Part of the id of every map that is named by its photos; raised when the same photos would give another map.
+_VERSION = "grown-1"
 # Points of two photos carry descriptors: a handful of photos has hardly longer tracks, and the next photo
 # needs them to be localised.
 _MAPS = MapOptions(min_track_length=2)
@@ -58,7 +57,7 @@ def grow_component(
     features_of: FeaturesOf,
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
-    identity: MapIdentity,
+    identity: MapIdentity | None,
     max_bound_m: float = DRIFT_BUDGET_M,
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
@@ -69,30 +68,9 @@ def grow_component(
         model: a connected reconstruction; its rows are rows of `photos`.
         localised: new photos that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
+        identity: of the map; None: it is named by its photos, so that the same ones give the same map.
         max_bound_m: photos that may be further off (95 %) are left out.
-
-    Returns:
-        The map, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this reconstruction
-        and not the others of the run, nor the next run.
     """
-    try:
-        return _grown(model, photos, features_of, localised, areas, identity, max_bound_m)
-    except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
-        rows = tuple(int(r) for r in model.rows)
-        _LOG.exception("a reconstruction of %d photos (%s ...)", len(rows), photos[rows[0]].name)
-        text = f"{type(error).__name__}: {error}; the log tells where. Please report it"
-        return Refused(reason="FAILED", message=text, rows=rows)
-
-
-def _grown(
-    model: Model,
-    photos: Sequence[Photo],
-    features_of: FeaturesOf,
-    localised: Mapping[int, LocalisedPhoto],
-    areas: Sequence[IndexedArea],
-    identity: MapIdentity,
-    max_bound_m: float,
-) -> GrownMap | Refused:
     rows = tuple(int(r) for r in model.rows)
     mine = {r: localised[r] for r in rows if r in localised}
     if not mine:
@@ -101,7 +79,7 @@ def _grown(
     frame, near = _meeting_place(mine, areas)
     mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
-    model, lenses = adopt_lenses(model, mine, photos, near, keypoints)
+    model, lenses = adopt_lenses(model, photos, near, keypoints)
     camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
     mine = {r: with_lens(photo, model.cameras[camera_of[r]]) for r, photo in mine.items()}
     correspondences = find_correspondences(model, mine, dict(zip(rows, keypoints, strict=True)))
@@ -117,13 +95,14 @@ def _grown(
 def _meeting_place(
     localised: Mapping[int, LocalisedPhoto], areas: Sequence[IndexedArea]
 ) -> tuple[LocalFrame, list[Area]]:
-    """The frame of the area with most inliers, and the areas whose heights have the same datum."""
+    """The frame of the area with most inliers; this area and then others whose heights have its datum."""
     inliers: dict[LocalFrame, int] = {}
     for photo in localised.values():
         inliers[photo.frame] = inliers.get(photo.frame, 0) + len(photo.pixels)
     frame = max(inliers, key=lambda f: inliers[f])
     datum = next(a.area for a in areas if a.area.frame == frame).maps[0].height_datum
-    return frame, [a.area for a in areas if a.area.maps[0].height_datum == datum]
+    near = [a.area for a in areas if a.area.maps[0].height_datum == datum]
+    return frame, sorted(near, key=lambda area: area.frame != frame)
 
 
 def _assembled(
@@ -131,7 +110,7 @@ def _assembled(
     photos: Sequence[Photo],
     features_of: FeaturesOf,
     areas: Sequence[Area],
-    identity: MapIdentity,
+    identity: MapIdentity | None,
 ) -> GrownMap | Refused:
     """The map of a refined model, with what growth knows of it as evidence."""
     model, placement = refined.model, refined.placement
@@ -150,7 +129,7 @@ def _assembled(
         placement.frame,
         [photos[r] for r in rows],
         [features_of(r) for r in rows],
-        identity,
+        identity or _named([photos[r] for r in rows]),
         replace(_MAPS, height_datum=parents[0][0].height_datum),
     )
     if feature_map is None:
@@ -161,8 +140,6 @@ def _assembled(
             gates=placement.gates,
         )
     growth = {
-        "drift_m": drift_m(to_anchors, places_of(feature_map)),
-        "steps": 1 + max(int(growth_of(m.placement.evidence).get("steps", 0)) for m, _ in parents),
         "covariance_relative": to_anchors.ravel().tolist(),
         "gates": gates.figures(placement.gates),
         "bending_m": refined.bending_m,
@@ -186,6 +163,18 @@ def _assembled(
         placement=placement,
         model=model,
         left_out=refined.left_out,
+    )
+
+
+def _named(photos: Sequence[Photo]) -> MapIdentity:
+    """A map is named by its photos: the same photos give the same map."""
+    key = digest(_VERSION, *sorted(p.sha256 for p in photos))[:20]
+    return MapIdentity(
+        map_id=f"g{key}",
+        name=f"grown {key[:6]}",
+        source="growth",
+        licence=", ".join(sorted({p.licence for p in photos if p.licence})),
+        provenance={"version": _VERSION, "photos": len(photos)},
     )
 
 

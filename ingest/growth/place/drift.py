@@ -19,7 +19,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap.adjust import longest_side, residuals_of
-from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, block_and_marks
+from ingest.colmap.anchored import MAPPING, FixedPoints, Lenses, block_and_marks
 from ingest.colmap.bridge import Model, with_observations
 from ingest.colmap.precision import design_effect
 
@@ -56,7 +56,6 @@ def photo_covariances(
     fixed: FixedPoints,
     kept: NDArray[np.bool_],
     lenses: Lenses,
-    adjust: AnchoredOptions,
 ) -> PhotoSpread:
     """Of all photos, relative to the existing points.
 
@@ -81,17 +80,16 @@ def photo_covariances(
     model = _thinned(model)
     everything = np.ones(len(model.point_of), dtype=np.bool_)
     block, marks = block_and_marks(model, everything, keypoints, fixed, kept)
-    dilution = adjust.mapping.dilution
     sigma_px = float(np.sqrt(_variance_px2(block, marks)))
     terms = Terms(
         keypoint_px=sigma_px,
-        dilution=dilution,
-        lenses=lenses.priors(model.cameras, adjust),
+        dilution=MAPPING.dilution,
+        lenses=lenses.priors(model.cameras),
         marks=replace(marks, sigma_px=sigma_px),
     )
     problem = Problem(block, terms)
     found, weighted = problem.honest_marginals()
-    common = found.by_lenses() - dilution**2 * problem.by_lens_priors(weighted, lenses.lent)
+    common = found.by_lenses() - MAPPING.dilution**2 * problem.by_lens_priors(weighted, lenses.lent)
     seen = np.flatnonzero(found.pose_start >= 0)
     for k in seen.tolist():
         at = found.pose_start[k] + np.arange(6)

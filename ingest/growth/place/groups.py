@@ -5,59 +5,37 @@ their geometry, estimated without any pose, fits the two poses, two independent 
 localised photo is never enough.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored, triangulate_posed
-from ingest.colmap.bridge import Model, SfmPhoto, TwoView, verify_pair
+from ingest.colmap.anchored import FixedPoints, Lenses, adjust_anchored, pixel_scale, triangulate_posed
+from ingest.colmap.bridge import Model, SfmPhoto, TwoView
 from ingest.growth.place.localised import in_frame
-from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, pixel_scale, tied_together
-from ingest.sfm.matching import MatchOptions, mutual_matches
+from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, tied_together
+from ingest.sfm.pairs import Pair
+from reloc.localise.pose import reprojection_errors
 
-_PARTNERS = 6  # photos that each one is compared with, those first that share most existing points
-_MOST_FEATURES = 6000  # of each photo, strongest and best spread first
 _LEAST_FITTING = 0.7  # share of a pair's verified matches that must fit the poses
 # Median between the rays. Below, any two photos from one spot fit, and two copies of one picture.
 _LEAST_ANGLE_DEG = 1.0
-_MATCHING = MatchOptions()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairCheck:
-    """What two photos say of each other's poses.
-
-    Attributes:
-        verified: matches with a two-view geometry of their own.
-        fitting: share of these that fits the two poses.
-        angle_deg: median angle between the rays of those that fit.
-    """
-
-    verified: int
-    fitting: float
-    angle_deg: float
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the pair bears the two poses out."""
-        return (
-            self.verified >= _MATCHING.min_inliers
-            and self.fitting >= _LEAST_FITTING
-            and self.angle_deg >= _LEAST_ANGLE_DEG
-        )
 
 
 def lone_groups(
-    localised: Mapping[int, LocalisedPhoto], features_of: FeaturesOf
+    localised: Mapping[int, LocalisedPhoto],
+    features_of: FeaturesOf,
+    overlaps: Collection[Pair],
+    geometry_of: Callable[[Pair], TwoView],
 ) -> tuple[list[Model], dict[int, str]]:
     """Groups among localised photos that no reconstruction holds, and for those in none the reason.
 
     Args:
         localised: the lone photos by row, those of one camera with one lens.
+        overlaps: pairs of rows with verified matches. geometry_of: theirs, in which no pose takes part.
 
     Returns:
         A model of each group, of its matches alone, with the lenses of the localisations and near their
@@ -67,10 +45,11 @@ def lone_groups(
         return [], {}
     frame = next(iter(localised.values())).frame
     photos = {r: in_frame(p, frame) for r, p in sorted(localised.items())}
-    geometries: dict[tuple[int, int], TwoView] = {}
-    for a, b in _candidate_pairs(photos):
-        view = _verified(photos[a], photos[b], features_of)
-        if _check_pair(photos[a], photos[b], view, features_of).agrees:
+    geometries: dict[Pair, TwoView] = {}
+    for a, b in sorted(pair for pair in overlaps if photos.keys() >= set(pair)):
+        view = geometry_of((a, b))
+        pixels = [features_of(r).features.xy[view.inliers[:, k]] for k, r in enumerate((a, b))]
+        if poses_fit(photos[a], photos[b], pixels[0].astype(np.float64), pixels[1].astype(np.float64)):
             geometries[a, b] = view
     reasons = dict.fromkeys(photos, "ALONE: no other photo bears its pose out")
     groups: list[Model] = []
@@ -85,61 +64,15 @@ def lone_groups(
     return groups, reasons
 
 
-def _candidate_pairs(photos: Mapping[int, LocalisedPhoto]) -> list[tuple[int, int]]:
-    """Pairs that share existing points or look at the same place, most shared first."""
-    seen = {
-        r: {(p.map_ids[m], q) for m, q in zip(p.map_of.tolist(), p.point_of.tolist(), strict=True)}
-        for r, p in photos.items()
-    }
-    scene = {r: np.median(p.points, axis=0) for r, p in photos.items()}
-    reach = {
-        r: float(np.median(np.linalg.norm(p.points - p.cam_from_local.center, axis=1)))
-        for r, p in photos.items()
-    }
-    pairs: set[tuple[int, int]] = set()
-    for r in photos:
-        scores = []
-        for other in photos.keys() - {r}:
-            shared = len(seen[r] & seen[other])
-            gap = float(np.linalg.norm(scene[r] - scene[other]))
-            if shared or gap < 0.5 * min(reach[r], reach[other]):
-                scores.append((-shared, gap, other))
-        pairs |= {(min(r, other), max(r, other)) for _, _, other in sorted(scores)[:_PARTNERS]}
-    return sorted(pairs)
-
-
-def _verified(a: LocalisedPhoto, b: LocalisedPhoto, features_of: FeaturesOf) -> TwoView:
-    """Two-view geometry of the pair; the lenses are those of the localisations, no pose takes part."""
-    one, two = features_of(a.row).features, features_of(b.row).features
-    matches = mutual_matches(one.descriptors[:_MOST_FEATURES], two.descriptors[:_MOST_FEATURES], _MATCHING)
-    return verify_pair(
-        a.camera,
-        one.xy,
-        b.camera,
-        two.xy,
-        matches,
-        focal_known=True,
-        max_error_px=_MATCHING.max_error_px * pixel_scale(a.camera, b.camera),
-        seed=_MATCHING.seed,
-    )
-
-
-def _check_pair(a: LocalisedPhoto, b: LocalisedPhoto, view: TwoView, features_of: FeaturesOf) -> PairCheck:
-    """How far a pair's verified matches fit the two localised poses, both in one frame."""
-    pixels_a = features_of(a.row).features.xy[view.inliers[:, 0]].astype(np.float64)
-    pixels_b = features_of(b.row).features.xy[view.inliers[:, 1]].astype(np.float64)
-    if not len(pixels_a):
-        return PairCheck(verified=0, fitting=0.0, angle_deg=0.0)
+def poses_fit(a: LocalisedPhoto, b: LocalisedPhoto, pixels_a: FloatArray, pixels_b: FloatArray) -> bool:
+    """Whether the verified matches of two photos, pixels (m, 2) of each, bear out the poses in one frame."""
     points, angle = intersections(a.camera, a.cam_from_local, pixels_a, b.camera, b.cam_from_local, pixels_b)
     fits = np.ones(len(points), dtype=np.bool_)
     for photo, pixels in ((a, pixels_a), (b, pixels_b)):
-        error = np.linalg.norm(photo.camera.project(photo.cam_from_local.act(points)) - pixels, axis=1)
-        fits &= np.nan_to_num(error, nan=np.inf) < TOLERANCE_PX * pixel_scale(photo.camera)
-    return PairCheck(
-        verified=len(points),
-        fitting=float(fits.mean()),
-        angle_deg=float(np.median(np.degrees(angle[fits]))) if fits.any() else 0.0,
-    )
+        errors = reprojection_errors(pixels, points, photo.camera, photo.cam_from_local)
+        fits &= errors < TOLERANCE_PX * pixel_scale(photo.camera)
+    enough = fits.sum() >= _LEAST_FITTING * len(fits)
+    return bool(enough and np.degrees(np.median(angle[fits])) >= _LEAST_ANGLE_DEG)
 
 
 def intersections(
@@ -172,7 +105,7 @@ def _rays(camera: Camera, pose: Rigid3, pixels: FloatArray) -> FloatArray:
 def _triangulated(
     rows: Sequence[int],
     photos: Mapping[int, LocalisedPhoto],
-    geometries: Mapping[tuple[int, int], TwoView],
+    geometries: Mapping[Pair, TwoView],
     features_of: FeaturesOf,
 ) -> Model:
     """A model of the group from its verified matches; rows are those of the photos.
@@ -196,5 +129,5 @@ def _triangulated(
     )
     keypoints = [sfm[int(k)].keypoints.astype(np.float64) for k in model.rows]
     lenses = Lenses(held=range(len(model.cameras)))
-    free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses, AnchoredOptions()).model
+    free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses).model
     return replace(free, rows=np.array([rows[int(k)] for k in model.rows], dtype=np.int64))

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from featuredb.features.features import Features
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from featuredb.index.descriptor_index import use_threads
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
@@ -23,7 +21,13 @@ from reloc.localise.lens_prior import LensPriors
 from reloc.localise.localise import Localised, localise_features
 from reloc.localise.matching import POSSIBLE_DEG, guided_matches, visible_points
 from reloc.localise.options import LocaliseOptions, PoseOptions
-from reloc.localise.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
+from reloc.localise.pose import (
+    PoseHypothesis,
+    estimate_pose,
+    pose_uncertainty,
+    refine_pose,
+    reprojection_errors,
+)
 from reloc.localise.result import LocaliseRequest
 from reloc.localise.search import pairs
 
@@ -191,7 +195,8 @@ def _match_each_map(
         points = visible[area.point_map[visible] == map_row].astype(np.int32)
         matches = guided_matches(features, area, points, pose.camera, pose.cam_from_local, QUERY.matching)
         pixels, places = pairs(features, area, matches)
-        near = _errors_px(pose.camera, pose.cam_from_local, places, pixels) < 2.0 * _tolerance_px(pose.camera)
+        errors = reprojection_errors(pixels, places, pose.camera, pose.cam_from_local)
+        near = errors < 2.0 * _tolerance_px(pose.camera)
         if near.sum() >= QUERY.acceptance.min_inliers:
             found = np.concatenate([found, np.stack([matches.feature[near], matches.point[near]])], axis=1)
     return found[0], found[1]
@@ -199,10 +204,6 @@ def _match_each_map(
 
 def _tolerance_px(camera: Camera) -> float:
     return QUERY.pose.tolerance_rel * max(camera.width, camera.height)
-
-
-def _errors_px(camera: Camera, pose: Rigid3, points: FloatArray, pixels: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(camera.project(pose.act(points)) - pixels, axis=1))
 
 
 def with_lens(photo: LocalisedPhoto, camera: Camera) -> LocalisedPhoto:
@@ -213,22 +214,9 @@ def with_lens(photo: LocalisedPhoto, camera: Camera) -> LocalisedPhoto:
     """
     if camera == photo.camera or (camera.width, camera.height) != (photo.camera.width, photo.camera.height):
         return photo
-    # The camera goes back along its axis as the focal length grows, so that the scene keeps its size.
-    was = photo.cam_from_local
-    back = (was.center - np.median(photo.points, axis=0)) * (camera.focal_px / photo.camera.focal_px - 1.0)
-    start = PoseHypothesis(
-        cam_from_local=Rigid3(rotation=was.rotation, translation=was.translation - was.rotation @ back),
-        camera=camera,
-        camera_source="request",
-        inliers=np.ones(len(photo.pixels), dtype=np.bool_),
-        prior_focal_px=camera.focal_px,
-    )
-    best = estimate_pose(photo.pixels, photo.points, camera, "request", QUERY.pose)
-    again = max(
-        (refine_pose(photo.pixels, photo.points, s, QUERY.pose) for s in (start, best) if s is not None),
-        key=lambda pose: pose.count,
-    )
-    if again.count < 0.5 * len(photo.pixels) or again.count < 4:
+    start = estimate_pose(photo.pixels, photo.points, camera, "request", QUERY.pose)
+    again = start and refine_pose(photo.pixels, photo.points, start, QUERY.pose)
+    if again is None or again.count < max(4.0, 0.5 * len(photo.pixels)):
         return photo
     rows = np.flatnonzero(again.inliers)
     spread = pose_uncertainty(
@@ -284,5 +272,5 @@ def _fitting(photo: LocalisedPhoto, lens: Camera) -> int:
     """Matches of the photo that fit its pose, if it has that lens."""
     if photo.camera != lens:
         return 0
-    errors = _errors_px(lens, photo.cam_from_local, photo.points, photo.pixels)
+    errors = reprojection_errors(photo.pixels, photo.points, lens, photo.cam_from_local)
     return int((errors < _tolerance_px(lens)).sum())

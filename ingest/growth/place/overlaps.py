@@ -10,18 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.geometry.sim3 import Sim3
-from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, features_and_points, model_of
 from ingest.growth.place.localised import in_frame, localise_photo
-from ingest.growth.place.similarity_fit import (
-    agreeing_photos,
-    best_proposal,
-    find_correspondences,
-    fit_similarity,
-    tolerances_px,
-)
+from ingest.growth.place.similarity_fit import agreed_similarity, find_correspondences, tolerances_px
 from ingest.growth.values import LEAST_PHOTOS, Edge, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
@@ -45,7 +37,7 @@ def measure_overlap(
     if feature_map.height_datum != other.height_datum:
         return Refused(reason="NO_OVERLAP", message="heights of different datums")
     images = _images_near(feature_map, other) if images is None else images
-    indexed = indexed_area(other)
+    indexed = IndexedArea.of([other])
     localised: dict[int, LocalisedPhoto] = {}
     for row, image in enumerate(images):
         found = localise_image(feature_map, image, row, [indexed])
@@ -71,25 +63,23 @@ def _fitted(
         r: features_and_points(feature_map, image)[0].xy.astype(float) for r, image in enumerate(images)
     }
     correspondences = find_correspondences(model, localised, keypoints)
-    proposal = best_proposal(model, localised, correspondences, [Sim3.identity()])
-    assert proposal is not None
-    best, agree = proposal
-    if len(agree) < LEAST_PHOTOS:
+    found = agreed_similarity(model, localised, correspondences, [Sim3.identity()])
+    agree = set() if found is None else found[1]
+    if found is None or len(agree) < LEAST_PHOTOS:
         return Refused(
             reason="FEW_IMAGES",
             message=f"{len(agree)} images of map {feature_map.map_id} agree on how it lies to map "
             f"{other.map_id}, {LEAST_PHOTOS} are needed",
         )
-    fit = fit_similarity(model, best, correspondences, np.isin(correspondences.photo_of, agree))
-    tolerance = tolerances_px(model, correspondences)
-    agree = agreeing_photos(fit.errors_px, tolerance, correspondences)
-    near = np.isin(correspondences.photo_of, agree) & (fit.errors_px < tolerance)
+    fit = found[0]
+    near = np.isin(correspondences.photo_of, list(agree))
+    near &= fit.errors_px < tolerances_px(model, correspondences)
     points = len(np.unique(correspondences.point_of[near]))
-    if len(agree) < LEAST_PHOTOS or points < _LEAST_POINTS:
+    if points < _LEAST_POINTS:
         return Refused(
             reason="FEW_POINTS",
-            message=f"{len(agree)} images and {points} points of maps {feature_map.map_id} and "
-            f"{other.map_id} agree, {LEAST_PHOTOS} and {_LEAST_POINTS} are needed",
+            message=f"{points} points of maps {feature_map.map_id} and {other.map_id} agree, {_LEAST_POINTS} "
+            "are needed",
         )
     return Edge(
         map_id=other.map_id,
@@ -98,12 +88,6 @@ def _fitted(
         shared_points=points,
         photos=len(agree),
     )
-
-
-def indexed_area(*maps: FeatureMap) -> IndexedArea:
-    """Maps alone, ready to be asked."""
-    area = build_area(maps)
-    return IndexedArea(area=area, index=build_index(area.descriptors))
 
 
 def localise_image(

@@ -27,8 +27,7 @@ from ingest.growth.place.contradictions import center_variance_m2
 from ingest.growth.place.similarity_fit import (
     Correspondences,
     FittedSimilarity,
-    agreeing_photos,
-    best_proposal,
+    agreed_similarity,
     fit_similarity,
     tolerances_px,
 )
@@ -37,12 +36,10 @@ from ingest.photos.photo import Photo
 from reloc.localise.acceptance import agreement
 from reloc.localise.matching import EXPECTED_DEG, visible_points
 
-_LEAST_PHOTOS = 2  # of the new ones that must see an existing map for it to be a parent
 # Least share of the parts that should show points of existing maps or of the photo's own reconstruction. A
 # re-upload 13.3 m off showed 0.17; right photos of that database 0.32 and more, of the one that grew with
 # this limit 0.23 and more.
 _LEAST_SHOWN = 0.25
-_LEAST_POINTS = 30  # a photo that should see fewer says nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,7 +101,7 @@ def place_by_maps(
         areas: that hold the existing maps.
     """
     own = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
-    found = _agreed(model, own, correspondences)
+    found = agreed_similarity(model, own, correspondences)
     edges: tuple[Edge, ...] = ()
     if found is not None:
         fit, agree = found
@@ -167,33 +164,6 @@ def _rows(model: Model, photos: Collection[int]) -> tuple[int, ...]:
     return tuple(int(model.rows[k]) for k in sorted(photos))
 
 
-def _agreed(
-    model: Model, own: Mapping[int, LocalisedPhoto], correspondences: Correspondences
-) -> tuple[FittedSimilarity, set[int]] | None:
-    """The fit to the photos that agree with it, and these; None where no photo does."""
-    best = best_proposal(model, own, correspondences)
-    if best is None or not len(best[1]):
-        return None
-    tolerance = tolerances_px(model, correspondences)
-    sim, chosen, fit = best[0], set(best[1].tolist()), None
-    for _ in range(5):  # the set of photos settles in two or three rounds
-        near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
-        if fit is not None:
-            near &= fit.errors_px < 2.0 * tolerance
-        if near.sum() < 4:
-            return None
-        fit = fit_similarity(model, sim, correspondences, near)
-        sim = fit.local_from_sfm
-        again = set(agreeing_photos(fit.errors_px, tolerance, correspondences).tolist()) & own.keys()
-        if not again:
-            return None
-        if again == chosen:
-            break
-        chosen = again
-    assert fit is not None
-    return fit, chosen
-
-
 def _against_positions(
     model: Model, centers: FloatArray, photos: Sequence[Photo], frame: LocalFrame, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -223,7 +193,7 @@ def edges_of(
         mine = used & (correspondences.map_of == m)
         points = len(np.unique(correspondences.point_of[mine]))
         photos = len(np.unique(correspondences.photo_of[mine]))
-        if points < LEAST_SHARED_POINTS or photos < _LEAST_PHOTOS:
+        if points < LEAST_SHARED_POINTS or photos < gates.LEAST_AGREEING:
             continue
         alone = fit_similarity(model, fit.local_from_sfm, correspondences, mine)
         found.append(
@@ -289,7 +259,7 @@ def _shown_parts(
         seen_own = model.point_of[(model.photo_of == k) & often[model.point_of]]
         for row in range(2):
             should = np.concatenate(expected)
-            if len(should) >= _LEAST_POINTS:
+            if len(should) >= LEAST_SHARED_POINTS:
                 shares[row, k] = agreement(np.concatenate(seen), should, camera.width, camera.height)
             expected.append(camera.project(pose.act(model.xyz[own])))
             seen.append(camera.project(pose.act(model.xyz[seen_own])))

@@ -5,7 +5,6 @@ after, that hang on the others by little, and that may be further off than allow
 without them, and say anew how sure they are.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,13 +14,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
-from ingest.colmap.anchored import (
-    Anchored,
-    AnchoredOptions,
-    FixedPoints,
-    Lenses,
-    adjust_anchored,
-)
+from ingest.colmap.anchored import Anchored, FixedPoints, Lenses, adjust_anchored, pixel_scale
 from ingest.colmap.bridge import Model, with_observations
 from ingest.growth import gates
 from ingest.growth.map_places import SIGMAS_95
@@ -35,7 +28,7 @@ from ingest.growth.place.drift import (
 )
 from ingest.growth.place.placement import MapsPlacement, edges_of
 from ingest.growth.place.similarity_fit import Correspondences, fit_similarity
-from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused, pixel_scale
+from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from ingest.sfm.links import bottleneck_share, select_photos
 
@@ -48,7 +41,6 @@ _ELSEWHERE = "the photo by itself sees existing points elsewhere than the others
 # 0.14. Those wait, and are localised by themselves once their neighbours are in an active map.
 _LEAST_LINK = 0.25
 _ROUNDS = 4  # of leaving photos out; the others are adjusted without them
-_ADJUST = AnchoredOptions()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,25 +66,23 @@ class Refinement:
 
 
 def adopt_lenses(
-    model: Model,
-    localised: Mapping[int, LocalisedPhoto],
-    photos: Sequence[Photo],
-    areas: Sequence[Area],
-    keypoints: Sequence[FloatArray],
+    model: Model, photos: Sequence[Photo], areas: Sequence[Area], keypoints: Sequence[FloatArray]
 ) -> tuple[Model, Lenses]:
     """The model adjusted, in its own frame, around the lenses that existing maps have for its cameras.
 
     Args:
         photos: all, rows as in the model.
-        areas: where it may lie; they lend lenses to cameras none of whose photos is localised, too.
+        areas: where it may lie; the first one that has a lens for a camera's EXIF key lends it.
         keypoints: pixels of all features of the model's photos, in the order of its rows.
     """
     lent: dict[int, Camera] = {}
     focals: dict[int, float] = {}
     for c, camera in enumerate(model.cameras):
         rows = model.rows[model.camera_of == c].tolist()
-        lens = _lens_of_maps([localised[r] for r in rows if r in localised])
-        lens = lens or _lens_for_key({photos[r].camera_key for r in rows}, areas)
+        keys = {photos[r].camera_key for r in rows}
+        key = keys.pop() if len(keys) == 1 else ""
+        known = (area.camera_for_key(key) for area in areas) if key else iter(())
+        lens = next((camera for camera in known if camera is not None), None)
         if lens is not None and (lens.width, lens.height) == (camera.width, camera.height):
             lent[c] = lens
         told = {photos[r].focal_px for r in rows}
@@ -103,20 +93,7 @@ def adopt_lenses(
     if not lent:
         return model, lenses
     given = replace(model, cameras=tuple(lent.get(c, own) for c, own in enumerate(model.cameras)))
-    return adjust_anchored(given, keypoints, FixedPoints.none(), lenses, _ADJUST).model, lenses
-
-
-def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:
-    """The lens that a map lent to most of these photos; None where none did."""
-    lent = Counter(p.camera for p in photos if p.result.pose and p.result.pose.camera_source == "map")
-    return lent.most_common(1)[0][0] if lent else None
-
-
-def _lens_for_key(keys: set[str], areas: Sequence[Area]) -> Camera | None:
-    """The lens that the areas have for a camera's EXIF key, the first area's first."""
-    key = keys.pop() if len(keys) == 1 else ""
-    found = (area.camera_for_key(key) for area in areas) if key else iter(())
-    return next((camera for camera in found if camera is not None), None)
+    return adjust_anchored(given, keypoints, FixedPoints.none(), lenses).model, lenses
 
 
 def refine_placed(
@@ -153,7 +130,7 @@ def refine_placed(
         )
         good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)
         adjusted, fixed = _refined(placed, outside, good, lenses, keypoints)
-        spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses, _ADJUST)
+        spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
         fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
         inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
@@ -267,7 +244,7 @@ def _refined(
     size = int(max(model.keypoint_of.max(initial=0), held.feature.max(initial=0))) + 1
     taken = np.isin(model.photo_of * size + model.keypoint_of, held.photo_of * size + held.feature)
     free = ~np.isin(model.photo_of, outside) & ~taken
-    return adjust_anchored(with_observations(model, free), keypoints, fixed, lenses, _ADJUST), fixed
+    return adjust_anchored(with_observations(model, free), keypoints, fixed, lenses), fixed
 
 
 def _sigma_px(model: Model, correspondences: Correspondences) -> FloatArray:

@@ -23,16 +23,14 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto
+from reloc.localise.pose import reprojection_errors
 
 _CHI2_2_MEDIAN = 1.386  # of the squared length of two normal coordinates
 _CHI2_2_95 = 5.991
 _OPEN = np.array([10.0] * 4 + [1e4] * 3)  # log scale, radians, metres: what nothing holds; gates refuse it
-# Pairs of photos that propose a similarity by their centres; with a third of the photos right, 300 hold a
-# pair of right ones 30 times over.
-_PAIRS = 300
 _MOST_SCORED = 3000  # correspondences that judge a proposal; more only take longer
-# A proposal rests on one or two photos, whose errors it carries far. What is of another place is hundreds of
-# pixels off.
+# A proposal rests on one photo, whose errors it carries far. What is of another place is hundreds of pixels
+# off.
 _LOOSE_PX = 2.0 * TOLERANCE_PX
 _LEAST_SHARE = 0.5  # of a photo's own correspondences that must be within the tolerance for it to agree
 _ROUNDS = 20  # of reweighting; weights settle within ten
@@ -184,40 +182,59 @@ class FittedSimilarity:
     neighbours_factor: float
 
 
-def best_proposal(
+def agreed_similarity(
     model: Model,
     own: Mapping[int, LocalisedPhoto],
     correspondences: Correspondences,
     more: Sequence[Sim3] = (),
-) -> tuple[Sim3, NDArray[np.int64]] | None:
-    """The similarity with which most photos agree, then the one of least truncated squared errors; and these.
-
-    Proposed by single photos (pose and depth of shared points), by pairs of photos, and by `more`.
+) -> tuple[FittedSimilarity, set[int]] | None:
+    """The fit to the photos that agree with it, and these; None where no photo does.
 
     Args:
         own: localised photos, by place among the model's, in order.
+        more: similarities that are tried beside those that single photos propose.
     """
+    best = _best_proposal(model, own, correspondences, more)
+    if best is None or not best[1]:
+        return None
+    tolerance = tolerances_px(model, correspondences)
+    (sim, chosen), fit = best, None
+    for _ in range(5):  # the set of photos settles in two or three rounds
+        near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
+        if fit is not None:
+            near &= fit.errors_px < 2.0 * tolerance
+        if near.sum() < 4:
+            return None
+        fit = fit_similarity(model, sim, correspondences, near)
+        sim = fit.local_from_sfm
+        again = set(agreeing_photos(fit.errors_px, tolerance, correspondences).tolist()) & own.keys()
+        if not again:
+            return None
+        if again == chosen:
+            break
+        chosen = again
+    assert fit is not None
+    return fit, chosen
+
+
+def _best_proposal(
+    model: Model, own: Mapping[int, LocalisedPhoto], correspondences: Correspondences, more: Sequence[Sim3]
+) -> tuple[Sim3, set[int]] | None:
+    """The similarity with which most photos agree, then that of least truncated errors; and these photos."""
     sims = [*more, *(_by_pose(model, correspondences, k, photo) for k, photo in own.items())]
-    every = [(a, b) for a in own for b in own if a < b]
-    sims += [_by_centres(model, (a, b), (own[a], own[b])) for a, b in _at_most(every, _PAIRS)]
-    rows = _at_most(np.flatnonzero(~correspondences.carried), _MOST_SCORED)
-    scored = correspondences.take(np.array(rows, dtype=np.int64))
+    rows = np.flatnonzero(~correspondences.carried)
+    if len(rows) > _MOST_SCORED:
+        rows = np.sort(np.random.default_rng(0).choice(rows, _MOST_SCORED, replace=False))
+    scored = correspondences.take(rows)
     tolerance = tolerances_px(model, scored, _LOOSE_PX)
     ranked = []
     for sim in sims:
         if sim is not None:
             errors = correspondence_errors(model, sim, scored)
             agree = agreeing_photos(errors, tolerance, scored)
-            ranked.append((-len(agree), float((np.minimum(errors / tolerance, 1.0) ** 2).sum()), sim, agree))
+            cost = float((np.minimum(errors / tolerance, 1.0) ** 2).sum())
+            ranked.append((-len(agree), cost, sim, set(agree.tolist())))
     return min(ranked, key=lambda item: item[:2])[2:] if ranked else None
-
-
-def _at_most(values: Sequence[Any] | NDArray[np.int64], count: int) -> list[Any]:
-    """The values, or so many of them, always the same."""
-    if len(values) <= count:
-        return list(values)
-    chosen = np.random.default_rng(0).choice(len(values), count, replace=False)
-    return [values[int(c)] for c in np.sort(chosen)]
 
 
 def _by_pose(model: Model, correspondences: Correspondences, k: int, photo: LocalisedPhoto) -> Sim3 | None:
@@ -237,24 +254,6 @@ def _by_pose(model: Model, correspondences: Correspondences, k: int, photo: Loca
     return Sim3(scale=scale, rotation=rotation, translation=center - scale * rotation @ ours.center)
 
 
-def _by_centres(
-    model: Model, photos: tuple[int, int], poses: tuple[LocalisedPhoto, LocalisedPhoto]
-) -> Sim3 | None:
-    """Scale by the baseline of two photos, rotation by the mean of theirs."""
-    ours = [model.cam_from_sfm[k] for k in photos]
-    theirs = [p.cam_from_local for p in poses]
-    base_sfm = float(np.linalg.norm(ours[1].center - ours[0].center))
-    base = float(np.linalg.norm(theirs[1].center - theirs[0].center))
-    sigma = float(np.sqrt(sum(np.linalg.eigvalsh(p.covariance[3:, 3:])[-1] for p in poses)))
-    if base_sfm <= 0 or base < 5.0 * sigma:  # a scale to 20 %; what is shorter says nothing
-        return None
-    rotation = nearest_rotation(sum(t.rotation.T @ o.rotation for t, o in zip(theirs, ours, strict=True)))
-    middle_sfm = 0.5 * (ours[0].center + ours[1].center)
-    middle = 0.5 * (theirs[0].center + theirs[1].center)
-    scale = base / base_sfm
-    return Sim3(scale=scale, rotation=rotation, translation=middle - scale * rotation @ middle_sfm)
-
-
 def correspondence_errors(model: Model, sim: Sim3, correspondences: Correspondences) -> FloatArray:
     """(m,) distance in pixels from where the placed model sees the existing point; inf if it cannot."""
     into_sfm = sim.inverse()
@@ -262,9 +261,11 @@ def correspondence_errors(model: Model, sim: Sim3, correspondences: Corresponden
     for k in np.unique(correspondences.photo_of):
         rows = np.flatnonzero(correspondences.photo_of == k)
         camera = model.cameras[int(model.camera_of[k])]
-        pixels = camera.project(model.cam_from_sfm[k].act(into_sfm.act(correspondences.points[rows])))
-        errors[rows] = np.linalg.norm(pixels - correspondences.pixels[rows], axis=1)
-    return np.where(np.isfinite(errors), errors, np.inf)
+        points = into_sfm.act(correspondences.points[rows])
+        errors[rows] = reprojection_errors(
+            correspondences.pixels[rows], points, camera, model.cam_from_sfm[k]
+        )
+    return errors
 
 
 def tolerances_px(

@@ -18,16 +18,17 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import Gate
+from ingest.growth.place.localised import QUERY
 
 # A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
 # photo in common count as one, three photos that confirm each other as one and a half.
 _ONE_PAIR = 1.0
-# Common points of the map from which on two photos confirm each other. An accepted pose has at least so many
-# inliers (reloc.localise.options), and chance gives a few.
-_LEAST_SHARED_POINTS = 15
 # Distance of two cameras over their distance from what both see. The same picture given by two people, cut or
 # compressed anew, shows no parallax; poses of one place are good to some thousandths.
 _LEAST_PARALLAX = 0.01
+# Common points of the map from which on two photos confirm each other: an accepted pose has so many, chance
+# gives a few.
+_LEAST_SHARED_POINTS = QUERY.acceptance.min_inliers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,22 +88,25 @@ def independent(a: Source, b: Source) -> bool:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CorroboratingImage:
-    """A photo that is not the map's own, and localised in it.
+class OutsidePhoto:
+    """A photo that is not the map's own, and localised in it alone.
 
     Attributes:
         name: for people.
         center: (3,) of its camera in the map's frame, metres.
         points: (k,) rows of the map's points that are its inliers.
+        contradicts: a sentence, where its place is known and is not where the map has it; else it
+            corroborates the map.
     """
 
     name: str
     source: Source
     center: FloatArray
     points: NDArray[np.int64]
+    contradicts: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Confirmation:
     """How far a map is confirmed.
 
@@ -112,14 +116,16 @@ class Confirmation:
         confirmed: image ids of the map.
         earned: those of the map's that make a record for their owner: proven themselves, or confirmed by a
             proven photo, or by photos of two other owners on record.
-        corroborating: names of photos from outside that confirm one of the map.
+        points: (n,) which points of the map two independent photos see, its own or from outside, or a proven
+            one of its own. A photo can be true in most of its parts and altered in one: it then fits its
+            neighbours, and the altered part makes points that only its owner has seen.
     """
 
     gate: Gate
     owners: tuple[str, ...]
     confirmed: tuple[int, ...]
-    earned: tuple[int, ...] = ()
-    corroborating: tuple[str, ...] = ()
+    earned: tuple[int, ...]
+    points: NDArray[np.bool_]
 
     @property
     def message(self) -> str:
@@ -129,43 +135,33 @@ class Confirmation:
         return f"{len(self.confirmed)} photos confirmed by {len(self.owners)} owners"
 
 
-def confirm(
-    feature_map: FeatureMap,
-    sources: Sources,
-    corroborating: Sequence[CorroboratingImage] = (),
-    against: Sequence[tuple[Source, str]] = (),
-) -> Confirmation:
+def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[OutsidePhoto] = ()) -> Confirmation:
     """How far a map is confirmed by those whose word counts.
 
     A photo of the map is confirmed when it is proven, or shares enough of the map's points with a photo that
     is independent of it, the map's own or one from outside.
-
-    Args:
-        against: photos from outside that the map has elsewhere than they are: where from, and a sentence.
     """
-    everyone = [*sources.of_map(feature_map), *(w.source for w in corroborating)]
+    corroborating = [photo for photo in outside if not photo.contradicts]
+    against = [photo for photo in outside if photo.contradicts]
+    everyone = [*sources.of_map(feature_map), *(photo.source for photo in corroborating)]
     own = len(feature_map.images)
     sees = _sees(feature_map, corroborating)
     sees_same = (sees @ sees.T).toarray() >= _LEAST_SHARED_POINTS
     apart = parallax(feature_map, corroborating) >= _LEAST_PARALLAX
-    agree = sees_same & apart & independent_pairs(everyone)
+    may_confirm = apart & np.array([[independent(a, b) for b in everyone] for a in everyone], dtype=bool)
+    agree = sees_same & may_confirm
     proven = np.array([s.proven for s in everyone], dtype=bool)
     confirmed: NDArray[np.bool_] = np.asarray(agree.any(axis=1) | proven, dtype=np.bool_)
-    vouching: list[bool] = [bool(row.any()) for row in agree[own:, :own]]
+    others = sparse.csr_array(may_confirm.astype(np.int64)) @ sees  # how many such photos see the point, too
+    by_two = np.asarray(sees.multiply(others).sum(axis=0)).ravel() > 0
+    by_proven = np.asarray(sees[np.flatnonzero(proven[:own])].sum(axis=0)).ravel() > 0
     ids = [image.image_id for image in feature_map.images]
     return Confirmation(
         gate=_gate(int(confirmed[:own].sum()), _pairs(agree), bool(proven[:own].any()), against),
         owners=tuple(dict.fromkeys(s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes)),
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
         earned=tuple(i for k, i in enumerate(ids) if _earns(k, everyone, sees_same, apart)),
-        corroborating=tuple(w.name for w, yes in zip(corroborating, vouching, strict=True) if yes),
-    )
-
-
-def independent_pairs(sources: Sequence[Source]) -> NDArray[np.bool_]:
-    """Which photos (n, n) are independent of each other."""
-    return np.array([[independent(a, b) for b in sources] for a in sources], dtype=bool).reshape(
-        len(sources), len(sources)
+        points=(by_two | by_proven)[: len(feature_map.points)],
     )
 
 
@@ -192,18 +188,19 @@ def _pairs(agree: NDArray[np.bool_]) -> float:
     return int(np.count_nonzero(partner >= 0)) / 2.0
 
 
-def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[tuple[Source, str]]) -> Gate:
+def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[OutsidePhoto]) -> Gate:
     """Whether more pairs confirm the map than one and as many as contradict it.
 
     Each proven photo contradicts it, and each other owner once, whose photos may all lie.
     """
-    contradicting = sum(s.proven for s, _ in against) + len({s.owner for s, _ in against if not s.proven})
+    theirs = [photo.source for photo in against]
+    contradicting = sum(s.proven for s in theirs) + len({s.owner for s in theirs if not s.proven})
     needed = contradicting + (0.0 if proven else _ONE_PAIR)
     if against and (proven or pairs > _ONE_PAIR):
         reason = "CONTRADICTED"
         message = (
             f"{len(against)} photos from outside contradict it and count as {contradicting}, {pairs:g} pairs "
-            f"confirm it: {against[0][1]}"
+            f"confirm it: {against[0].contradicts}"
         )
     elif pairs:
         reason = "FEW_PAIRS"
@@ -223,7 +220,7 @@ def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[tuple[So
     )
 
 
-def _sees(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage]) -> sparse.csr_array:
+def _sees(feature_map: FeatureMap, corroborating: Sequence[OutsidePhoto]) -> sparse.csr_array:
     """Which points each photo sees, (photos, points), 1 or 0: images of the map, then photos from outside."""
     row = {image.image_id: i for i, image in enumerate(feature_map.images)}
     seen = feature_map.observations
@@ -237,7 +234,7 @@ def _sees(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage]) 
     return sees
 
 
-def parallax(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage]) -> FloatArray:
+def parallax(feature_map: FeatureMap, corroborating: Sequence[OutsidePhoto]) -> FloatArray:
     """Distances of the cameras from each other over those from what they see, (n, n)."""
     points = feature_map.points_local()
     seen = feature_map.observations
@@ -254,24 +251,6 @@ def parallax(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage
     )
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     return np.asarray(apart / np.maximum(np.minimum(reach[:, None], reach[None]), 1e-9), dtype=np.float64)
-
-
-def confirmed_points(
-    feature_map: FeatureMap, sources: Sources, corroborating: Sequence[CorroboratingImage] = ()
-) -> NDArray[np.bool_]:
-    """Which points (n,) two independent photos see, the map's or from outside, or a proven one of the map.
-
-    A photo can be true in most of its parts and altered in one: it then fits its neighbours, and the altered
-    part makes points that only its owner has seen.
-    """
-    own = sources.of_map(feature_map)
-    everyone = [*own, *(w.source for w in corroborating)]
-    sees = _sees(feature_map, corroborating)
-    pairs = (parallax(feature_map, corroborating) >= _LEAST_PARALLAX) & independent_pairs(everyone)
-    others = sparse.csr_array(pairs.astype(np.int64)) @ sees  # how many independent photos see the point, too
-    both = np.asarray(sees.multiply(others).sum(axis=0)).ravel() > 0
-    proven = np.asarray(sees[[k for k, s in enumerate(own) if s.proven]].sum(axis=0)).ravel() > 0
-    return np.asarray((both | proven)[: len(feature_map.points)], dtype=np.bool_)
 
 
 def answering_with(feature_map: FeatureMap, points: NDArray[np.bool_]) -> FeatureMap:

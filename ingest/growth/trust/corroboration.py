@@ -1,26 +1,20 @@
 """Photos that look at a quarantined map from outside, localised in it alone: of other maps, and new ones."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.states import OPERATOR
 from ingest.growth.gates import SIGMAS
 from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, NEAR_M, features_and_points
 from ingest.growth.place.localised import in_frame, localise_photos
-from ingest.growth.place.overlaps import indexed_area, localise_image
-from ingest.growth.trust.confirmation import CorroboratingImage, Source, Sources
-from ingest.growth.values import FeaturesOf, LocalisedPhoto
-from ingest.photos.photo import Photo
-from ingest.sfm.pairs import Pair
+from ingest.growth.place.overlaps import localise_image
+from ingest.growth.trust.confirmation import OutsidePhoto, Source, Sources
+from ingest.growth.values import DRIFT_BUDGET_M, GrowthPhotos, LocalisedPhoto
 from reloc.localise.candidates import IndexedArea
-
-# A photo whose place is known contradicts the map if the map has it further away than that, and than `SIGMAS`
-# standard deviations of both.
-_LEAST_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,39 +22,29 @@ class NewPhotos:
     """New photos that may corroborate.
 
     Attributes:
-        rows: of `photos` that may be asked.
+        rows: of the given photos that may be asked.
         localised: those that the active maps localise, by row.
         heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
             map is examined again whenever another one changes, and its own photos are the same.
-        overlaps: pairs of `photos` that show the same, as their matches say; None: not known. Of a map that
-            is made of `photos`, those are asked that overlap with one of its own.
     """
 
-    photos: Sequence[Photo]
+    given: GrowthPhotos
     rows: Sequence[int]
-    features_of: FeaturesOf
-    localised: dict[int, LocalisedPhoto]
+    localised: Mapping[int, LocalisedPhoto]
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
-    overlaps: Collection[Pair] | None = None
 
     def that_may_see(self, feature_map: FeatureMap) -> list[int]:
-        """Rows of those that may be asked about a map."""
-        if self.overlaps is None:
-            return list(self.rows)
+        """Rows of those that may be asked about a map.
+
+        Of a map that is made of the given photos, those that overlap with one of its own.
+        """
         names = {image.sha256 for image in feature_map.images}
-        own = {row for row, photo in enumerate(self.photos) if photo.sha256 in names}
+        own = {row for row, photo in enumerate(self.given.photos) if photo.sha256 in names}
         if len(own) < len(names):  # whose matches with these photos nobody has looked at
             return list(self.rows)
-        beside = {j for i, j in self.overlaps if i in own} | {i for i, j in self.overlaps if j in own}
+        pairs = self.given.overlaps
+        beside = {j for i, j in pairs if i in own} | {i for i, j in pairs if j in own}
         return [row for row in self.rows if row in beside]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Corroboration:
-    """Photos from outside that see the map's points; sources of those that contradict it, with sentences."""
-
-    corroborating: tuple[CorroboratingImage, ...]
-    contradictions: tuple[tuple[Source, str], ...]
 
 
 def corroborate(
@@ -71,44 +55,43 @@ def corroborate(
     *,
     write_id: str,
     threads: int = 1,
-) -> Corroboration:
-    """Localise photos of other owners than the map's, whose word counts, in the map alone.
+) -> list[OutsidePhoto]:
+    """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 
     Args:
         others: maps around it, active or quarantined.
         write_id: of the map as it is.
     """
-    indexed = indexed_area(feature_map)
-    corroborating: list[CorroboratingImage] = []
-    against: list[tuple[Source, str]] = []
-    if len(indexed.area.points):
-        own = set(sources.of_map(feature_map))
-        heard = list(_of_maps(feature_map, others, indexed, own, sources))
-        if new is not None:
-            heard += _of_new(feature_map, write_id, indexed, new, own, sources, threads)
-        for one in heard:
-            if one.apart_m > max(_LEAST_M, SIGMAS * float(np.sqrt(one.variance_m2))):
-                against.append((one.source, f"{one.name} is {one.apart_m:.2f} m from where the map has it"))
-                continue
-            corroborating.append(
-                CorroboratingImage(
-                    name=one.name,
-                    source=one.source,
-                    center=one.found.cam_from_local.center,
-                    points=np.unique(one.found.point_of),
-                )
-            )
-    return Corroboration(corroborating=tuple(corroborating), contradictions=tuple(against))
+    indexed, own = IndexedArea.of([feature_map]), set(sources.of_map(feature_map))
+    if not len(indexed.area.points):
+        return []
+    heard = list(_of_maps(feature_map, others, indexed, own, sources))
+    if new is not None:
+        heard += _of_new(feature_map, write_id, indexed, new, own, sources, threads)
+    return heard
 
 
-class _Heard(NamedTuple):
-    """A photo localised in the map, in its frame; how far from its known place, and the variance of that."""
+def _heard(
+    feature_map: FeatureMap,
+    found: LocalisedPhoto,
+    source: Source,
+    name: str,
+    known: tuple[FloatArray, float] | None,
+) -> OutsidePhoto:
+    """A photo that the map localises.
 
-    found: LocalisedPhoto
-    source: Source
-    name: str
-    apart_m: float
-    variance_m2: float
+    Args:
+        known: its centre (3,) by others, in the map's frame, and the variance of that, square metres.
+    """
+    here = in_frame(found, feature_map.frame)
+    center, contradicts = here.cam_from_local.center, ""
+    if known is not None:
+        apart_m = float(np.linalg.norm(known[0] - center))
+        # What is nearer than a map may drift contradicts nothing.
+        if apart_m > max(DRIFT_BUDGET_M, SIGMAS * float(np.sqrt(_spread(here) + known[1]))):
+            contradicts = f"{name} is {apart_m:.2f} m from where the map has it"
+    points = np.unique(here.point_of)
+    return OutsidePhoto(name=name, source=source, center=center, points=points, contradicts=contradicts)
 
 
 def _of_maps(
@@ -117,16 +100,14 @@ def _of_maps(
     indexed: IndexedArea,
     own: set[Source],
     sources: Sources,
-) -> Iterator[_Heard]:
+) -> Iterator[OutsidePhoto]:
     names = {image.sha256 for image in feature_map.images}
     for other, image, source in _images_around(feature_map, others, own, sources):
         found = None if image.sha256 in names else localise_image(other, image, 0, [indexed])
         if found is not None:
-            found = in_frame(found, feature_map.frame)
-            known = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
-            apart = float(np.linalg.norm(known.center - found.cam_from_local.center))
-            variance = _spread(found) + _center_variance(other, image)
-            yield _Heard(found, source, f"{image.name} of map {other.map_id}", apart, variance)
+            pose = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
+            known = pose.center, _center_variance(other, image)
+            yield _heard(feature_map, found, source, f"{image.name} of map {other.map_id}", known)
 
 
 def _of_new(
@@ -137,27 +118,24 @@ def _of_new(
     own: set[Source],
     sources: Sources,
     threads: int,
-) -> Iterator[_Heard]:
-    names = {image.sha256 for image in feature_map.images}
+) -> Iterator[OutsidePhoto]:
+    names, photos = {image.sha256 for image in feature_map.images}, new.given.photos
     asked: dict[int, Source] = {}
     for row in new.that_may_see(feature_map):
-        source = sources.of_owner(new.photos[row].contributor or OPERATOR)
-        if new.photos[row].sha256 not in names and source.speaks_to(own):
+        source = sources.of_owner(photos[row].contributor or OPERATOR)
+        if photos[row].sha256 not in names and source.speaks_to(own):
             asked[row] = source
     unheard = [row for row in asked if (write_id, row) not in new.heard]
-    said = localise_photos(new.photos, unheard, new.features_of, [indexed], threads)[0]
+    said = localise_photos(photos, unheard, new.given.features_of, [indexed], threads)[0]
     new.heard.update({(write_id, row): said.get(row) for row in unheard})
     for row, source in asked.items():
-        heard = new.heard[write_id, row]
-        if heard is None:
+        found, known = new.heard[write_id, row], None
+        if found is None:
             continue
-        found = in_frame(heard, feature_map.frame)
-        apart, variance = 0.0, _spread(found)
         if row in new.localised:
             there = in_frame(new.localised[row], feature_map.frame)
-            apart = float(np.linalg.norm(there.cam_from_local.center - found.cam_from_local.center))
-            variance += _spread(there)
-        yield _Heard(found, source, new.photos[row].name, apart, variance)
+            known = there.cam_from_local.center, _spread(there)
+        yield _heard(feature_map, found, source, photos[row].name, known)
 
 
 def _spread(photo: LocalisedPhoto) -> float:

@@ -13,21 +13,14 @@ from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.owners import read_owners
 from featuredb.store.candidates.photos import mark_confirmed
 from featuredb.store.changes import is_imported
-from ingest.fingerprint import digest, options_fingerprint
+from ingest.fingerprint import digest
 from ingest.growth import gates
+from ingest.growth.asked_before import recall, remember
 from ingest.growth.gates import Gate
-from ingest.growth.place.localised import QUERY
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import (
-    Confirmation,
-    Sources,
-    answering_with,
-    confirm,
-    confirmed_points,
-)
+from ingest.growth.trust.confirmation import Confirmation, Sources, answering_with, confirm
 from ingest.growth.trust.corroboration import NewPhotos, corroborate
-from ingest.growth.trust.examined import recall, remember
-from ingest.growth.values import Refused
+from ingest.growth.values import GrowthOptions, Refused
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
@@ -37,7 +30,7 @@ PARENT_MOVED = "was placed anew"  # said of maps whose parent was, see featuredb
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ExaminedMap:
-    """A map that others confirm, and the write id of its state in the database.
+    """A map that others confirm, as `summary` has it in the database.
 
     Attributes:
         feature_map: with descriptors where they confirm it: a photo that is altered in one part brings that
@@ -45,9 +38,9 @@ class ExaminedMap:
         earned: candidate ids of its photos that make a record for their owners.
     """
 
+    summary: MapSummary
     feature_map: FeatureMap
     confirmation: Confirmation
-    write_id: str
     earned: frozenset[str]
 
 
@@ -72,29 +65,20 @@ class Promotion:
 
 
 def promote_confirmed(
-    database: Database,
-    localiser: Localiser,
-    trusted: Sequence[str] = (),
-    new: NewPhotos | None = None,
-    *,
-    budget_m: float,
-    work: Path | None = None,
-    threads: int = 1,
+    database: Database, localiser: Localiser, options: GrowthOptions, work: Path, new: NewPhotos | None = None
 ) -> list[Promotion]:
-    """Try every quarantined map that growth has made.
+    """Try every quarantined map that growth has made; those that have drifted beyond the budget stay.
 
     Args:
         localiser: of the active maps of the newest snapshot.
-        trusted: identities that the operator vouches for.
-        new: photos that may corroborate a map, beside the images of other maps.
-        budget_m: maps that have drifted further stay.
         work: work folder, where it is kept what was found out: without anything new nothing is asked again.
+        new: photos that may corroborate a map, beside the images of other maps.
 
     Raises:
         StoreError
     """
     snapshot = database.snapshot()
-    sources = Sources(owners=read_owners(database, snapshot), trusted=tuple(trusted))
+    sources = Sources(owners=read_owners(database, snapshot), trusted=options.trusted)
     asked = _question(database, snapshot, sources, new)
     open_maps: list[MapSummary] = []
     ready: list[ExaminedMap] = []
@@ -102,25 +86,24 @@ def promote_confirmed(
     for summary in snapshot.maps():
         if summary.status != "quarantined" or summary.method != "map":
             continue
-        why = _held_back(summary, snapshot, budget_m) or recall(work, summary.map_id, asked)
+        known = recall(work, "maps", summary.map_id, asked)
+        why = _held_back(summary, snapshot, options.drift_budget_m)
+        why = why or (Refused.from_json(known) if known else None)
         if why is None:
             open_maps.append(summary)
         else:
             outcomes.append(_stays(summary.map_id, why))
-    found = _examined(open_maps, snapshot, sources, new, threads)
+    found = _examined(open_maps, snapshot, sources, new, options.threads)
     for summary, one in zip(open_maps, found, strict=True):
         if isinstance(one, ExaminedMap):
-            ready.append(_committed(database, summary, one))
+            ready.append(one)
         else:
             outcomes.append(_stays(summary.map_id, one))
-            remember(work, summary.map_id, asked, one)
+            remember(work, "maps", summary.map_id, one.as_json(), asked)
 
     def by_itself(was: ExaminedMap) -> ExaminedMap | Refused:
-        summary = snapshot.get(was.feature_map.map_id)
         as_is = replace(sources, owners=read_owners(database, database.snapshot()))
-        (one,) = _examined([summary], snapshot, as_is, new, threads)
-        there = replace(summary, write_id=was.write_id, descriptors=_descriptors(was.feature_map))
-        return _committed(database, there, one) if isinstance(one, ExaminedMap) else one
+        return _examined([was.summary], snapshot, as_is, new, options.threads)[0]
 
     if ready:
         decided = _promote(database, localiser, ready, by_itself)
@@ -129,7 +112,7 @@ def promote_confirmed(
         for outcome in decided:
             if not outcome.promoted and outcome.reason_code != "CONFLICT":
                 why = Refused(reason=outcome.reason_code, message=outcome.reason, gates=outcome.gates)
-                remember(work, outcome.map_id, after, why)
+                remember(work, "maps", outcome.map_id, why.as_json(), after)
         outcomes += decided
     return outcomes
 
@@ -158,11 +141,10 @@ def _question(database: Database, snapshot: Snapshot, sources: Sources, new: New
     """Digest of all that an examination depends on: live maps, canaries, photos, whose word counts."""
     maps = sorted(f"{m.write_id} {m.status}" for m in snapshot.maps())
     canaries = [f"{c.name} {c.created_at.isoformat()}" for c in list_canaries(database)]
-    photos = [] if new is None else [new.photos[row].sha256 for row in new.rows]
+    photos = [] if new is None else [new.given.photos[row].sha256 for row in new.rows]
     records = [f"{owner} is on record" for owner in sources.owners.on_record]
     trusted = [f"{owner} is trusted" for owner in sources.trusted]
-    asks = options_fingerprint(QUERY)
-    return digest(asks, *maps, "|", *canaries, "|", *sorted([*photos, *records, *trusted]))
+    return digest(*maps, "|", *canaries, "|", *sorted([*photos, *records, *trusted]))
 
 
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
@@ -193,16 +175,15 @@ def _examine(
     """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
     feature_map, others = snapshot.load_map(summary.map_id), _others(summary, snapshot)
     heard = corroborate(feature_map, others, new, sources, write_id=summary.write_id, threads=threads)
-    confirmation = confirm(feature_map, sources, heard.corroborating, heard.contradictions)
+    confirmation = confirm(feature_map, sources, heard)
     if not confirmation.gate.passes:
         return Refused.by(confirmation.gate)
-    points = confirmed_points(feature_map, sources, heard.corroborating)
     contributed = sources.owners.made_of.get(feature_map.map_id, frozenset())
     earned = {i.sha256[:32] for i in feature_map.images if i.image_id in confirmation.earned}
     return ExaminedMap(
-        feature_map=answering_with(feature_map, points),
+        summary=summary,
+        feature_map=answering_with(feature_map, confirmation.points),
         confirmation=confirmation,
-        write_id=summary.write_id,
         earned=frozenset(earned & contributed),
     )
 
@@ -243,18 +224,14 @@ def _others(me: MapSummary, snapshot: Snapshot) -> list[FeatureMap]:
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
 
-def _committed(database: Database, summary: MapSummary, found: ExaminedMap) -> ExaminedMap:
-    """The map with the descriptors that it will answer with, still in quarantine; the same place."""
-    if _descriptors(found.feature_map) == summary.descriptors:
-        return replace(found, write_id=summary.write_id)
-    result = database.commit_map(
-        found.feature_map, replaces=summary.map_id, based_on=summary.write_id, moves=False
-    )
-    return replace(found, write_id=result.write_id)
-
-
-def _descriptors(feature_map: FeatureMap) -> int:
-    return int(feature_map.observations.has_descriptor.sum())
+def _committed(database: Database, found: ExaminedMap) -> str:
+    """The map with the descriptors that it will answer with, still in quarantine; its write id."""
+    described = int(found.feature_map.observations.has_descriptor.sum())
+    write_id = found.summary.write_id
+    if described == found.summary.descriptors:
+        return write_id
+    map_id = found.summary.map_id
+    return database.commit_map(found.feature_map, replaces=map_id, based_on=write_id, moves=False).write_id
 
 
 def _promote(
@@ -288,7 +265,8 @@ def _promote(
 
 
 def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) -> CanaryRun:
-    after = Localiser.open(database, previous=before, also=[m.map_id for m in maps])
+    instead = {m.map_id: m for m in maps}
+    after = Localiser.open(database, previous=before, also=instead.keys(), instead=instead)
     return run_canaries(database, before, after, maps)
 
 
@@ -301,10 +279,10 @@ def _decide(
     confirmed = "; ".join(dict.fromkeys(found.confirmation.message for found in ready))
     reason = f"{confirmed}; {run.message}"
     active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
-    based_on = {found.feature_map.map_id: found.write_id for found in ready}
     for found in ready:
         mark_confirmed(database, found.earned, found.feature_map.map_id)
     try:
+        based_on = {found.feature_map.map_id: _committed(database, found) for found in ready}
         database.set_status(list(asked), "active", reason, based_on=based_on, active=active)
     except ConflictError as error:
         _LOG.info("promotion of %s waits: %s", list(asked), error)

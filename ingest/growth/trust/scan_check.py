@@ -6,7 +6,7 @@ covers the map, the rigid motion that brings the map's points onto its surface m
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ from featuredb.store import Database
 from featuredb.store.scans import has_scans
 from ingest.growth.gates import SIGMAS, Gate, sigmas_limit
 from ingest.growth.map_places import growth_of, with_growth
-from ingest.growth.values import LEAST_VIEWS, MAD
+from ingest.growth.place.component import GrownMap
+from ingest.growth.values import LEAST_VIEWS, MAD, Refused
 from ingest.register.structure.surface_fit import (
     MIN_REACH_M,
     Surface,
@@ -50,22 +51,20 @@ _MARGIN_M = 20.0  # of scan around the map
 _LEAST_GAIN = 0.1
 
 
-def checked_by_scan(database: Database, feature_map: FeatureMap) -> tuple[FeatureMap, Gate | None, str]:
-    """The map with the gate's figure in its evidence; the gate, None where no scan says anything of it.
-
-    Args:
-        feature_map: with the covariance of its placement on Earth.
+def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Refused, str]:
+    """The map with the gate's figure in its evidence, or the refusal of a scan.
 
     Returns:
-        The third is why a scan that is there could not be compared, "" otherwise. Where the extra `lidar` is
-        missing, the gate does not pass: the scan might refuse the map.
+        The second is why a scan that is there could not be compared, "" otherwise. Where the extra `lidar` is
+        missing, the map is refused: the scan might refuse it.
 
     Raises:
         StoreError: the scans cannot be read.
     """
+    feature_map = grown.feature_map
     points = _points(feature_map) if has_scans(database) else np.zeros((0, 3))
     if len(points) < _LEAST_POINTS:
-        return feature_map, None, ""
+        return grown, ""
     low, high = points[:, :2].min(axis=0) - _MARGIN_M, points[:, :2].max(axis=0) + _MARGIN_M
     gate, why = None, ""
     try:
@@ -80,13 +79,16 @@ def checked_by_scan(database: Database, feature_map: FeatureMap) -> tuple[Featur
         gate = Gate(name="scan", reason=NOT_ASKED, figure=np.inf, limit=limit, passes=False, message=text)
     except ScanError as error:  # heights of several datums
         why = str(error)
-    if gate is not None:
-        told = {**growth_of(feature_map.placement.evidence).get("gates", {}), gate.name: gate.as_json()}
-        return with_growth(feature_map, gates=told), gate, ""
     if why:
         why = f"map {feature_map.map_id} was not compared with the scans in store: {why}"
         _LOG.warning("%s", why)
-    return feature_map, None, why
+    if gate is None:
+        return grown, why
+    if not gate.passes:
+        rows = tuple(int(r) for r in grown.model.rows)
+        return Refused.by(gate, *grown.placement.gates, rows=rows), ""
+    told = {**growth_of(feature_map.placement.evidence).get("gates", {}), gate.name: gate.as_json()}
+    return replace(grown, feature_map=with_growth(feature_map, gates=told)), ""
 
 
 def cloud_gate(cloud: PointCloud, points: FloatArray, covariance: FloatArray) -> Gate | None:

@@ -1,0 +1,39 @@
+"""What was asked before, kept in the work folder: no question is asked twice.
+
+Contributions and quarantined maps wait for weeks, and what is found nowhere costs more than what is.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from ingest.fingerprint import digest, options_fingerprint
+from ingest.growth.place.localised import QUERY
+from ingest.workspace import read_json, write_json
+
+# Raised when the same question gets another answer: with any limit of growth (its gates, `place/`, `trust/`).
+_VERSION = "4"
+
+
+def recall(work: Path, kind: str, about: str, question: str = "") -> dict[str, Any] | None:
+    """The answer to what was last asked about something, if it was this question; else None.
+
+    Args:
+        kind: of the things that are asked about; each has a folder. about: one of them.
+    """
+    file = _file(work, kind, about)
+    value = read_json(file) if file.is_file() else {}
+    answer: dict[str, Any] | None = value.get("answer") if value.get("question") == _key(question) else None
+    return answer
+
+
+def remember(work: Path, kind: str, about: str, answer: dict[str, Any], question: str = "") -> None:
+    """Note the answer, in place of that to an earlier question about the same."""
+    write_json(_file(work, kind, about), {"question": _key(question), "answer": answer})
+
+
+def _key(question: str) -> str:
+    return digest(_VERSION, options_fingerprint(QUERY), question)
+
+
+def _file(work: Path, kind: str, about: str) -> Path:
+    return work / "asked" / kind / f"{digest(about)[:24]}.json"
