@@ -14,13 +14,12 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.precision import linearise
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.adjustment import LidarAdjustment, adjust_to_scan, adjusted_map
-from ingest.register.structure.pairs import RegisteredImage
-from ingest.register.structure.projection import StructurePlacement, placed_map, project_structure
+from ingest.register.frame_registration import FrameRegistration
+from ingest.register.structure.adjustment import LidarAdjustment, adjust_to_scan, placed_map
+from ingest.register.structure.projection import StructurePlacement, project_structure
 from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map
 
 pytest.importorskip("numba")
-pytest.importorskip("small_gicp")
 
 _ADJUSTMENT = "ingest.register.structure.adjustment"
 _STIFF = LensWidths(focal_rel=1e-6, aspect_rel=0.002, center_rel=1e-6, radial=1e-6, tangential=1e-6)
@@ -64,10 +63,10 @@ def replace_map(world: ScannedMap, feature_map: FeatureMap) -> ScannedMap:
     return replace(world, feature_map=feature_map)
 
 
-def _registered_by_its_lens(world: ScannedMap, image: int, seed: int) -> RegisteredImage:
+def _registered_by_its_lens(world: ScannedMap, image: int, seed: int) -> FrameRegistration:
     """A frame registered through the map's wrong lens: its pose is the one that fits its correspondences."""
-    frame = world.registered(image, correspondences=150, seed=seed)
-    lens, found = world.feature_map.cameras[0], frame.registration
+    found = world.registered(image, correspondences=150, seed=seed)
+    lens = world.feature_map.cameras[0]
     pose, none = found.cam_from_local, np.zeros(len(found.pixels), np.int64)
     assert pose is not None
     for _ in range(20):
@@ -76,7 +75,7 @@ def _registered_by_its_lens(world: ScannedMap, image: int, seed: int) -> Registe
         )
         jacobian = linear.by_pose.reshape(-1, 6)
         pose = Rigid3.exp(np.linalg.lstsq(jacobian, linear.residual.ravel(), rcond=None)[0]) @ pose
-    return replace(frame, registration=replace(found, cam_from_local=pose))
+    return replace(found, cam_from_local=pose, camera=lens)
 
 
 def _heights_off(feature_map: FeatureMap, world: ScannedMap) -> FloatArray:
@@ -89,7 +88,7 @@ def _heights_off(feature_map: FeatureMap, world: ScannedMap) -> FloatArray:
 
 
 def _adjusted(world: ScannedMap, frames: tuple[int, ...]) -> tuple[StructurePlacement, LidarAdjustment]:
-    registered = [_registered_by_its_lens(world, k, seed) for seed, k in enumerate(frames)]
+    registered = {k: _registered_by_its_lens(world, k, seed) for seed, k in enumerate(frames)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     assert structure.accepted, structure.message
     return structure, adjust_to_scan(world.feature_map, structure, registered, world.cloud)
@@ -115,7 +114,7 @@ def test_the_scan_mends_the_lens(wrong_lens: ScannedMap, frames: tuple[int, ...]
     structure, adjustment = _adjusted(wrong_lens, frames)
     assert adjustment.accepted, adjustment.message
     by_similarity = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud)
-    by_scan = adjusted_map(wrong_lens.feature_map, adjustment, wrong_lens.cloud)
+    by_scan = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud, adjustment)
     # The similarity lays the points on the ground and leaves the cameras metres too high.
     assert np.abs(_heights_off(by_similarity, wrong_lens)).min() > 3.0
     assert np.abs(_heights_off(by_scan, wrong_lens)).max() < 0.5
@@ -129,9 +128,9 @@ def test_the_scan_mends_the_lens(wrong_lens: ScannedMap, frames: tuple[int, ...]
 
 
 def test_the_adjusted_map_keeps_what_is_not_geometry(wrong_lens: ScannedMap) -> None:
-    _, adjustment = _adjusted(wrong_lens, (4,))
+    structure, adjustment = _adjusted(wrong_lens, (4,))
     before = wrong_lens.feature_map
-    after = adjusted_map(before, adjustment, wrong_lens.cloud)
+    after = placed_map(before, structure, wrong_lens.cloud, adjustment)
     assert after.map_id == before.map_id
     assert after.frame == before.frame
     assert after.height_datum == wrong_lens.cloud.height_datum
@@ -141,30 +140,22 @@ def test_the_adjusted_map_keeps_what_is_not_geometry(wrong_lens: ScannedMap) -> 
 
 
 def test_a_right_lens_stays(world: ScannedMap) -> None:
-    _, adjustment = _adjusted(world, (0, 4, 8))
+    structure, adjustment = _adjusted(world, (0, 4, 8))
     assert adjustment.accepted, adjustment.message
-    after = adjusted_map(world.feature_map, adjustment, world.cloud)
+    after = placed_map(world.feature_map, structure, world.cloud, adjustment)
     assert after.cameras[0].focal_px == pytest.approx(CAMERA.focal_px, rel=0.005)
     for image, pose in zip(after.images, world.true_poses, strict=True):
         assert np.linalg.norm(image.cam_from_local.center - pose.center) < 0.3
 
 
-def test_frames_without_correspondences_count_by_their_pairs(world: ScannedMap) -> None:
-    registered = [world.registered(k) for k in (0, 4, 8)]
-    structure = project_structure(world.feature_map, registered, world.cloud)
-    adjustment = adjust_to_scan(world.feature_map, structure, registered, world.cloud)
-    assert adjustment.accepted, adjustment.message
-    assert adjustment.figures["control"] == int(structure.inliers.sum())
-
-
 def test_too_little_control_is_refused(world: ScannedMap) -> None:
-    registered = [world.registered(4, correspondences=20)]
+    registered = {4: world.registered(4, correspondences=20)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     assert adjust_to_scan(world.feature_map, structure, registered, world.cloud).reason == "NO_CONTROL"
 
 
 def test_no_scan_under_the_map_is_refused(world: ScannedMap) -> None:
-    registered = [world.registered(4, correspondences=150)]
+    registered = {4: world.registered(4, correspondences=150)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     away = plain_cloud(world.cloud.xyz + np.array([900.0, 0.0, 0.0]))
     assert adjust_to_scan(world.feature_map, structure, registered, away).reason == "NO_SCAN"
@@ -174,13 +165,10 @@ def test_a_scan_that_contradicts_the_photos_is_refused(
     world: ScannedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A scan twice as rugged as the ground, and a lens that may not change to make up for it."""
-    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    registered = {k: world.registered(k, correspondences=150) for k in (0, 4, 8)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     rugged = np.array([1.0, 1.0, 2.0])
-    high = [
-        replace(r, registration=replace(r.registration, points_local=r.registration.points_local * rugged))
-        for r in registered
-    ]
+    high = {k: replace(r, points_local=r.points_local * rugged) for k, r in registered.items()}
     monkeypatch.setattr(f"{_ADJUSTMENT}._REACH_M", 5.0)
     monkeypatch.setattr(f"{_ADJUSTMENT}._LENS", replace(_STIFF, tangential=0.003))
     scan = plain_cloud(world.cloud.xyz.astype(np.float64) * rugged)
@@ -193,7 +181,7 @@ def test_bending_the_photos_to_the_scan_is_refused(
     world: ScannedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Waves that are not there, and tracks that are hardly trusted: the map bends, and its photos tell."""
-    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    registered = {k: world.registered(k, correspondences=150) for k in (0, 4, 8)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     xyz = world.cloud.xyz.astype(np.float64)
     xyz[:, 2] += 0.4 * np.sin(xyz[:, 0] / 2.0) * np.sin(xyz[:, 1] / 2.0)
@@ -206,17 +194,10 @@ def test_an_adjustment_that_does_not_gain_is_refused(
     world: ScannedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Control that pulls the map off the scan: correspondences all 2 m too high."""
-    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    registered = {k: world.registered(k, correspondences=150) for k in (0, 4, 8)}
     structure = project_structure(world.feature_map, registered, world.cloud)
-    high = [
-        replace(
-            r,
-            registration=replace(
-                r.registration, points_local=r.registration.points_local + np.array([0.0, 0.0, 2.0])
-            ),
-        )
-        for r in registered
-    ]
+    up = np.array([0.0, 0.0, 2.0])
+    high = {k: replace(r, points_local=r.points_local + up) for k, r in registered.items()}
     monkeypatch.setattr(f"{_ADJUSTMENT}._REACH_M", 5.0)
     monkeypatch.setattr(f"{_ADJUSTMENT}._MIN_SURFACE_M", 5.0)
     monkeypatch.setattr(f"{_ADJUSTMENT}._MAX_CONTROL_REL", 1.0)
@@ -228,7 +209,7 @@ def test_a_lens_that_folds_is_refused(world: ScannedMap, monkeypatch: pytest.Mon
     folding = Camera(model="RADIAL", width=1200, height=900, params=(1000.0, 600.0, 450.0, -0.9, 0.0))
     assert folding.tan_of_fold < 0.75  # the corner is at 0.75
     bad = replace(world.feature_map, cameras=(folding,))
-    registered = [world.registered(4, correspondences=150)]
+    registered = {4: world.registered(4, correspondences=150)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     monkeypatch.setattr(f"{_ADJUSTMENT}._LENS", _STIFF)
     monkeypatch.setattr(f"{_ADJUSTMENT}._ROUNDS", 1)
@@ -237,8 +218,8 @@ def test_a_lens_that_folds_is_refused(world: ScannedMap, monkeypatch: pytest.Mon
 
 
 def test_the_placement_s_similarity_is_next_to_the_truth(world: ScannedMap) -> None:
-    _, adjustment = _adjusted(world, (0, 4, 8))
-    after = adjusted_map(world.feature_map, adjustment, world.cloud)
+    structure, adjustment = _adjusted(world, (0, 4, 8))
+    after = placed_map(world.feature_map, structure, world.cloud, adjustment)
     assert np.abs(Sim3.log(after.placement.local_from_sfm)[:4]).max() < 0.01
 
 
@@ -246,8 +227,7 @@ def test_the_covariances_cover_the_cameras(wrong_lens: ScannedMap) -> None:
     """One frame's correspondences leave the lens' doubt in every camera: it is in the poses' covariances."""
     structure, adjustment = _adjusted(wrong_lens, (4,))
     assert structure.covariance is not None
-    assert adjustment.covariance is not None
-    after = adjusted_map(wrong_lens.feature_map, adjustment, wrong_lens.cloud)
+    after = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud, adjustment)
     squared = []
     for image, true in zip(after.images, wrong_lens.true_poses, strict=True):
         assert image.covariance is not None

@@ -16,8 +16,9 @@ from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.files import load_proposals, save_proposals
 from ingest.register.anchor.pictures import FramePicture, edges_of, flick_page, overlay_rgb, scan_view
 from ingest.register.anchor.proposals import propose_frames, small_camera
+from ingest.register.block import block_of_map
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from ingest.register.structure.map_move import map_move, map_residuals, viewing_distance_m
+from ingest.register.structure.map_move import map_move, map_residuals
 from tests.support.maps import random_map
 from tools.worlds.clouds import build_cloud
 
@@ -121,7 +122,8 @@ def test_blurred_and_empty_photos_fall_back(monkeypatch: pytest.MonkeyPatch) -> 
 def moved(feature_map: FeatureMap, move: Sim3) -> FeatureMap:
     utm = feature_map.frame.utm_from_enu(move.act(feature_map.points_local()), feature_map.epsg)
     images = tuple(replace(i, cam_from_local=move.act_on_pose(i.cam_from_local)) for i in feature_map.images)
-    return replace(feature_map, images=images, points=replace(feature_map.points, utm=utm))
+    placed = replace(feature_map.placement, local_from_sfm=move @ feature_map.placement.local_from_sfm)
+    return replace(feature_map, images=images, points=replace(feature_map.points, utm=utm), placement=placed)
 
 
 def test_a_move_is_told_in_words_that_people_know() -> None:
@@ -129,9 +131,10 @@ def test_a_move_is_told_in_words_that_people_know() -> None:
     old = random_map(4, points=500, extent_m=80.0)
     old = replace(old, placement=replace(old.placement, covariance=covariance))
     turn = np.radians(2.0)
-    new = moved(old, Sim3.exp([0.01, 0.0, 0.0, turn, 0.0, 0.0, 0.0]))
+    true = Sim3.exp([0.01, 0.0, 0.0, turn, 0.0, 0.0, 0.0])
+    new = moved(old, true)
     middle = np.median(old.points_local(), axis=0)
-    shift = np.median(new.points_local(), axis=0) - middle
+    shift = true.act(middle) - middle
     move = map_move(old, new)
     assert move.heading_deg == pytest.approx(2.0, abs=1e-3)
     assert move.heading_sigmas == pytest.approx(turn / 0.02, rel=1e-3)
@@ -152,7 +155,7 @@ def test_residuals_compare_the_same_points_and_leave_out_holes() -> None:
     assert before.median_m == pytest.approx(7.0, abs=0.05)
     far = moved(feature_map, Sim3.exp([0, 0, 0, 0, 500.0, 0, 0]))
     assert map_residuals(feature_map, far, cloud)[1].as_figures()["compared"] == 0
-    assert viewing_distance_m(feature_map) == pytest.approx(54.0, abs=3.0)
+    assert np.median(block_of_map(feature_map).distances()) == pytest.approx(54.0, abs=3.0)
 
 
 def test_edges_lie_where_depth_and_colour_change_and_not_at_the_scans_border() -> None:

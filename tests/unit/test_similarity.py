@@ -14,7 +14,6 @@ from ingest.register.structure.similarity import (
     Pairs,
     ransac_similarity,
     refine_similarity,
-    similarities,
 )
 
 _TRUE = Sim3(scale=1.03, rotation=so3_exp([0.02, -0.03, 0.4]), translation=np.array([3.0, -8.0, 11.0]))
@@ -38,11 +37,9 @@ def _pairs(
     shift = rng.normal(0, frame_sigma, (frames, 3))
     noise = rng.normal(0, sigma, (count, 3)) + rng.normal(0, cell_sigma, (cell_of.max() + 1, 3))[cell_of]
     return Pairs(
-        point_index=np.arange(count),
         frame_of=frame_of,
         source=_TRUE.inverse().act(target),
         target=target + noise + shift[frame_of],
-        normals=np.tile([0.0, 0.0, 1.0], (count, 1)),
         covariance=np.tile(np.eye(3) * sigma**2, (count, 1, 1)),
         by_frame=by_frame,
         cell_of=cell_of,
@@ -52,25 +49,6 @@ def _pairs(
 
 def _error(sim: Sim3) -> FloatArray:
     return (_TRUE @ sim.inverse()).log()
-
-
-def test_many_sets_at_once_give_what_each_gives_alone() -> None:
-    rng = np.random.default_rng(0)
-    source = rng.normal(0, 5, (20, 6, 3))
-    target = rng.normal(0, 5, (20, 6, 3)) + 2.0 * source
-    scale, rotation, translation, usable = similarities(source, target)
-    assert usable.all()
-    for k in range(20):
-        alone = similarity_closed_form(source[k], target[k])
-        assert alone is not None
-        assert scale[k] == pytest.approx(alone.scale, abs=1e-9)
-        assert np.abs(rotation[k] - alone.rotation).max() < 1e-9
-        assert np.abs(translation[k] - alone.translation).max() < 1e-8
-
-
-def test_points_on_a_line_determine_nothing() -> None:
-    line = np.linspace(0, 1, 5)[:, None] * np.array([1.0, 2.0, 3.0])
-    assert not similarities(line[None], 2.0 * line[None])[3][0]
 
 
 def test_ransac_finds_the_similarity_among_two_thirds_outliers() -> None:

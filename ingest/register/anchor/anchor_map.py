@@ -6,7 +6,7 @@ is a new map, or a reason. Gates ask of the map as a whole whether it lies on th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -22,14 +22,14 @@ from ingest.register.anchor.frames import (
     TriedFrames,
     frames_that_agree,
 )
-from ingest.register.anchor.placing import PlaceRound, place_in_rounds, with_lens
+from ingest.register.anchor.placing import PlaceRound, place_in_rounds
 from ingest.register.anchor.proposals import PhotoReader
+from ingest.register.block import block_of_map
 from ingest.register.structure.map_move import (
     MapMove,
     MapResidual,
     map_move,
     map_residuals,
-    viewing_distance_m,
 )
 from ingest.register.structure.projection import (
     project_structure,
@@ -178,7 +178,7 @@ def _alone(
     refused: dict[str, str] = {}
     for frame in frames:
         image = frame.image
-        structure = project_structure(feature_map, [with_lens(frame, feature_map.cameras)], cloud)
+        structure = project_structure(feature_map, {image.image_id: frame.registration}, cloud)
         if not structure.accepted or structure.new_from_old is None:
             refused[image.name] = f"{structure.reason}: {structure.message}"
             continue
@@ -240,13 +240,13 @@ def _judged(
     """The gates on the placed map as a whole."""
     before, after = map_residuals(old, new, cloud)
     move = map_move(old, new)
-    distance = viewing_distance_m(new)
+    distance = float(np.median(block_of_map(new).distances()))
     apart = found.agreement.apart_m if found.agreement else {}
     allowed = found.agreement.allowed_m if found.agreement else {}
     checks: dict[str, Any] = {
         "before": before.as_figures(),
         "after": after.as_figures(),
-        "move": move.as_figures(),
+        "move": asdict(move),
         "viewing_distance_m": distance,
         "frames_apart_m": [
             {"frames": list(pair), "apart_m": metres, "allowed_m": allowed[pair]}

@@ -6,21 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress
 from ingest.register.anchor.frames import TriedFrame, register_again
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.structure.adjustment import (
-    adjust_to_scan,
-    adjusted_map,
-)
-from ingest.register.structure.pairs import RegisteredImage
-from ingest.register.structure.projection import (
-    placed_map,
-    project_structure,
-)
+from ingest.register.structure.adjustment import adjust_to_scan, placed_map
+from ingest.register.structure.projection import project_structure
 
 _LOG = logging.getLogger(__name__)
 
@@ -70,7 +62,7 @@ def place_in_rounds(
     rounds: list[PlaceRound] = []
     for number in range(_LENS_ROUNDS):
         lens = (placed or feature_map).cameras
-        registered = [with_lens(frame, lens) for frame in frames]
+        registered = {frame.image.image_id: frame.registration for frame in frames}
         start, cpu = time.perf_counter(), time.process_time()
         structure = project_structure(feature_map, registered, cloud)
         structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
@@ -84,7 +76,7 @@ def place_in_rounds(
         adjustment = adjust_to_scan(feature_map, structure, registered, cloud, adjusted)
         adjust_s = time.perf_counter() - start
         if adjustment.accepted:
-            placed = adjusted = adjusted_map(feature_map, adjustment, cloud)
+            placed = adjusted = placed_map(feature_map, structure, cloud, adjustment)
         elif placed is None:
             placed = placed_map(feature_map, structure, cloud)
         rounds.append(
@@ -121,12 +113,3 @@ def place_in_rounds(
             break
         frames = kept
     return placed, rounds, ""
-
-
-def with_lens(frame: TriedFrame, lens: Sequence[Camera]) -> RegisteredImage:
-    """The frame with the lens that it was registered with."""
-    return RegisteredImage(
-        image_id=frame.image.image_id,
-        registration=frame.registration,
-        camera=lens[frame.image.camera_id],
-    )

@@ -6,20 +6,18 @@ covariance of all residuals, and one is left out at a time.
 """
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
-from featuredb.adjust.block import Block
 from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.control.adjust import Adjusted, Weights
+from ingest.register.control.adjust import Adjusted, Task, Weights, adjust
 from ingest.register.control.fit import ControlFit
 from ingest.register.control.marks import Control
-from ingest.register.control.rays import mark_errors, mark_residuals
+from ingest.register.control.rays import mark_residuals
 
 _LOG = logging.getLogger(__name__)
 _SETTLED = 0.01  # relative change of the sigma, whose own uncertainty is tens of per cent
@@ -31,7 +29,6 @@ _SIGNIFICANCE = 0.01  # chance of naming a good observation as wrong, over the w
 _READMISSION = 0.05
 _MIN_MARK_PX = 5.0  # marks nearer than that are not called wrong: people mark to one to three pixels
 _MIN_POINT_M = 0.05  # the same for points; better surveys are rare
-_MAX_MARK_PX = 12.0  # marks within that take part from the start
 _START_MARK_PX = 1.0  # standard deviation of marks before they have been compared
 # Below, agreement is luck.
 _MIN_MARK_SIGMA_PX = 0.3
@@ -39,22 +36,8 @@ _MIN_CONTROL_SIGMA_M = 0.005
 _MAX_ROUNDS = 12  # of adjusting and testing
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Outcome:
-    """The last adjustment.
-
-    Attributes:
-        freedom: degrees of freedom of the surveyed coordinates.
-        rounds: adjustments done.
-    """
-
-    adjusted: Adjusted
-    freedom: float
-    rounds: int
-
-
 def initial_weights(
-    placed: Block, control: Control, fit: ControlFit, sigma_m: tuple[float, float] | None
+    control: Control, fit: ControlFit, sigma_m: tuple[float, float] | None
 ) -> tuple[Weights, FloatArray]:
     """What takes part at first, and where the control points lie in the placed block."""
     count = len(control.names)
@@ -62,13 +45,9 @@ def initial_weights(
     marks = np.zeros(len(control.marks), dtype=bool)
     xyz = np.zeros((count, 3))
     for hypothesis, inlier in zip(fit.chosen, fit.inliers, strict=True):
-        point = control.point_of[hypothesis.marks[0]]
-        rows = control.marks_of(int(point))
-        xyz[point] = fit.local_from_block.act(hypothesis.xyz)
-        near = mark_errors(placed, control.photo_of[rows], control.xy[rows], xyz[point]) <= _MAX_MARK_PX
-        near |= np.isin(rows, hypothesis.marks)
-        points[point] = inlier
-        marks[rows] = near
+        xyz[hypothesis.point] = fit.local_from_block.act(hypothesis.xyz)
+        points[hypothesis.point] = inlier
+        marks[list(hypothesis.marks)] = True
     horizontal, vertical = sigma_m or (fit.sigma_m, fit.sigma_m)
     weights = Weights(
         mark_px=_START_MARK_PX,
@@ -79,16 +58,15 @@ def initial_weights(
     return weights, xyz
 
 
-def improve(
-    control: Control,
-    weights: Weights,
-    solve: Callable[[Weights, Adjusted | None], Adjusted],
-    sigma_is_given: bool,
-) -> Outcome:
-    """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none."""
-    rounds, adjusted = 0, None
+def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjusted, float, int]:
+    """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none.
+
+    Returns:
+        The last adjustment, degrees of freedom of the surveyed coordinates, and the number of adjustments.
+    """
+    control, rounds, adjusted = task.control, 0, None
     while True:
-        adjusted = solve(weights, adjusted)
+        adjusted = adjust(task, weights, adjusted)
         rounds += 1
         control_m, freedom = _control_sigma(adjusted, control)
         tested = replace(
@@ -99,7 +77,7 @@ def improve(
         settled = np.allclose(tested.control_m, weights.control_m, rtol=_SETTLED)
         unchanged = (tested.marks == weights.marks).all() and (tested.points == weights.points).all()
         if (settled and unchanged) or rounds >= _MAX_ROUNDS:
-            return Outcome(adjusted=adjusted, freedom=freedom, rounds=rounds)
+            return adjusted, freedom, rounds
         weights = tested
         _LOG.info("round %d: control sigma %s m", rounds, weights.control_m)
 

@@ -7,12 +7,10 @@ correspondences) and the scan's surface under all points of the map determine po
 """
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
@@ -23,13 +21,12 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from featuredb.render.cloud import PointCloud
-from ingest.colmap.adjust import AdjustOptions, longest_side
-from ingest.colmap.precision import design_effect, linearise
+from ingest.colmap.adjust import AdjustOptions, longest_side, residuals_of
+from ingest.colmap.precision import design_effect
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.pairs import RegisteredImage
-from ingest.register.structure.projection import StructurePlacement, move_in_map_frame
-from ingest.register.structure.similarity import similarities
-from ingest.register.structure.surface_fit import Surface, plane_distances, surface_near
+from ingest.register.structure.pairs import Registered
+from ingest.register.structure.projection import StructurePlacement
+from ingest.register.structure.surface_fit import Surface, nearest_planes, surface_near
 
 _LOG = logging.getLogger(__name__)
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
@@ -69,7 +66,6 @@ class LidarAdjustment:
     Attributes:
         reason: gate that refused it, or None; `message` says it for people.
         block: the map in the cloud's local frame, None when refused.
-        covariance: (7, 7) of what moves the whole map (left perturbation of a similarity), or None.
         poses: (6, 6) of each pose, with all that points and lenses leave open; none when refused.
         lenses: what is left open of the lenses; None when refused, or where no lens has OPENCV's parameters.
         figures: before and after, JSON-able.
@@ -77,10 +73,9 @@ class LidarAdjustment:
 
     reason: AdjustReason | None
     message: str
-    block: Block | None
-    covariance: FloatArray | None
-    poses: tuple[FloatArray, ...]
-    lenses: LensUncertainty | None
+    block: Block | None = None
+    poses: tuple[FloatArray, ...] = ()
+    lenses: LensUncertainty | None = None
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -91,7 +86,7 @@ class LidarAdjustment:
 def adjust_to_scan(
     feature_map: FeatureMap,
     structure: StructurePlacement,
-    registered: Sequence[RegisteredImage],
+    registered: Registered,
     cloud: PointCloud,
     begin: FeatureMap | None = None,
 ) -> LidarAdjustment:
@@ -99,22 +94,20 @@ def adjust_to_scan(
 
     Args:
         structure: an accepted placement of this map on this cloud.
-        registered: the frames with their correspondences, in the cloud's local frame. A frame without
-            correspondences takes part by the pairs of structure projection, which know no better lens than
-            the one it was registered with.
+        registered: the frames with their correspondences, in the cloud's local frame.
         begin: the map as an earlier adjustment left it, from which the solver starts.
     """
     assert structure.new_from_old is not None  # accepted
     to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
     start = whole_lens(block_of_map(feature_map).moved(structure.new_from_old @ to_cloud))
-    control = control_of(feature_map, structure, registered)
+    control = _control_of(feature_map, registered)
     if len(control.xyz) < _MIN_CONTROL:
         words = f"{len(control.xyz)} correspondences with the scan, at least {_MIN_CONTROL} are needed"
-        return _refused("NO_CONTROL", words, {})
+        return LidarAdjustment(reason="NO_CONTROL", message=words)
     low, high = np.percentile(start.xyz, [1, 99], axis=0)
     surface = surface_near(cloud, np.clip(start.xyz, low, high), _MAX_SURFACE_POINTS)
     if surface is None:
-        return _refused("NO_SCAN", "the scan has no points under the map", {})
+        return LidarAdjustment(reason="NO_SCAN", message="the scan has no points under the map")
     first = start
     if begin is not None:
         first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
@@ -122,43 +115,60 @@ def adjust_to_scan(
     figures = {
         "control": len(control.xyz),
         "frames": len(np.unique(control.photo_of)),
-        "before": _state(start, control, plane_distances(surface, start.xyz, _REACH_M)),
-        "after": _state(block, control, plane_distances(surface, block.xyz, _REACH_M)),
+        "before": _state(start, control, surface),
+        "after": _state(block, control, surface),
     }
     reason, message = _gate(block, figures)
     if reason is not None:
-        return _refused(reason, message, figures)
+        return LidarAdjustment(reason=reason, message=message, figures=figures)
     poses, lenses = _left_open(block, control, surface, structure, start)
     return LidarAdjustment(
         reason=None,
         message="adjusted to the scan",
         block=block,
-        covariance=structure.covariance,
         poses=poses,
         lenses=lenses,
         figures=figures,
     )
 
 
-def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: PointCloud) -> FeatureMap:
-    """The map with the adjusted poses, points and lenses, in its own local frame; the scan's height datum.
+def placed_map(
+    feature_map: FeatureMap,
+    structure: StructurePlacement,
+    cloud: PointCloud,
+    adjustment: LidarAdjustment | None = None,
+) -> FeatureMap:
+    """The map at its new place: same ids, descriptors and local frame; the scan's height datum.
 
-    `local_from_sfm` becomes the similarity next to the old one; what is left over is the adjustment itself.
+    The new placement's `local_from_sfm` is the old one followed by the move of structure projection; what is
+    left over is the adjustment itself.
+
+    Args:
+        structure, adjustment: accepted ones; without an adjustment the map follows the similarity.
     """
-    assert adjustment.block is not None
-    assert adjustment.covariance is not None  # accepted
+    assert structure.new_from_old is not None
+    assert structure.covariance is not None  # accepted
     map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
-    block = adjustment.block.moved(map_from_cloud)
-    whole = _nearest_similarity(block_of_map(feature_map).centers(), block.centers())
-    _, covariance = move_in_map_frame(feature_map, Sim3.identity(), adjustment.covariance, cloud)
+    move = map_from_cloud @ structure.new_from_old @ map_from_cloud.inverse()
+    adjoint = map_from_cloud.adjoint()
+    covariance = adjoint @ structure.covariance @ adjoint.T
+    if adjustment is None:
+        block = block_of_map(feature_map).moved(move)
+        rms_m, evidence = structure.figures["residual_rms_m"], {"structure": structure.figures}
+    else:
+        assert adjustment.block is not None  # accepted
+        block = adjustment.block.moved(map_from_cloud)
+        rms_m, evidence = adjustment.figures["after"]["surface_rms_m"], {"adjustment": adjustment.figures}
     placement = Placement(
         method="lidar",
-        local_from_sfm=whole @ feature_map.placement.local_from_sfm,
-        covariance=covariance,
-        residual_rms_m=float(adjustment.figures["after"]["surface_rms_m"]),
-        evidence={"adjustment": adjustment.figures, "replaces": feature_map.placement.method},
+        local_from_sfm=move @ feature_map.placement.local_from_sfm,
+        covariance=(covariance + covariance.T) / 2,
+        residual_rms_m=float(rms_m),
+        evidence=evidence | {"replaces": feature_map.placement.method},
     )
     placed = map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
+    if adjustment is None:
+        return placed
     images = zip(placed.images, adjustment.poses, strict=True)
     uncertainty = {} if adjustment.lenses is None else adjustment.lenses.as_provenance()
     return replace(
@@ -168,49 +178,26 @@ def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: Po
     )
 
 
-def control_of(
-    feature_map: FeatureMap, structure: StructurePlacement, registered: Sequence[RegisteredImage]
-) -> Marks:
-    """Scan points that the registered frames see, by their correspondences or else by their pairs."""
+def _control_of(feature_map: FeatureMap, registered: Registered) -> Marks:
+    """Scan points that the registered frames see, by their correspondences."""
     row_of_image = {image.image_id: row for row, image in enumerate(feature_map.images)}
-    xyz, xy, photo_of = [], [], []
-    for frame, item in enumerate(registered):
-        points, pixels = item.registration.points_local, item.registration.pixels
-        if len(points) == 0:
-            points, pixels = _pairs_as_control(feature_map, structure, frame, item.image_id)
-        xyz.append(points)
-        xy.append(pixels)
-        photo_of.append(np.full(len(points), row_of_image[item.image_id], dtype=np.int64))
+    counts = [len(found.pixels) for found in registered.values()]
     return Marks(
-        xyz=np.concatenate(xyz).reshape(-1, 3),
-        photo_of=np.concatenate(photo_of),
-        xy=np.concatenate(xy).reshape(-1, 2),
+        xyz=np.concatenate([found.points_local for found in registered.values()]),
+        photo_of=np.repeat([row_of_image[image_id] for image_id in registered], counts),
+        xy=np.concatenate([found.pixels for found in registered.values()]),
     )
-
-
-def _pairs_as_control(
-    feature_map: FeatureMap, structure: StructurePlacement, frame: int, image_id: int
-) -> tuple[FloatArray, FloatArray]:
-    assert structure.pairs is not None  # accepted
-    rows = np.flatnonzero((structure.pairs.frame_of == frame) & structure.inliers)
-    observations = feature_map.observations
-    mine = np.flatnonzero(observations.image_id == image_id)
-    row_of_point = dict(zip(observations.point_index[mine].tolist(), mine.tolist(), strict=True))
-    seen = [row_of_point[int(p)] for p in structure.pairs.point_index[rows]]
-    return structure.pairs.target[rows], observations.xy[seen].astype(np.float64)
 
 
 def _iterate(start: Block, lenses: tuple[Camera, ...], control: Marks, surface: Surface) -> Block:
     """Rounds of planes, standard deviations and solving until the points settle."""
     block = start
     for _ in range(_ROUNDS):
-        planes = _planes(surface, block.xyz, _REACH_M)[0]
-        sigmas = _sigmas(block, control, planes, _MIN_SIGMA_REL, _MIN_SURFACE_M)
-        problem = Problem(block, _terms(block, control, surface, lenses, sigmas))
+        problem = Problem(block, _terms(block, control, surface, lenses, _MIN_SIGMA_REL, _MIN_SURFACE_M))
         problem.solve(_STEPS, _FUNCTION_TOLERANCE)
         moved = problem.block()
         step_m, block = _step_m(block, moved), moved
-        _LOG.debug("sigmas %s, points moved %.4f m", sigmas, step_m)
+        _LOG.debug("points moved %.4f m", step_m)
         if step_m < _SETTLED_M:
             break
     return block
@@ -223,13 +210,25 @@ def _step_m(before: Block, after: Block) -> float:
 
 
 def _terms(
-    block: Block, control: Marks, surface: Surface, lenses: tuple[Camera, ...], sigmas: "_Sigmas"
+    block: Block,
+    control: Marks,
+    surface: Surface,
+    lenses: tuple[Camera, ...],
+    least_rel: float,
+    least_m: float,
 ) -> Terms:
+    """Each kind of residual weighs by its own spread as it is now.
+
+    Args:
+        least_rel: least standard deviation in pictures, over the longer side. least_m: from the surface.
+    """
+    longer = longest_side(block.cameras)
+    offset, normals = nearest_planes(surface, block.xyz, _REACH_M)
     return Terms(
-        keypoint_px=sigmas.track_px,
+        keypoint_px=max(least_rel * longer, _spread(residuals_of(block)[0])),
         lenses=tuple(lens_prior(camera, _LENS) for camera in lenses),
-        marks=replace(control, sigma_px=sigmas.control_px),
-        points=surface_priors(block.xyz, *_planes(surface, block.xyz, _REACH_M), sigmas.surface_m),
+        marks=replace(control, sigma_px=max(least_rel * longer, _spread(_control_residuals(block, control)))),
+        points=surface_priors(block.xyz, offset, normals, max(least_m, _spread(offset))),
     )
 
 
@@ -241,46 +240,13 @@ def _left_open(
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
     or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
     """
-    sigmas = _sigmas(block, control, _planes(surface, block.xyz, _REACH_M)[0], 1e-6, 1e-3)
-    found = Problem(block, _terms(block, control, surface, start.cameras, sigmas)).marginals()
-    shared = design_effect(_track_residuals(block), block.xy, block.photo_of, longest_side(block.cameras))
+    found = Problem(block, _terms(block, control, surface, start.cameras, 1e-6, 1e-3)).marginals()
+    shared = design_effect(*residuals_of(block), longest_side(block.cameras))
     factor = max(float(structure.figures["neighbours_factor"]), shared)
     lenses = [factor * _LENS_DILUTION * found.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
     uncertainty = uncertainty_of_lenses(block.cameras, lenses, photos, _LENS_DILUTION)
     return tuple(factor * found.poses(_LENS_DILUTION)), uncertainty
-
-
-def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:
-    """Signed distances (n,) from the scan's planes next to the points, NaN beyond reach; normals (n, 3)."""
-    centred = np.ascontiguousarray(xyz - surface.middle)
-    found, _ = surface.tree.batch_nearest_neighbor_search(centred)
-    return plane_distances(surface, xyz, reach_m), surface.normals[np.asarray(found).astype(np.int64)]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Sigmas:
-    """Standard deviations of one residual of each kind."""
-
-    track_px: float
-    control_px: float
-    surface_m: float
-
-
-def _sigmas(
-    block: Block,
-    control: Marks,
-    offset: FloatArray,
-    least_rel: float,
-    least_m: float,
-) -> _Sigmas:
-    """Each kind of residual weighs by its own spread as it is now."""
-    longer = longest_side(block.cameras)
-    return _Sigmas(
-        track_px=max(least_rel * longer, _spread(_track_residuals(block))),
-        control_px=max(least_rel * longer, _spread(_control_residuals(block, control))),
-        surface_m=max(least_m, _spread(offset)),
-    )
 
 
 def _spread(residuals: FloatArray) -> float:
@@ -289,35 +255,23 @@ def _spread(residuals: FloatArray) -> float:
     return 1.4826 * float(np.median(finite)) if len(finite) else 0.0
 
 
-def _track_residuals(block: Block) -> FloatArray:
-    return _residuals(block, block.xyz, block.point_of, block.photo_of, block.xy)
-
-
 def _control_residuals(block: Block, control: Marks) -> FloatArray:
-    return _residuals(block, control.xyz, np.arange(len(control.xyz)), control.photo_of, control.xy)
+    """(m, 2) of the correspondences that their photos can see, pixels."""
+    rows = np.arange(len(control.xyz))
+    return residuals_of(
+        replace(block, xyz=control.xyz, point_of=rows, photo_of=control.photo_of, xy=control.xy)
+    )[0]
 
 
-def _residuals(
-    block: Block,
-    points: FloatArray,
-    point_of: NDArray[np.int64],
-    photo_of: NDArray[np.int64],
-    xy: FloatArray,
-) -> FloatArray:
-    """Observed minus projected (m, 2), pixels."""
-    return linearise(
-        block.cameras, block.camera_of, block.cam_from_block, points, point_of, photo_of, xy
-    ).residual
-
-
-def _state(block: Block, control: Marks, distances: FloatArray) -> dict[str, Any]:
-    tracks = np.linalg.norm(_track_residuals(block), axis=1)
+def _state(block: Block, control: Marks, surface: Surface) -> dict[str, Any]:
+    tracks = np.linalg.norm(residuals_of(block)[0], axis=1)
     seen = np.linalg.norm(_control_residuals(block, control), axis=1)
+    distances = nearest_planes(surface, block.xyz, _REACH_M)[0]
     near = np.abs(distances[np.isfinite(distances)])
     return {
-        "reprojection_median_px": float(np.nanmedian(tracks)),
-        "reprojection_rms_px": float(np.sqrt(np.nanmean(tracks**2))),
-        "control_median_px": float(np.nanmedian(seen)),
+        "reprojection_median_px": float(np.median(tracks)),
+        "reprojection_rms_px": float(np.sqrt(np.mean(tracks**2))),
+        "control_median_px": float(np.median(seen)),
         "surface_points": len(near),
         "surface_median_m": float(np.median(near)) if len(near) else None,
         "surface_rms_m": float(np.sqrt((near**2).mean())) if len(near) else None,
@@ -358,24 +312,9 @@ def _folds_inside(camera: Camera) -> bool:
     return bool(camera.tan_of_fold < reach / camera.focal_px)
 
 
-def _nearest_similarity(source: FloatArray, target: FloatArray) -> Sim3:
-    """Least-squares similarity of the camera centres; the identity's neighbour where they are on a line."""
-    scale, rotation, translation, usable = similarities(source[None], target[None])
-    if not usable[0]:
-        shift = target.mean(axis=0) - source.mean(axis=0)
-        return Sim3(scale=1.0, rotation=np.eye(3), translation=shift)
-    return Sim3(scale=float(scale[0]), rotation=rotation[0], translation=translation[0])
-
-
 def _further(before: dict[str, Any], after: dict[str, Any]) -> bool:
     """Whether the median distance grew by more than three standard errors of two normal medians."""
     if before["surface_median_m"] is None:
         return False
     errors = [1.858 * s["surface_median_m"] / np.sqrt(s["surface_points"]) for s in (before, after)]
     return bool(after["surface_median_m"] - before["surface_median_m"] > 3.0 * np.hypot(*errors))
-
-
-def _refused(reason: AdjustReason, message: str, figures: dict[str, Any]) -> LidarAdjustment:
-    return LidarAdjustment(
-        reason=reason, message=message, block=None, covariance=None, poses=(), lenses=None, figures=figures
-    )

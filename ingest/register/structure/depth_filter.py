@@ -135,9 +135,6 @@ def _intersect(
     valid = np.zeros(total, dtype=bool)
     points, normals = np.full((total, 3), np.nan), np.full((total, 3), np.nan)
     sigma, depths = np.full(total, np.nan), np.full(total, np.nan)
-    hits = SurfaceHits(valid=valid, points=points, normals=normals, sigma_ray_m=sigma, depths=depths)
-    if len(rows) == 0:
-        return hits
     pose = rendering.cam_from_local
     mean, count, values, vectors = _principal_axes(cloud, index, weight)
     normal = vectors[:, :, 0]
@@ -162,20 +159,17 @@ def _intersect(
     normals[rows] = -normal[ok] * np.sign(facing[ok])[:, None]
     sigma[rows] = rough[ok] / cosine[ok]
     depths[rows] = depth
-    return hits
+    return SurfaceHits(valid=valid, points=points, normals=normals, sigma_ray_m=sigma, depths=depths)
 
 
 def _principal_axes(
     cloud: PointCloud, index: NDArray[np.int32], weight: NDArray[np.bool_]
 ) -> tuple[FloatArray, NDArray[np.int64], FloatArray, FloatArray]:
     """Mean (n, 3), number (n,), variances (n, 3) and axes (n, 3, 3) of the points chosen in each row."""
-    # A window shows fewer points than it has samples: those are moved to the front, and the rest left out.
     count = weight.sum(axis=1)
-    front = np.argsort(~weight, axis=1, kind="stable")[:, : int(count.max())]
-    chosen = np.arange(front.shape[1]) < count[:, None]
-    points = cloud.xyz[np.where(chosen, np.take_along_axis(index, front, axis=1), 0)].astype(np.float64)
-    mean = (chosen[:, None, :] @ points)[:, 0] / count[:, None]
+    points = cloud.xyz[np.where(weight, index, 0)].astype(np.float64)
+    mean = (weight[:, None, :] @ points)[:, 0] / count[:, None]
     points -= mean[:, None]
-    points *= chosen[:, :, None]
+    points *= weight[:, :, None]
     values, vectors = np.linalg.eigh(np.swapaxes(points, 1, 2) @ points / count[:, None, None])
     return mean, count, values, vectors

@@ -1,6 +1,6 @@
 """How a map moves when it is placed anew, and how it lies on a scan."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,7 +10,6 @@ from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.structure.similarity import similarities
 
 _MAX_POINTS = 20_000  # of a map; more say nothing new of it
 _PLAN_REACH_M = 2.0  # a map point with no scan this near in plan lies over a hole or beyond the border
@@ -18,7 +17,7 @@ _PLAN_REACH_M = 2.0  # a map point with no scan this near in plan lies over a ho
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapMove:
-    """The similarity nearest to how a map's points moved, about their middle.
+    """The similarity between two placements of a map, about the middle of its points.
 
     Attributes:
         horizontal_m, up_m: of the middle.
@@ -37,10 +36,6 @@ class MapMove:
     heading_sigmas: float
     tilt_sigmas: float
     scale_sigmas: float
-
-    def as_figures(self) -> dict[str, float]:
-        """JSON-able."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,15 +69,11 @@ class MapResidual:
 
 
 def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
-    """From the places of the same points in both; a bent map that is straightened has one that fits best."""
-    step = max(1, len(old.points) // _MAX_POINTS)
-    before = old.points_local()[::step]
-    after = new.points_local(old.frame)[::step]
-    scale, rotation, _, usable = similarities(before[None], after[None])
-    turn = so3_log(rotation[0]) if usable[0] else np.zeros(3)
-    ratio = float(scale[0]) if usable[0] else 1.0
-    middle = np.median(before, axis=0)
-    shift = np.median(after, axis=0) - middle
+    """From the placements of the same map in one local frame."""
+    move = new.placement.local_from_sfm @ old.placement.local_from_sfm.inverse()
+    turn = so3_log(move.rotation)
+    middle = np.median(old.points_local(), axis=0)
+    shift = move.act(middle) - middle
     covariance = old.placement.covariance
     jacobian = point_jacobian(middle)
     spread = jacobian @ covariance @ jacobian.T
@@ -92,11 +83,11 @@ def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
         up_m=float(shift[2]),
         heading_deg=float(np.degrees(turn[2])),
         tilt_deg=float(np.degrees(tilt)),
-        scale=ratio,
+        scale=move.scale,
         horizontal_sigmas=float(np.hypot(*shift[:2]) / np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])),
         heading_sigmas=heading / float(np.sqrt(covariance[3, 3])),
         tilt_sigmas=tilt / float(np.sqrt(max(covariance[1, 1], covariance[2, 2]))),
-        scale_sigmas=abs(float(np.log(ratio))) / float(np.sqrt(covariance[0, 0])),
+        scale_sigmas=abs(float(np.log(move.scale))) / float(np.sqrt(covariance[0, 0])),
     )
 
 
@@ -113,8 +104,6 @@ def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[
     high = np.maximum(before.max(axis=0), after.max(axis=0))[:2] + _PLAN_REACH_M
     near = ((cloud.xyz[:, :2] >= low) & (cloud.xyz[:, :2] <= high)).all(axis=1)
     scan = cloud.xyz[near].astype(np.float64)
-    if not len(scan):
-        return tuple(MapResidual(distance_m=np.zeros(0), points=len(old.points)) for _ in range(2))  # type: ignore[return-value]
     in_plan, _ = cKDTree(scan[:, :2]).query(after[:, :2], distance_upper_bound=_PLAN_REACH_M)
     compared = np.isfinite(in_plan)
     tree = cKDTree(scan)
@@ -123,14 +112,3 @@ def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[
         for points in (before, after)
     )
     return first, second
-
-
-def viewing_distance_m(feature_map: FeatureMap) -> float:
-    """Median distance from which the map's images see its points."""
-    rows = {image.image_id: row for row, image in enumerate(feature_map.images)}
-    centers = np.array([image.cam_from_local.center for image in feature_map.images])
-    observations = feature_map.observations
-    step = max(1, len(observations) // _MAX_POINTS)
-    points = feature_map.points_local()[observations.point_index[::step]]
-    seen_from = centers[[rows[int(i)] for i in observations.image_id[::step]]]
-    return float(np.median(np.linalg.norm(points - seen_from, axis=1)))

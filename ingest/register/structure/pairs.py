@@ -1,10 +1,9 @@
 """3D/3D pairs: points of a map, projected through a registered frame onto the scan."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
@@ -29,32 +28,11 @@ _SCAN_SIGMA_M = 0.03  # of the scan's points across their surface, beyond what t
 _MAX_POINT_SIGMA_REL = 0.05  # map points less certain than this share of their distance are left out
 _CELLS = 6  # per side of the grid of neighbourhoods in a frame
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RegisteredImage:
-    """A frame of a map that was registered to the scan.
-
-    Attributes:
-        image_id: of the map's image.
-        registration: accepted, in the local frame of the cloud.
-        camera: the lens with which it was registered, where the registration does not name it itself;
-            None for the map's own.
-    """
-
-    image_id: int
-    registration: FrameRegistration
-    camera: Camera | None = None
-
-    def __post_init__(self) -> None:
-        if not self.registration.accepted:
-            raise InvalidValueError(
-                f"RegisteredImage {self.image_id}: expected an accepted registration, "
-                f"found {self.registration.reason}"
-            )
+Registered = Mapping[int, FrameRegistration]  # accepted, in the local frame of the cloud, by image id
 
 
 def structure_pairs(
-    feature_map: FeatureMap, source: FloatArray, registered: Sequence[RegisteredImage], cloud: PointCloud
+    feature_map: FeatureMap, source: FloatArray, registered: Registered, cloud: PointCloud
 ) -> Pairs:
     """Pairs of all frames.
 
@@ -62,25 +40,21 @@ def structure_pairs(
         source: (n, 3) the map's points in the cloud's local frame, at their present place.
 
     Raises:
-        InvalidValueError: a registered image that the map does not have.
+        InvalidValueError: a registration that was refused, or of an image that the map does not have.
     """
     images = {image.image_id: image for image in feature_map.images}
-    missing = [r.image_id for r in registered if r.image_id not in images]
-    if missing:
-        raise InvalidValueError(f"structure_pairs: the map {feature_map.map_id} has no images {missing}")
+    wrong = [i for i, found in registered.items() if i not in images or not found.accepted]
+    if wrong:
+        raise InvalidValueError(
+            f"structure_pairs: expected accepted registrations of images of map {feature_map.map_id}, found "
+            f"others of {wrong}"
+        )
     uncertainty = full_covariances(feature_map.points.covariance)
     parts = [
-        _pairs_of_frame(feature_map, source, uncertainty, images[r.image_id], r, row, cloud)
-        for row, r in enumerate(registered)
+        _pairs_of_frame(feature_map, source, uncertainty, images[image_id], registration, row, cloud)
+        for row, (image_id, registration) in enumerate(registered.items())
     ]
-    joined = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in (
-            *("point_index", "frame_of", "source", "target", "normals"),
-            *("covariance", "by_frame", "cell_of", "frame_covariance"),
-        )
-    }
-    return Pairs(**joined)
+    return Pairs(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Pairs)})
 
 
 def _pairs_of_frame(
@@ -88,14 +62,14 @@ def _pairs_of_frame(
     source: FloatArray,
     uncertainty: FloatArray,
     image: MapImage,
-    registered: RegisteredImage,
+    registration: FrameRegistration,
     row: int,
     cloud: PointCloud,
 ) -> Pairs:
-    pose, covariance = registered.registration.cam_from_local, registered.registration.covariance
+    pose, covariance, camera = registration.cam_from_local, registration.covariance, registration.camera
     assert pose is not None
-    assert covariance is not None  # accepted
-    camera = registered.registration.camera or registered.camera or feature_map.cameras[image.camera_id]
+    assert covariance is not None
+    assert camera is not None  # accepted
     width = min(_RENDER_WIDTH_PX, camera.width)
     small = camera.scaled_to(width, round(camera.height * width / camera.width))
     rendering = render(cloud, small, pose, RenderOptions(attributes=False))
@@ -109,30 +83,20 @@ def _pairs_of_frame(
     hits = surface_at(rendering, cloud, pixels)
     distance = np.linalg.norm(hits.points - pose.center, axis=1)
     kept = np.flatnonzero(hits.valid)
-    kept = kept[_no_larger(uncertainty[points[kept]], _MAX_POINT_SIGMA_REL * distance[kept])]
+    largest = np.linalg.eigvalsh(uncertainty[points[kept]])[:, -1]
+    kept = kept[largest <= (_MAX_POINT_SIGMA_REL * distance[kept]) ** 2]
     own, by_frame = _errors(hits.rows(kept), pose, camera)
     grid = np.minimum((pixels / (small.width, small.height) * _CELLS).astype(np.int64), _CELLS - 1)
     cell = row * _CELLS**2 + grid[:, 1] * _CELLS + grid[:, 0]
     return Pairs(
-        point_index=points[kept],
         frame_of=np.full(len(kept), row, dtype=np.int64),
         source=source[points[kept]],
         target=hits.points[kept],
-        normals=hits.normals[kept],
         covariance=own + uncertainty[points[kept]],
         by_frame=by_frame,
         cell_of=cell[kept],
         frame_covariance=covariance[None],
     )
-
-
-def _no_larger(covariance: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
-    """(n,) bool: whether the largest standard deviation of covariances (n, 3, 3) is at most sigma (n,)."""
-    trace, limit = np.trace(covariance, axis1=1, axis2=2), sigma**2
-    small = trace <= limit  # the largest eigenvalue is between a third of the trace and the trace
-    open_ = np.flatnonzero(~small & (trace <= 3.0 * limit))
-    small[open_] = np.linalg.eigvalsh(covariance[open_])[:, -1] <= limit[open_]
-    return np.asarray(small)
 
 
 def _errors(hits: SurfaceHits, pose: Rigid3, camera: Camera) -> tuple[FloatArray, FloatArray]:

@@ -6,7 +6,6 @@ pairs by their own covariance and knows that all pairs of a frame share its pose
 which slides over flat ground, comes the adjustment by the scan's surface (`adjustment.py`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -15,23 +14,15 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.pairs import RegisteredImage, structure_pairs
+from ingest.register.structure.pairs import Registered, structure_pairs
 from ingest.register.structure.similarity import (
     Pairs,
     SimilarityFit,
     ransac_similarity,
     refine_similarity,
 )
-from ingest.register.structure.surface_fit import (
-    plane_distances,
-    reach_of,
-    surface_near,
-)
-
-_MAX_BEFORE = 4000  # points whose distance from the scan before the move is looked up
 
 StructureReason = Literal["NO_FRAMES", "TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
 
@@ -62,8 +53,6 @@ class StructurePlacement:
         new_from_old: similarity of the scan's local frame that moves the map from its present place to
             the new one, None when refused.
         covariance: (7, 7) of its left perturbation, None when refused.
-        pairs: the 3D/3D pairs, None without frames.
-        inliers: (n,) bool of the pairs.
         figures: what the decision rests on, JSON-able.
     """
 
@@ -71,8 +60,6 @@ class StructurePlacement:
     message: str
     new_from_old: Sim3 | None = None
     covariance: FloatArray | None = None
-    pairs: Pairs | None = None
-    inliers: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -81,7 +68,7 @@ class StructurePlacement:
 
 
 def project_structure(
-    feature_map: FeatureMap, registered: Sequence[RegisteredImage], cloud: PointCloud
+    feature_map: FeatureMap, registered: Registered, cloud: PointCloud
 ) -> StructurePlacement:
     """Place a map on a scan by frames of the map that were registered to it.
 
@@ -92,107 +79,38 @@ def project_structure(
         return StructurePlacement(reason="NO_FRAMES", message="no frame is registered to the scan")
     source = feature_map.points_local(cloud.frame)
     pairs = structure_pairs(feature_map, source, registered, cloud)
-    none = np.zeros(len(pairs), dtype=bool)
     if len(pairs) < _MIN_PAIRS:
         words = f"{len(pairs)} of the map's points meet the scan, at least {_MIN_PAIRS} are needed"
-        return StructurePlacement(reason="TOO_FEW_PAIRS", message=words, pairs=pairs, inliers=none)
+        return StructurePlacement(reason="TOO_FEW_PAIRS", message=words)
     distances = _distances(pairs, registered)
     tolerance = np.maximum(_MIN_TOLERANCE_M, _TOLERANCE_REL * distances)
     start = ransac_similarity(pairs.source, pairs.target, tolerance)
     if start is None:
         words = "the pairs lie on a line or coincide"
-        return StructurePlacement(reason="NO_SIMILARITY", message=words, pairs=pairs, inliers=none)
+        return StructurePlacement(reason="NO_SIMILARITY", message=words)
     near = np.linalg.norm(pairs.target - start.act(pairs.source), axis=1) <= 2 * tolerance
     reason, message, figures = _gate_of_pairs(pairs, near, distances)
     if reason is not None:
-        return StructurePlacement(reason=reason, message=message, pairs=pairs, inliers=none, figures=figures)
-    kept = _rows(pairs, near)
+        return StructurePlacement(reason=reason, message=message, figures=figures)
+    kept = pairs.of(near)
     fit = refine_similarity(start, kept)
     figures |= _figures_of_fit(fit, kept, feature_map, registered)
     reason, message = _gate_of_fit(fit, distances[near], figures)
-    inliers = near.copy()
-    inliers[near] = fit.inliers
     if reason is not None:
-        return StructurePlacement(
-            reason=reason, message=message, pairs=pairs, inliers=inliers, figures=figures
-        )
-    figures |= _surface_figures(source, fit.target_from_source, cloud)
+        return StructurePlacement(reason=reason, message=message, figures=figures)
     return StructurePlacement(
         reason=None,
         message="placed on the scan",
         new_from_old=fit.target_from_source,
         covariance=fit.covariance,
-        pairs=pairs,
-        inliers=inliers,
         figures=figures,
     )
 
 
-def _surface_figures(source: FloatArray, sim: Sim3, cloud: PointCloud) -> dict[str, Any]:
-    """How points (n, 3) lie on the scan's surface before the move, a sample of them, and after it."""
-    placed = sim.act(source)
-    # Points far from all others (gross errors of matching) would make the box endless.
-    low, high = np.percentile(placed, [1, 99], axis=0)
-    surface = surface_near(cloud, np.clip(placed, low, high))
-    if surface is None:
-        return {}
-    after = plane_distances(surface, placed, reach_of(surface))
-    # The nearest neighbour of what is far away costs most; a sample says as much.
-    some = np.flatnonzero(np.isfinite(after))
-    some = some[:: max(1, -(-len(some) // _MAX_BEFORE))]
-    before = plane_distances(surface, source[some], np.inf)
-    return {"surface": {"before": _summary(before), "after": _summary(after)}}
-
-
-def placed_map(feature_map: FeatureMap, structure: StructurePlacement, cloud: PointCloud) -> FeatureMap:
-    """The map at its new place: same ids, points, descriptors and local frame; the scan's height datum.
-
-    The new placement's `local_from_sfm` is the old one followed by the move, both in the map's frame.
-    """
-    assert structure.new_from_old is not None
-    assert structure.covariance is not None  # accepted
-    move, covariance = move_in_map_frame(feature_map, structure.new_from_old, structure.covariance, cloud)
-    placement = Placement(
-        method="lidar",
-        local_from_sfm=move @ feature_map.placement.local_from_sfm,
-        covariance=covariance,
-        residual_rms_m=float(structure.figures["residual_rms_m"]),
-        evidence={"structure": structure.figures, "replaces": feature_map.placement.method},
-    )
-    block = block_of_map(feature_map).moved(move)
-    return map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
-
-
-def move_in_map_frame(
-    feature_map: FeatureMap, new_from_old: Sim3, covariance: FloatArray, cloud: PointCloud
-) -> tuple[Sim3, FloatArray]:
-    """A move and its covariance, given in the cloud's local frame, in the map's."""
-    map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
-    adjoint = map_from_cloud.adjoint()
-    moved_covariance = adjoint @ covariance @ adjoint.T
-    return map_from_cloud @ new_from_old @ map_from_cloud.inverse(), (
-        moved_covariance + moved_covariance.T
-    ) / 2
-
-
-def _distances(pairs: Pairs, registered: Sequence[RegisteredImage]) -> FloatArray:
+def _distances(pairs: Pairs, registered: Registered) -> FloatArray:
     """(n,) from the registered cameras, metres."""
-    centers = np.array([r.registration.cam_from_local.center for r in registered])  # type: ignore[union-attr]
+    centers = np.array([r.cam_from_local.center for r in registered.values()])  # type: ignore[union-attr]
     return np.asarray(np.linalg.norm(pairs.target - centers[pairs.frame_of], axis=1))
-
-
-def _rows(pairs: Pairs, kept: NDArray[np.bool_]) -> Pairs:
-    return Pairs(
-        point_index=pairs.point_index[kept],
-        frame_of=pairs.frame_of[kept],
-        source=pairs.source[kept],
-        target=pairs.target[kept],
-        normals=pairs.normals[kept],
-        covariance=pairs.covariance[kept],
-        by_frame=pairs.by_frame[kept],
-        cell_of=pairs.cell_of[kept],
-        frame_covariance=pairs.frame_covariance,
-    )
 
 
 def _gate_of_pairs(
@@ -230,21 +148,19 @@ def _gate_of_pairs(
 
 
 def _figures_of_fit(
-    fit: SimilarityFit, pairs: Pairs, feature_map: FeatureMap, registered: Sequence[RegisteredImage]
+    fit: SimilarityFit, pairs: Pairs, feature_map: FeatureMap, registered: Registered
 ) -> dict[str, Any]:
     """What is written into the evidence."""
     residuals = np.linalg.norm(fit.residuals_m[fit.inliers], axis=1)
-    along = np.einsum("ij,ij->i", fit.residuals_m, pairs.normals)[fit.inliers]
     sim = fit.target_from_source
     middle = pairs.source[fit.inliers].mean(axis=0)
     corrections = fit.frame_corrections
     return {
         "inliers": int(fit.inliers.sum()),
         "inliers_by_frame": np.bincount(pairs.frame_of[fit.inliers], minlength=len(registered)).tolist(),
-        "frame_images": [r.image_id for r in registered],
+        "frame_images": list(registered),
         "residual_rms_m": float(np.sqrt((residuals**2).mean())),
         "residual_median_m": float(np.median(residuals)),
-        "residual_across_surface_median_m": float(np.median(np.abs(along))),
         "sigma_factor": fit.spread,
         "neighbours_factor": fit.neighbours_factor,
         "scale_change": sim.scale - 1.0,
@@ -278,15 +194,3 @@ def _gate_of_fit(
             "placement"
         )
     return None, ""
-
-
-def _summary(distances: FloatArray) -> dict[str, float | int | None]:
-    near = np.abs(distances[np.isfinite(distances)])
-    if len(near) == 0:
-        return {"points": 0, "median_m": None, "rms_m": None, "p90_m": None}
-    return {
-        "points": len(near),
-        "median_m": float(np.median(near)),
-        "rms_m": float(np.sqrt((near**2).mean())),
-        "p90_m": float(np.percentile(near, 90)),
-    }
