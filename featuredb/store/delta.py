@@ -54,14 +54,16 @@ _HEX = re.compile(r"[0-9a-f]{1,64}")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataFile:
-    """One live Parquet file of a table, as the log describes it; path relative to the table."""
+    """One live Parquet file of a table, as the log describes it.
+
+    Attributes:
+        path: relative to the table.
+        write_id: of all its rows; None where the log does not say that they have the same.
+    """
 
     path: str
-    size_bytes: int
     rows: int
-    partition: dict[str, Any]
-    min_write_id: str | None
-    max_write_id: str | None
+    write_id: str | None
 
 
 class Table:
@@ -188,11 +190,8 @@ class Table:
         return [
             DataFile(
                 path=unquote(row["path"]),
-                size_bytes=row["size_bytes"],
                 rows=row.get("num_records") or 0,  # a damaged entry may not say
-                partition={name: row.get(f"partition.{name}") for name in self.spec.partition_by},
-                min_write_id=row.get("min.write_id"),
-                max_write_id=row.get("max.write_id"),
+                write_id=first if (first := row.get("min.write_id")) == row.get("max.write_id") else None,
             )
             for row in rows
         ]
@@ -268,18 +267,6 @@ class Table:
                 self._write(delta, none, "overwrite", properties, predicate=predicate)
 
         self._maintain(delete)
-
-    def rewrite(self, rows_of: Callable[["Table"], pa.Table | None]) -> bool:
-        """Write rows anew in one commit; `rows_of` gives all rows of some write ids, or None."""
-
-        def again(delta: Any) -> bool:
-            if (rows := rows_of(self)) is None:
-                return False
-            predicate = _is_in("write_id", pc.unique(rows["write_id"]).to_pylist())
-            self._write(delta, rows, "overwrite", CommitProperties(), predicate=predicate)
-            return True
-
-        return self._maintain(again)
 
     def compact(self) -> int:
         """Merge small files of each partition; returns the number of files saved."""

@@ -107,8 +107,8 @@ def write_ids_in(table: Table) -> dict[str, set[str]]:
     found: defaultdict[str, set[str]] = defaultdict(set)
     mixed = set()
     for file in table.files():
-        if file.min_write_id is not None and file.min_write_id == file.max_write_id:
-            found[file.min_write_id].add(file.path)
+        if file.write_id is not None:
+            found[file.write_id].add(file.path)
         else:
             mixed.add(file.path)
     for fragment in table.dataset().get_fragments() if mixed else ():

@@ -231,9 +231,7 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Found]:
             ]
             tables[name] = snapshot.dataset(name).to_table(columns, filter=mine)
         except (OSError, pa.ArrowException) as error:
-            # Types that Arrow cannot filter: older releases left them in files of which they removed rows.
-            advice = "; run `featuredb upgrade`" if isinstance(error, pa.ArrowNotImplementedError) else ""
-            yield where, f"cannot read its {name}: {one_line(error)[:300]}{advice}"
+            yield where, f"cannot read its {name}: {one_line(error)[:300]}"
     if len(tables) < len(CHILD_TABLES):
         return
     found = [
