@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.dataset as ds
 
 from featuredb.errors import CanaryNotFoundError, InvalidValueError, StoreError
 from featuredb.geo.datum import check_datum
@@ -21,8 +20,8 @@ from featuredb.geo.utm import zone_of
 from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.store.commits import CHANGED, OPERATION, new_write_id
 from featuredb.store.database import Database
-from featuredb.store.delta import Table
-from featuredb.store.encode import Row, rows_of
+from featuredb.store.decode import read_image, read_rows
+from featuredb.store.encode import Row
 from featuredb.store.retry import retry_stale
 from featuredb.store.tables import CANARIES, SPECS
 
@@ -96,11 +95,6 @@ class Canary:
     note: str = ""
 
 
-def has_canaries(database: Database) -> bool:
-    """Whether the table of canaries exists."""
-    return Table.exists(database.table_url(CANARIES), database.storage_options)
-
-
 def add_canary(
     database: Database,
     name: str,
@@ -142,12 +136,11 @@ def add_canary(
         "snapshot": snapshot,
         "note": note,
     }
-    if not has_canaries(database):
-        Table.create(database.table_url(CANARIES), SPECS[CANARIES], database.storage_options)
+    database.make(CANARIES)
 
     def attempt() -> Row:
         table = database.table(CANARIES)
-        for other in _rows(table):
+        for other in read_rows(table, _LIGHT):
             if other["name"] == name:
                 return _same(other, row)
         rows = pa.Table.from_pylist([{**row, "image": image}], schema=SPECS[CANARIES].schema)
@@ -159,9 +152,7 @@ def add_canary(
 
 def list_canaries(database: Database) -> list[Canary]:
     """All known queries, by name."""
-    if not has_canaries(database):
-        return []
-    return [_canary(row) for row in sorted(_rows(database.table(CANARIES)), key=lambda row: str(row["name"]))]
+    return [_canary(row) for row in sorted(_rows(database), key=lambda row: str(row["name"]))]
 
 
 def remove_canary(database: Database, name: str) -> None:
@@ -171,8 +162,7 @@ def remove_canary(database: Database, name: str) -> None:
         CanaryNotFoundError: there is none of this name.
         ConflictError, StoreError
     """
-    rows = _rows(database.table(CANARIES)) if has_canaries(database) else []
-    mine = [row["canary_id"] for row in rows if row["name"] == name]
+    mine = [row["canary_id"] for row in _rows(database) if row["name"] == name]
     if not mine:
         raise CanaryNotFoundError(f"no canary {name!r}; `featuredb canary list` lists what there is")
     database.table(CANARIES).delete_rows("canary_id", mine, {OPERATION: "canary remove", CHANGED: name})
@@ -185,31 +175,20 @@ def load_canary_image(database: Database, canary: Canary) -> bytes:
         CanaryNotFoundError: it was removed.
         StoreError: they cannot be read, or are not those that were added.
     """
-    mine = ds.field("canary_id") == canary.canary_id
-    if not has_canaries(database):
+    if not database.has(CANARIES):
         raise CanaryNotFoundError(f"no canary {canary.name!r}")
-    dataset = database.table(CANARIES).dataset([("canary_id", "=", canary.canary_id)])
-    try:
-        found = dataset.to_table(["image"], filter=mine, use_threads=False)["image"]
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(
-            f"canary {canary.name}: cannot read its image ({error}); run `featuredb verify`"
-        ) from error
-    if not len(found):
+    table = database.table(CANARIES)
+    image = read_image(table, "canary_id", canary.canary_id, f"canary {canary.name}")
+    if image is None:
         raise CanaryNotFoundError(f"canary {canary.name!r} was removed")
-    image: bytes = found[0].as_py()
     if hashlib.sha256(image).hexdigest() != canary.sha256:
         raise StoreError(f"canary {canary.name}: its image is not the one that was added")
     return image
 
 
-def _rows(table: Table) -> list[Row]:
-    """All rows without their images."""
-    try:
-        found = table.dataset().to_table(_LIGHT, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"cannot read the table canaries ({error}); run `featuredb verify`") from error
-    return rows_of(found, CANARIES, "created_at")
+def _rows(database: Database) -> list[Row]:
+    """All rows without their images; none where the table does not exist."""
+    return read_rows(database.table(CANARIES), _LIGHT) if database.has(CANARIES) else []
 
 
 def _same(there: Row, wanted: Row) -> Row:

@@ -5,13 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-import pyarrow as pa
-
-from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
+from featuredb.errors import ConflictError, SnapshotNotFoundError
 from featuredb.store.changes import Change
 from featuredb.store.delta import Table
 from featuredb.store.durable.log import Commit
-from featuredb.store.encode import EncodedMap, Row, map_rows_table, rows_of
+from featuredb.store.encode import EncodedMap, map_rows_table
 from featuredb.store.tables import FORMAT_VERSION
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
@@ -93,29 +91,6 @@ def new_write_id(now: datetime) -> str:
 def write_time(write_id: str) -> datetime:
     """When the rows of a write id were begun, UTC."""
     return datetime.fromtimestamp(int(write_id[:12], 16) / 1000.0, tz=UTC)
-
-
-def read_rows(table: Table) -> list[Row]:
-    """All rows of a version of a table that has `created_at`.
-
-    Raises:
-        SnapshotNotFoundError: its files are gone.
-        StoreError: they cannot be read.
-    """
-    try:
-        rows = table.dataset().to_table()
-        for field in table.spec.schema:  # those that an older format does not have
-            if field.name not in rows.column_names:
-                rows = rows.append_column(field.name, pa.nulls(len(rows), field.type))
-        return rows_of(rows, table.spec.name, "created_at")
-    except FileNotFoundError as error:
-        raise SnapshotNotFoundError(
-            f"version {table.version} is gone, vacuum removed its files ({error}); choose a newer one"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise StoreError(
-            f"cannot read the table {table.spec.name} ({error}); run `featuredb verify`"
-        ) from error
 
 
 def commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:

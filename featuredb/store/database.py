@@ -21,15 +21,15 @@ from featuredb.store.commits import (
     commit_as_of,
     history_entry,
     new_write_id,
-    read_rows,
 )
+from featuredb.store.decode import read_rows
 from featuredb.store.delta import Table
 from featuredb.store.durable.copies import check_restored
 from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import CHILD_TABLES, FORMAT_VERSION, MAPS, SPECS
+from featuredb.store.tables import CHILD_TABLES, CHILDREN, FORMAT_VERSION, MAPS, SPECS
 
 logger = logging.getLogger(__name__)
 
@@ -61,10 +61,9 @@ class Database:
         """
         database = cls(str(url), storage_options)
         check_restored(database.url, database._storage_options)
-        if not exist_ok and Table.exists(database.table_url(MAPS), database._storage_options):
+        if not exist_ok and database.has(MAPS):
             raise StoreError(f"there is a database at {database.url} already")
-        for name in (*CHILD_TABLES, MAPS):
-            Table.create(database.table_url(name), SPECS[name], database._storage_options)
+        database.make(MAPS)
         database.table(MAPS)
         return database
 
@@ -94,6 +93,32 @@ class Database:
     def table(self, name: str, version: int | None = None) -> Table:
         """A table at its newest or the given version; for maintenance and tests."""
         return Table.load(self.table_url(name), SPECS[name], self._storage_options, version)
+
+    def has(self, name: str) -> bool:
+        """Whether there is a table of CHILDREN, and with it those of which it names rows.
+
+        Raises:
+            StoreError: the store cannot be reached.
+        """
+        return Table.exists(self.table_url(name), self._storage_options)
+
+    def make(self, name: str) -> None:
+        """Make a table of CHILDREN, after those of which it names rows; harmless where they are.
+
+        Raises:
+            StoreError: the place cannot be written.
+        """
+        for part in (*CHILDREN[name], name):
+            Table.create(self.table_url(part), SPECS[part], self._storage_options)
+
+    def tables(self) -> list[str]:
+        """The tables that there are: those of maps, and what was made on first use.
+
+        Raises:
+            StoreError: the store cannot be reached.
+        """
+        there = [name for name in CHILDREN if name == MAPS or self.has(name)]
+        return [part for name in there for part in (name, *CHILDREN[name])]
 
     def snapshot(self, as_of: int | datetime | None = None) -> Snapshot:
         """The newest version, that of a number, or the one that was newest at a time (aware datetime).

@@ -1,15 +1,15 @@
-"""Rows of the tables back to the map that was committed."""
+"""Rows of the tables read, and back to the map that was committed."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import DTypeLike, NDArray
 
-from featuredb.errors import FeatureDbError, StoreError
+from featuredb.errors import FeatureDbError, SnapshotNotFoundError, StoreError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
@@ -17,8 +17,72 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObservations, MapPoints, Placement
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, OwnPoints, UnplacedMap
+from featuredb.store.delta import Condition, Table
+from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
-from featuredb.store.tables import IMAGES, OBSERVATIONS, OWN_COORDINATES, POINT_COVARIANCE, POINTS, SPECS
+from featuredb.store.tables import (
+    IMAGES,
+    MAPS,
+    OBSERVATIONS,
+    OWN_COORDINATES,
+    POINT_COVARIANCE,
+    POINTS,
+    SPECS,
+)
+
+
+def read_rows(
+    table: Table, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()
+) -> list[Row]:
+    """Rows of a version of a table, times in UTC; what an older format does not have is None.
+
+    Raises:
+        SnapshotNotFoundError: files of an earlier version are gone.
+        StoreError: they cannot be read, or rows lack what no row lacks.
+    """
+    spec = table.spec
+    try:
+        with read_errors(f"cannot read the table {spec.name}"):
+            found = table.dataset(where).to_table(columns and list(columns))
+    except StoreError as error:
+        if spec.name == MAPS and isinstance(error.__cause__, FileNotFoundError):
+            raise SnapshotNotFoundError(
+                f"version {table.version} is gone, vacuum removed its files ({error}); choose a newer one"
+            ) from error
+        raise
+    for field in spec.schema:
+        if field.name not in found.column_names:
+            if columns is None:
+                found = found.append_column(field.name, pa.nulls(len(found), field.type))
+        elif not field.nullable and found[field.name].null_count:
+            raise StoreError(
+                f"the table {spec.name} is damaged: rows without {field.name}; run `featuredb verify`"
+            )
+    times = [field.name for field in found.schema if pa.types.is_timestamp(field.type)]
+    rows = plain_times(found).to_pylist()
+    return [{**row, **{name: row[name].replace(tzinfo=UTC) for name in times}} for row in rows]
+
+
+def plain_times(rows: pa.Table) -> pa.Table:
+    """Times of UTC without their zone, which Arrow and DuckDB look up and small machines do not have."""
+    for index, field in enumerate(rows.schema):
+        if pa.types.is_timestamp(field.type):
+            rows = rows.set_column(index, field.name, rows[field.name].cast(pa.timestamp("us")))
+    return rows
+
+
+def read_image(table: Table, column: str, value: str, whose: str) -> bytes | None:
+    """The photo in the row with this value of a column; None where there is no such row.
+
+    Args:
+        whose: what the photo is of, in words.
+
+    Raises:
+        StoreError: it cannot be read.
+    """
+    with read_errors(f"{whose}: cannot read its image"):
+        found = table.dataset([(column, "=", value)]).to_table(["image"], use_threads=False)["image"]
+    return found[0].as_py() if len(found) else None
 
 
 def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> AnyMap:

@@ -8,6 +8,7 @@ What deltalake 1.6 does, and tests/integration/test_delta_behaviour.py pins:
   the next log entry exists already, it raises. All commits to `maps` go this way.
 """
 
+import operator
 import re
 import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -48,6 +49,13 @@ from featuredb.store.tables import FORMAT_VERSION, TableSpec
 
 T = TypeVar("T")
 
+Condition = tuple[str, Literal["=", ">=", "<=", "in"], Any]  # column, relation, value; texts for "in"
+_RELATIONS: dict[str, Callable[[Any, Any], ds.Expression]] = {
+    "=": operator.eq,
+    ">=": operator.ge,
+    "<=": operator.le,
+    "in": lambda column, texts: column.isin(pa.array(texts, pa.string())),
+}
 COMMIT_ID = "featuredb.commit_id"  # in the entries of compare-and-swaps
 _HEX = re.compile(r"[0-9a-f]{1,64}")
 
@@ -169,20 +177,24 @@ class Table:
             self._delta.update_incremental()
             check_end(self._url, self.storage, self.version)
 
-    def dataset(self, pruning: Sequence[tuple[str, str, Any]] = ()) -> ds.Dataset:
-        """An Arrow dataset over the files that the log does not exclude by (column, operator, value)."""
+    def dataset(self, where: Sequence[Condition] = ()) -> ds.Dataset:
+        """The rows that meet all conditions, in the files that the log does not exclude."""
         filesystem = self.storage
         if "://" in self._url:
             filesystem = None  # deltalake's, which knows the files' sizes
+        pruning = [condition for condition in where if condition[1] != "in"]
         with store_errors(f"cannot read {self._url}"):
-            return self._delta.to_pyarrow_dataset(
-                file_pruning_predicate=list(pruning) or None, filesystem=filesystem
+            rows = self._delta.to_pyarrow_dataset(
+                file_pruning_predicate=pruning or None, filesystem=filesystem
             )
+            for column, relation, value in where:
+                rows = rows.filter(_RELATIONS[relation](ds.field(column), value))
+            return rows
 
     def count(self, column: str, value: str) -> int:
         """The rows with a value in a column of which the log has statistics."""
         with store_errors(f"cannot read {self._url}"):
-            return int(self.dataset([(column, "=", value)]).count_rows(filter=ds.field(column) == value))
+            return int(self.dataset([(column, "=", value)]).count_rows())
 
     def files(self) -> list[DataFile]:
         """The live files."""

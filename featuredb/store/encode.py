@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError, StoreError
+from featuredb.errors import InvalidValueError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
@@ -284,24 +284,6 @@ def _descriptor_column(seen: MapObservations) -> pa.Array:
         pa.binary(DESCRIPTOR_SIZE), len(seen), [None, pa.py_buffer(packed)]
     )
     return pc.if_else(mask, pa.scalar(None, type=fixed.type), fixed).cast(pa.binary())
-
-
-def rows_of(table: pa.Table, name: str, time: str) -> list[Row]:
-    """The rows of the table `name` whose column `time` has times of UTC.
-
-    Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
-
-    Raises:
-        StoreError: rows lack what no row lacks.
-    """
-    for field in SPECS[name].schema:
-        if not field.nullable and field.name in table.column_names and table[field.name].null_count:
-            raise StoreError(
-                f"the table {name} is damaged: rows without {field.name}; run `featuredb verify`"
-            )
-    times = table[time].cast(pa.timestamp("us")).to_pylist()
-    rows = table.drop_columns(time).to_pylist()
-    return [{**row, time: at.replace(tzinfo=UTC)} for row, at in zip(rows, times, strict=True)]
 
 
 def map_rows_table(rows: list[Row]) -> pa.Table:

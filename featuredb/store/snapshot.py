@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from featuredb.errors import MapNotFoundError, StoreError, UnplacedMapError
+from featuredb.errors import MapNotFoundError, UnplacedMapError
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
 from featuredb.maps.place_bounds import PlaceBounds
@@ -17,6 +17,7 @@ from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, 
 from featuredb.store.changes import RETIRED
 from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_place
 from featuredb.store.delta import Table
+from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS, CHILD_TABLES
 
@@ -240,11 +241,7 @@ class Snapshot:
         write_ids = [
             row["write_id"] for row in self._rows.values() if include_retired or row["status"] != RETIRED
         ]
-        return (
-            self._children[table]
-            .dataset()
-            .filter(ds.field("write_id").isin(pa.array(write_ids, pa.string())))
-        )
+        return self._children[table].dataset([("write_id", "in", write_ids)])
 
     def rows(self) -> list[Row]:
         """All rows of `maps`, as dictionaries."""
@@ -259,23 +256,17 @@ class Snapshot:
 
     def _batches(self, table: str, row: Row) -> list[pa.RecordBatch]:
         """The map's rows of one child table, from the few files that can hold them."""
-        try:
+        with read_errors(f"map {row['map_id']}: cannot read its {table}"):
             try:
                 return self._read(table, row["write_id"])
             except FileNotFoundError:
                 # Compacted and vacuumed since this snapshot was taken: the same rows, in newer files.
                 self._children[table].refresh()
                 return self._read(table, row["write_id"])
-        except (OSError, pa.ArrowException) as error:
-            raise StoreError(
-                f"map {row['map_id']}: cannot read its {table} ({error}); run `featuredb verify`"
-            ) from error
 
     def _read(self, table: str, write_id: str) -> list[pa.RecordBatch]:
         dataset = self._children[table].dataset([("write_id", "=", write_id)])
-        batches: list[pa.RecordBatch] = dataset.to_table(
-            filter=ds.field("write_id") == write_id, use_threads=False
-        ).to_batches()
+        batches: list[pa.RecordBatch] = dataset.to_table(use_threads=False).to_batches()
         return batches
 
 

@@ -23,14 +23,13 @@ IMAGES = "images"
 POINTS = "points"
 OBSERVATIONS = "observations"
 CHILD_TABLES = (IMAGES, POINTS, OBSERVATIONS)
-TABLES = (MAPS, *CHILD_TABLES)
 LIDAR = "lidar"
 LIDAR_POINTS = "lidar_points"
-LIDAR_TABLES = (LIDAR, LIDAR_POINTS)
 CANDIDATES = "candidates"
 CANDIDATE_IMAGES = "candidate_images"
-CANDIDATE_TABLES = (CANDIDATES, CANDIDATE_IMAGES)
 CANARIES = "canaries"
+# Each table that names rows of others, and those; where it is, they are, too.
+CHILDREN = {MAPS: CHILD_TABLES, LIDAR: (LIDAR_POINTS,), CANDIDATES: (CANDIDATE_IMAGES,), CANARIES: ()}
 # Compaction puts maps one after the other into a file; reading one skips the row groups of the others.
 # 32768 observations are 4 MB, large enough to be read in one go.
 ROW_GROUP_ROWS = 32_768

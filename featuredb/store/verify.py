@@ -16,9 +16,8 @@ from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
-from featuredb.store.candidates.events import has_candidates
 from featuredb.store.candidates.photos import count_candidates
-from featuredb.store.candidates.upkeep import check_growth_tables, growth_tables, named_writes
+from featuredb.store.candidates.upkeep import check_growth_tables, named_writes
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place
@@ -31,7 +30,6 @@ from featuredb.store.maintenance import write_ids_in, write_ids_of_history
 from featuredb.store.scans import (
     PointsChecksum,
     ScanSummary,
-    has_scans,
     list_scans,
     scan_batches,
     scan_rows,
@@ -40,10 +38,11 @@ from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import (
     BOUNDS,
     CANDIDATE_IMAGES,
+    CANDIDATES,
     CHILD_TABLES,
     IMAGES,
+    LIDAR,
     LIDAR_POINTS,
-    LIDAR_TABLES,
     MAPS,
     NO_TILE,
     NO_ZONE,
@@ -51,7 +50,6 @@ from featuredb.store.tables import (
     OWN_COORDINATES,
     POINTS,
     SPECS,
-    TABLES,
 )
 
 logger = logging.getLogger(__name__)
@@ -142,15 +140,14 @@ def _verify(database: Database) -> VerifyReport:
     try:
         snapshot = database.snapshot()
         scans = list_scans(database)
-        growth_tables(database)
+        names = database.tables()
     except StoreError as error:
         if not problems:
             raise
         logger.debug("nothing but the logs can be checked: %s", error)
         return VerifyReport(problems=_said(problems))
     files = rows = 0
-    lidar = LIDAR_TABLES if has_scans(database) else ()
-    for name in (*TABLES, *lidar, *growth_tables(database)):
+    for name in names:
         table = database.table(name)
         live = table.files()
         files += len(live)
@@ -364,11 +361,11 @@ def _orphans(database: Database) -> list[str]:
     first = oldest_kept_version(database.table(MAPS).commits())
     present: set[str] = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
     orphans = present - write_ids_of_history(database, first)
-    if has_scans(database):
+    if database.has(LIDAR):
         orphans |= set(write_ids_in(database.table(LIDAR_POINTS))) - {
             r["write_id"] for r in scan_rows(database)
         }
-    if has_candidates(database):
+    if database.has(CANDIDATES):
         orphans |= set(write_ids_in(database.table(CANDIDATE_IMAGES))) - named_writes(database)
     return sorted(orphans)
 

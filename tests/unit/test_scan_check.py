@@ -91,8 +91,7 @@ def test_where_there_is_no_scan_nothing_is_said(cloud: PointCloud) -> None:
 def test_without_the_extra_a_map_with_a_scan_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     world = scanned_map(placed_by=Sim3.identity())
     known = replace(world.feature_map, height_datum=world.cloud.height_datum)
-    database: Any = None
-    monkeypatch.setattr(scan_check, "has_scans", lambda _: True)
+    database: Any = SimpleNamespace(has=lambda _: True)
     monkeypatch.setattr(scan_check, "load_cloud", lambda *_: world.cloud)
     gate = checked_by_scan(database, known)[1]
     assert gate is not None

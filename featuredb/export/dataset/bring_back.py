@@ -11,8 +11,9 @@ from featuredb.export.dataset.read import Row, load_map, open_dataset
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
 from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
 from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
-from featuredb.store.commits import apply_change, read_rows
+from featuredb.store.commits import apply_change
 from featuredb.store.database import Database
+from featuredb.store.decode import read_rows
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import MapSummary, UnplacedSummary
 from featuredb.store.tables import MAPS

@@ -4,20 +4,15 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 
 import pyarrow as pa
-import pyarrow.dataset as ds
 
-from featuredb.errors import CandidateNotFoundError, StoreError
+from featuredb.errors import CandidateNotFoundError
 from featuredb.store.candidates.states import CONTRIBUTED, event_order
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
-from featuredb.store.delta import Table
-from featuredb.store.encode import Row, rows_of
+from featuredb.store.decode import read_rows
+from featuredb.store.delta import Condition
+from featuredb.store.encode import Row
 from featuredb.store.tables import CANDIDATES, SPECS
-
-
-def has_candidates(database: Database) -> bool:
-    """Whether the tables of candidates exist."""
-    return Table.exists(database.table_url(CANDIDATES), database.storage_options)
 
 
 def read_events(
@@ -28,17 +23,12 @@ def read_events(
     Raises:
         StoreError: they cannot be read.
     """
-    if not has_candidates(database):
+    if not database.has(CANDIDATES):
         return []
-    wanted = None
+    where: list[Condition] = []
     if candidate_ids is not None:
-        wanted = ds.field("candidate_id").isin(pa.array(sorted(candidate_ids), pa.string()))
-    try:
-        dataset = database.table(CANDIDATES).dataset()
-        table = dataset.to_table(list(columns) if columns else None, filter=wanted, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"cannot read the table candidates ({error}); run `featuredb verify`") from error
-    return sorted(rows_of(table, CANDIDATES, "happened_at"), key=event_order)
+        where = [("candidate_id", "in", sorted(candidate_ids))]
+    return sorted(read_rows(database.table(CANDIDATES), columns, where), key=event_order)
 
 
 def by_candidate(events: Iterable[Row]) -> dict[str, list[Row]]:

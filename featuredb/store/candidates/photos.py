@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 import pyarrow as pa
-import pyarrow.dataset as ds
 
 from featuredb.errors import CandidateNotFoundError, StoreError
 from featuredb.store.candidates.events import (
     after,
     append_events,
     by_candidate,
-    has_candidates,
     live_maps,
     not_found,
     note_events,
@@ -43,9 +41,9 @@ from featuredb.store.candidates.states import (
 )
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
-from featuredb.store.delta import Table
+from featuredb.store.decode import read_image
 from featuredb.store.encode import Row
-from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATE_TABLES, SPECS
+from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATES, SPECS
 
 _ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "request")
 _LIGHT = (*_ORDER, "size_bytes", "map_id", "reason_code", "reason")
@@ -94,9 +92,7 @@ def contribute(database: Database, contributions: Sequence[Contribution]) -> lis
     Raises:
         StoreError: the store failed; none of them is visible.
     """
-    if not has_candidates(database):
-        for name in reversed(CANDIDATE_TABLES):  # `candidates` last: where it is, the other is, too
-            Table.create(database.table_url(name), SPECS[name], database.storage_options)
+    database.make(CANDIDATES)
     ids = [candidate_id_of(c.image) for c in contributions]
     known = read_events(database, columns=_ORDER, candidate_ids=set(ids))
     owners = _owners(known)
@@ -218,23 +214,15 @@ def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tu
         CandidateNotFoundError: no such photo, or it was withdrawn.
         StoreError: they cannot be read, or are not those that were contributed.
     """
-    table = database.table(CANDIDATE_IMAGES) if has_candidates(database) else None
+    table = database.table(CANDIDATE_IMAGES) if database.has(CANDIDATES) else None
     for candidate_id in candidate_ids:
         if table is None:
             raise not_found([candidate_id])
-        mine = ds.field("candidate_id") == candidate_id
-        try:
-            dataset = table.dataset([("candidate_id", "=", candidate_id)])
-            found = dataset.to_table(["image"], filter=mine, use_threads=False)["image"]
-        except (OSError, pa.ArrowException) as error:
-            raise StoreError(
-                f"candidate {candidate_id}: cannot read its image ({error}); run `featuredb verify`"
-            ) from error
-        if not len(found):
+        image = read_image(table, "candidate_id", candidate_id, f"candidate {candidate_id}")
+        if image is None:
             raise CandidateNotFoundError(
                 f"candidate {candidate_id} has no image; it was never there, or was withdrawn"
             )
-        image: bytes = found[0].as_py()
         if hashlib.sha256(image).hexdigest()[:32] != candidate_id:
             raise StoreError(f"candidate {candidate_id}: its image is not the one that was contributed")
         yield candidate_id, image

@@ -48,6 +48,15 @@ def store_errors(what: str) -> Iterator[None]:
         raise StoreError(f"{what}: {one_line(error)}") from error
 
 
+@contextmanager
+def read_errors(what: str) -> Iterator[None]:
+    """What Arrow raises of files that are lost or damaged, as `StoreError`; `what` says what was read."""
+    try:
+        yield
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise StoreError(f"{what} ({error}); run `featuredb verify`") from error
+
+
 def one_line(error: Exception) -> str:
     """A message without line ends, and without the colours that deltalake gives some."""
     return " ".join(re.sub(r"\x1b\[\d*m", "", str(error)).split())

@@ -1,11 +1,11 @@
 """A database of an older format made one of the newest. Each step is one commit; what was cut off goes on."""
 
-from featuredb.store.commits import read_rows, upgrade_metadata
+from featuredb.store.commits import upgrade_metadata
 from featuredb.store.database import Database
-from featuredb.store.delta import Table
+from featuredb.store.decode import read_rows
 from featuredb.store.encode import map_rows_table
 from featuredb.store.retry import retry_stale
-from featuredb.store.tables import FORMAT_VERSION, MAPS, SPECS
+from featuredb.store.tables import FORMAT_VERSION, MAPS
 
 
 def upgrade(database: Database) -> list[str]:
@@ -21,9 +21,7 @@ def upgrade(database: Database) -> list[str]:
         StoreError: the store failed.
     """
     steps: list[str] = []
-    for name in (*(name for name in SPECS if name != MAPS), MAPS):
-        if not Table.exists(database.table_url(name), database.storage_options):
-            continue
+    for name in reversed(database.tables()):
         found = database.table(name).format
         if found < FORMAT_VERSION:
             _to_newest_format(database, name)
