@@ -23,11 +23,13 @@ from featuredb.store.database import Database
 from featuredb.store.decode import read_image, read_rows
 from featuredb.store.encode import Row
 from featuredb.store.retry import retry_stale
-from featuredb.store.tables import CANARIES, SPECS
+from featuredb.store.tables import CANARIES, SPECS, UTM_COORDINATES
 
 Origin = Literal["person", "answer"]
 LONGEST_NAME = 200
 _UNIT = 1e-6  # how far the norm of a stored quaternion may be from 1
+_AS_STORED = ("canary_id", "name", "created_at", "sha256", "origin", "snapshot", "note")
+_POSE_AS_STORED = ("epsg", "height_datum", "tolerance_m", "tolerance_deg")
 _LIGHT = [field.name for field in SPECS[CANARIES].schema if field.name != "image"]
 
 
@@ -205,32 +207,20 @@ def _same(there: Row, wanted: Row) -> Row:
 def _pose_columns(pose: KnownPose | None) -> Row:
     if pose is None:
         return {"expected": "not_localised"}
-    easting, northing, height = pose.utm.tolist()
     return {
         "expected": "localised",
-        "epsg": pose.epsg,
-        "easting": easting,
-        "northing": northing,
-        "height": height,
+        **{name: getattr(pose, name) for name in _POSE_AS_STORED},
+        **dict(zip(UTM_COORDINATES, pose.utm.tolist(), strict=True)),
         "cam_from_utm_xyzw": pose.cam_from_utm_xyzw.tolist(),
-        "height_datum": pose.height_datum,
-        "tolerance_m": float(pose.tolerance_m),
-        "tolerance_deg": float(pose.tolerance_deg),
     }
 
 
 def _canary(row: Row) -> Canary:
     try:
         return Canary(
-            canary_id=row["canary_id"],
-            name=row["name"],
-            created_at=row["created_at"],
-            sha256=row["sha256"],
+            **{name: row[name] for name in _AS_STORED},
             request=json.loads(row["request"]),
             pose=_pose(row) if row["expected"] == "localised" else None,
-            origin=row["origin"],
-            snapshot=row["snapshot"],
-            note=row["note"],
         )
     except (TypeError, ValueError) as error:
         raise StoreError(
@@ -240,10 +230,7 @@ def _canary(row: Row) -> Canary:
 
 def _pose(row: Row) -> KnownPose:
     return KnownPose(
-        epsg=row["epsg"],
-        utm=np.array([row["easting"], row["northing"], row["height"]]),
-        height_datum=row["height_datum"],
+        **{name: row[name] for name in _POSE_AS_STORED},
+        utm=np.array([row[name] for name in UTM_COORDINATES]),
         cam_from_utm_xyzw=np.array(row["cam_from_utm_xyzw"]),
-        tolerance_m=row["tolerance_m"],
-        tolerance_deg=row["tolerance_deg"],
     )

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from datetime import UTC, datetime
 from typing import Any
 
@@ -19,7 +20,7 @@ from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObserv
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.filesystem import read_errors
-from featuredb.store.encode import Row
+from featuredb.store.encode import AS_IN_MAP, Row
 from featuredb.store.tables import (
     IMAGES,
     MAPS,
@@ -28,6 +29,7 @@ from featuredb.store.tables import (
     POINT_COVARIANCE,
     POINTS,
     SPECS,
+    UTM_COORDINATES,
 )
 
 
@@ -93,17 +95,12 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
     """
     try:
         shared: dict[str, Any] = {
-            "map_id": row["map_id"],
-            "name": row["name"],
+            **{name: row[name] for name in AS_IN_MAP},
             "cameras": tuple(Camera(**{**c, "params": tuple(c["params"])}) for c in row["cameras"]),
             "camera_keys": tuple(row["camera_keys"]),
             "images": _decode_images(children[IMAGES], row["images"]),
             "observations": _decode_observations(children[OBSERVATIONS], row["observations"]),
-            "extractor_fingerprint": row["extractor_fingerprint"],
-            "status": row["status"],
             "parents": tuple(row["parents"]),
-            "source": row["source"],
-            "licence": row["licence"],
             "provenance": json.loads(row["provenance"]),
         }
         points = _decode_points(children[POINTS], row["points"], _coordinate_columns(row))
@@ -131,11 +128,7 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
 
 def frame_of(row: Row) -> LocalFrame:
     """Of a map with a place."""
-    return LocalFrame(
-        latitude_deg=row["origin_latitude_deg"],
-        longitude_deg=row["origin_longitude_deg"],
-        height_m=row["origin_height_m"],
-    )
+    return LocalFrame(**{field.name: row[f"origin_{field.name}"] for field in fields(LocalFrame)})
 
 
 def has_place(row: Row) -> bool:
@@ -150,7 +143,7 @@ def decode_no_place(row: Row) -> NoPlace:
 
 
 def _coordinate_columns(row: Row) -> tuple[str, ...]:
-    return ("easting", "northing", "height") if has_place(row) else OWN_COORDINATES
+    return UTM_COORDINATES if has_place(row) else OWN_COORDINATES
 
 
 def _decode_placement(row: Row) -> Placement:
@@ -177,18 +170,9 @@ def _decode_images(batches: Iterable[pa.RecordBatch], count: int) -> tuple[MapIm
 def _decode_image(row: Row) -> MapImage:
     gps = None
     if row["gps_latitude_deg"] is not None:
-        gps = GeoPrior(
-            latitude_deg=row["gps_latitude_deg"],
-            longitude_deg=row["gps_longitude_deg"],
-            height_m=row["gps_height_m"],
-            sigma_horizontal_m=row["gps_sigma_horizontal_m"],
-            sigma_vertical_m=row["gps_sigma_vertical_m"],
-        )
+        gps = GeoPrior(**{field.name: row[f"gps_{field.name}"] for field in fields(GeoPrior)})
     return MapImage(
-        image_id=row["image_id"],
-        name=row["name"],
-        sha256=row["sha256"],
-        camera_id=row["camera_id"],
+        **{name: row[name] for name in ("image_id", "name", "sha256", "camera_id", "owner", "licence")},
         cam_from_local=Rigid3(
             rotation=np.reshape(row["cam_from_local_rotation"], (3, 3)),
             translation=np.array(row["cam_from_local_translation"]),
@@ -196,8 +180,6 @@ def _decode_image(row: Row) -> MapImage:
         covariance=None if row["covariance"] is None else np.reshape(row["covariance"], (6, 6)),
         capture_time=None if row["capture_time"] is None else datetime.fromisoformat(row["capture_time"]),
         gps=gps,
-        owner=row["owner"],
-        licence=row["licence"],
     )
 
 

@@ -30,7 +30,7 @@ from featuredb.store.durable.log import list_entries
 from featuredb.store.encode import Row, table_of
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import UtmBox
-from featuredb.store.tables import BOUNDS, LIDAR, LIDAR_POINTS, SPECS
+from featuredb.store.tables import BOUNDS, LIDAR, LIDAR_POINTS, SPECS, UTM_COORDINATES
 
 # One row of `lidar_points` in memory, without the columns that are the same for a whole tile.
 POINT_ROW = np.dtype(
@@ -317,7 +317,7 @@ def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
         "node_spacing_m": rows["node_spacing_m"],
         "level": rows["level"].astype(np.int32),
     }
-    for axis, name in enumerate(("easting", "northing", "height")):
+    for axis, name in enumerate(UTM_COORDINATES):
         columns[name] = np.ascontiguousarray(rows["utm"][:, axis])
     for axis, name in enumerate(("red", "green", "blue")):
         if not no_rgb.all():

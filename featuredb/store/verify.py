@@ -50,6 +50,7 @@ from featuredb.store.tables import (
     OWN_COORDINATES,
     POINTS,
     SPECS,
+    UTM_COORDINATES,
 )
 
 logger = logging.getLogger(__name__)
@@ -354,7 +355,7 @@ def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
 
 
 def _utm(table: pa.Table | pa.RecordBatch) -> FloatArray:
-    return np.column_stack([table[name].to_numpy() for name in ("easting", "northing", "height")])
+    return np.column_stack([table[name].to_numpy() for name in UTM_COORDINATES])
 
 
 def _orphans(database: Database) -> list[str]:

@@ -46,6 +46,7 @@ from featuredb.store.encode import Row
 from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATES, SPECS
 
 _ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "request")
+_AS_CONTRIBUTED = ("licence", "client_id", "width", "height", "snapshot")
 _LIGHT = (*_ORDER, "size_bytes", "map_id", "reason_code", "reason")
 
 
@@ -241,14 +242,10 @@ def _owners(events: Iterable[Row]) -> dict[str, set[str]]:
 
 def _contribution_row(contribution: Contribution) -> Row:
     return {
+        **{name: getattr(contribution, name) for name in _AS_CONTRIBUTED},
         "owner": contribution.credit,
-        "licence": contribution.licence,
-        "client_id": contribution.client_id,
         "sha256": hashlib.sha256(contribution.image).hexdigest(),
         "size_bytes": len(contribution.image),
-        "width": contribution.width,
-        "height": contribution.height,
-        "snapshot": contribution.snapshot,
         "answer_status": str(contribution.answer.get("status", "")),
         "request": request_column(contribution),
         "answer": json.dumps(dict(contribution.answer), sort_keys=True, allow_nan=False),
