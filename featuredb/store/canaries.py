@@ -12,7 +12,6 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
 
 from featuredb.errors import CanaryNotFoundError, InvalidValueError, StoreError
 from featuredb.geo.datum import check_datum
@@ -21,7 +20,7 @@ from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.store.commits import CHANGED, OPERATION, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import read_image, read_rows
-from featuredb.store.encode import Row
+from featuredb.store.encode import Row, rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.tables import CANARIES, SPECS, UTM_COORDINATES
 
@@ -145,7 +144,7 @@ def add_canary(
         for other in read_rows(table, _LIGHT):
             if other["name"] == name:
                 return _same(other, row)
-        rows = pa.Table.from_pylist([{**row, "image": image}], schema=SPECS[CANARIES].schema)
+        rows = rows_table(CANARIES, [{**row, "image": image}])
         table.swap(rows, mode="append", metadata={OPERATION: "canary add", CHANGED: name})
         return row
 

@@ -34,18 +34,18 @@ _PLACE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Change:
-    """What a commit to `maps` will do.
+    """What a commit to `maps` or `lidar` will do.
 
     Attributes:
         rows: all rows after the change.
-        added: the rows among them that are new.
+        added: the rows among them that are new, where that is known.
         only_adds: no old row is changed or gone, so that appending `added` is enough.
         flagged: ids of maps put into quarantine, because a map that placed them gave way.
     """
 
     rows: list[Row]
-    added: list[Row]
-    only_adds: bool
+    added: Sequence[Row] = ()
+    only_adds: bool = False
     flagged: tuple[str, ...] = ()
 
 
@@ -104,7 +104,7 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
     if not any(row["map_id"] == map_id for row in rows):
         raise MapNotFoundError(f"no map {map_id}; `featuredb maps` lists what there is")
     if live_row(rows, map_id) is None:
-        return Change(rows=list(rows), added=[], only_adds=True), []
+        return Change(rows=list(rows), only_adds=True), []
     dependants = sorted(anchored(rows) - anchored(rows, without=map_id) - {map_id})
     retired = [map_id, *dependants]
     changed = [
@@ -117,7 +117,7 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
         else row
         for row in rows
     ]
-    return Change(rows=changed, added=[], only_adds=False), retired
+    return Change(rows=changed), retired
 
 
 def change_status(
@@ -147,19 +147,19 @@ def change_status(
             raise StoreError(f"map {map_id} is retired ({known[map_id]['status_reason']}); commit it again")
     wanted = [m for m in dict.fromkeys(map_ids) if known[m]["status"] != status]
     if not wanted:
-        return Change(rows=list(rows), added=[], only_adds=True), []
+        return Change(rows=list(rows), only_adds=True), []
     changed = [{**r, "status": status, "status_reason": reason} if r["map_id"] in wanted else r for r in rows]
     standing = anchored(changed, statuses=(ACTIVE,))
     if status == ACTIVE:
         _check_parents(known, [m for m in wanted if m not in standing])
-        return Change(rows=changed, added=[], only_adds=False), wanted
+        return Change(rows=changed), wanted
     fallen = sorted(anchored(rows, statuses=(ACTIVE,)) - standing - set(wanted))
     because = f"{reason} ({', '.join(wanted)})"
     changed = [
         {**r, "status": QUARANTINED, "status_reason": because} if r["map_id"] in fallen else r
         for r in changed
     ]
-    return Change(rows=changed, added=[], only_adds=False), [*wanted, *fallen]
+    return Change(rows=changed), [*wanted, *fallen]
 
 
 def _check_parents(known: Mapping[str, Row], refused: Sequence[str]) -> None:
@@ -216,7 +216,7 @@ def vouch_for(
         r["map_id"] for r in rows if r["map_id"] in reasons and is_imported(r["status"], r["status_reason"])
     ]
     if not ids:
-        return Change(rows=list(rows), added=[], only_adds=True), []
+        return Change(rows=list(rows), only_adds=True), []
     up = {
         r["map_id"] for r in rows if r["map_id"] in active and r["map_id"] in ids and r["status"] != UNPLACED
     }
@@ -232,9 +232,7 @@ def vouch_for(
         lacking = ", ".join(p for p in row["parents"] if p not in standing)
         return {**row, "status_reason": f"what placed it is not active: {lacking}"}
 
-    return Change(
-        rows=[vouched(r) if r["map_id"] in ids else r for r in rows], added=[], only_adds=False
-    ), ids
+    return Change(rows=[vouched(r) if r["map_id"] in ids else r for r in rows]), ids
 
 
 def _still_imported(row: Row, before: Row | None) -> Row:

@@ -9,7 +9,7 @@ from featuredb.errors import ConflictError, SnapshotNotFoundError
 from featuredb.store.changes import Change
 from featuredb.store.delta import Table
 from featuredb.store.durable.log import Commit
-from featuredb.store.encode import EncodedMap, map_rows_table
+from featuredb.store.encode import EncodedMap, rows_table
 from featuredb.store.tables import FORMAT_VERSION
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
@@ -19,14 +19,6 @@ LONGEST_COMMIT = timedelta(hours=6)
 # Keys of what a commit to `maps` says about itself.
 OPERATION, CHANGED, REASON = "featuredb.operation", "featuredb.maps", "featuredb.reason"
 KEPT_FROM = "featuredb.kept_from"
-
-
-_OPERATIONS = {
-    "CREATE TABLE": "init",
-    "OPTIMIZE": "compact",
-    "VACUUM START": "vacuum",
-    "VACUUM END": "vacuum",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +69,7 @@ def history_entry(commit: Commit) -> HistoryEntry:
     return HistoryEntry(
         version=commit.version,
         timestamp=commit.timestamp,
-        operation=commit.metadata.get(OPERATION, _OPERATIONS.get(commit.operation, "")),
+        operation=commit.metadata.get(OPERATION, "" if commit.version else "init"),
         maps=tuple(filter(None, commit.metadata.get(CHANGED, "").split("\n"))),
         reason=commit.metadata.get(REASON, ""),
     )
@@ -137,22 +129,25 @@ def check_children(encoded: EncodedMap, table_of: Callable[[str], Table]) -> Non
 
 
 def apply_change(
-    maps: Table,
+    table: Table,
     change: Change,
     *,
     operation: str,
-    maps_changed: Sequence[str],
+    changed: Sequence[str] = (),
     reason: str = "",
     extra: Mapping[str, str] | None = None,
 ) -> int:
-    """Commit a change as the very next version and return its number.
+    """Commit a change of `maps` or `lidar` as the very next version and return its number.
+
+    Args:
+        changed: ids of the maps or scans that history names with it.
 
     Raises:
-        StaleVersionError: someone else committed since `maps` was read.
+        StaleVersionError: someone else committed since `table` was read.
     """
     if change.only_adds and not change.added:
-        return maps.version
-    metadata = {OPERATION: operation, CHANGED: "\n".join(maps_changed), REASON: reason, **(extra or {})}
+        return table.version
+    metadata = {OPERATION: operation, CHANGED: "\n".join(changed), REASON: reason, **(extra or {})}
     if change.only_adds:
-        return maps.swap(map_rows_table(change.added), mode="append", metadata=metadata)
-    return maps.swap(map_rows_table(change.rows), mode="overwrite", metadata=metadata)
+        return table.swap(rows_table(table.spec.name, change.added), mode="append", metadata=metadata)
+    return table.swap(rows_table(table.spec.name, change.rows), mode="overwrite", metadata=metadata)

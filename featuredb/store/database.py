@@ -228,7 +228,7 @@ class Database:
                     maps,
                     change,
                     operation="commit",
-                    maps_changed=[*(m.map_id for m in pending), *change.flagged],
+                    changed=[*(m.map_id for m in pending), *change.flagged],
                 )
                 flagged = change.flagged
             # After a commit whose answer was lost the map is there already, by our own write.
@@ -260,7 +260,7 @@ class Database:
         def attempt() -> int:
             maps = self.table(MAPS)
             change, retired[:] = retire_map(read_rows(maps), map_id, reason)
-            return apply_change(maps, change, operation="retire", maps_changed=retired, reason=reason)
+            return apply_change(maps, change, operation="retire", changed=retired, reason=reason)
 
         retry_stale(f"retire {map_id}", attempt)
         return tuple(retired)
@@ -300,7 +300,7 @@ class Database:
             _check_active(rows, active)
             change, changed[:] = change_status(rows, map_ids, status, reason)
             operation = _STATUS_OPERATION[status]
-            return apply_change(maps, change, operation=operation, maps_changed=changed, reason=reason)
+            return apply_change(maps, change, operation=operation, changed=changed, reason=reason)
 
         version = retry_stale(f"{status} for {', '.join(map_ids)}", attempt)
         return StatusResult(version=version, changed=tuple(changed))
@@ -315,10 +315,8 @@ class Database:
         def attempt() -> int:
             maps = self.table(MAPS)
             old = self.snapshot(as_of)
-            change = Change(rows=old.rows(), added=[], only_adds=False)
-            return apply_change(
-                maps, change, operation="rollback", maps_changed=[], reason=f"to version {old.version}"
-            )
+            change = Change(rows=old.rows())
+            return apply_change(maps, change, operation="rollback", reason=f"to version {old.version}")
 
         return retry_stale(f"rollback to {as_of}", attempt)
 

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -21,7 +22,6 @@ from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store.tables import (
     BOUNDS,
     IMAGES,
-    MAPS,
     NO_PLACE_COLUMNS,
     NO_TILE,
     NO_ZONE,
@@ -209,7 +209,7 @@ def _image_rows(feature_map: AnyMap, ids: Row) -> pa.Table:
             zip(feature_map.images, utm.tolist(), tiles, strict=True)
         )
     ]
-    return pa.Table.from_pylist(rows, schema=SPECS[IMAGES].schema)
+    return rows_table(IMAGES, rows)
 
 
 def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
@@ -276,6 +276,6 @@ def _descriptor_column(seen: MapObservations) -> pa.Array:
     return pc.if_else(mask, pa.scalar(None, type=fixed.type), fixed).cast(pa.binary())
 
 
-def map_rows_table(rows: list[Row]) -> pa.Table:
-    """Rows of `maps` as an Arrow table."""
-    return pa.Table.from_pylist(rows, schema=SPECS[MAPS].schema)
+def rows_table(name: str, rows: Sequence[Row]) -> pa.Table:
+    """Rows of a table as an Arrow table."""
+    return pa.Table.from_pylist(list(rows), schema=SPECS[name].schema)

@@ -133,8 +133,7 @@ def _compact_maps(database: Database) -> int:
     files = len(maps.files())
     if files <= 1:
         return 0
-    change = Change(rows=read_rows(maps), added=[], only_adds=False)
-    apply_change(maps, change, operation="compact", maps_changed=[])
+    apply_change(maps, Change(rows=read_rows(maps)), operation="compact")
     return files - 1
 
 
@@ -147,14 +146,11 @@ def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run
     old = [version for version, time in list_entries(maps.storage).items() if time <= cutoff]
     kept_from = max(*old, oldest_kept_version(commits), 0)
     if not dry_run and kept_from > oldest_kept_version(commits):
-        change = Change(rows=read_rows(maps), added=[], only_adds=False)
-        reason = f"versions before {kept_from} are gone"
         apply_change(
             maps,
-            change,
+            Change(rows=read_rows(maps)),
             operation="vacuum",
-            maps_changed=[],
-            reason=reason,
+            reason=f"versions before {kept_from} are gone",
             extra={KEPT_FROM: str(kept_from)},
         )
     return kept_from

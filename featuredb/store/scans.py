@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geometry.arrays import FloatArray
-from featuredb.store.changes import RETIRED
-from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, REASON, new_write_id
+from featuredb.store.changes import RETIRED, Change
+from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, apply_change, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
 from featuredb.store.delta import Condition
@@ -195,11 +195,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
         changed = [
             {**r, "status": RETIRED, "status_reason": reason} if r["scan_id"] == scan_id else r for r in rows
         ]
-        table.swap(
-            scan_rows_table(changed),
-            mode="overwrite",
-            metadata={OPERATION: "retire", CHANGED: scan_id, REASON: reason},
-        )
+        apply_change(table, Change(rows=changed), operation="retire", changed=[scan_id], reason=reason)
         return True
 
     return retry_stale(f"retire {scan_id}", attempt)
@@ -260,11 +256,6 @@ def points_dataset(database: Database) -> ds.Dataset | None:
     return database.table(LIDAR_POINTS).dataset([("write_id", "in", named)])
 
 
-def scan_rows_table(rows: Sequence[Row]) -> pa.Table:
-    """Rows of `lidar` as an Arrow table."""
-    return pa.Table.from_pylist(list(rows), schema=SPECS[LIDAR].schema)
-
-
 class PointsChecksum:
     """Sum over all points of a hash of each, so that the order, which compaction changes, does not count."""
 
@@ -300,11 +291,8 @@ def _add_row(database: Database, row: Row) -> str:
     if visible is not None:
         return str(visible["write_id"])
     kept = [r for r in rows if r["scan_id"] != row["scan_id"]]
-    metadata = {OPERATION: "lidar add", CHANGED: row["scan_id"], REASON: ""}
-    if len(kept) == len(rows):
-        table.swap(scan_rows_table([row]), mode="append", metadata=metadata)
-    else:
-        table.swap(scan_rows_table([*kept, row]), mode="overwrite", metadata=metadata)
+    change = Change(rows=[*kept, row], added=[row], only_adds=len(kept) == len(rows))
+    apply_change(table, change, operation="lidar add", changed=[row["scan_id"]])
     return str(row["write_id"])
 
 

@@ -16,8 +16,8 @@ from featuredb.errors import StoreError
 from featuredb.extras import require
 from featuredb.store.database import Database
 from featuredb.store.decode import plain_times
-from featuredb.store.encode import map_rows_table
-from featuredb.store.scans import points_dataset, scan_rows, scan_rows_table
+from featuredb.store.encode import rows_table
+from featuredb.store.scans import points_dataset, scan_rows
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import (
     CANARIES,
@@ -26,6 +26,7 @@ from featuredb.store.tables import (
     IMAGES,
     LIDAR,
     LIDAR_POINTS,
+    MAPS,
     POINTS,
     SPECS,
 )
@@ -164,7 +165,7 @@ class SqlSession:
         return statements[0]
 
     def _register(self) -> None:
-        self._connection.register("stored_maps", plain_times(map_rows_table(self.snapshot.rows())))
+        self._connection.register("stored_maps", plain_times(rows_table(MAPS, self.snapshot.rows())))
         self._connection.execute("CREATE VIEW maps AS SELECT * EXCLUDE (write_id) FROM stored_maps")
         self._connection.execute(_CAMERAS_VIEW)
         for name in CHILD_TABLES:
@@ -172,7 +173,7 @@ class SqlSession:
             self._connection.execute(_CHILD_VIEW.format(name=name, places=_PLACES.get(name, "")))
 
     def _register_scans(self, database: Database) -> None:
-        rows = plain_times(scan_rows_table(scan_rows(database)))
+        rows = plain_times(rows_table(LIDAR, scan_rows(database)))
         self._connection.register(f"stored_{LIDAR}", rows)
         points = points_dataset(database)
         if points is None:

@@ -117,7 +117,7 @@ def _vouch_for(database: Database, rows: Sequence[Row], missing: Mapping[str, Se
     def attempt() -> int:
         maps = database.table(MAPS)
         change, changed = vouch_for(read_rows(maps), active, reasons)
-        return apply_change(maps, change, operation="vouch", maps_changed=changed, reason=VOUCHED)
+        return apply_change(maps, change, operation="vouch", changed=changed, reason=VOUCHED)
 
     retry_stale("vouch for what was imported", attempt)
 

@@ -3,16 +3,14 @@
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 
-import pyarrow as pa
-
 from featuredb.errors import CandidateNotFoundError
 from featuredb.store.candidates.states import CONTRIBUTED, event_order
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
 from featuredb.store.delta import Condition
-from featuredb.store.encode import Row
-from featuredb.store.tables import CANDIDATES, SPECS
+from featuredb.store.encode import Row, rows_table
+from featuredb.store.tables import CANDIDATES
 
 
 def read_events(
@@ -73,7 +71,7 @@ def append_events(database: Database, rows: Sequence[Row], write_id: str) -> Non
     if not rows:
         return
     full = [{**row, "write_id": write_id, "event_index": i} for i, row in enumerate(rows)]
-    database.table(CANDIDATES).append(pa.Table.from_pylist(full, schema=SPECS[CANDIDATES].schema))
+    database.table(CANDIDATES).append(rows_table(CANDIDATES, full))
 
 
 def not_found(candidate_ids: Sequence[str]) -> CandidateNotFoundError:

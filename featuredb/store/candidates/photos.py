@@ -12,8 +12,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-import pyarrow as pa
-
 from featuredb.errors import CandidateNotFoundError, StoreError
 from featuredb.store.candidates.events import (
     after,
@@ -42,8 +40,8 @@ from featuredb.store.candidates.states import (
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import read_image
-from featuredb.store.encode import Row
-from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATES, SPECS
+from featuredb.store.encode import Row, rows_table
+from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATES
 
 _ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "request")
 _AS_CONTRIBUTED = ("licence", "client_id", "width", "height", "snapshot")
@@ -111,9 +109,8 @@ def contribute(database: Database, contributions: Sequence[Contribution]) -> lis
         row = {"candidate_id": candidate_id, "event": CONTRIBUTED, "happened_at": at}
         rows.append({**_contribution_row(contribution), **row})
     if images:
-        columns = {"candidate_id": list(images), "write_id": [write_id] * len(images)}
-        table = pa.table({**columns, "image": list(images.values())}, schema=SPECS[CANDIDATE_IMAGES].schema)
-        database.table(CANDIDATE_IMAGES).append(table)
+        stored = [{"candidate_id": c, "write_id": write_id, "image": image} for c, image in images.items()]
+        database.table(CANDIDATE_IMAGES).append(rows_table(CANDIDATE_IMAGES, stored))
     append_events(database, rows, write_id)
     return ids
 

@@ -3,7 +3,7 @@
 from featuredb.store.commits import upgrade_metadata
 from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
-from featuredb.store.encode import map_rows_table
+from featuredb.store.encode import rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.tables import FORMAT_VERSION, MAPS
 
@@ -33,7 +33,7 @@ def _to_newest_format(database: Database, name: str) -> None:
     def attempt() -> None:
         table = database.table(name)
         if name == MAPS:
-            table.upgrade(map_rows_table(read_rows(table)), upgrade_metadata())
+            table.upgrade(rows_table(MAPS, read_rows(table)), upgrade_metadata())
         else:
             table.upgrade()
 
