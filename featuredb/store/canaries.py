@@ -19,7 +19,7 @@ from featuredb.geo.utm import zone_of
 from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.store.commits import CHANGED, OPERATION, new_write_id
 from featuredb.store.database import Database
-from featuredb.store.decode import read_image, read_rows
+from featuredb.store.decode import of_columns, read_image, read_rows
 from featuredb.store.encode import Row, rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.tables import CANARIES, SPECS, UTM_COORDINATES
@@ -27,7 +27,6 @@ from featuredb.store.tables import CANARIES, SPECS, UTM_COORDINATES
 Origin = Literal["person", "answer"]
 LONGEST_NAME = 200
 _UNIT = 1e-6  # how far the norm of a stored quaternion may be from 1
-_AS_STORED = ("canary_id", "name", "created_at", "sha256", "origin", "snapshot", "note")
 _POSE_AS_STORED = ("epsg", "height_datum", "tolerance_m", "tolerance_deg")
 _LIGHT = [field.name for field in SPECS[CANARIES].schema if field.name != "image"]
 
@@ -216,11 +215,8 @@ def _pose_columns(pose: KnownPose | None) -> Row:
 
 def _canary(row: Row) -> Canary:
     try:
-        return Canary(
-            **{name: row[name] for name in _AS_STORED},
-            request=json.loads(row["request"]),
-            pose=_pose(row) if row["expected"] == "localised" else None,
-        )
+        pose = _pose(row) if row["expected"] == "localised" else None
+        return of_columns(Canary, {**row, "request": json.loads(row["request"]), "pose": pose})
     except (TypeError, ValueError) as error:
         raise StoreError(
             f"canary {row['name']}: its row is damaged ({error}); run `featuredb verify`"
@@ -228,8 +224,5 @@ def _canary(row: Row) -> Canary:
 
 
 def _pose(row: Row) -> KnownPose:
-    return KnownPose(
-        **{name: row[name] for name in _POSE_AS_STORED},
-        utm=np.array([row[name] for name in UTM_COORDINATES]),
-        cam_from_utm_xyzw=np.array(row["cam_from_utm_xyzw"]),
-    )
+    utm, turn = np.array([row[name] for name in UTM_COORDINATES]), np.array(row["cam_from_utm_xyzw"])
+    return of_columns(KnownPose, {**row, "utm": utm, "cam_from_utm_xyzw": turn})

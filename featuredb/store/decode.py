@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -31,6 +31,11 @@ from featuredb.store.tables import (
     SPECS,
     UTM_COORDINATES,
 )
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Value = TypeVar("Value", bound="DataclassInstance")
 
 
 def read_rows(
@@ -126,9 +131,14 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
         ) from error
 
 
+def of_columns(kind: type[Value], values: Mapping[str, Any], prefix: str = "") -> Value:
+    """A dataclass of the columns that are called like its fields, after a prefix."""
+    return kind(**{field.name: values[prefix + field.name] for field in fields(kind)})
+
+
 def frame_of(row: Row) -> LocalFrame:
     """Of a map with a place."""
-    return LocalFrame(**{field.name: row[f"origin_{field.name}"] for field in fields(LocalFrame)})
+    return of_columns(LocalFrame, row, "origin_")
 
 
 def has_place(row: Row) -> bool:
@@ -170,7 +180,7 @@ def _decode_images(batches: Iterable[pa.RecordBatch], count: int) -> tuple[MapIm
 def _decode_image(row: Row) -> MapImage:
     gps = None
     if row["gps_latitude_deg"] is not None:
-        gps = GeoPrior(**{field.name: row[f"gps_{field.name}"] for field in fields(GeoPrior)})
+        gps = of_columns(GeoPrior, row, "gps_")
     return MapImage(
         **{name: row[name] for name in ("image_id", "name", "sha256", "camera_id", "owner", "licence")},
         cam_from_local=Rigid3(

@@ -23,14 +23,14 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.store.changes import RETIRED, Change
 from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, apply_change, new_write_id
 from featuredb.store.database import Database
-from featuredb.store.decode import read_rows
+from featuredb.store.decode import of_columns, read_rows
 from featuredb.store.delta import Condition
 from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.durable.log import list_entries
 from featuredb.store.encode import Row, table_of
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import UtmBox
-from featuredb.store.tables import BOUNDS, LIDAR, LIDAR_POINTS, SPECS, UTM_COORDINATES
+from featuredb.store.tables import LIDAR, LIDAR_POINTS, SPECS, UTM_COORDINATES
 
 # One row of `lidar_points` in memory, without the columns that are the same for a whole tile.
 POINT_ROW = np.dtype(
@@ -335,16 +335,10 @@ def _level_rows(
 
 
 def _summary(row: Row) -> ScanSummary:
-    return ScanSummary(
-        box=UtmBox(**{name: row[name] for name in BOUNDS}),
-        level_points=tuple(row["level_points"]),
-        classes={c["classification"]: c["points"] for c in row["classes"]},
-        row=row,
-        **{name: row[name] for name in _AS_STORED},
-    )
-
-
-_AS_STORED = (
-    "scan_id", "write_id", "name", "status", "status_reason", "created_at", "epsg", "height_datum", "points",
-    "points_in_files", "spacing_m", "colour", "has_intensity", "licence",
-)  # fmt: skip
+    values = {
+        "box": of_columns(UtmBox, row),
+        "level_points": tuple(row["level_points"]),
+        "classes": {c["classification"]: c["points"] for c in row["classes"]},
+        "row": row,
+    }
+    return of_columns(ScanSummary, {**row, **values})

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
@@ -15,7 +15,7 @@ from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
 from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, UnplacedStatus
 from featuredb.store.changes import RETIRED
-from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_place
+from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_place, of_columns
 from featuredb.store.delta import Table
 from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
@@ -279,25 +279,17 @@ def _without_place(row: Row) -> UnplacedMapError:
 
 
 def _unplaced_summary(row: Row) -> UnplacedSummary:
-    return UnplacedSummary(
-        frame=OwnFrame(metric=row["frame_is_metric"], upright=row["frame_is_upright"]),
-        no_place=decode_no_place(row),
-        **{name: row[name] for name in _AS_STORED},
-    )
-
-
-_AS_STORED = (*(field.name for field in fields(_Summary)), "status")
-_PLACED_AS_STORED = ("epsg", "height_datum", "method", "generation", "residual_rms_m")
+    frame = OwnFrame(metric=row["frame_is_metric"], upright=row["frame_is_upright"])
+    return of_columns(UnplacedSummary, {**row, "frame": frame, "no_place": decode_no_place(row)})
 
 
 def _summary(row: Row) -> MapSummary:
-    box = None if row[BOUNDS[0]] is None else UtmBox(**{name: row[name] for name in BOUNDS})
     drift_m, budget_m = drift_and_budget(json.loads(row["placement_evidence"]))
-    return MapSummary(
-        box=box,
-        tiles=tuple(row["tiles"]),
-        parents=tuple(row["parents"]),
-        drift_m=drift_m,
-        budget_m=budget_m,
-        **{name: row[name] for name in (*_AS_STORED, *_PLACED_AS_STORED)},
-    )
+    values = {
+        "box": None if row[BOUNDS[0]] is None else of_columns(UtmBox, row),
+        "tiles": tuple(row["tiles"]),
+        "parents": tuple(row["parents"]),
+        "drift_m": drift_m,
+        "budget_m": budget_m,
+    }
+    return of_columns(MapSummary, {**row, **values})

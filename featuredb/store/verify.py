@@ -1,6 +1,5 @@
 """Does the database hold what it says? Every file, every row and every cross-reference of one snapshot."""
 
-import hashlib
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -10,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
-import pyarrow.fs as fs
 
 from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
@@ -23,7 +21,7 @@ from featuredb.store.database import Database
 from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
 from featuredb.store.durable.copies import LIST, CopyPlace, cut_off
-from featuredb.store.durable.filesystem import one_line, store_errors, table_files
+from featuredb.store.durable.filesystem import one_line, sha256_of, store_errors, table_files
 from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
@@ -60,7 +58,6 @@ _LIGHT_COLUMNS = {
     POINTS: ["point_index", "easting", "northing", "height", "zone", "tile"],
     OBSERVATIONS: ["observation_index", "point_index", "image_id", "zone", "tile"],
 }
-_BLOCK_BYTES = 2**20
 _INDEX = {IMAGES: "image_index", POINTS: "point_index", OBSERVATIONS: "observation_index"}
 
 
@@ -206,7 +203,7 @@ def _file_problems(table: Table) -> Iterator[Found]:
         try:
             found = fragment.metadata.num_rows
             digest = digests.get(fragment.path)
-            same = digest is None or digest == _sha256(table.storage, fragment.path)
+            same = digest is None or digest == sha256_of(table.storage, fragment.path)
         except (OSError, pa.ArrowException) as error:
             yield where, f"cannot be opened: {one_line(error)[:300]}"
             continue
@@ -369,11 +366,3 @@ def _orphans(database: Database) -> list[str]:
     if database.has(CANDIDATES):
         orphans |= set(write_ids_in(database.table(CANDIDATE_IMAGES))) - named_writes(database)
     return sorted(orphans)
-
-
-def _sha256(files: fs.FileSystem, path: str) -> str:
-    digest = hashlib.sha256()
-    with files.open_input_file(path) as stream:
-        while block := stream.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()

@@ -10,13 +10,16 @@ from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
 from featuredb.store.delta import Condition
 from featuredb.store.encode import Row, rows_table
-from featuredb.store.tables import CANDIDATES
+from featuredb.store.tables import CANDIDATES, SPECS
 
 
 def read_events(
-    database: Database, *, columns: Sequence[str] | None = None, candidate_ids: Iterable[str] | None = None
+    database: Database, *, answers: bool = False, candidate_ids: Iterable[str] | None = None
 ) -> list[Row]:
     """Events in order, all or those of some candidates; none where the table does not exist.
+
+    Args:
+        answers: also what the server answered, the longest column by far.
 
     Raises:
         StoreError: they cannot be read.
@@ -26,6 +29,7 @@ def read_events(
     where: list[Condition] = []
     if candidate_ids is not None:
         where = [("candidate_id", "in", sorted(candidate_ids))]
+    columns = [name for name in SPECS[CANDIDATES].schema.names if answers or name != "answer"]
     return sorted(read_rows(database.table(CANDIDATES), columns, where), key=event_order)
 
 
@@ -50,7 +54,7 @@ def note_events(database: Database, events: Mapping[str, Row]) -> None:
     """
     if not events:
         return
-    known = read_events(database, columns=["candidate_id", "write_id", "event_index", "happened_at"])
+    known = read_events(database)
     if missing := sorted(set(events) - {row["candidate_id"] for row in known}):
         raise not_found(missing)
     now = after(known, events, datetime.now(UTC))

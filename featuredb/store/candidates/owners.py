@@ -10,11 +10,6 @@ from featuredb.store.database import Database
 from featuredb.store.encode import Row
 from featuredb.store.snapshot import Snapshot
 
-_COLUMNS = (
-    *("candidate_id", "write_id", "event_index", "event", "happened_at", "request", "map_id"),
-    *("owner", "licence", "client_id"),
-)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Owners:
@@ -57,7 +52,7 @@ def read_owners(database: Database, snapshot: Snapshot) -> Owners:
     givers: dict[str, str] = {}
     made_of: dict[str, set[str]] = {}
     on_record: set[str] = set()
-    for candidate_id, events in by_candidate(read_events(database, columns=_COLUMNS)).items():
+    for candidate_id, events in by_candidate(read_events(database)).items():
         givers[candidate_id] = _giver(events)
         for k, event in enumerate(events):
             kind, map_id = event["event"], event["map_id"]

@@ -43,9 +43,7 @@ from featuredb.store.decode import read_image
 from featuredb.store.encode import Row, rows_table
 from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATES
 
-_ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "request")
 _AS_CONTRIBUTED = ("licence", "client_id", "width", "height", "snapshot")
-_LIGHT = (*_ORDER, "size_bytes", "map_id", "reason_code", "reason")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +91,7 @@ def contribute(database: Database, contributions: Sequence[Contribution]) -> lis
     """
     database.make(CANDIDATES)
     ids = [candidate_id_of(c.image) for c in contributions]
-    known = read_events(database, columns=_ORDER, candidate_ids=set(ids))
+    known = read_events(database, candidate_ids=set(ids))
     owners = _owners(known)
     write_id = new_write_id(datetime.now(UTC))
     images: dict[str, bytes] = {}
@@ -183,7 +181,9 @@ def delete_images(database: Database, candidate_ids: Iterable[str]) -> list[str]
 def list_candidates(database: Database, *, state: CandidateState | None = None) -> list[Candidate]:
     """The contributed photos, or only those in one state, oldest first."""
     live = live_maps(database)
-    found = [candidate_of(events, live) for events in by_candidate(read_events(database)).values()]
+    found = [
+        candidate_of(events, live) for events in by_candidate(read_events(database, answers=True)).values()
+    ]
     wanted = [c for c in found if state is None or c.state == state]
     return sorted(wanted, key=lambda c: (c.received_at, c.candidate_id))
 
@@ -194,7 +194,7 @@ def count_candidates(database: Database) -> InboxCounts:
     states: Counter[str] = Counter()
     owners: Counter[str] = Counter()
     stored = 0
-    for events in by_candidate(read_events(database, columns=_LIGHT)).values():
+    for events in by_candidate(read_events(database)).values():
         given = next(e for e in events if e["event"] == CONTRIBUTED)
         state = standing_of(events, live).state
         states[state] += 1

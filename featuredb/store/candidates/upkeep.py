@@ -14,16 +14,11 @@ from featuredb.store.database import Database
 from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATES
 
 _GROWTH = (CANDIDATES, CANDIDATE_IMAGES, CANARIES)
-_COLUMNS = (
-    "candidate_id", "write_id", "event_index", "event", "happened_at", "sha256", "map_id", "reason_code",
-    "reason",
-)  # fmt: skip
 
 
 def named_writes(database: Database) -> set[str]:
     """Write ids of the events, which are those of the images that they name."""
-    events = read_events(database, columns=("candidate_id", "write_id", "event_index", "happened_at"))
-    return {event["write_id"] for event in events}
+    return {event["write_id"] for event in read_events(database)}
 
 
 def superfluous_images(
@@ -37,7 +32,7 @@ def superfluous_images(
         return set()
     live = live_maps(database)
     found = set()
-    for candidate_id, events in by_candidate(read_events(database, columns=_COLUMNS)).items():
+    for candidate_id, events in by_candidate(read_events(database)).items():
         state = standing_of(events, live).state
         if state == "withdrawn" or (state == "refused" and now - events[-1]["happened_at"] >= history):
             found.add(candidate_id)
@@ -73,7 +68,7 @@ def _check_candidates(database: Database) -> Iterator[tuple[str, str]]:
     if not database.has(CANDIDATES):
         return
     try:
-        events = read_events(database, columns=_COLUMNS)
+        events = read_events(database)
         live = live_maps(database)
         digests = dict(_stored_digests(database))
     except (FeatureDbError, OSError, pa.ArrowException) as error:
