@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from featuredb.errors import MapNotFoundError, StoreError
+from featuredb.errors import ConflictError, MapNotFoundError, StoreError
 from featuredb.store.encode import Row
 
 ACTIVE = "active"
@@ -52,6 +52,42 @@ class Change:
 def live_row(rows: Iterable[Row], map_id: str) -> Row | None:
     """The row of a map that is visible and not retired, or None."""
     return next((row for row in rows if row["map_id"] == map_id and row["status"] != RETIRED), None)
+
+
+def check_unchanged(rows: Sequence[Row], based_on: Mapping[str, str]) -> None:
+    """Refuse to replace what the caller has never seen.
+
+    Args:
+        based_on: write ids, by id, of the maps that were seen.
+
+    Raises:
+        ConflictError: one has been placed anew, retired or rolled back.
+    """
+    for map_id, write_id in based_on.items():
+        row = live_row(rows, map_id)
+        if row is None or row["write_id"] != write_id:
+            found = "retired or gone" if row is None else "placed anew"
+            raise ConflictError(
+                f"map {map_id} was {found} by someone else while this was computed from an earlier state "
+                f"of it (write {write_id}); run the command again"
+            )
+
+
+def check_active(rows: Sequence[Row], active: Collection[str] | None) -> None:
+    """Refuse a decision that was made beside other maps than those that answer now.
+
+    Args:
+        active: write ids of the maps that were active then; None: does not matter.
+
+    Raises:
+        ConflictError: others are active now.
+    """
+    now = {row["write_id"] for row in rows if row["status"] == ACTIVE}
+    if active is not None and now != set(active):
+        raise ConflictError(
+            f"the active maps have changed since this was decided ({len(now - set(active))} came, "
+            f"{len(set(active) - now)} went); run the command again"
+        )
 
 
 def add_maps(

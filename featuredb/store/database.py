@@ -10,7 +10,16 @@ from time import monotonic
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import MapStatus
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
-from featuredb.store.changes import RETIRED, Change, add_maps, change_status, live_row, retire_map
+from featuredb.store.changes import (
+    RETIRED,
+    Change,
+    add_maps,
+    change_status,
+    check_active,
+    check_unchanged,
+    live_row,
+    retire_map,
+)
 from featuredb.store.commits import (
     LONGEST_COMMIT,
     CommitResult,
@@ -211,7 +220,7 @@ class Database:
             visible = {m: row for m in ids if (row := _already_there(rows, m, replaces, digests))}
             pending = [m for m in feature_maps if m.map_id not in visible]
             if pending:
-                _check_unchanged(rows, based_on or {})
+                check_unchanged(rows, based_on or {})
             for feature_map in pending:
                 if feature_map.map_id not in encoded:
                     encoded[feature_map.map_id] = self._write_children(feature_map)
@@ -296,8 +305,8 @@ class Database:
         def attempt() -> int:
             maps = self.table(MAPS)
             rows = read_rows(maps)
-            _check_unchanged(rows, based_on or {})
-            _check_active(rows, active)
+            check_unchanged(rows, based_on or {})
+            check_active(rows, active)
             change, changed[:] = change_status(rows, map_ids, status, reason)
             operation = _STATUS_OPERATION[status]
             return apply_change(maps, change, operation=operation, changed=changed, reason=reason)
@@ -381,25 +390,3 @@ def _already_there(
     if row is None or (map_id in replaces and row["content_digest"] != digests[map_id]):
         return None
     return row
-
-
-def _check_unchanged(rows: Sequence[Row], based_on: Mapping[str, str]) -> None:
-    """Refuse to replace what the caller has never seen."""
-    for map_id, write_id in based_on.items():
-        row = live_row(rows, map_id)
-        if row is None or row["write_id"] != write_id:
-            found = "retired or gone" if row is None else "placed anew"
-            raise ConflictError(
-                f"map {map_id} was {found} by someone else while this was computed from an earlier state "
-                f"of it (write {write_id}); run the command again"
-            )
-
-
-def _check_active(rows: Sequence[Row], active: Collection[str] | None) -> None:
-    """Refuse a decision that was made beside other maps than those that answer now."""
-    now = {row["write_id"] for row in rows if row["status"] == "active"}
-    if active is not None and now != set(active):
-        raise ConflictError(
-            f"the active maps have changed since this was decided ({len(now - set(active))} came, "
-            f"{len(set(active) - now)} went); run the command again"
-        )
