@@ -54,7 +54,8 @@ def read_rows(
     except StoreError as error:
         if spec.name == MAPS and isinstance(error.__cause__, FileNotFoundError):
             raise SnapshotNotFoundError(
-                f"version {table.version} is gone, vacuum removed its files ({error}); choose a newer one"
+                f"version {table.version} is gone, vacuum removed its files ({error.__cause__}); "
+                "choose a newer one"
             ) from error
         raise
     for field in spec.schema:
