@@ -248,14 +248,6 @@ def count_points(
     return int(_level_rows(database, scan, level, box).count_rows())
 
 
-def points_dataset(database: Database) -> ds.Dataset | None:
-    """The rows of `lidar_points` of scans that are not retired, or None where there are no tables."""
-    if not database.has(LIDAR):
-        return None
-    named = [s.write_id for s in list_scans(database)]
-    return database.table(LIDAR_POINTS).dataset([("write_id", "in", named)])
-
-
 class PointsChecksum:
     """Sum over all points of a hash of each, so that the order, which compaction changes, does not count."""
 

@@ -17,7 +17,7 @@ from featuredb.extras import require
 from featuredb.store.database import Database
 from featuredb.store.decode import plain_times
 from featuredb.store.encode import rows_table
-from featuredb.store.scans import points_dataset, scan_rows
+from featuredb.store.scans import list_scans, scan_rows
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import (
     CANARIES,
@@ -175,9 +175,10 @@ class SqlSession:
     def _register_scans(self, database: Database) -> None:
         rows = plain_times(rows_table(LIDAR, scan_rows(database)))
         self._connection.register(f"stored_{LIDAR}", rows)
-        points = points_dataset(database)
-        if points is None:
-            points = SPECS[LIDAR_POINTS].schema.empty_table()
+        points = SPECS[LIDAR_POINTS].schema.empty_table()
+        if database.has(LIDAR):
+            named = [scan.write_id for scan in list_scans(database)]
+            points = database.table(LIDAR_POINTS).dataset([("write_id", "in", named)])
         self._connection.register(f"stored_{LIDAR_POINTS}", points)
         self._connection.execute(_LIDAR_VIEW)
         self._connection.execute(_LIDAR_POINTS_VIEW)

@@ -14,7 +14,6 @@ from featuredb.store.candidates.states import (
     ANONYMOUS,
     candidate_id_of,
     candidate_of,
-    contributors_of,
     event_order,
     standing_of,
 )
@@ -88,7 +87,7 @@ def test_reasons_and_maps_are_told() -> None:
 
 def test_the_same_bytes_by_another_are_noted() -> None:
     rows = events("contributed:Ada contributed:Bob contributed:Ada")
-    assert [(c.owner, c.at) for c in contributors_of(rows)] == [
+    assert [(c.owner, c.at) for c in candidate_of(rows, ()).contributors] == [
         ("Ada", NOON),
         ("Bob", NOON + timedelta(minutes=1)),
     ]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.events import by_candidate, read_events
-from featuredb.store.candidates.states import ANONYMOUS, CONFIRMED, OPERATOR, USED, contributors_of
+from featuredb.store.candidates.states import ANONYMOUS, CONFIRMED, OPERATOR, USED, contributions_of, owner_of
 from featuredb.store.database import Database
 from featuredb.store.encode import Row
 from featuredb.store.snapshot import Snapshot
@@ -67,5 +67,5 @@ def read_owners(database: Database, snapshot: Snapshot) -> Owners:
 
 
 def _giver(events: Sequence[Row]) -> str:
-    contributors = contributors_of(events)
-    return contributors[0].owner if contributors else ANONYMOUS
+    given = contributions_of(events)
+    return owner_of(given[0]) if given else ANONYMOUS

@@ -202,41 +202,38 @@ def owner_of(event: "Row") -> str:
     return str(json.loads(event["request"] or "{}").get(_IDENTITY) or ANONYMOUS)
 
 
-def contributors_of(events: Iterable["Row"]) -> tuple[Contributor, ...]:
-    """Those who gave the photo, each owner once, by their first contribution since it was last withdrawn."""
-    found: dict[str, Contributor] = {}
-    gone: dict[str, Contributor] = {}
+def contributions_of(events: Iterable["Row"]) -> "list[Row]":
+    """The first contribution of each owner since the photo was last withdrawn, in order."""
+    found: dict[str, Row] = {}
+    gone: dict[str, Row] = {}
     for event in events:
         if event["event"] == WITHDRAWN:
             gone, found = found or gone, {}
         elif event["event"] == CONTRIBUTED:
-            owner = owner_of(event)
-            found.setdefault(
-                owner,
-                Contributor(
-                    owner=owner,
-                    credit=event["owner"],
-                    licence=event["licence"],
-                    client_id=event["client_id"] or "",
-                    at=event["happened_at"],
-                ),
-            )
-    return tuple((found or gone).values())
+            found.setdefault(owner_of(event), event)
+    return list((found or gone).values())
+
+
+def _contributor_of(event: "Row") -> Contributor:
+    return Contributor(
+        owner=owner_of(event),
+        credit=event["owner"],
+        licence=event["licence"],
+        client_id=event["client_id"] or "",
+        at=event["happened_at"],
+    )
 
 
 def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidate:
     """A candidate out of all its events, in order, among them at least one contribution."""
-    given = [event for event in events if event["event"] == CONTRIBUTED]
-    contributors = contributors_of(events)
-    first = next(
-        e for e in given if e["happened_at"] == contributors[0].at and owner_of(e) == contributors[0].owner
-    )
+    given = contributions_of(events)
+    first = given[0]
     request: dict[str, Any] = json.loads(first["request"] or "{}")
     request.pop(_IDENTITY, None)
     return Candidate(
         **asdict(standing_of(events, live_maps)),
         **{name: first[name] for name in _AS_GIVEN},
-        contributors=contributors,
+        contributors=tuple(map(_contributor_of, given)),
         request=request,
         answer=json.loads(first["answer"] or "{}"),
     )
