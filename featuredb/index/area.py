@@ -180,9 +180,7 @@ def _lay_out(feature_map: FeatureMap, frame: LocalFrame) -> dict[str, NDArray[An
     keep = np.flatnonzero(observations.has_descriptor)
     rows, see_point = np.unique(observations.point_index[keep], return_inverse=True)
     points = feature_map.points_local(frame)[rows]
-    ids = np.array([image.image_id for image in feature_map.images], dtype=np.int32)
-    by_id = np.argsort(ids)
-    see_image = by_id[np.searchsorted(ids[by_id], observations.image_id[keep])]
+    see_image = feature_map.image_rows(observations.image_id[keep])
     centers = np.array([area_from_map.act(i.cam_from_local.center) for i in feature_map.images]).reshape(
         -1, 3
     )

@@ -9,9 +9,7 @@ from featuredb.index.nearest import knn
 _CHUNK = 1024  # queries at a time: bounds the float32 copies
 
 
-def most_similar(
-    vectors: NDArray[np.float16], rows: NDArray[np.int64], k: int
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def most_similar(vectors: NDArray[np.float16], rows: NDArray[np.int64], k: int) -> NDArray[np.int64]:
     """The k photos most similar to each of some photos, without themselves, best first.
 
     An exhaustive search: 5,000 photos with 4,096 numbers each take seconds, and its share of an ingest's time
@@ -22,13 +20,12 @@ def most_similar(
         rows: (m,) photos that ask.
 
     Returns:
-        Rows (m, k) int64, -1 where there are fewer, and cosines (m, k) float32.
+        Rows (m, k) int64, -1 where there are fewer.
     """
     found = np.full((len(rows), k), -1, np.int64)
-    cosines = np.full((len(rows), k), -1.0, np.float32)
     count = min(k + 1, len(vectors))
     if count < 2 or not len(rows):
-        return found, cosines
+        return found
     base = vectors.astype(np.float32)
     for start in range(0, len(rows), _CHUNK):
         own = rows[start : start + _CHUNK]
@@ -37,5 +34,4 @@ def most_similar(
             good = (near != me) & (cosine > 0.0)
             best = near[good][:k]
             found[place, : len(best)] = best
-            cosines[place, : len(best)] = cosine[good][:k]
-    return found, cosines
+    return found

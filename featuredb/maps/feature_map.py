@@ -177,11 +177,13 @@ class MapObservations:
     def __len__(self) -> int:
         return len(self.point_index)
 
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "MapObservations":
+        """Some rows, by a mask (m,) or their numbers; `point_index` names the same points as before."""
+        return MapObservations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
     def none(self) -> "MapObservations":
         """No observations."""
-        return MapObservations(
-            **{f.name: getattr(self, f.name)[:0].copy() for f in fields(self)}  # no view of the others
-        )
+        return self.take(np.zeros(0, np.int64))  # no view of the others
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -272,6 +274,12 @@ class MapParts:
                 raise InvalidValueError(f"{where}: an observation names a point that the map does not have")
             if not np.isin(observations.image_id, np.asarray(ids, dtype=np.int32)).all():
                 raise InvalidValueError(f"{where}: an observation names an image that the map does not have")
+
+    def image_rows(self, image_id: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Places (k,) in `images` of images with these ids (k,)."""
+        ids = np.array([image.image_id for image in self.images], dtype=np.int32)
+        by_id = np.argsort(ids)
+        return np.asarray(by_id[np.searchsorted(ids[by_id], image_id)], dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -5,7 +5,7 @@ sees this as an error of its lens; so localisation needs to know how large it ma
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -37,14 +37,7 @@ class LensUncertainty:
 
     def as_provenance(self) -> dict[str, Any]:
         """To be merged into a map's provenance."""
-        numbers = (
-            self.focal_rel,
-            self.aspect,
-            *self.center_rel,
-            *self.radial,
-            *self.tangential,
-            self.dilution,
-        )
+        numbers = np.hstack([getattr(self, field.name) for field in fields(self)])
         return {_KEY: [float(f"{number:.4g}") for number in numbers]}
 
     @classmethod

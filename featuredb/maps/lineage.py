@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from featuredb.maps.statuses import MapMethod, MapStatus
+from featuredb.maps.statuses import MapStatus
 
 GROWTH = "growth"  # key of Placement.evidence that growth writes and this module reads
 
@@ -23,10 +23,6 @@ class Described(Protocol):
     def map_id(self) -> str: ...
     @property
     def status(self) -> MapStatus: ...
-    @property
-    def method(self) -> MapMethod: ...
-    @property
-    def generation(self) -> int: ...
     @property
     def parents(self) -> tuple[str, ...]: ...
     @property

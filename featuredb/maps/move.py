@@ -1,6 +1,6 @@
 """A feature map moved by a similarity: points, poses and covariances, as one rigid and scaled whole."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,12 @@ from featuredb.geo.utm import utm_epsg
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints, Placement
+from featuredb.maps.feature_map import FeatureMap, MapImage, MapParts, MapPoints, Placement
 from featuredb.maps.unplaced_map import UnplacedMap
 
 _UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))  # order of MapPoints.covariance
+# Fields that a map keeps where it gets a place.
+_STAYING = {f.name for f in fields(MapParts)} - {"images", "points", "status", "parents"}
 
 
 def move_map(
@@ -36,13 +38,12 @@ def move_map(
     move = in_frame(new_from_old, frame or feature_map.frame, feature_map.frame)
     placement = feature_map.placement
     adjoint = move.adjoint()
-    moved = Placement(
-        method=placement.method,
+    moved = replace(
+        placement,
         local_from_sfm=placement.local_from_sfm if is_identity(move) else move @ placement.local_from_sfm,
         covariance=_symmetric(adjoint @ placement.covariance @ adjoint.T)
         if covariance is None
         else np.asarray(covariance, dtype=np.float64),
-        residual_rms_m=placement.residual_rms_m,
         evidence=dict(placement.evidence),
     )
     if is_identity(move):
@@ -67,13 +68,10 @@ def placed_map(
     epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
     points = unplaced.points
     return FeatureMap(
-        map_id=unplaced.map_id,
-        name=unplaced.name,
+        **{name: getattr(unplaced, name) for name in _STAYING},
         epsg=epsg,
         height_datum=height_datum,
         frame=frame,
-        cameras=unplaced.cameras,
-        camera_keys=unplaced.camera_keys,
         images=tuple(moved_image(image, move) for image in unplaced.images),
         points=MapPoints(
             utm=frame.utm_from_enu(move.act(points.xyz), epsg),
@@ -82,12 +80,7 @@ def placed_map(
             error_px=points.error_px,
             covariance=moved_covariances(points.covariance, move),
         ),
-        observations=unplaced.observations,
         placement=placement,
-        extractor_fingerprint=unplaced.extractor_fingerprint,
-        source=unplaced.source,
-        licence=unplaced.licence,
-        provenance=unplaced.provenance,
     )
 
 

@@ -8,10 +8,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.maps.error_modes import ErrorModes
-from featuredb.maps.feature_map import MapObservations
 from featuredb.maps.unplaced_map import MapKind
-
-_PER_OBSERVATION = ("image_id", "xy", "scale", "angle", "has_descriptor", "descriptors")
 
 
 def only_images(feature_map: MapKind, image_ids: Collection[int], min_views: int = 2) -> MapKind:
@@ -48,7 +45,7 @@ def only_images(feature_map: MapKind, image_ids: Collection[int], min_views: int
         camera_keys=tuple(feature_map.camera_keys[c] for c in cameras) if feature_map.camera_keys else (),
         images=tuple(replace(image, camera_id=cameras.index(image.camera_id)) for image in images),
         points=replace(feature_map.points, track_length=views),
-        observations=take_observations(seen, stays),
+        observations=seen.take(stays),
     )
     return only_points(part, views >= min_views)
 
@@ -58,21 +55,11 @@ def only_points(feature_map: MapKind, stays: NDArray[np.bool_]) -> MapKind:
     if stays.all():
         return feature_map
     new_row = np.cumsum(stays) - 1
-    seen = take_observations(feature_map.observations, stays[feature_map.observations.point_index])
+    seen = feature_map.observations.take(stays[feature_map.observations.point_index])
     return replace(
         feature_map,
         points=feature_map.points.take(stays),
         observations=replace(seen, point_index=new_row[seen.point_index]),
-    )
-
-
-def take_observations(
-    observations: MapObservations, rows: NDArray[np.bool_] | NDArray[np.int64]
-) -> MapObservations:
-    """Some rows, by a mask (m,) or their numbers; `point_index` names the same points as before."""
-    return MapObservations(
-        point_index=observations.point_index[rows],
-        **{name: getattr(observations, name)[rows] for name in _PER_OBSERVATION},
     )
 
 

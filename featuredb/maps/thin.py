@@ -127,7 +127,7 @@ def _sightings(
     """Point row, image row and cell of the image's grid, once for each image that sees a described point."""
     seen = feature_map.observations
     rows = np.flatnonzero(seen.has_descriptor)
-    image = _image_rows(feature_map, seen.image_id[rows])
+    image = feature_map.image_rows(seen.image_id[rows])
     _, first = np.unique(seen.point_index[rows] * len(feature_map.images) + image, return_index=True)
     rows, image = rows[first], image[first]
     sizes = np.array(
@@ -136,12 +136,6 @@ def _sightings(
     ).reshape(-1, 2)  # fmt: skip
     place = np.clip((seen.xy[rows] * (_GRID / sizes[image])).astype(np.int64), 0, _GRID - 1)
     return seen.point_index[rows], image, place[:, 1] * _GRID + place[:, 0]
-
-
-def _image_rows(feature_map: AnyMap, image_id: NDArray[np.int32]) -> NDArray[np.int64]:
-    ids = np.array([image.image_id for image in feature_map.images], dtype=np.int32)
-    by_id = np.argsort(ids)
-    return np.asarray(by_id[np.searchsorted(ids[by_id], image_id)], dtype=np.int64)
 
 
 def _precision(feature_map: AnyMap) -> FloatArray:
@@ -165,7 +159,7 @@ def _views(feature_map: AnyMap) -> tuple[FloatArray, FloatArray]:
     """Unit vector (m, 3) from the point to the camera and distance (m,) of each observation, local metres."""
     seen = feature_map.observations
     centers = np.array([i.cam_from_local.center for i in feature_map.images]).reshape(-1, 3)
-    toward = centers[_image_rows(feature_map, seen.image_id)] - feature_map.points_local()[seen.point_index]
+    toward = centers[feature_map.image_rows(seen.image_id)] - feature_map.points_local()[seen.point_index]
     distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
     return toward / distance[:, None], distance
 
@@ -178,7 +172,7 @@ def _thinned_views(feature_map: AnyMap, points: NDArray[np.bool_], options: Thin
     """
     seen = feature_map.observations
     kept = seen.has_descriptor & points[seen.point_index]
-    image = _image_rows(feature_map, seen.image_id)
+    image = feature_map.image_rows(seen.image_id)
     # An image may see a point twice, which counts once.
     pairs = np.unique(np.stack([image[kept], seen.point_index[kept]]), axis=1)
     spare = np.bincount(pairs[0], minlength=len(feature_map.images)) - options.cover

@@ -12,8 +12,6 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.dataset as ds
 
 from featuredb.errors import CanaryNotFoundError, InvalidValueError, StoreError
 from featuredb.geo.datum import check_datum
@@ -21,14 +19,15 @@ from featuredb.geo.utm import zone_of
 from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.store.commits import CHANGED, OPERATION, new_write_id
 from featuredb.store.database import Database
-from featuredb.store.delta import Table
-from featuredb.store.encode import Row, rows_of
+from featuredb.store.decode import of_columns, read_image, read_rows
+from featuredb.store.encode import Row, rows_table
 from featuredb.store.retry import retry_stale
-from featuredb.store.tables import CANARIES, SPECS
+from featuredb.store.tables import CANARIES, SPECS, UTM_COORDINATES
 
 Origin = Literal["person", "answer"]
 LONGEST_NAME = 200
 _UNIT = 1e-6  # how far the norm of a stored quaternion may be from 1
+_POSE_AS_STORED = ("epsg", "height_datum", "tolerance_m", "tolerance_deg")
 _LIGHT = [field.name for field in SPECS[CANARIES].schema if field.name != "image"]
 
 
@@ -96,11 +95,6 @@ class Canary:
     note: str = ""
 
 
-def has_canaries(database: Database) -> bool:
-    """Whether the table of canaries exists."""
-    return Table.exists(database.table_url(CANARIES), database.storage_options)
-
-
 def add_canary(
     database: Database,
     name: str,
@@ -142,15 +136,14 @@ def add_canary(
         "snapshot": snapshot,
         "note": note,
     }
-    if not has_canaries(database):
-        Table.create(database.table_url(CANARIES), SPECS[CANARIES], database.storage_options)
+    database.make(CANARIES)
 
     def attempt() -> Row:
         table = database.table(CANARIES)
-        for other in _rows(table):
+        for other in read_rows(table, _LIGHT):
             if other["name"] == name:
                 return _same(other, row)
-        rows = pa.Table.from_pylist([{**row, "image": image}], schema=SPECS[CANARIES].schema)
+        rows = rows_table(CANARIES, [{**row, "image": image}])
         table.swap(rows, mode="append", metadata={OPERATION: "canary add", CHANGED: name})
         return row
 
@@ -159,9 +152,7 @@ def add_canary(
 
 def list_canaries(database: Database) -> list[Canary]:
     """All known queries, by name."""
-    if not has_canaries(database):
-        return []
-    return [_canary(row) for row in sorted(_rows(database.table(CANARIES)), key=lambda row: str(row["name"]))]
+    return [_canary(row) for row in sorted(_rows(database), key=lambda row: str(row["name"]))]
 
 
 def remove_canary(database: Database, name: str) -> None:
@@ -171,8 +162,7 @@ def remove_canary(database: Database, name: str) -> None:
         CanaryNotFoundError: there is none of this name.
         ConflictError, StoreError
     """
-    rows = _rows(database.table(CANARIES)) if has_canaries(database) else []
-    mine = [row["canary_id"] for row in rows if row["name"] == name]
+    mine = [row["canary_id"] for row in _rows(database) if row["name"] == name]
     if not mine:
         raise CanaryNotFoundError(f"no canary {name!r}; `featuredb canary list` lists what there is")
     database.table(CANARIES).delete_rows("canary_id", mine, {OPERATION: "canary remove", CHANGED: name})
@@ -185,31 +175,20 @@ def load_canary_image(database: Database, canary: Canary) -> bytes:
         CanaryNotFoundError: it was removed.
         StoreError: they cannot be read, or are not those that were added.
     """
-    mine = ds.field("canary_id") == canary.canary_id
-    if not has_canaries(database):
+    if not database.has(CANARIES):
         raise CanaryNotFoundError(f"no canary {canary.name!r}")
-    dataset = database.table(CANARIES).dataset([("canary_id", "=", canary.canary_id)])
-    try:
-        found = dataset.to_table(["image"], filter=mine, use_threads=False)["image"]
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(
-            f"canary {canary.name}: cannot read its image ({error}); run `featuredb verify`"
-        ) from error
-    if not len(found):
+    table = database.table(CANARIES)
+    image = read_image(table, "canary_id", canary.canary_id, f"canary {canary.name}")
+    if image is None:
         raise CanaryNotFoundError(f"canary {canary.name!r} was removed")
-    image: bytes = found[0].as_py()
     if hashlib.sha256(image).hexdigest() != canary.sha256:
         raise StoreError(f"canary {canary.name}: its image is not the one that was added")
     return image
 
 
-def _rows(table: Table) -> list[Row]:
-    """All rows without their images."""
-    try:
-        found = table.dataset().to_table(_LIGHT, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"cannot read the table canaries ({error}); run `featuredb verify`") from error
-    return rows_of(found, CANARIES, "created_at")
+def _rows(database: Database) -> list[Row]:
+    """All rows without their images; none where the table does not exist."""
+    return read_rows(database.table(CANARIES), _LIGHT) if database.has(CANARIES) else []
 
 
 def _same(there: Row, wanted: Row) -> Row:
@@ -226,33 +205,18 @@ def _same(there: Row, wanted: Row) -> Row:
 def _pose_columns(pose: KnownPose | None) -> Row:
     if pose is None:
         return {"expected": "not_localised"}
-    easting, northing, height = pose.utm.tolist()
     return {
         "expected": "localised",
-        "epsg": pose.epsg,
-        "easting": easting,
-        "northing": northing,
-        "height": height,
+        **{name: getattr(pose, name) for name in _POSE_AS_STORED},
+        **dict(zip(UTM_COORDINATES, pose.utm.tolist(), strict=True)),
         "cam_from_utm_xyzw": pose.cam_from_utm_xyzw.tolist(),
-        "height_datum": pose.height_datum,
-        "tolerance_m": float(pose.tolerance_m),
-        "tolerance_deg": float(pose.tolerance_deg),
     }
 
 
 def _canary(row: Row) -> Canary:
     try:
-        return Canary(
-            canary_id=row["canary_id"],
-            name=row["name"],
-            created_at=row["created_at"],
-            sha256=row["sha256"],
-            request=json.loads(row["request"]),
-            pose=_pose(row) if row["expected"] == "localised" else None,
-            origin=row["origin"],
-            snapshot=row["snapshot"],
-            note=row["note"],
-        )
+        pose = _pose(row) if row["expected"] == "localised" else None
+        return of_columns(Canary, {**row, "request": json.loads(row["request"]), "pose": pose})
     except (TypeError, ValueError) as error:
         raise StoreError(
             f"canary {row['name']}: its row is damaged ({error}); run `featuredb verify`"
@@ -260,11 +224,5 @@ def _canary(row: Row) -> Canary:
 
 
 def _pose(row: Row) -> KnownPose:
-    return KnownPose(
-        epsg=row["epsg"],
-        utm=np.array([row["easting"], row["northing"], row["height"]]),
-        height_datum=row["height_datum"],
-        cam_from_utm_xyzw=np.array(row["cam_from_utm_xyzw"]),
-        tolerance_m=row["tolerance_m"],
-        tolerance_deg=row["tolerance_deg"],
-    )
+    utm, turn = np.array([row[name] for name in UTM_COORDINATES]), np.array(row["cam_from_utm_xyzw"])
+    return of_columns(KnownPose, {**row, "utm": utm, "cam_from_utm_xyzw": turn})

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from featuredb.errors import MapNotFoundError, StoreError
+from featuredb.errors import ConflictError, MapNotFoundError, StoreError
 from featuredb.store.encode import Row
 
 ACTIVE = "active"
@@ -34,24 +34,60 @@ _PLACE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Change:
-    """What a commit to `maps` will do.
+    """What a commit to `maps` or `lidar` will do.
 
     Attributes:
         rows: all rows after the change.
-        added: the rows among them that are new.
+        added: the rows among them that are new, where that is known.
         only_adds: no old row is changed or gone, so that appending `added` is enough.
         flagged: ids of maps put into quarantine, because a map that placed them gave way.
     """
 
     rows: list[Row]
-    added: list[Row]
-    only_adds: bool
+    added: Sequence[Row] = ()
+    only_adds: bool = False
     flagged: tuple[str, ...] = ()
 
 
 def live_row(rows: Iterable[Row], map_id: str) -> Row | None:
     """The row of a map that is visible and not retired, or None."""
     return next((row for row in rows if row["map_id"] == map_id and row["status"] != RETIRED), None)
+
+
+def check_unchanged(rows: Sequence[Row], based_on: Mapping[str, str]) -> None:
+    """Refuse to replace what the caller has never seen.
+
+    Args:
+        based_on: write ids, by id, of the maps that were seen.
+
+    Raises:
+        ConflictError: one has been placed anew, retired or rolled back.
+    """
+    for map_id, write_id in based_on.items():
+        row = live_row(rows, map_id)
+        if row is None or row["write_id"] != write_id:
+            found = "retired or gone" if row is None else "placed anew"
+            raise ConflictError(
+                f"map {map_id} was {found} by someone else while this was computed from an earlier state "
+                f"of it (write {write_id}); run the command again"
+            )
+
+
+def check_active(rows: Sequence[Row], active: Collection[str] | None) -> None:
+    """Refuse a decision that was made beside other maps than those that answer now.
+
+    Args:
+        active: write ids of the maps that were active then; None: does not matter.
+
+    Raises:
+        ConflictError: others are active now.
+    """
+    now = {row["write_id"] for row in rows if row["status"] == ACTIVE}
+    if active is not None and now != set(active):
+        raise ConflictError(
+            f"the active maps have changed since this was decided ({len(now - set(active))} came, "
+            f"{len(set(active) - now)} went); run the command again"
+        )
 
 
 def add_maps(
@@ -104,7 +140,7 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
     if not any(row["map_id"] == map_id for row in rows):
         raise MapNotFoundError(f"no map {map_id}; `featuredb maps` lists what there is")
     if live_row(rows, map_id) is None:
-        return Change(rows=list(rows), added=[], only_adds=True), []
+        return Change(rows=list(rows), only_adds=True), []
     dependants = sorted(anchored(rows) - anchored(rows, without=map_id) - {map_id})
     retired = [map_id, *dependants]
     changed = [
@@ -117,7 +153,7 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
         else row
         for row in rows
     ]
-    return Change(rows=changed, added=[], only_adds=False), retired
+    return Change(rows=changed), retired
 
 
 def change_status(
@@ -147,19 +183,19 @@ def change_status(
             raise StoreError(f"map {map_id} is retired ({known[map_id]['status_reason']}); commit it again")
     wanted = [m for m in dict.fromkeys(map_ids) if known[m]["status"] != status]
     if not wanted:
-        return Change(rows=list(rows), added=[], only_adds=True), []
+        return Change(rows=list(rows), only_adds=True), []
     changed = [{**r, "status": status, "status_reason": reason} if r["map_id"] in wanted else r for r in rows]
     standing = anchored(changed, statuses=(ACTIVE,))
     if status == ACTIVE:
         _check_parents(known, [m for m in wanted if m not in standing])
-        return Change(rows=changed, added=[], only_adds=False), wanted
+        return Change(rows=changed), wanted
     fallen = sorted(anchored(rows, statuses=(ACTIVE,)) - standing - set(wanted))
     because = f"{reason} ({', '.join(wanted)})"
     changed = [
         {**r, "status": QUARANTINED, "status_reason": because} if r["map_id"] in fallen else r
         for r in changed
     ]
-    return Change(rows=changed, added=[], only_adds=False), [*wanted, *fallen]
+    return Change(rows=changed), [*wanted, *fallen]
 
 
 def _check_parents(known: Mapping[str, Row], refused: Sequence[str]) -> None:
@@ -216,7 +252,7 @@ def vouch_for(
         r["map_id"] for r in rows if r["map_id"] in reasons and is_imported(r["status"], r["status_reason"])
     ]
     if not ids:
-        return Change(rows=list(rows), added=[], only_adds=True), []
+        return Change(rows=list(rows), only_adds=True), []
     up = {
         r["map_id"] for r in rows if r["map_id"] in active and r["map_id"] in ids and r["status"] != UNPLACED
     }
@@ -232,9 +268,7 @@ def vouch_for(
         lacking = ", ".join(p for p in row["parents"] if p not in standing)
         return {**row, "status_reason": f"what placed it is not active: {lacking}"}
 
-    return Change(
-        rows=[vouched(r) if r["map_id"] in ids else r for r in rows], added=[], only_adds=False
-    ), ids
+    return Change(rows=[vouched(r) if r["map_id"] in ids else r for r in rows]), ids
 
 
 def _still_imported(row: Row, before: Row | None) -> Row:

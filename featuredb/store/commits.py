@@ -5,13 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-import pyarrow as pa
-
-from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
+from featuredb.errors import ConflictError, SnapshotNotFoundError
 from featuredb.store.changes import Change
 from featuredb.store.delta import Table
 from featuredb.store.durable.log import Commit
-from featuredb.store.encode import EncodedMap, Row, map_rows_table, rows_of
+from featuredb.store.encode import EncodedMap, rows_table
 from featuredb.store.tables import FORMAT_VERSION
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
@@ -21,14 +19,6 @@ LONGEST_COMMIT = timedelta(hours=6)
 # Keys of what a commit to `maps` says about itself.
 OPERATION, CHANGED, REASON = "featuredb.operation", "featuredb.maps", "featuredb.reason"
 KEPT_FROM = "featuredb.kept_from"
-
-
-_OPERATIONS = {
-    "CREATE TABLE": "init",
-    "OPTIMIZE": "compact",
-    "VACUUM START": "vacuum",
-    "VACUUM END": "vacuum",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +69,7 @@ def history_entry(commit: Commit) -> HistoryEntry:
     return HistoryEntry(
         version=commit.version,
         timestamp=commit.timestamp,
-        operation=commit.metadata.get(OPERATION, _OPERATIONS.get(commit.operation, "")),
+        operation=commit.metadata.get(OPERATION, "" if commit.version else "init"),
         maps=tuple(filter(None, commit.metadata.get(CHANGED, "").split("\n"))),
         reason=commit.metadata.get(REASON, ""),
     )
@@ -93,29 +83,6 @@ def new_write_id(now: datetime) -> str:
 def write_time(write_id: str) -> datetime:
     """When the rows of a write id were begun, UTC."""
     return datetime.fromtimestamp(int(write_id[:12], 16) / 1000.0, tz=UTC)
-
-
-def read_rows(table: Table) -> list[Row]:
-    """All rows of a version of a table that has `created_at`.
-
-    Raises:
-        SnapshotNotFoundError: its files are gone.
-        StoreError: they cannot be read.
-    """
-    try:
-        rows = table.dataset().to_table()
-        for field in table.spec.schema:  # those that an older format does not have
-            if field.name not in rows.column_names:
-                rows = rows.append_column(field.name, pa.nulls(len(rows), field.type))
-        return rows_of(rows, table.spec.name, "created_at")
-    except FileNotFoundError as error:
-        raise SnapshotNotFoundError(
-            f"version {table.version} is gone, vacuum removed its files ({error}); choose a newer one"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise StoreError(
-            f"cannot read the table {table.spec.name} ({error}); run `featuredb verify`"
-        ) from error
 
 
 def commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:
@@ -162,22 +129,25 @@ def check_children(encoded: EncodedMap, table_of: Callable[[str], Table]) -> Non
 
 
 def apply_change(
-    maps: Table,
+    table: Table,
     change: Change,
     *,
     operation: str,
-    maps_changed: Sequence[str],
+    changed: Sequence[str] = (),
     reason: str = "",
     extra: Mapping[str, str] | None = None,
 ) -> int:
-    """Commit a change as the very next version and return its number.
+    """Commit a change of `maps` or `lidar` as the very next version and return its number.
+
+    Args:
+        changed: ids of the maps or scans that history names with it.
 
     Raises:
-        StaleVersionError: someone else committed since `maps` was read.
+        StaleVersionError: someone else committed since `table` was read.
     """
     if change.only_adds and not change.added:
-        return maps.version
-    metadata = {OPERATION: operation, CHANGED: "\n".join(maps_changed), REASON: reason, **(extra or {})}
+        return table.version
+    metadata = {OPERATION: operation, CHANGED: "\n".join(changed), REASON: reason, **(extra or {})}
     if change.only_adds:
-        return maps.swap(map_rows_table(change.added), mode="append", metadata=metadata)
-    return maps.swap(map_rows_table(change.rows), mode="overwrite", metadata=metadata)
+        return table.swap(rows_table(table.spec.name, change.added), mode="append", metadata=metadata)
+    return table.swap(rows_table(table.spec.name, change.rows), mode="overwrite", metadata=metadata)

@@ -10,7 +10,16 @@ from time import monotonic
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import MapStatus
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
-from featuredb.store.changes import RETIRED, Change, add_maps, change_status, live_row, retire_map
+from featuredb.store.changes import (
+    RETIRED,
+    Change,
+    add_maps,
+    change_status,
+    check_active,
+    check_unchanged,
+    live_row,
+    retire_map,
+)
 from featuredb.store.commits import (
     LONGEST_COMMIT,
     CommitResult,
@@ -21,15 +30,15 @@ from featuredb.store.commits import (
     commit_as_of,
     history_entry,
     new_write_id,
-    read_rows,
 )
+from featuredb.store.decode import read_rows
 from featuredb.store.delta import Table
 from featuredb.store.durable.copies import check_restored
 from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import CHILD_TABLES, FORMAT_VERSION, MAPS, SPECS
+from featuredb.store.tables import CHILD_TABLES, CHILDREN, FORMAT_VERSION, MAPS, SPECS
 
 logger = logging.getLogger(__name__)
 
@@ -61,10 +70,9 @@ class Database:
         """
         database = cls(str(url), storage_options)
         check_restored(database.url, database._storage_options)
-        if not exist_ok and Table.exists(database.table_url(MAPS), database._storage_options):
+        if not exist_ok and database.has(MAPS):
             raise StoreError(f"there is a database at {database.url} already")
-        for name in (*CHILD_TABLES, MAPS):
-            Table.create(database.table_url(name), SPECS[name], database._storage_options)
+        database.make(MAPS)
         database.table(MAPS)
         return database
 
@@ -94,6 +102,32 @@ class Database:
     def table(self, name: str, version: int | None = None) -> Table:
         """A table at its newest or the given version; for maintenance and tests."""
         return Table.load(self.table_url(name), SPECS[name], self._storage_options, version)
+
+    def has(self, name: str) -> bool:
+        """Whether there is a table of CHILDREN, and with it those of which it names rows.
+
+        Raises:
+            StoreError: the store cannot be reached.
+        """
+        return Table.exists(self.table_url(name), self._storage_options)
+
+    def make(self, name: str) -> None:
+        """Make a table of CHILDREN, after those of which it names rows; harmless where they are.
+
+        Raises:
+            StoreError: the place cannot be written.
+        """
+        for part in (*CHILDREN[name], name):
+            Table.create(self.table_url(part), SPECS[part], self._storage_options)
+
+    def tables(self) -> list[str]:
+        """The tables that there are: those of maps, and what was made on first use.
+
+        Raises:
+            StoreError: the store cannot be reached.
+        """
+        there = [name for name in CHILDREN if name == MAPS or self.has(name)]
+        return [part for name in there for part in (name, *CHILDREN[name])]
 
     def snapshot(self, as_of: int | datetime | None = None) -> Snapshot:
         """The newest version, that of a number, or the one that was newest at a time (aware datetime).
@@ -186,7 +220,7 @@ class Database:
             visible = {m: row for m in ids if (row := _already_there(rows, m, replaces, digests))}
             pending = [m for m in feature_maps if m.map_id not in visible]
             if pending:
-                _check_unchanged(rows, based_on or {})
+                check_unchanged(rows, based_on or {})
             for feature_map in pending:
                 if feature_map.map_id not in encoded:
                     encoded[feature_map.map_id] = self._write_children(feature_map)
@@ -203,7 +237,7 @@ class Database:
                     maps,
                     change,
                     operation="commit",
-                    maps_changed=[*(m.map_id for m in pending), *change.flagged],
+                    changed=[*(m.map_id for m in pending), *change.flagged],
                 )
                 flagged = change.flagged
             # After a commit whose answer was lost the map is there already, by our own write.
@@ -235,7 +269,7 @@ class Database:
         def attempt() -> int:
             maps = self.table(MAPS)
             change, retired[:] = retire_map(read_rows(maps), map_id, reason)
-            return apply_change(maps, change, operation="retire", maps_changed=retired, reason=reason)
+            return apply_change(maps, change, operation="retire", changed=retired, reason=reason)
 
         retry_stale(f"retire {map_id}", attempt)
         return tuple(retired)
@@ -271,11 +305,11 @@ class Database:
         def attempt() -> int:
             maps = self.table(MAPS)
             rows = read_rows(maps)
-            _check_unchanged(rows, based_on or {})
-            _check_active(rows, active)
+            check_unchanged(rows, based_on or {})
+            check_active(rows, active)
             change, changed[:] = change_status(rows, map_ids, status, reason)
             operation = _STATUS_OPERATION[status]
-            return apply_change(maps, change, operation=operation, maps_changed=changed, reason=reason)
+            return apply_change(maps, change, operation=operation, changed=changed, reason=reason)
 
         version = retry_stale(f"{status} for {', '.join(map_ids)}", attempt)
         return StatusResult(version=version, changed=tuple(changed))
@@ -290,10 +324,8 @@ class Database:
         def attempt() -> int:
             maps = self.table(MAPS)
             old = self.snapshot(as_of)
-            change = Change(rows=old.rows(), added=[], only_adds=False)
-            return apply_change(
-                maps, change, operation="rollback", maps_changed=[], reason=f"to version {old.version}"
-            )
+            change = Change(rows=old.rows())
+            return apply_change(maps, change, operation="rollback", reason=f"to version {old.version}")
 
         return retry_stale(f"rollback to {as_of}", attempt)
 
@@ -358,25 +390,3 @@ def _already_there(
     if row is None or (map_id in replaces and row["content_digest"] != digests[map_id]):
         return None
     return row
-
-
-def _check_unchanged(rows: Sequence[Row], based_on: Mapping[str, str]) -> None:
-    """Refuse to replace what the caller has never seen."""
-    for map_id, write_id in based_on.items():
-        row = live_row(rows, map_id)
-        if row is None or row["write_id"] != write_id:
-            found = "retired or gone" if row is None else "placed anew"
-            raise ConflictError(
-                f"map {map_id} was {found} by someone else while this was computed from an earlier state "
-                f"of it (write {write_id}); run the command again"
-            )
-
-
-def _check_active(rows: Sequence[Row], active: Collection[str] | None) -> None:
-    """Refuse a decision that was made beside other maps than those that answer now."""
-    now = {row["write_id"] for row in rows if row["status"] == "active"}
-    if active is not None and now != set(active):
-        raise ConflictError(
-            f"the active maps have changed since this was decided ({len(now - set(active))} came, "
-            f"{len(set(active) - now)} went); run the command again"
-        )

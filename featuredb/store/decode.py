@@ -1,15 +1,16 @@
-"""Rows of the tables back to the map that was committed."""
+"""Rows of the tables read, and back to the map that was committed."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import datetime
-from typing import Any
+from dataclasses import fields
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import DTypeLike, NDArray
 
-from featuredb.errors import FeatureDbError, StoreError
+from featuredb.errors import FeatureDbError, SnapshotNotFoundError, StoreError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
@@ -17,8 +18,79 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObservations, MapPoints, Placement
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, OwnPoints, UnplacedMap
-from featuredb.store.encode import Row
-from featuredb.store.tables import IMAGES, OBSERVATIONS, OWN_COORDINATES, POINT_COVARIANCE, POINTS, SPECS
+from featuredb.store.delta import Condition, Table
+from featuredb.store.durable.filesystem import read_errors
+from featuredb.store.encode import AS_IN_MAP, Row
+from featuredb.store.tables import (
+    IMAGES,
+    MAPS,
+    OBSERVATIONS,
+    OWN_COORDINATES,
+    POINT_COVARIANCE,
+    POINTS,
+    SPECS,
+    UTM_COORDINATES,
+)
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Value = TypeVar("Value", bound="DataclassInstance")
+
+
+def read_rows(
+    table: Table, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()
+) -> list[Row]:
+    """Rows of a version of a table, times in UTC; what an older format does not have is None.
+
+    Raises:
+        SnapshotNotFoundError: files of an earlier version are gone.
+        StoreError: they cannot be read, or rows lack what no row lacks.
+    """
+    spec = table.spec
+    try:
+        with read_errors(f"cannot read the table {spec.name}"):
+            found = table.dataset(where).to_table(columns and list(columns))
+    except StoreError as error:
+        if spec.name == MAPS and isinstance(error.__cause__, FileNotFoundError):
+            raise SnapshotNotFoundError(
+                f"version {table.version} is gone, vacuum removed its files ({error.__cause__}); "
+                "choose a newer one"
+            ) from error
+        raise
+    for field in spec.schema:
+        if field.name not in found.column_names:
+            if columns is None:
+                found = found.append_column(field.name, pa.nulls(len(found), field.type))
+        elif not field.nullable and found[field.name].null_count:
+            raise StoreError(
+                f"the table {spec.name} is damaged: rows without {field.name}; run `featuredb verify`"
+            )
+    times = [field.name for field in found.schema if pa.types.is_timestamp(field.type)]
+    rows = plain_times(found).to_pylist()
+    return [{**row, **{name: row[name].replace(tzinfo=UTC) for name in times}} for row in rows]
+
+
+def plain_times(rows: pa.Table) -> pa.Table:
+    """Times of UTC without their zone, which Arrow and DuckDB look up and small machines do not have."""
+    for index, field in enumerate(rows.schema):
+        if pa.types.is_timestamp(field.type):
+            rows = rows.set_column(index, field.name, rows[field.name].cast(pa.timestamp("us")))
+    return rows
+
+
+def read_image(table: Table, column: str, value: str, whose: str) -> bytes | None:
+    """The photo in the row with this value of a column; None where there is no such row.
+
+    Args:
+        whose: what the photo is of, in words.
+
+    Raises:
+        StoreError: it cannot be read.
+    """
+    with read_errors(f"{whose}: cannot read its image"):
+        found = table.dataset([(column, "=", value)]).to_table(["image"], use_threads=False)["image"]
+    return found[0].as_py() if len(found) else None
 
 
 def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> AnyMap:
@@ -29,17 +101,12 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
     """
     try:
         shared: dict[str, Any] = {
-            "map_id": row["map_id"],
-            "name": row["name"],
+            **{name: row[name] for name in AS_IN_MAP},
             "cameras": tuple(Camera(**{**c, "params": tuple(c["params"])}) for c in row["cameras"]),
             "camera_keys": tuple(row["camera_keys"]),
             "images": _decode_images(children[IMAGES], row["images"]),
             "observations": _decode_observations(children[OBSERVATIONS], row["observations"]),
-            "extractor_fingerprint": row["extractor_fingerprint"],
-            "status": row["status"],
             "parents": tuple(row["parents"]),
-            "source": row["source"],
-            "licence": row["licence"],
             "provenance": json.loads(row["provenance"]),
         }
         points = _decode_points(children[POINTS], row["points"], _coordinate_columns(row))
@@ -65,13 +132,14 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
         ) from error
 
 
+def of_columns(kind: type[Value], values: Mapping[str, Any], prefix: str = "") -> Value:
+    """A dataclass of the columns that are called like its fields, after a prefix."""
+    return kind(**{field.name: values[prefix + field.name] for field in fields(kind)})
+
+
 def frame_of(row: Row) -> LocalFrame:
     """Of a map with a place."""
-    return LocalFrame(
-        latitude_deg=row["origin_latitude_deg"],
-        longitude_deg=row["origin_longitude_deg"],
-        height_m=row["origin_height_m"],
-    )
+    return of_columns(LocalFrame, row, "origin_")
 
 
 def has_place(row: Row) -> bool:
@@ -86,7 +154,7 @@ def decode_no_place(row: Row) -> NoPlace:
 
 
 def _coordinate_columns(row: Row) -> tuple[str, ...]:
-    return ("easting", "northing", "height") if has_place(row) else OWN_COORDINATES
+    return UTM_COORDINATES if has_place(row) else OWN_COORDINATES
 
 
 def placement_of(row: Row) -> Placement:
@@ -114,18 +182,9 @@ def _decode_images(batches: Iterable[pa.RecordBatch], count: int) -> tuple[MapIm
 def _decode_image(row: Row) -> MapImage:
     gps = None
     if row["gps_latitude_deg"] is not None:
-        gps = GeoPrior(
-            latitude_deg=row["gps_latitude_deg"],
-            longitude_deg=row["gps_longitude_deg"],
-            height_m=row["gps_height_m"],
-            sigma_horizontal_m=row["gps_sigma_horizontal_m"],
-            sigma_vertical_m=row["gps_sigma_vertical_m"],
-        )
+        gps = of_columns(GeoPrior, row, "gps_")
     return MapImage(
-        image_id=row["image_id"],
-        name=row["name"],
-        sha256=row["sha256"],
-        camera_id=row["camera_id"],
+        **{name: row[name] for name in ("image_id", "name", "sha256", "camera_id", "owner", "licence")},
         cam_from_local=Rigid3(
             rotation=np.reshape(row["cam_from_local_rotation"], (3, 3)),
             translation=np.array(row["cam_from_local_translation"]),
@@ -133,8 +192,6 @@ def _decode_image(row: Row) -> MapImage:
         covariance=None if row["covariance"] is None else np.reshape(row["covariance"], (6, 6)),
         capture_time=None if row["capture_time"] is None else datetime.fromisoformat(row["capture_time"]),
         gps=gps,
-        owner=row["owner"],
-        licence=row["licence"],
     )
 
 

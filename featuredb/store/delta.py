@@ -8,6 +8,7 @@ What deltalake 1.6 does, and tests/integration/test_delta_behaviour.py pins:
   the next log entry exists already, it raises. All commits to `maps` go this way.
 """
 
+import operator
 import re
 import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -48,20 +49,29 @@ from featuredb.store.tables import FORMAT_VERSION, TableSpec
 
 T = TypeVar("T")
 
+Condition = tuple[str, Literal["=", ">=", "<=", "in"], Any]  # column, relation, value; texts for "in"
+_RELATIONS: dict[str, Callable[[Any, Any], ds.Expression]] = {
+    "=": operator.eq,
+    ">=": operator.ge,
+    "<=": operator.le,
+    "in": lambda column, texts: column.isin(pa.array(texts, pa.string())),
+}
 COMMIT_ID = "featuredb.commit_id"  # in the entries of compare-and-swaps
 _HEX = re.compile(r"[0-9a-f]{1,64}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataFile:
-    """One live Parquet file of a table, as the log describes it; path relative to the table."""
+    """One live Parquet file of a table, as the log describes it.
+
+    Attributes:
+        path: relative to the table.
+        write_id: of all its rows; None where the log does not say that they have the same.
+    """
 
     path: str
-    size_bytes: int
     rows: int
-    partition: dict[str, Any]
-    min_write_id: str | None
-    max_write_id: str | None
+    write_id: str | None
 
 
 class Table:
@@ -167,20 +177,24 @@ class Table:
             self._delta.update_incremental()
             check_end(self._url, self.storage, self.version)
 
-    def dataset(self, pruning: Sequence[tuple[str, str, Any]] = ()) -> ds.Dataset:
-        """An Arrow dataset over the files that the log does not exclude by (column, operator, value)."""
+    def dataset(self, where: Sequence[Condition] = ()) -> ds.Dataset:
+        """The rows that meet all conditions, in the files that the log does not exclude."""
         filesystem = self.storage
         if "://" in self._url:
             filesystem = None  # deltalake's, which knows the files' sizes
+        pruning = [condition for condition in where if condition[1] != "in"]
         with store_errors(f"cannot read {self._url}"):
-            return self._delta.to_pyarrow_dataset(
-                file_pruning_predicate=list(pruning) or None, filesystem=filesystem
+            rows = self._delta.to_pyarrow_dataset(
+                file_pruning_predicate=pruning or None, filesystem=filesystem
             )
+            for column, relation, value in where:
+                rows = rows.filter(_RELATIONS[relation](ds.field(column), value))
+            return rows
 
     def count(self, column: str, value: str) -> int:
         """The rows with a value in a column of which the log has statistics."""
         with store_errors(f"cannot read {self._url}"):
-            return int(self.dataset([(column, "=", value)]).count_rows(filter=ds.field(column) == value))
+            return int(self.dataset([(column, "=", value)]).count_rows())
 
     def files(self) -> list[DataFile]:
         """The live files."""
@@ -188,11 +202,8 @@ class Table:
         return [
             DataFile(
                 path=unquote(row["path"]),
-                size_bytes=row["size_bytes"],
                 rows=row.get("num_records") or 0,  # a damaged entry may not say
-                partition={name: row.get(f"partition.{name}") for name in self.spec.partition_by},
-                min_write_id=row.get("min.write_id"),
-                max_write_id=row.get("max.write_id"),
+                write_id=first if (first := row.get("min.write_id")) == row.get("max.write_id") else None,
             )
             for row in rows
         ]
@@ -268,18 +279,6 @@ class Table:
                 self._write(delta, none, "overwrite", properties, predicate=predicate)
 
         self._maintain(delete)
-
-    def rewrite(self, rows_of: Callable[["Table"], pa.Table | None]) -> bool:
-        """Write rows anew in one commit; `rows_of` gives all rows of some write ids, or None."""
-
-        def again(delta: Any) -> bool:
-            if (rows := rows_of(self)) is None:
-                return False
-            predicate = _is_in("write_id", pc.unique(rows["write_id"]).to_pylist())
-            self._write(delta, rows, "overwrite", CommitProperties(), predicate=predicate)
-            return True
-
-        return self._maintain(again)
 
     def compact(self) -> int:
         """Merge small files of each partition; returns the number of files saved."""

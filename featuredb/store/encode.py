@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -12,16 +13,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError, StoreError
+from featuredb.errors import InvalidValueError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations
+from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObservations
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store.tables import (
     BOUNDS,
     IMAGES,
-    MAPS,
     NO_PLACE_COLUMNS,
     NO_TILE,
     NO_ZONE,
@@ -31,10 +31,11 @@ from featuredb.store.tables import (
     POINT_COVARIANCE,
     POINTS,
     SPECS,
+    UTM_COORDINATES,
 )
 
 Row = dict[str, Any]
-_UTM_COLUMNS = ("easting", "northing", "height")
+AS_IN_MAP = ("map_id", "name", "status", "extractor_fingerprint", "source", "licence")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,9 +117,7 @@ def _place_columns(feature_map: AnyMap) -> Row:
         "method": placement.method,
         "generation": feature_map.generation,
         "residual_rms_m": float(placement.residual_rms_m),
-        "origin_latitude_deg": frame.latitude_deg,
-        "origin_longitude_deg": frame.longitude_deg,
-        "origin_height_m": frame.height_m,
+        **{f"origin_{field.name}": getattr(frame, field.name) for field in dataclasses.fields(frame)},
         "local_from_sfm_scale": placement.local_from_sfm.scale,
         "local_from_sfm_rotation": placement.local_from_sfm.rotation.ravel().tolist(),
         "local_from_sfm_translation": placement.local_from_sfm.translation.tolist(),
@@ -131,11 +130,9 @@ def _map_row(
     feature_map: AnyMap, write_id: str, created_at: datetime, tiles: list[str], digest: str | None = None
 ) -> Row:
     return {
-        "map_id": feature_map.map_id,
+        **{name: getattr(feature_map, name) for name in AS_IN_MAP},
         "write_id": write_id,
         "content_digest": content_digest(feature_map) if digest is None else digest,
-        "name": feature_map.name,
-        "status": feature_map.status,
         "status_reason": "",
         "created_at": created_at,
         **_place_columns(feature_map),
@@ -150,9 +147,6 @@ def _map_row(
             {"model": c.model, "width": c.width, "height": c.height, "params": list(c.params)}
             for c in feature_map.cameras
         ],
-        "extractor_fingerprint": feature_map.extractor_fingerprint,
-        "source": feature_map.source,
-        "licence": feature_map.licence,
         "provenance": _json(feature_map, "provenance", feature_map.provenance),
     }
 
@@ -168,7 +162,7 @@ def _json(feature_map: AnyMap, field: str, value: dict[str, Any]) -> str:
 
 
 def _image_row(image: MapImage) -> Row:
-    gps = image.gps
+    gps = {f"gps_{f.name}": image.gps and getattr(image.gps, f.name) for f in dataclasses.fields(GeoPrior)}
     return {
         "image_id": image.image_id,
         "name": image.name,
@@ -178,11 +172,7 @@ def _image_row(image: MapImage) -> Row:
         "cam_from_local_translation": image.cam_from_local.translation.tolist(),
         "covariance": None if image.covariance is None else image.covariance.ravel().tolist(),
         "capture_time": None if image.capture_time is None else image.capture_time.isoformat(),
-        "gps_latitude_deg": gps and gps.latitude_deg,
-        "gps_longitude_deg": gps and gps.longitude_deg,
-        "gps_height_m": gps and gps.height_m,
-        "gps_sigma_horizontal_m": gps and gps.sigma_horizontal_m,
-        "gps_sigma_vertical_m": gps and gps.sigma_vertical_m,
+        **gps,
         "owner": image.owner,
         "licence": image.licence,
     }
@@ -219,7 +209,7 @@ def _image_rows(feature_map: AnyMap, ids: Row) -> pa.Table:
             zip(feature_map.images, utm.tolist(), tiles, strict=True)
         )
     ]
-    return pa.Table.from_pylist(rows, schema=SPECS[IMAGES].schema)
+    return rows_table(IMAGES, rows)
 
 
 def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
@@ -230,10 +220,10 @@ def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
         "error_px": points.error_px,
         "tile": tiles,
     }
-    here = _UTM_COLUMNS
+    here = UTM_COORDINATES
     if isinstance(feature_map, UnplacedMap):
         here = OWN_COORDINATES
-        columns |= {name: np.full(len(points), np.nan) for name in _UTM_COLUMNS}
+        columns |= {name: np.full(len(points), np.nan) for name in UTM_COORDINATES}
     columns |= dict(zip(here, _coordinates(feature_map).T, strict=True))
     for axis, name in enumerate(("red", "green", "blue")):
         columns[name] = points.rgb[:, axis].astype(np.int16)
@@ -286,24 +276,6 @@ def _descriptor_column(seen: MapObservations) -> pa.Array:
     return pc.if_else(mask, pa.scalar(None, type=fixed.type), fixed).cast(pa.binary())
 
 
-def rows_of(table: pa.Table, name: str, time: str) -> list[Row]:
-    """The rows of the table `name` whose column `time` has times of UTC.
-
-    Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
-
-    Raises:
-        StoreError: rows lack what no row lacks.
-    """
-    for field in SPECS[name].schema:
-        if not field.nullable and field.name in table.column_names and table[field.name].null_count:
-            raise StoreError(
-                f"the table {name} is damaged: rows without {field.name}; run `featuredb verify`"
-            )
-    times = table[time].cast(pa.timestamp("us")).to_pylist()
-    rows = table.drop_columns(time).to_pylist()
-    return [{**row, time: at.replace(tzinfo=UTC)} for row, at in zip(rows, times, strict=True)]
-
-
-def map_rows_table(rows: list[Row]) -> pa.Table:
-    """Rows of `maps` as an Arrow table."""
-    return pa.Table.from_pylist(rows, schema=SPECS[MAPS].schema)
+def rows_table(name: str, rows: Sequence[Row]) -> pa.Table:
+    """Rows of a table as an Arrow table."""
+    return pa.Table.from_pylist(list(rows), schema=SPECS[name].schema)

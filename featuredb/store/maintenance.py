@@ -6,18 +6,18 @@ from datetime import datetime, timedelta
 
 import pyarrow.compute as pc
 
-from featuredb.store.candidates.events import has_candidates
-from featuredb.store.candidates.upkeep import growth_tables, named_writes, superfluous_images
+from featuredb.store.candidates.upkeep import named_writes, superfluous_images
 from featuredb.store.changes import RETIRED, Change
-from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, read_rows
+from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version
 from featuredb.store.database import Database
+from featuredb.store.decode import read_rows
 from featuredb.store.delta import Table
 from featuredb.store.durable.ages import store_time, write_times
 from featuredb.store.durable.filesystem import store_errors
 from featuredb.store.durable.log import list_entries
 from featuredb.store.retry import retry_stale
-from featuredb.store.scans import has_scans, retired_since, scan_rows
-from featuredb.store.tables import CANDIDATE_IMAGES, CHILD_TABLES, LIDAR_POINTS, MAPS, TABLES
+from featuredb.store.scans import retired_since, scan_rows
+from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATES, CHILD_TABLES, LIDAR, LIDAR_POINTS, MAPS
 from featuredb.store.vacuum_options import VacuumOptions as VacuumOptions
 
 
@@ -42,9 +42,9 @@ class VacuumReport:
 def compact(database: Database) -> dict[str, int]:
     """Merge small files; returns for each table how many files it has less. Snapshots do not change."""
     saved = {}
-    scans = (LIDAR_POINTS,) if has_scans(database) else ()
-    for name in (*CHILD_TABLES, *scans, *growth_tables(database)):
-        saved[name] = database.table(name).compact()
+    for name in database.tables():
+        if name not in (MAPS, LIDAR):
+            saved[name] = database.table(name).compact()
     saved[MAPS] = retry_stale("compact maps", lambda: _compact_maps(database))
     return saved
 
@@ -107,8 +107,8 @@ def write_ids_in(table: Table) -> dict[str, set[str]]:
     found: defaultdict[str, set[str]] = defaultdict(set)
     mixed = set()
     for file in table.files():
-        if file.min_write_id is not None and file.min_write_id == file.max_write_id:
-            found[file.min_write_id].add(file.path)
+        if file.write_id is not None:
+            found[file.write_id].add(file.path)
         else:
             mixed.add(file.path)
     for fragment in table.dataset().get_fragments() if mixed else ():
@@ -133,8 +133,7 @@ def _compact_maps(database: Database) -> int:
     files = len(maps.files())
     if files <= 1:
         return 0
-    change = Change(rows=read_rows(maps), added=[], only_adds=False)
-    apply_change(maps, change, operation="compact", maps_changed=[])
+    apply_change(maps, Change(rows=read_rows(maps)), operation="compact")
     return files - 1
 
 
@@ -147,14 +146,11 @@ def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run
     old = [version for version, time in list_entries(maps.storage).items() if time <= cutoff]
     kept_from = max(*old, oldest_kept_version(commits), 0)
     if not dry_run and kept_from > oldest_kept_version(commits):
-        change = Change(rows=read_rows(maps), added=[], only_adds=False)
-        reason = f"versions before {kept_from} are gone"
         apply_change(
             maps,
-            change,
+            Change(rows=read_rows(maps)),
             operation="vacuum",
-            maps_changed=[],
-            reason=reason,
+            reason=f"versions before {kept_from} are gone",
             extra={KEPT_FROM: str(kept_from)},
         )
     return kept_from
@@ -162,7 +158,7 @@ def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run
 
 def _vacuum_scans(database: Database, options: VacuumOptions, now: datetime, dry_run: bool) -> set[str]:
     """Remove points that no scan names, and those of scans that were retired before the kept history."""
-    if not has_scans(database):
+    if not database.has(LIDAR):
         return set()
     since = retired_since(database)
     history = timedelta(hours=options.history_h)
@@ -179,7 +175,7 @@ def _vacuum_candidates(
     database: Database, options: VacuumOptions, now: datetime, dry_run: bool
 ) -> tuple[set[str], set[str]]:
     """Remove images that no event names, and those of photos that were refused long ago."""
-    if not has_candidates(database):
+    if not database.has(CANDIDATES):
         return set(), set()
     table = database.table(CANDIDATE_IMAGES)
     named = named_writes(database)
@@ -196,8 +192,9 @@ def _vacuum_candidates(
 
 def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dry_run: bool) -> list[str]:
     files = []
-    scans = (LIDAR_POINTS,) if has_scans(database) else ()
-    for name in (*TABLES, *scans, *growth_tables(database)):
+    for name in database.tables():
+        if name == LIDAR:
+            continue
         table = database.table(name)
         # Versions of `maps` are kept by number; the newest child table serves all of them.
         keep = range(kept_from, table.version + 1) if name == MAPS else ()

@@ -20,15 +20,17 @@ from numpy.typing import NDArray
 from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geometry.arrays import FloatArray
-from featuredb.store.changes import RETIRED
-from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, REASON, new_write_id, read_rows
+from featuredb.store.changes import RETIRED, Change
+from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, apply_change, new_write_id
 from featuredb.store.database import Database
-from featuredb.store.delta import Table
+from featuredb.store.decode import of_columns, read_rows
+from featuredb.store.delta import Condition
+from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.durable.log import list_entries
 from featuredb.store.encode import Row, table_of
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import UtmBox
-from featuredb.store.tables import BOUNDS, LIDAR, LIDAR_POINTS, LIDAR_TABLES, SPECS
+from featuredb.store.tables import LIDAR, LIDAR_POINTS, SPECS, UTM_COORDINATES
 
 # One row of `lidar_points` in memory, without the columns that are the same for a whole tile.
 POINT_ROW = np.dtype(
@@ -94,14 +96,9 @@ class ScanSummary:
     row: Row
 
 
-def has_scans(database: Database) -> bool:
-    """Whether the tables of scans exist."""
-    return Table.exists(database.table_url(LIDAR), database.storage_options)
-
-
 def scan_rows(database: Database) -> list[Row]:
     """All rows of `lidar`, oldest first; none where the table does not exist."""
-    if not has_scans(database):
+    if not database.has(LIDAR):
         return []
     rows = read_rows(database.table(LIDAR))
     return sorted(rows, key=lambda row: (row["created_at"], row["scan_id"]))
@@ -144,8 +141,7 @@ def commit_scan(
         ConflictError: other writers were faster too many times.
         StoreError: the store failed.
     """
-    for name in reversed(LIDAR_TABLES):
-        Table.create(database.table_url(name), SPECS[name], database.storage_options)
+    database.make(LIDAR)
     visible = _live(scan_rows(database), row["scan_id"])
     if visible is not None:
         return False, visible["write_id"]
@@ -199,11 +195,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
         changed = [
             {**r, "status": RETIRED, "status_reason": reason} if r["scan_id"] == scan_id else r for r in rows
         ]
-        table.swap(
-            scan_rows_table(changed),
-            mode="overwrite",
-            metadata={OPERATION: "retire", CHANGED: scan_id, REASON: reason},
-        )
+        apply_change(table, Change(rows=changed), operation="retire", changed=[scan_id], reason=reason)
         return True
 
     return retry_stale(f"retire {scan_id}", attempt)
@@ -225,25 +217,19 @@ def scan_points(
     Raises:
         StoreError: they cannot be read.
     """
-    dataset, wanted = _level_rows(database, scan, level, box)
-    try:
-        return dataset.to_table(list(columns), filter=wanted)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(
-            f"scan {scan.scan_id}: cannot read its points ({error}); run `featuredb verify`"
-        ) from error
+    with read_errors(f"scan {scan.scan_id}: cannot read its points"):
+        return _level_rows(database, scan, level, box).to_table(list(columns))
 
 
 def scan_batches(database: Database, scan: ScanSummary, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
     """All points of a scan, some thousand at a time, in no particular order."""
     dataset = database.table(LIDAR_POINTS).dataset([("write_id", "=", scan.write_id)])
-    wanted = ds.field("write_id") == scan.write_id
-    yield from dataset.to_batches(columns=list(columns), filter=wanted, use_threads=False)
+    yield from dataset.to_batches(columns=list(columns), use_threads=False)
 
 
 def retired_since(database: Database) -> dict[str, datetime]:
     """When each scan was retired last, by scan id and the store's time."""
-    if not has_scans(database):
+    if not database.has(LIDAR):
         return {}
     table = database.table(LIDAR)
     times, entries = {}, list_entries(table.storage)
@@ -259,23 +245,7 @@ def count_points(
     """How many points of a level lie in a box; see `scan_points`."""
     if box is None or level >= len(scan.level_points):
         return scan.level_points[level] if level < len(scan.level_points) else 0
-    dataset, wanted = _level_rows(database, scan, level, box)
-    return int(dataset.count_rows(filter=wanted))
-
-
-def points_dataset(database: Database, *, include_retired: bool = True) -> ds.Dataset | None:
-    """The rows of `lidar_points` that rows of `lidar` name, or None where there are no tables."""
-    if not has_scans(database):
-        return None
-    named = [s.write_id for s in list_scans(database, include_retired=include_retired)]
-    return (
-        database.table(LIDAR_POINTS).dataset().filter(ds.field("write_id").isin(pa.array(named, pa.string())))
-    )
-
-
-def scan_rows_table(rows: Sequence[Row]) -> pa.Table:
-    """Rows of `lidar` as an Arrow table."""
-    return pa.Table.from_pylist(list(rows), schema=SPECS[LIDAR].schema)
+    return int(_level_rows(database, scan, level, box).count_rows())
 
 
 class PointsChecksum:
@@ -313,11 +283,8 @@ def _add_row(database: Database, row: Row) -> str:
     if visible is not None:
         return str(visible["write_id"])
     kept = [r for r in rows if r["scan_id"] != row["scan_id"]]
-    metadata = {OPERATION: "lidar add", CHANGED: row["scan_id"], REASON: ""}
-    if len(kept) == len(rows):
-        table.swap(scan_rows_table([row]), mode="append", metadata=metadata)
-    else:
-        table.swap(scan_rows_table([*kept, row]), mode="overwrite", metadata=metadata)
+    change = Change(rows=[*kept, row], added=[row], only_adds=len(kept) == len(rows))
+    apply_change(table, change, operation="lidar add", changed=[row["scan_id"]])
     return str(row["write_id"])
 
 
@@ -330,7 +297,7 @@ def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
         "node_spacing_m": rows["node_spacing_m"],
         "level": rows["level"].astype(np.int32),
     }
-    for axis, name in enumerate(("easting", "northing", "height")):
+    for axis, name in enumerate(UTM_COORDINATES):
         columns[name] = np.ascontiguousarray(rows["utm"][:, axis])
     for axis, name in enumerate(("red", "green", "blue")):
         if not no_rgb.all():
@@ -343,41 +310,27 @@ def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
 
 def _level_rows(
     database: Database, scan: ScanSummary, level: int, box: tuple[float, float, float, float] | None
-) -> tuple[ds.Dataset, ds.Expression]:
-    """The files that can hold a level's points in a box, and what picks the rows."""
-    wanted = (
-        (ds.field("zone") == scan.epsg)
-        & (ds.field("level") == level)
-        & (ds.field("write_id") == scan.write_id)
-    )
-    pruning: list[tuple[str, str, Any]] = [("zone", "=", scan.epsg), ("level", "=", level)]
-    pruning.append(("write_id", "=", scan.write_id))
+) -> ds.Dataset:
+    """A level's points in a box."""
+    where: list[Condition] = [("zone", "=", scan.epsg), ("level", "=", level)]
+    where.append(("write_id", "=", scan.write_id))
     if box is not None:
         e0, n0, e1, n1 = box
-        tiles = sorted(set(tiles_touching(*box)) & set(scan.row["tiles"]))
-        pruning += [
+        where += [
             ("easting", ">=", e0),
             ("easting", "<=", e1),
             ("northing", ">=", n0),
             ("northing", "<=", n1),
+            ("tile", "in", sorted(set(tiles_touching(*box)) & set(scan.row["tiles"]))),
         ]
-        wanted &= ds.field("tile").isin(pa.array(tiles, pa.string()))
-        wanted &= (ds.field("easting") >= e0) & (ds.field("easting") <= e1)
-        wanted &= (ds.field("northing") >= n0) & (ds.field("northing") <= n1)
-    return database.table(LIDAR_POINTS).dataset(pruning), wanted
+    return database.table(LIDAR_POINTS).dataset(where)
 
 
 def _summary(row: Row) -> ScanSummary:
-    return ScanSummary(
-        box=UtmBox(**{name: row[name] for name in BOUNDS}),
-        level_points=tuple(row["level_points"]),
-        classes={c["classification"]: c["points"] for c in row["classes"]},
-        row=row,
-        **{name: row[name] for name in _AS_STORED},
-    )
-
-
-_AS_STORED = (
-    "scan_id", "write_id", "name", "status", "status_reason", "created_at", "epsg", "height_datum", "points",
-    "points_in_files", "spacing_m", "colour", "has_intensity", "licence",
-)  # fmt: skip
+    values = {
+        "box": of_columns(UtmBox, row),
+        "level_points": tuple(row["level_points"]),
+        "classes": {c["classification"]: c["points"] for c in row["classes"]},
+        "row": row,
+    }
+    return of_columns(ScanSummary, {**row, **values})

@@ -2,21 +2,22 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from featuredb.errors import MapNotFoundError, StoreError, UnplacedMapError
+from featuredb.errors import MapNotFoundError, UnplacedMapError
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
 from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, UnplacedStatus
 from featuredb.store.changes import RETIRED
-from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_place
+from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_place, of_columns
 from featuredb.store.delta import Table
+from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS, CHILD_TABLES
 
@@ -240,11 +241,7 @@ class Snapshot:
         write_ids = [
             row["write_id"] for row in self._rows.values() if include_retired or row["status"] != RETIRED
         ]
-        return (
-            self._children[table]
-            .dataset()
-            .filter(ds.field("write_id").isin(pa.array(write_ids, pa.string())))
-        )
+        return self._children[table].dataset([("write_id", "in", write_ids)])
 
     def rows(self) -> list[Row]:
         """All rows of `maps`, as dictionaries."""
@@ -259,23 +256,17 @@ class Snapshot:
 
     def _batches(self, table: str, row: Row) -> list[pa.RecordBatch]:
         """The map's rows of one child table, from the few files that can hold them."""
-        try:
+        with read_errors(f"map {row['map_id']}: cannot read its {table}"):
             try:
                 return self._read(table, row["write_id"])
             except FileNotFoundError:
                 # Compacted and vacuumed since this snapshot was taken: the same rows, in newer files.
                 self._children[table].refresh()
                 return self._read(table, row["write_id"])
-        except (OSError, pa.ArrowException) as error:
-            raise StoreError(
-                f"map {row['map_id']}: cannot read its {table} ({error}); run `featuredb verify`"
-            ) from error
 
     def _read(self, table: str, write_id: str) -> list[pa.RecordBatch]:
         dataset = self._children[table].dataset([("write_id", "=", write_id)])
-        batches: list[pa.RecordBatch] = dataset.to_table(
-            filter=ds.field("write_id") == write_id, use_threads=False
-        ).to_batches()
+        batches: list[pa.RecordBatch] = dataset.to_table(use_threads=False).to_batches()
         return batches
 
 
@@ -288,25 +279,17 @@ def _without_place(row: Row) -> UnplacedMapError:
 
 
 def _unplaced_summary(row: Row) -> UnplacedSummary:
-    return UnplacedSummary(
-        frame=OwnFrame(metric=row["frame_is_metric"], upright=row["frame_is_upright"]),
-        no_place=decode_no_place(row),
-        **{name: row[name] for name in _AS_STORED},
-    )
-
-
-_AS_STORED = (*(field.name for field in fields(_Summary)), "status")
-_PLACED_AS_STORED = ("epsg", "height_datum", "method", "generation", "residual_rms_m")
+    frame = OwnFrame(metric=row["frame_is_metric"], upright=row["frame_is_upright"])
+    return of_columns(UnplacedSummary, {**row, "frame": frame, "no_place": decode_no_place(row)})
 
 
 def _summary(row: Row) -> MapSummary:
-    box = None if row[BOUNDS[0]] is None else UtmBox(**{name: row[name] for name in BOUNDS})
     drift_m, budget_m = drift_and_budget(json.loads(row["placement_evidence"]))
-    return MapSummary(
-        box=box,
-        tiles=tuple(row["tiles"]),
-        parents=tuple(row["parents"]),
-        drift_m=drift_m,
-        budget_m=budget_m,
-        **{name: row[name] for name in (*_AS_STORED, *_PLACED_AS_STORED)},
-    )
+    values = {
+        "box": None if row[BOUNDS[0]] is None else of_columns(UtmBox, row),
+        "tiles": tuple(row["tiles"]),
+        "parents": tuple(row["parents"]),
+        "drift_m": drift_m,
+        "budget_m": budget_m,
+    }
+    return of_columns(MapSummary, {**row, **values})

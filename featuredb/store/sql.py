@@ -14,10 +14,10 @@ import pyarrow as pa
 
 from featuredb.errors import StoreError
 from featuredb.extras import require
-from featuredb.store.candidates.upkeep import growth_tables
 from featuredb.store.database import Database
-from featuredb.store.encode import map_rows_table
-from featuredb.store.scans import points_dataset, scan_rows, scan_rows_table
+from featuredb.store.decode import plain_times
+from featuredb.store.encode import rows_table
+from featuredb.store.scans import list_scans, scan_rows
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import (
     CANARIES,
@@ -26,6 +26,7 @@ from featuredb.store.tables import (
     IMAGES,
     LIDAR,
     LIDAR_POINTS,
+    MAPS,
     POINTS,
     SPECS,
 )
@@ -164,7 +165,7 @@ class SqlSession:
         return statements[0]
 
     def _register(self) -> None:
-        self._connection.register("stored_maps", _without_zone(map_rows_table(self.snapshot.rows())))
+        self._connection.register("stored_maps", plain_times(rows_table(MAPS, self.snapshot.rows())))
         self._connection.execute("CREATE VIEW maps AS SELECT * EXCLUDE (write_id) FROM stored_maps")
         self._connection.execute(_CAMERAS_VIEW)
         for name in CHILD_TABLES:
@@ -172,27 +173,24 @@ class SqlSession:
             self._connection.execute(_CHILD_VIEW.format(name=name, places=_PLACES.get(name, "")))
 
     def _register_scans(self, database: Database) -> None:
-        rows = _without_zone(scan_rows_table(scan_rows(database)))
+        rows = plain_times(rows_table(LIDAR, scan_rows(database)))
         self._connection.register(f"stored_{LIDAR}", rows)
-        points = points_dataset(database, include_retired=False)
-        if points is None:
-            points = SPECS[LIDAR_POINTS].schema.empty_table()
+        points = SPECS[LIDAR_POINTS].schema.empty_table()
+        if database.has(LIDAR):
+            named = [scan.write_id for scan in list_scans(database)]
+            points = database.table(LIDAR_POINTS).dataset([("write_id", "in", named)])
         self._connection.register(f"stored_{LIDAR_POINTS}", points)
         self._connection.execute(_LIDAR_VIEW)
         self._connection.execute(_LIDAR_POINTS_VIEW)
 
     def _register_growth(self, database: Database) -> None:
-        there = growth_tables(database)
-        for name, time, hidden in (
-            (CANDIDATES, "happened_at", "event_index"),
-            (CANARIES, "created_at", "image"),
-        ):
+        for name, hidden in ((CANDIDATES, "event_index"), (CANARIES, "image")):
             columns = [field.name for field in SPECS[name].schema if field.name not in (hidden, "write_id")]
-            if name in there:
+            if database.has(name):
                 rows = database.table(name).dataset().to_table(columns)
             else:
                 rows = SPECS[name].schema.empty_table().select(columns)
-            self._connection.register(name, _without_zone(rows, time))
+            self._connection.register(name, plain_times(rows))
 
     def _fetch(self) -> Iterator[tuple[Any, ...]]:
         try:
@@ -200,9 +198,3 @@ class SqlSession:
                 yield from rows
         except (duckdb.Error, OSError, pa.ArrowException) as error:
             raise StoreError(f"SQL: {error}") from error
-
-
-def _without_zone(rows: pa.Table, time: str = "created_at") -> pa.Table:
-    """A column as plain UTC timestamps: DuckDB needs pytz to hand out one with a zone."""
-    index = rows.schema.get_field_index(time)
-    return rows.set_column(index, time, rows[time].cast(pa.timestamp("us")))

@@ -23,14 +23,13 @@ IMAGES = "images"
 POINTS = "points"
 OBSERVATIONS = "observations"
 CHILD_TABLES = (IMAGES, POINTS, OBSERVATIONS)
-TABLES = (MAPS, *CHILD_TABLES)
 LIDAR = "lidar"
 LIDAR_POINTS = "lidar_points"
-LIDAR_TABLES = (LIDAR, LIDAR_POINTS)
 CANDIDATES = "candidates"
 CANDIDATE_IMAGES = "candidate_images"
-CANDIDATE_TABLES = (CANDIDATES, CANDIDATE_IMAGES)
 CANARIES = "canaries"
+# Each table that names rows of others, and those; where it is, they are, too.
+CHILDREN = {MAPS: CHILD_TABLES, LIDAR: (LIDAR_POINTS,), CANDIDATES: (CANDIDATE_IMAGES,), CANARIES: ()}
 # Compaction puts maps one after the other into a file; reading one skips the row groups of the others.
 # 32768 observations are 4 MB, large enough to be read in one go.
 ROW_GROUP_ROWS = 32_768
@@ -75,8 +74,8 @@ _FLOAT, _DOUBLE, _DOUBLES = pa.float32(), pa.float64(), _list(pa.float64())
 _CAMERA = pa.struct(
     [*_required(_TEXT, "model"), *_required(_INT, "width", "height"), *_required(_DOUBLES, "params")]
 )
-_COORDINATES = ("easting", "northing", "height")
-_UTM = _required(_DOUBLE, *_COORDINATES)
+UTM_COORDINATES = ("easting", "northing", "height")
+_UTM = _required(_DOUBLE, *UTM_COORDINATES)
 _PARTITION = [*_required(_INT, "zone"), *_required(_TEXT, "tile")]
 
 BOUNDS = ("min_easting", "min_northing", "min_height", "max_easting", "max_northing", "max_height")
@@ -238,7 +237,7 @@ _CANARIES_SCHEMA = pa.schema(
         *_required(_TIME, "created_at"),
         *_required(_TEXT, "sha256", "request", "expected"),
         *_nullable(_INT, "epsg"),
-        *_nullable(_DOUBLE, *_COORDINATES),
+        *_nullable(_DOUBLE, *UTM_COORDINATES),
         *_nullable(_DOUBLES, "cam_from_utm_xyzw"),
         *_nullable(_TEXT, "height_datum"),
         *_nullable(_DOUBLE, "tolerance_m", "tolerance_deg"),

@@ -1,6 +1,5 @@
 """Does the database hold what it says? Every file, every row and every cross-reference of one snapshot."""
 
-import hashlib
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -10,28 +9,25 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
-import pyarrow.fs as fs
 
 from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
-from featuredb.store.candidates.events import has_candidates
 from featuredb.store.candidates.photos import count_candidates
-from featuredb.store.candidates.upkeep import check_growth_tables, growth_tables, named_writes
+from featuredb.store.candidates.upkeep import check_growth_tables, named_writes
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
 from featuredb.store.durable.copies import LIST, CopyPlace, cut_off
-from featuredb.store.durable.filesystem import one_line, store_errors, table_files
+from featuredb.store.durable.filesystem import one_line, sha256_of, store_errors, table_files
 from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
 from featuredb.store.scans import (
     PointsChecksum,
     ScanSummary,
-    has_scans,
     list_scans,
     scan_batches,
     scan_rows,
@@ -40,10 +36,11 @@ from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import (
     BOUNDS,
     CANDIDATE_IMAGES,
+    CANDIDATES,
     CHILD_TABLES,
     IMAGES,
+    LIDAR,
     LIDAR_POINTS,
-    LIDAR_TABLES,
     MAPS,
     NO_TILE,
     NO_ZONE,
@@ -51,7 +48,7 @@ from featuredb.store.tables import (
     OWN_COORDINATES,
     POINTS,
     SPECS,
-    TABLES,
+    UTM_COORDINATES,
 )
 
 logger = logging.getLogger(__name__)
@@ -61,7 +58,6 @@ _LIGHT_COLUMNS = {
     POINTS: ["point_index", "easting", "northing", "height", "zone", "tile"],
     OBSERVATIONS: ["observation_index", "point_index", "image_id", "zone", "tile"],
 }
-_BLOCK_BYTES = 2**20
 _INDEX = {IMAGES: "image_index", POINTS: "point_index", OBSERVATIONS: "observation_index"}
 
 
@@ -142,15 +138,14 @@ def _verify(database: Database) -> VerifyReport:
     try:
         snapshot = database.snapshot()
         scans = list_scans(database)
-        growth_tables(database)
+        names = database.tables()
     except StoreError as error:
         if not problems:
             raise
         logger.debug("nothing but the logs can be checked: %s", error)
         return VerifyReport(problems=_said(problems))
     files = rows = 0
-    lidar = LIDAR_TABLES if has_scans(database) else ()
-    for name in (*TABLES, *lidar, *growth_tables(database)):
+    for name in names:
         table = database.table(name)
         live = table.files()
         files += len(live)
@@ -208,7 +203,7 @@ def _file_problems(table: Table) -> Iterator[Found]:
         try:
             found = fragment.metadata.num_rows
             digest = digests.get(fragment.path)
-            same = digest is None or digest == _sha256(table.storage, fragment.path)
+            same = digest is None or digest == sha256_of(table.storage, fragment.path)
         except (OSError, pa.ArrowException) as error:
             yield where, f"cannot be opened: {one_line(error)[:300]}"
             continue
@@ -231,9 +226,7 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Found]:
             ]
             tables[name] = snapshot.dataset(name).to_table(columns, filter=mine)
         except (OSError, pa.ArrowException) as error:
-            # Types that Arrow cannot filter: older releases left them in files of which they removed rows.
-            advice = "; run `featuredb upgrade`" if isinstance(error, pa.ArrowNotImplementedError) else ""
-            yield where, f"cannot read its {name}: {one_line(error)[:300]}{advice}"
+            yield where, f"cannot read its {name}: {one_line(error)[:300]}"
     if len(tables) < len(CHILD_TABLES):
         return
     found = [
@@ -359,25 +352,17 @@ def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
 
 
 def _utm(table: pa.Table | pa.RecordBatch) -> FloatArray:
-    return np.column_stack([table[name].to_numpy() for name in ("easting", "northing", "height")])
+    return np.column_stack([table[name].to_numpy() for name in UTM_COORDINATES])
 
 
 def _orphans(database: Database) -> list[str]:
     first = oldest_kept_version(database.table(MAPS).commits())
     present: set[str] = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
     orphans = present - write_ids_of_history(database, first)
-    if has_scans(database):
+    if database.has(LIDAR):
         orphans |= set(write_ids_in(database.table(LIDAR_POINTS))) - {
             r["write_id"] for r in scan_rows(database)
         }
-    if has_candidates(database):
+    if database.has(CANDIDATES):
         orphans |= set(write_ids_in(database.table(CANDIDATE_IMAGES))) - named_writes(database)
     return sorted(orphans)
-
-
-def _sha256(files: fs.FileSystem, path: str) -> str:
-    digest = hashlib.sha256()
-    with files.open_input_file(path) as stream:
-        while block := stream.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()

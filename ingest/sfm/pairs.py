@@ -202,7 +202,7 @@ def _look_pairs(
     """Each photo with those whose aggregated descriptor is nearest, wherever they are."""
     for precise, count in ((True, options.look_neighbours), (False, options.retrieval_neighbours)):
         rows = [i for i, p in enumerate(photos) if _is_precise(p, options) == precise]
-        found, _ = most_similar(vectors, np.array(rows, dtype=np.int64), count)
+        found = most_similar(vectors, np.array(rows, dtype=np.int64), count)
         for i, near in zip(rows, found.tolist(), strict=True):
             for rank, j in enumerate(near):
                 if j >= 0:

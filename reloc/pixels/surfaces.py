@@ -14,7 +14,8 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
 from featuredb.store import Database
-from featuredb.store.scans import has_scans, list_scans
+from featuredb.store.scans import list_scans
+from featuredb.store.tables import LIDAR
 from reloc.answered_view import AnsweredView
 from reloc.pixels.patch import Patch, fit_patch
 
@@ -195,7 +196,7 @@ def scan_surface(
     Args:
         box: in the view's frame, what is loaded.
     """
-    if not has_scans(database):
+    if not database.has(LIDAR):
         return None
     scans = [s.scan_id for s in list_scans(database) if s.height_datum == view.height_datum]
     if not scans:

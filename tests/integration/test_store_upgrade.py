@@ -1,22 +1,17 @@
-"""Databases as older releases have written them, kept in `tests/data`: read, and made as those of today."""
+"""Databases of each format, kept in `tests/data`: read, and those of older ones made as those of today."""
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 from deltalake import DeltaTable
 
 from featuredb.cli.main import main
-from featuredb.errors import StoreError
 from featuredb.store import Database
 from featuredb.store.canaries import list_canaries, load_canary_image
 from featuredb.store.candidates.photos import list_candidates, load_images
 from featuredb.store.delta import Table
 from featuredb.store.durable import making
-from featuredb.store.durable import upgrade as upgrade_module
-from featuredb.store.durable.log import acknowledged
-from featuredb.store.durable.making import is_of_an_older_release
 from featuredb.store.durable.upgrade import upgrade
 from featuredb.store.encode import content_digest
 from featuredb.store.tables import FORMAT_VERSION
@@ -27,14 +22,12 @@ from tests.support.maps import random_map, random_unplaced_map
 from tests.support.power_cut import Disk, State, write_state
 
 DATA = Path(__file__).parent.parent / "data"
-# Written by the release before maps without a place; by the one before durable commits, which left files
-# beside removed rows that Arrow cannot filter, and photos in statistics.
-GOLDEN = ("format1.db", "format2.db")
+OLD = DATA / "format1.db"  # written before maps without a place
 
 
-@pytest.fixture(params=GOLDEN)
-def old(request: pytest.FixtureRequest, tmp_path: Path) -> Database:
-    shutil.copytree(DATA / request.param, tmp_path / "old.db")
+@pytest.fixture
+def old(tmp_path: Path) -> Database:
+    shutil.copytree(OLD, tmp_path / "old.db")
     return Database.open(tmp_path / "old.db")
 
 
@@ -42,15 +35,8 @@ def tables_of(database: Database) -> list[Table]:
     return [database.table(path.name) for path in sorted(Path(database.url).iterdir())]
 
 
-def old_files(database: Database) -> list[str]:
-    fragments = [f for table in tables_of(database) for f in table.dataset().get_fragments()]
-    return [f.path for f in fragments if is_of_an_older_release(f)]
-
-
 def is_of_today(database: Database) -> bool:
-    tables = tables_of(database)
-    formats = {table.format for table in tables}
-    return formats == {FORMAT_VERSION} and all(acknowledged(t.storage) == t.version for t in tables)
+    return {table.format for table in tables_of(database)} == {FORMAT_VERSION}
 
 
 def test_an_upgrade_changes_nothing_that_is_there(old: Database) -> None:
@@ -58,7 +44,6 @@ def test_an_upgrade_changes_nothing_that_is_there(old: Database) -> None:
     digests = {row["map_id"]: row["content_digest"] for row in before.rows()}
     assert upgrade(old)
     assert is_of_today(old)
-    assert old_files(old) == []
     assert upgrade(old) == []
     for snapshot in (old.snapshot(), old.snapshot(before.version)):
         assert {m: content_digest(snapshot.load_any(m)) for m in digests} == digests
@@ -70,48 +55,18 @@ def test_an_upgrade_changes_nothing_that_is_there(old: Database) -> None:
         assert stored == fresh
 
 
-def test_what_an_older_release_made_unreadable_comes_back(tmp_path: Path) -> None:
-    shutil.copytree(DATA / "format2.db", tmp_path / "old.db")
-    old = Database.open(tmp_path / "old.db")
-    assert any("run `featuredb upgrade`" in p.what for p in verify(old).problems)
-    assert len(old_files(old)) == 6
-    with pytest.raises(StoreError):
-        old.snapshot().load_map("map-1")
-    upgrade(old)
-    assert verify(old).problems == ()
-    assert [c.candidate_id for c in list_candidates(old, state="withdrawn")]
-    (waiting,) = list_candidates(old, state="waiting")
-    assert dict(load_images(old, [waiting.candidate_id])) == {waiting.candidate_id: contribution(1).image}
-    images = {c.name: load_canary_image(old, c) for c in list_canaries(old)}
+def test_a_database_of_the_newest_format_is_read(tmp_path: Path) -> None:
+    shutil.copytree(DATA / "format2.db", tmp_path / "there.db")
+    there = Database.open(tmp_path / "there.db")
+    assert upgrade(there) == []
+    assert verify(there).problems == ()
+    for row in there.snapshot().rows():
+        assert content_digest(there.snapshot().load_any(row["map_id"])) == row["content_digest"]
+    assert [c.candidate_id for c in list_candidates(there, state="withdrawn")]
+    (waiting,) = list_candidates(there, state="waiting")
+    assert dict(load_images(there, [waiting.candidate_id])) == {waiting.candidate_id: contribution(1).image}
+    images = {c.name: load_canary_image(there, c) for c in list_canaries(there)}
     assert images == {"gate": contribution(7).image, "sea": contribution(8).image}
-
-
-@pytest.mark.parametrize(("commit_bytes", "commits"), [(2**30, 1), (1, 6)])
-def test_old_files_are_written_anew_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, commit_bytes: int, commits: int
-) -> None:
-    database = Database.create(tmp_path / "many.db")
-    for seed in range(6):
-        database.commit_map(random_map(seed, extent_m=10.0))
-    for row in database.snapshot().rows():  # leaves types that are not written any more, in a file each
-        one = f"write_id = '{row['write_id']}' AND point_index = 0"
-        DeltaTable(f"{database.url}/points").delete(one)
-    number = len(old_files(database))
-    assert number == 6
-    looked, before = list[str](), database.table("points").version
-
-    def look(fragment: Any) -> bool:
-        looked.append(fragment.path)
-        return is_of_an_older_release(fragment)
-
-    monkeypatch.setattr(upgrade_module, "is_of_an_older_release", look)
-    monkeypatch.setattr(upgrade_module, "_COMMIT_BYTES", commit_bytes)
-    rows = database.table("points").dataset().count_rows()
-    assert upgrade(database) == [f"points: {number} files of an older release written anew"]
-    assert len(looked) == len(set(looked))
-    assert database.table("points").version == before + commits
-    assert old_files(database) == []
-    assert database.table("points").dataset().count_rows() == rows
 
 
 def test_an_upgrade_that_was_cut_off_goes_on(

@@ -13,14 +13,13 @@ from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from featuredb.store.canaries import add_canary
 from featuredb.store.candidates.photos import contribute, mark_used, refuse
-from featuredb.store.tables import CANARIES, CANDIDATE_TABLES, LIDAR_TABLES
-from featuredb.store.tables import TABLES as MAP_TABLES
+from featuredb.store.tables import SPECS
 from schemas import load_schema, schema_names
 from tests.support.contributions import contribution, known_pose
 from tests.support.las_files import grid_points, write_scan
 from tests.support.maps import random_map, random_unplaced_map
 
-TABLES = (*MAP_TABLES, *LIDAR_TABLES, *CANDIDATE_TABLES, CANARIES)
+TABLES = tuple(SPECS)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from featuredb.store.commits import new_write_id, write_time
 from featuredb.store.decode import decode_map
-from featuredb.store.encode import content_digest, encode_map, map_rows_table
+from featuredb.store.encode import content_digest, encode_map, rows_table
 from featuredb.store.verify import verify
 from tests.support.maps import assert_same_map, random_map
 
@@ -32,7 +32,7 @@ maps = st.builds(
 @settings(deadline=None, max_examples=40)
 def test_rows_in_any_order_give_the_same_map(original: FeatureMap, shuffler: random.Random) -> None:
     encoded = encode_map(original, "0" * 32, datetime(2024, 1, 1, tzinfo=UTC))
-    row = map_rows_table([encoded.row]).to_pylist()[0]
+    row = rows_table("maps", [encoded.row]).to_pylist()[0]
     children = {}
     for name, table in encoded.children.items():
         order = list(range(len(table)))

@@ -8,7 +8,7 @@ import pytest
 
 from featuredb.errors import StoreError
 from featuredb.store import Database
-from featuredb.store.candidates.events import has_candidates
+from featuredb.store.tables import CANDIDATES
 from featuredb.store.verify import verify
 from tests.support.s3_faults import KINDS, LOST, REFUSED, RETRIED, Fault, FaultyStore, faulty_store
 from tests.support.s3_server import BUCKET, moto_server
@@ -75,7 +75,7 @@ def test_a_store_that_does_not_answer_is_not_damaged(
         with store.failing(Fault(kind=kind, first=first, count=1000, writes=False)):
             for ask in (
                 verify,
-                has_candidates,
+                lambda d: d.has(CANDIDATES),
                 lambda d: d.snapshot(0),
                 lambda d: Database.open(d.url, storage_options=d.storage_options),
             ):

@@ -14,7 +14,6 @@ from featuredb.store.candidates.states import (
     ANONYMOUS,
     candidate_id_of,
     candidate_of,
-    contributors_of,
     event_order,
     standing_of,
 )
@@ -62,11 +61,8 @@ def events(text: str) -> list[dict[str, Any]]:
         ("contributed used:m1 used:m2", "m3", "waiting"),
         ("contributed refused:BLUR", "m1", "refused"),
         ("contributed refused:BLUR contributed:Bob", "", "refused"),
-        ("contributed refused:BLUR reopened", "", "waiting"),
-        ("contributed refused:BLUR reopened used:m1", "m1", "used"),
         ("contributed refused:BLUR used:m1", "", "waiting"),
         ("contributed used:m1 refused:ALTERED", "m1", "refused"),
-        ("contributed used:m1 reopened", "m1", "waiting"),
         ("contributed withdrawn:OWNER", "", "withdrawn"),
         ("contributed withdrawn:OWNER used:m1", "m1", "withdrawn"),  # a map that was under way
         ("contributed used:m1 withdrawn:OWNER", "m1", "withdrawn"),
@@ -91,7 +87,7 @@ def test_reasons_and_maps_are_told() -> None:
 
 def test_the_same_bytes_by_another_are_noted() -> None:
     rows = events("contributed:Ada contributed:Bob contributed:Ada")
-    assert [(c.owner, c.at) for c in contributors_of(rows)] == [
+    assert [(c.owner, c.at) for c in candidate_of(rows, ()).contributors] == [
         ("Ada", NOON),
         ("Bob", NOON + timedelta(minutes=1)),
     ]
@@ -118,7 +114,7 @@ def test_a_claimed_name_is_no_owner(asked: str | None) -> None:
 
 
 def test_events_sort_by_time_then_as_they_were_given() -> None:
-    rows = events("contributed refused:A reopened")
+    rows = events("contributed refused:A used:m1")
     rows[1]["happened_at"] = rows[2]["happened_at"]
     rows[1]["write_id"] = rows[2]["write_id"]
     rows[2]["event_index"] = 1
@@ -155,7 +151,6 @@ _KINDS = st.sampled_from(
         "used:m2",
         "confirmed:m1",
         "refused:X",
-        "reopened",
         "withdrawn:OWNER",
     ]
 )
@@ -177,8 +172,6 @@ def test_laws_of_states(more: list[str], live: set[str]) -> None:
     last = more[-1].split(":")[0] if more else "contributed"
     if last in ("refused", "withdrawn"):
         assert standing.state == last
-    if last == "reopened":
-        assert standing.state == "waiting"
     # Withdrawn bytes come back only by being given again.
     if "withdrawn:OWNER" in more:
         after = more[len(more) - more[::-1].index("withdrawn:OWNER") :]

@@ -99,8 +99,7 @@ def test_without_the_extra_a_map_with_a_scan_waits(monkeypatch: pytest.MonkeyPat
         placement=placement,
         model=model_of(known, known.points_local(), known.images, described=False),
     )
-    database: Any = None
-    monkeypatch.setattr(scan_check, "has_scans", lambda _: True)
+    database: Any = SimpleNamespace(has=lambda _: True)
     monkeypatch.setattr(scan_check, "load_cloud", lambda *_: world.cloud)
     checked, why = checked_by_scan(database, grown)
     assert isinstance(checked, GrownMap)

@@ -156,4 +156,4 @@ def test_a_promotion_leaves_others_alone() -> None:
 
 def test_nothing_to_change_is_no_change() -> None:
     change, changed = change_status(FAMILY, ["a", "b"], "active", "seen")
-    assert (changed, change.only_adds, change.added) == ([], True, [])
+    assert (changed, change.only_adds, change.added) == ([], True, ())

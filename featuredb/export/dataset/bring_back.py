@@ -11,8 +11,9 @@ from featuredb.export.dataset.read import Row, load_map, open_dataset
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
 from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
 from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
-from featuredb.store.commits import apply_change, read_rows
+from featuredb.store.commits import apply_change
 from featuredb.store.database import Database
+from featuredb.store.decode import read_rows
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import MapSummary, UnplacedSummary
 from featuredb.store.tables import MAPS
@@ -116,7 +117,7 @@ def _vouch_for(database: Database, rows: Sequence[Row], missing: Mapping[str, Se
     def attempt() -> int:
         maps = database.table(MAPS)
         change, changed = vouch_for(read_rows(maps), active, reasons)
-        return apply_change(maps, change, operation="vouch", maps_changed=changed, reason=VOUCHED)
+        return apply_change(maps, change, operation="vouch", changed=changed, reason=VOUCHED)
 
     retry_stale("vouch for what was imported", attempt)
 

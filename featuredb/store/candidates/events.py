@@ -3,42 +3,34 @@
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 
-import pyarrow as pa
-import pyarrow.dataset as ds
-
-from featuredb.errors import CandidateNotFoundError, StoreError
+from featuredb.errors import CandidateNotFoundError
 from featuredb.store.candidates.states import CONTRIBUTED, event_order
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
-from featuredb.store.delta import Table
-from featuredb.store.encode import Row, rows_of
+from featuredb.store.decode import read_rows
+from featuredb.store.delta import Condition
+from featuredb.store.encode import Row, rows_table
 from featuredb.store.tables import CANDIDATES, SPECS
 
 
-def has_candidates(database: Database) -> bool:
-    """Whether the tables of candidates exist."""
-    return Table.exists(database.table_url(CANDIDATES), database.storage_options)
-
-
 def read_events(
-    database: Database, *, columns: Sequence[str] | None = None, candidate_ids: Iterable[str] | None = None
+    database: Database, *, answers: bool = False, candidate_ids: Iterable[str] | None = None
 ) -> list[Row]:
     """Events in order, all or those of some candidates; none where the table does not exist.
+
+    Args:
+        answers: also what the server answered, the longest column by far.
 
     Raises:
         StoreError: they cannot be read.
     """
-    if not has_candidates(database):
+    if not database.has(CANDIDATES):
         return []
-    wanted = None
+    where: list[Condition] = []
     if candidate_ids is not None:
-        wanted = ds.field("candidate_id").isin(pa.array(sorted(candidate_ids), pa.string()))
-    try:
-        dataset = database.table(CANDIDATES).dataset()
-        table = dataset.to_table(list(columns) if columns else None, filter=wanted, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"cannot read the table candidates ({error}); run `featuredb verify`") from error
-    return sorted(rows_of(table, CANDIDATES, "happened_at"), key=event_order)
+        where = [("candidate_id", "in", sorted(candidate_ids))]
+    columns = [name for name in SPECS[CANDIDATES].schema.names if answers or name != "answer"]
+    return sorted(read_rows(database.table(CANDIDATES), columns, where), key=event_order)
 
 
 def by_candidate(events: Iterable[Row]) -> dict[str, list[Row]]:
@@ -62,7 +54,7 @@ def note_events(database: Database, events: Mapping[str, Row]) -> None:
     """
     if not events:
         return
-    known = read_events(database, columns=["candidate_id", "write_id", "event_index", "happened_at"])
+    known = read_events(database)
     if missing := sorted(set(events) - {row["candidate_id"] for row in known}):
         raise not_found(missing)
     now = after(known, events, datetime.now(UTC))
@@ -83,7 +75,7 @@ def append_events(database: Database, rows: Sequence[Row], write_id: str) -> Non
     if not rows:
         return
     full = [{**row, "write_id": write_id, "event_index": i} for i, row in enumerate(rows)]
-    database.table(CANDIDATES).append(pa.Table.from_pylist(full, schema=SPECS[CANDIDATES].schema))
+    database.table(CANDIDATES).append(rows_table(CANDIDATES, full))
 
 
 def not_found(candidate_ids: Sequence[str]) -> CandidateNotFoundError:

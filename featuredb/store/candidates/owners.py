@@ -5,15 +5,10 @@ from dataclasses import dataclass, field
 
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.events import by_candidate, read_events
-from featuredb.store.candidates.states import ANONYMOUS, CONFIRMED, OPERATOR, USED, contributors_of
+from featuredb.store.candidates.states import ANONYMOUS, CONFIRMED, OPERATOR, USED, contributions_of, owner_of
 from featuredb.store.database import Database
 from featuredb.store.encode import Row
 from featuredb.store.snapshot import Snapshot
-
-_COLUMNS = (
-    *("candidate_id", "write_id", "event_index", "event", "happened_at", "request", "map_id"),
-    *("owner", "licence", "client_id"),
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +52,7 @@ def read_owners(database: Database, snapshot: Snapshot) -> Owners:
     givers: dict[str, str] = {}
     made_of: dict[str, set[str]] = {}
     on_record: set[str] = set()
-    for candidate_id, events in by_candidate(read_events(database, columns=_COLUMNS)).items():
+    for candidate_id, events in by_candidate(read_events(database)).items():
         givers[candidate_id] = _giver(events)
         for k, event in enumerate(events):
             kind, map_id = event["event"], event["map_id"]
@@ -72,5 +67,5 @@ def read_owners(database: Database, snapshot: Snapshot) -> Owners:
 
 
 def _giver(events: Sequence[Row]) -> str:
-    contributors = contributors_of(events)
-    return contributors[0].owner if contributors else ANONYMOUS
+    given = contributions_of(events)
+    return owner_of(given[0]) if given else ANONYMOUS

@@ -12,15 +12,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-import pyarrow as pa
-import pyarrow.dataset as ds
-
 from featuredb.errors import CandidateNotFoundError, StoreError
 from featuredb.store.candidates.events import (
     after,
     append_events,
     by_candidate,
-    has_candidates,
     live_maps,
     not_found,
     note_events,
@@ -43,12 +39,11 @@ from featuredb.store.candidates.states import (
 )
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
-from featuredb.store.delta import Table
-from featuredb.store.encode import Row
-from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATE_TABLES, SPECS
+from featuredb.store.decode import read_image
+from featuredb.store.encode import Row, rows_table
+from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATES
 
-_ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "request")
-_LIGHT = (*_ORDER, "size_bytes", "map_id", "reason_code", "reason")
+_AS_CONTRIBUTED = ("licence", "client_id", "width", "height", "snapshot")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,11 +89,9 @@ def contribute(database: Database, contributions: Sequence[Contribution]) -> lis
     Raises:
         StoreError: the store failed; none of them is visible.
     """
-    if not has_candidates(database):
-        for name in reversed(CANDIDATE_TABLES):  # `candidates` last: where it is, the other is, too
-            Table.create(database.table_url(name), SPECS[name], database.storage_options)
+    database.make(CANDIDATES)
     ids = [candidate_id_of(c.image) for c in contributions]
-    known = read_events(database, columns=_ORDER, candidate_ids=set(ids))
+    known = read_events(database, candidate_ids=set(ids))
     owners = _owners(known)
     write_id = new_write_id(datetime.now(UTC))
     images: dict[str, bytes] = {}
@@ -114,9 +107,8 @@ def contribute(database: Database, contributions: Sequence[Contribution]) -> lis
         row = {"candidate_id": candidate_id, "event": CONTRIBUTED, "happened_at": at}
         rows.append({**_contribution_row(contribution), **row})
     if images:
-        columns = {"candidate_id": list(images), "write_id": [write_id] * len(images)}
-        table = pa.table({**columns, "image": list(images.values())}, schema=SPECS[CANDIDATE_IMAGES].schema)
-        database.table(CANDIDATE_IMAGES).append(table)
+        stored = [{"candidate_id": c, "write_id": write_id, "image": image} for c, image in images.items()]
+        database.table(CANDIDATE_IMAGES).append(rows_table(CANDIDATE_IMAGES, stored))
     append_events(database, rows, write_id)
     return ids
 
@@ -189,7 +181,9 @@ def delete_images(database: Database, candidate_ids: Iterable[str]) -> list[str]
 def list_candidates(database: Database, *, state: CandidateState | None = None) -> list[Candidate]:
     """The contributed photos, or only those in one state, oldest first."""
     live = live_maps(database)
-    found = [candidate_of(events, live) for events in by_candidate(read_events(database)).values()]
+    found = [
+        candidate_of(events, live) for events in by_candidate(read_events(database, answers=True)).values()
+    ]
     wanted = [c for c in found if state is None or c.state == state]
     return sorted(wanted, key=lambda c: (c.received_at, c.candidate_id))
 
@@ -200,7 +194,7 @@ def count_candidates(database: Database) -> InboxCounts:
     states: Counter[str] = Counter()
     owners: Counter[str] = Counter()
     stored = 0
-    for events in by_candidate(read_events(database, columns=_LIGHT)).values():
+    for events in by_candidate(read_events(database)).values():
         given = next(e for e in events if e["event"] == CONTRIBUTED)
         state = standing_of(events, live).state
         states[state] += 1
@@ -218,23 +212,15 @@ def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tu
         CandidateNotFoundError: no such photo, or it was withdrawn.
         StoreError: they cannot be read, or are not those that were contributed.
     """
-    table = database.table(CANDIDATE_IMAGES) if has_candidates(database) else None
+    table = database.table(CANDIDATE_IMAGES) if database.has(CANDIDATES) else None
     for candidate_id in candidate_ids:
         if table is None:
             raise not_found([candidate_id])
-        mine = ds.field("candidate_id") == candidate_id
-        try:
-            dataset = table.dataset([("candidate_id", "=", candidate_id)])
-            found = dataset.to_table(["image"], filter=mine, use_threads=False)["image"]
-        except (OSError, pa.ArrowException) as error:
-            raise StoreError(
-                f"candidate {candidate_id}: cannot read its image ({error}); run `featuredb verify`"
-            ) from error
-        if not len(found):
+        image = read_image(table, "candidate_id", candidate_id, f"candidate {candidate_id}")
+        if image is None:
             raise CandidateNotFoundError(
                 f"candidate {candidate_id} has no image; it was never there, or was withdrawn"
             )
-        image: bytes = found[0].as_py()
         if hashlib.sha256(image).hexdigest()[:32] != candidate_id:
             raise StoreError(f"candidate {candidate_id}: its image is not the one that was contributed")
         yield candidate_id, image
@@ -253,14 +239,10 @@ def _owners(events: Iterable[Row]) -> dict[str, set[str]]:
 
 def _contribution_row(contribution: Contribution) -> Row:
     return {
+        **{name: getattr(contribution, name) for name in _AS_CONTRIBUTED},
         "owner": contribution.credit,
-        "licence": contribution.licence,
-        "client_id": contribution.client_id,
         "sha256": hashlib.sha256(contribution.image).hexdigest(),
         "size_bytes": len(contribution.image),
-        "width": contribution.width,
-        "height": contribution.height,
-        "snapshot": contribution.snapshot,
         "answer_status": str(contribution.answer.get("status", "")),
         "request": request_column(contribution),
         "answer": json.dumps(dict(contribution.answer), sort_keys=True, allow_nan=False),

@@ -8,7 +8,7 @@ and from the maps that live now: being used by a map counts only while that map 
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -20,15 +20,16 @@ if TYPE_CHECKING:
 CandidateState = Literal["waiting", "used", "refused", "withdrawn"]
 CANDIDATE_STATES: tuple[CandidateState, ...] = get_args(CandidateState)
 
-CONTRIBUTED, USED, REFUSED, REOPENED, WITHDRAWN = "contributed", "used", "refused", "reopened", "withdrawn"
+CONTRIBUTED, USED, REFUSED, WITHDRAWN = "contributed", "used", "refused", "withdrawn"
 CONFIRMED = "confirmed"
-EVENTS = (CONTRIBUTED, USED, CONFIRMED, REFUSED, REOPENED, WITHDRAWN)
+EVENTS = (CONTRIBUTED, USED, CONFIRMED, REFUSED, WITHDRAWN)
 
 # Owners that no certificate names: whoever was not authenticated, all of them one; who keeps the database.
 ANONYMOUS = "anonymous"
 OPERATOR = "the operator"  # with a space, so that no client can be called so
 LONGEST_NAME = 200  # of an owner, a credit, a licence, a client; longer ones are no names
 _IDENTITY = "identity"  # member of a contribution's `request` in the table
+_AS_GIVEN = ("candidate_id", "sha256", "size_bytes", "width", "height", "snapshot")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +92,23 @@ class Contributor:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
+class CandidateStanding:
+    """What has become of a candidate.
+
+    Attributes:
+        state: waiting, used (by a map that lives), refused or withdrawn.
+        used_by: the living maps that use it.
+        reason_code, reason: why it was refused or withdrawn; "" otherwise.
+    """
+
+    state: CandidateState
+    used_by: tuple[str, ...] = ()
+    reason_code: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate(CandidateStanding):
     """A contributed photo as its events and the living maps describe it; its bytes are loaded on demand.
 
     Attributes:
@@ -100,9 +117,6 @@ class Candidate:
         contributors: the first one first; later ones gave the same bytes again.
         received_at: of the first contribution.
         request, answer, snapshot: of the first contribution; see `Contribution`.
-        state: waiting, used (by a map that lives), refused or withdrawn.
-        used_by: the living maps that use it.
-        reason_code, reason: why it was refused or withdrawn; "" otherwise.
     """
 
     candidate_id: str
@@ -114,10 +128,6 @@ class Candidate:
     request: dict[str, Any]
     answer: dict[str, Any]
     snapshot: int
-    state: CandidateState
-    used_by: tuple[str, ...]
-    reason_code: str
-    reason: str
 
     @property
     def owner(self) -> str:
@@ -136,16 +146,6 @@ class Candidate:
         return self.contributors[0].at
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CandidateStanding:
-    """What has become of a candidate; see `Candidate`."""
-
-    state: CandidateState
-    used_by: tuple[str, ...] = ()
-    reason_code: str = ""
-    reason: str = ""
-
-
 def candidate_id_of(image: bytes) -> str:
     """The id of a photo: 128 bits of the SHA-256 of its bytes."""
     return hashlib.sha256(image).hexdigest()[:32]
@@ -159,7 +159,7 @@ def event_order(event: "Row") -> tuple[datetime, str, int]:
 def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> CandidateStanding:
     """The state that a candidate's events add up to.
 
-    The latest refusal, withdrawal or opening decides, unless it was used after it: then it is used while one
+    The latest refusal or withdrawal decides, unless it was used after it: then it is used while one
     of those maps lives, and waits again when none does. Only giving a withdrawn photo again opens it.
 
     Args:
@@ -175,14 +175,14 @@ def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidat
         if kind == USED:
             if latest is None or latest["event"] != WITHDRAWN:  # noted too late, the bytes are gone
                 used.append(event["map_id"])
-        elif kind in (REFUSED, REOPENED, WITHDRAWN) or (latest is not None and latest["event"] == WITHDRAWN):
+        elif kind in (REFUSED, WITHDRAWN) or (latest is not None and latest["event"] == WITHDRAWN):
             latest, used = event, []
     if used:
         living = tuple(m for m in dict.fromkeys(used) if m in live_maps)
         return (
             CandidateStanding(state="used", used_by=living) if living else CandidateStanding(state="waiting")
         )
-    if latest is None or latest["event"] in (REOPENED, CONTRIBUTED):
+    if latest is None or latest["event"] == CONTRIBUTED:
         return CandidateStanding(state="waiting")
     return CandidateStanding(
         state="refused" if latest["event"] == REFUSED else "withdrawn",
@@ -202,50 +202,38 @@ def owner_of(event: "Row") -> str:
     return str(json.loads(event["request"] or "{}").get(_IDENTITY) or ANONYMOUS)
 
 
-def contributors_of(events: Iterable["Row"]) -> tuple[Contributor, ...]:
-    """Those who gave the photo, each owner once, by their first contribution since it was last withdrawn."""
-    found: dict[str, Contributor] = {}
-    gone: dict[str, Contributor] = {}
+def contributions_of(events: Iterable["Row"]) -> "list[Row]":
+    """The first contribution of each owner since the photo was last withdrawn, in order."""
+    found: dict[str, Row] = {}
+    gone: dict[str, Row] = {}
     for event in events:
         if event["event"] == WITHDRAWN:
             gone, found = found or gone, {}
         elif event["event"] == CONTRIBUTED:
-            owner = owner_of(event)
-            found.setdefault(
-                owner,
-                Contributor(
-                    owner=owner,
-                    credit=event["owner"],
-                    licence=event["licence"],
-                    client_id=event["client_id"] or "",
-                    at=event["happened_at"],
-                ),
-            )
-    return tuple((found or gone).values())
+            found.setdefault(owner_of(event), event)
+    return list((found or gone).values())
+
+
+def _contributor_of(event: "Row") -> Contributor:
+    return Contributor(
+        owner=owner_of(event),
+        credit=event["owner"],
+        licence=event["licence"],
+        client_id=event["client_id"] or "",
+        at=event["happened_at"],
+    )
 
 
 def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidate:
     """A candidate out of all its events, in order, among them at least one contribution."""
-    given = [event for event in events if event["event"] == CONTRIBUTED]
-    contributors = contributors_of(events)
-    first = next(
-        e for e in given if e["happened_at"] == contributors[0].at and owner_of(e) == contributors[0].owner
-    )
-    standing = standing_of(events, live_maps)
+    given = contributions_of(events)
+    first = given[0]
     request: dict[str, Any] = json.loads(first["request"] or "{}")
     request.pop(_IDENTITY, None)
     return Candidate(
-        candidate_id=first["candidate_id"],
-        sha256=first["sha256"],
-        size_bytes=first["size_bytes"],
-        width=first["width"],
-        height=first["height"],
-        contributors=contributors,
+        **asdict(standing_of(events, live_maps)),
+        **{name: first[name] for name in _AS_GIVEN},
+        contributors=tuple(map(_contributor_of, given)),
         request=request,
         answer=json.loads(first["answer"] or "{}"),
-        snapshot=first["snapshot"],
-        state=standing.state,
-        used_by=standing.used_by,
-        reason_code=standing.reason_code,
-        reason=standing.reason,
     )

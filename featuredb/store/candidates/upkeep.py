@@ -7,30 +7,18 @@ from datetime import datetime, timedelta
 import pyarrow as pa
 
 from featuredb.errors import FeatureDbError
-from featuredb.store.canaries import has_canaries, list_canaries, load_canary_image
-from featuredb.store.candidates.events import by_candidate, has_candidates, live_maps, read_events
+from featuredb.store.canaries import list_canaries, load_canary_image
+from featuredb.store.candidates.events import by_candidate, live_maps, read_events
 from featuredb.store.candidates.states import CONTRIBUTED, EVENTS, standing_of
 from featuredb.store.database import Database
-from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATE_TABLES
+from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATES
 
-_COLUMNS = (
-    "candidate_id", "write_id", "event_index", "event", "happened_at", "sha256", "map_id", "reason_code",
-    "reason",
-)  # fmt: skip
-
-
-def growth_tables(database: Database) -> tuple[str, ...]:
-    """Those of the tables made on first use, scans apart, that exist."""
-    return (
-        *(CANDIDATE_TABLES if has_candidates(database) else ()),
-        *((CANARIES,) if has_canaries(database) else ()),
-    )
+_GROWTH = (CANDIDATES, CANDIDATE_IMAGES, CANARIES)
 
 
 def named_writes(database: Database) -> set[str]:
     """Write ids of the events, which are those of the images that they name."""
-    events = read_events(database, columns=("candidate_id", "write_id", "event_index", "happened_at"))
-    return {event["write_id"] for event in events}
+    return {event["write_id"] for event in read_events(database)}
 
 
 def superfluous_images(
@@ -40,11 +28,11 @@ def superfluous_images(
 
     Bytes of `fresh_writes` stay: somebody may be giving the photo again just now.
     """
-    if not has_candidates(database):
+    if not database.has(CANDIDATES):
         return set()
     live = live_maps(database)
     found = set()
-    for candidate_id, events in by_candidate(read_events(database, columns=_COLUMNS)).items():
+    for candidate_id, events in by_candidate(read_events(database)).items():
         state = standing_of(events, live).state
         if state == "withdrawn" or (state == "refused" and now - events[-1]["happened_at"] >= history):
             found.add(candidate_id)
@@ -61,12 +49,14 @@ def check_growth_tables(database: Database) -> list[tuple[str, str]]:
     """
 
     def look() -> tuple[list[int], list[tuple[str, str]]]:
-        versions = [database.table(name).version for name in growth_tables(database)]
-        return versions, [*_check_candidates(database), *_check_canaries(database)]
+        return versions(), [*_check_candidates(database), *_check_canaries(database)]
 
-    versions, found = look()
-    while found and versions != [database.table(name).version for name in growth_tables(database)]:
-        versions, again = look()
+    def versions() -> list[int]:
+        return [database.table(name).version for name in database.tables() if name in _GROWTH]
+
+    seen, found = look()
+    while found and seen != versions():
+        seen, again = look()
         lasting = [problem for problem in found if problem in again]
         if lasting == found:
             break
@@ -75,10 +65,10 @@ def check_growth_tables(database: Database) -> list[tuple[str, str]]:
 
 
 def _check_candidates(database: Database) -> Iterator[tuple[str, str]]:
-    if not has_candidates(database):
+    if not database.has(CANDIDATES):
         return
     try:
-        events = read_events(database, columns=_COLUMNS)
+        events = read_events(database)
         live = live_maps(database)
         digests = dict(_stored_digests(database))
     except (FeatureDbError, OSError, pa.ArrowException) as error:

@@ -32,23 +32,7 @@ from featuredb.store.durable.copies import (
 from featuredb.store.durable.filesystem import store_errors
 from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_name, whole_entry
 from featuredb.store.retry import StaleVersionError, retry_stale
-from featuredb.store.tables import (
-    CANARIES,
-    CANDIDATE_IMAGES,
-    CANDIDATES,
-    CHILD_TABLES,
-    LIDAR,
-    LIDAR_POINTS,
-    MAPS,
-)
-
-# Each table that names rows of others, and those; `maps` makes the database visible and comes last.
-_GROUPS = (
-    (CANARIES, ()),
-    (CANDIDATES, (CANDIDATE_IMAGES,)),
-    (LIDAR, (LIDAR_POINTS,)),
-    (MAPS, CHILD_TABLES),
-)
+from featuredb.store.tables import CHILDREN, MAPS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,8 +131,8 @@ def _consistent(database: Database) -> Iterator[Table]:
     Raises:
         StaleVersionError: others have committed while they were looked at.
     """
-    for name, children in _GROUPS:
-        if name != MAPS and not Table.exists(database.table_url(name), database.storage_options):
+    for name, children in reversed(CHILDREN.items()):
+        if name != MAPS and not database.has(name):
             continue
         table = database.table(name)
         yield from [database.table(child) for child in children]

@@ -6,7 +6,7 @@ last one is in its place: what was cut off is known for it, and goes on where it
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -16,7 +16,7 @@ from typing import Any
 import pyarrow.fs as fs
 
 from featuredb.errors import StoreError
-from featuredb.store.durable.filesystem import object_writer, one_line, table_files
+from featuredb.store.durable.filesystem import blocks_of, object_writer, one_line, sha256_of, table_files
 from featuredb.store.durable.log import ACKNOWLEDGED
 from featuredb.store.durable.publish import flush, make_folder
 from featuredb.store.tables import SPECS
@@ -24,7 +24,6 @@ from featuredb.store.tables import SPECS
 LIST = "backup.json"
 PART = ".part"  # end of the name of a file that is being written
 _FORMAT = 1
-_BLOCK_BYTES = 2**20
 
 
 class DamagedFileError(StoreError):
@@ -76,10 +75,7 @@ class CopyPlace:
 
     def sha256(self, path: str) -> str:
         """Of a file's bytes, in hex digits."""
-        digest = hashlib.sha256()
-        for block in self._blocks(path):
-            digest.update(block)
-        return digest.hexdigest()
+        return sha256_of(self.files, path)
 
     def take(self, path: str, source: "CopyPlace", expected: str | None) -> CopiedFile:
         """Copy a file from another place.
@@ -95,7 +91,7 @@ class CopyPlace:
         digest, size = hashlib.sha256(), 0
         try:
             with self._writer(path) as out:
-                for block in source._blocks(path):
+                for block in blocks_of(source.files, path):
                     digest.update(block)
                     size += len(block)
                     out.write(block)
@@ -115,7 +111,7 @@ class CopyPlace:
             StoreError: its list is damaged, or of a newer release.
         """
         try:
-            content = b"".join(self._blocks(LIST))
+            content = b"".join(blocks_of(self.files, LIST))
         except FileNotFoundError:
             return None
         try:
@@ -153,11 +149,6 @@ class CopyPlace:
             for folder in sorted({(self._root / path).parent for path in paths}):
                 if folder.exists():
                     flush(folder)
-
-    def _blocks(self, path: str) -> Iterator[bytes]:
-        with self.files.open_input_file(path) as stream:
-            while block := stream.read(_BLOCK_BYTES):
-                yield block
 
     def _writer(self, path: str) -> closing[Any]:
         if self._root is None:

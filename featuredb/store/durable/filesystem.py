@@ -1,6 +1,7 @@
 """A table's folder as Arrow sees it, on a local disk or in an object store."""
 
 import atexit
+import hashlib
 import re
 import time
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ from deltalake.fs import DeltaStorageHandler
 
 from featuredb.errors import StoreError
 
+_BLOCK_BYTES = 2**20
+
 
 def table_files(url: str, storage_options: dict[str, str] | None, opened: Any = None) -> fs.FileSystem:
     """The files of the table at a URL; paths are relative to it.
@@ -29,6 +32,29 @@ def table_files(url: str, storage_options: dict[str, str] | None, opened: Any = 
     if opened is not None:  # as deltalake's own `to_pyarrow_dataset` does
         return fs.PyFileSystem(DeltaStorageHandler.from_table(opened._table, storage_options))
     return fs.PyFileSystem(DeltaStorageHandler(url, storage_options))
+
+
+def blocks_of(files: fs.FileSystem, path: str) -> Iterator[bytes]:
+    """The bytes of a file, piece by piece.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with files.open_input_file(path) as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            yield block
+
+
+def sha256_of(files: fs.FileSystem, path: str) -> str:
+    """SHA-256 of a file's bytes, in hex digits.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    digest = hashlib.sha256()
+    for block in blocks_of(files, path):
+        digest.update(block)
+    return digest.hexdigest()
 
 
 def object_writer(files: fs.PyFileSystem, path: str) -> Any:
@@ -46,6 +72,15 @@ def store_errors(what: str) -> Iterator[None]:
         yield
     except (DeltaError, OSError, pa.ArrowException) as error:
         raise StoreError(f"{what}: {one_line(error)}") from error
+
+
+@contextmanager
+def read_errors(what: str) -> Iterator[None]:
+    """What Arrow raises of files that are lost or damaged, as `StoreError`; `what` says what was read."""
+    try:
+        yield
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise StoreError(f"{what} ({error}); run `featuredb verify`") from error
 
 
 def one_line(error: Exception) -> str:

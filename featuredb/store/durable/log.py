@@ -112,11 +112,10 @@ def list_entries(files: fs.FileSystem) -> dict[int, datetime]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Commit:
-    """One entry of a table's log, timestamp in UTC."""
+    """One entry of a table's log, timestamp in UTC, and what featuredb says with it."""
 
     version: int
     timestamp: datetime
-    operation: str
     metadata: dict[str, str]
 
 
@@ -124,18 +123,12 @@ def read_commit(files: fs.FileSystem, version: int) -> Commit:
     """What a log entry says of itself.
 
     Raises:
-        StoreError: it is missing, empty or torn, or says nothing.
+        StoreError: it is missing, empty or torn, or does not say when it was made.
     """
-    told = [action["commitInfo"] for action in whole_entry(files, version)[1] if "commitInfo" in action]
-    if not told or "timestamp" not in told[0]:
-        raise StoreError(
-            f"log entry {entry_name(version)}: it does not say when it was made; run `featuredb verify`"
-        )
-    info = told[0]
+    info = next(a["commitInfo"] for a in whole_entry(files, version)[1] if "commitInfo" in a)
     return Commit(
         version=version,
         timestamp=datetime.fromtimestamp(info["timestamp"] / 1000.0, tz=UTC),
-        operation=str(info.get("operation", "")),
         metadata={k: str(v) for k, v in info.items() if k.startswith("featuredb.")},
     )
 

@@ -86,19 +86,6 @@ def format_of(metadata: Any) -> Any:
         return None
 
 
-def is_of_an_older_release(fragment: Any) -> bool:
-    """Whether a file has what is not written any more.
-
-    That is strings as views, which Arrow cannot filter, where rows beside them were removed; and statistics
-    of a column of photos, with two of them.
-    """
-    if any(t in (pa.string_view(), pa.binary_view()) for t in fragment.physical_schema.types):
-        return True
-    group = fragment.metadata.row_group(0) if fragment.metadata.num_row_groups else None
-    columns = [group.column(i) for i in range(group.num_columns)] if group is not None else []
-    return any(c.is_stats_set and c.path_in_schema == "image" for c in columns)
-
-
 def why_not_opened(
     url: str, storage_options: dict[str, str] | None, version: int | None, error: Exception
 ) -> StoreError:

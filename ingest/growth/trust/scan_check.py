@@ -20,7 +20,7 @@ from featuredb.lidar.load import load_cloud
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
-from featuredb.store.scans import has_scans
+from featuredb.store.tables import LIDAR
 from ingest.growth.gates import SIGMAS, Gate, sigmas_limit
 from ingest.growth.map_places import growth_of, with_growth
 from ingest.growth.place.component import GrownMap
@@ -62,7 +62,7 @@ def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Ref
         StoreError: the scans cannot be read.
     """
     feature_map = grown.feature_map
-    points = _points(feature_map) if has_scans(database) else np.zeros((0, 3))
+    points = _points(feature_map) if database.has(LIDAR) else np.zeros((0, 3))
     if len(points) < _LEAST_POINTS:
         return grown, ""
     low, high = points[:, :2].min(axis=0) - _MARGIN_M, points[:, :2].max(axis=0) + _MARGIN_M
