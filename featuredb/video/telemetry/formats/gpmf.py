@@ -2,9 +2,9 @@
 
 | stream | rate | what is used |
 |---|---|---|
-| GPS9 (HERO11, 13, MAX2) | 10 Hz | latitude, longitude, height, day, second, DOP and fix of every sample |
-| GPS5 (HERO5 to 11) | 18 Hz | latitude, longitude, height; GPSF, GPSP and GPSU once a packet |
-| Karma's GLPI, GPRI, ATTD, SYST | 4 Hz | `gpmf_karma.py` |
+| GPS9 (HERO11, 13, MAX2) | 10 Hz | latitude, longitude, height, day, second and fix of every sample |
+| GPS5 (HERO5 to 11) | 18 Hz | latitude, longitude, height; GPSF and GPSU once a packet |
+| Karma's GLPI, GPRI, SYST | 4 Hz | `gpmf_karma.py` |
 
 A camera that writes several is read by the first of them. Everything else (ACCL, GYRO, CORI, GRAV, ...) is
 skipped. GoPro's heights: without the entry GPSA they are above the ellipsoid (the parser's author, issue 4 of
@@ -22,7 +22,7 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import RANGE_ERROR_M, About, SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import About, SampleTable, assemble, check_count
 from featuredb.video.telemetry.formats.gpmf_karma import boot_to_utc, karma_samples
 from featuredb.video.telemetry.formats.gpmf_streams import Stream, first_number, scaled, streams_of
 from featuredb.video.telemetry.formats.klv import Klv
@@ -31,9 +31,6 @@ from featuredb.video.telemetry.values import Telemetry
 _EPOCH_2000_S = datetime(2000, 1, 1, tzinfo=UTC).timestamp()
 _MIN_FIX = 2  # 0 no fix, 2 in two dimensions, 3 in three
 _FIX_3D = 3
-# GPSP is a dilution of precision in hundredths. u-blox receivers report that of position (PDOP), which is not
-# smaller than the horizontal one: times the range error it errs to the careful side.
-_GPSP_UNIT = 0.01
 _GPSU = re.compile(r"([0-9]{12})(?:\.([0-9]{1,3}))?")
 
 
@@ -179,8 +176,8 @@ def _gps9(streams: list[Stream]) -> Decoded | None:
         values = scaled(stream, "GPS9", 9)
         if values is None:
             continue
-        fix, dop = values[:, 8], values[:, 7]
-        columns = _fixed(values, fix, dop)
+        fix = values[:, 8]
+        columns = _fixed(values, fix)
         columns["clock_s"] = np.where(
             fix >= _MIN_FIX, _EPOCH_2000_S + 86_400.0 * values[:, 5] + values[:, 6], np.nan
         )
@@ -190,7 +187,7 @@ def _gps9(streams: list[Stream]) -> Decoded | None:
 
 
 def _gps5(streams: list[Stream]) -> Decoded | None:
-    """Latitude, longitude, height, two speeds; fix, dilution and time once for the packet."""
+    """Latitude, longitude, height, two speeds; fix and time once for the packet."""
     for stream in streams:
         values = scaled(stream, "GPS5", 5)
         if values is None:
@@ -201,20 +198,19 @@ def _gps5(streams: list[Stream]) -> Decoded | None:
             warnings.append("GPS5 without its fix status (GPSF): whether positions are fresh is not known")
             fix = _FIX_3D
         n = len(values)
-        columns = _fixed(values, np.full(n, fix), np.full(n, _GPSP_UNIT * first_number(stream, "GPSP")))
+        columns = _fixed(values, np.full(n, fix))
         start = _utc(stream.get("GPSU")) if fix >= _MIN_FIX else float("nan")
         return Decoded(columns, n, start, datum, warnings)
     return None
 
 
-def _fixed(values: FloatArray, fix: FloatArray, dop: FloatArray) -> dict[str, FloatArray]:
+def _fixed(values: FloatArray, fix: FloatArray) -> dict[str, FloatArray]:
     """Positions of samples with a fix, heights of those with a fix in three dimensions."""
     known, deep = fix >= _MIN_FIX, fix >= _FIX_3D
     return {
         "latitude_deg": np.where(known, values[:, 0], np.nan),
         "longitude_deg": np.where(known, values[:, 1], np.nan),
         "height_m": np.where(deep, values[:, 2], np.nan),
-        "sigma_m": np.where(known & (dop > 0.0), RANGE_ERROR_M * dop, np.nan),
     }
 
 
