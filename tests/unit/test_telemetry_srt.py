@@ -1,6 +1,5 @@
 """Drones' subtitles: each dialect by a text of our own, the order of coordinates, damage, and any bytes."""
 
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

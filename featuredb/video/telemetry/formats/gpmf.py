@@ -4,12 +4,14 @@
 |---|---|---|
 | GPS9 (HERO11, 13, MAX2) | 10 Hz | latitude, longitude, height, day, second and fix of every sample |
 | GPS5 (HERO5 to 11) | 18 Hz | latitude, longitude, height; GPSF and GPSU once a packet |
-| Karma's GLPI, GPRI, SYST | 4 Hz | `gpmf_karma.py` |
+| Karma's GLPI, GPRI, SYST | 4 Hz | MAVLink's messages GLOBAL_POSITION_INT, GPS_RAW_INT, SYSTEM_TIME |
 
 A camera that writes several is read by the first of them. Everything else (ACCL, GYRO, CORI, GRAV, ...) is
 skipped. GoPro's heights: without the entry GPSA they are above the ellipsoid (the parser's author, issue 4 of
 gopro/gpmf-parser: UBX-M8030, "height above the ellipsoid"), with GPSA "MSLV" above a mean sea level that
-nobody names, hence "unknown"; so are GPS9's without GPSA.
+nobody names, hence "unknown"; so are GPS9's without GPSA. Karma's positions are the autopilot's own (GLPI);
+whether there is a fix comes from the receiver (GPRI). Its attitude (ATTD) is the aircraft's and not read: the
+camera hangs in a gimbal whose angles are not written.
 """
 
 import re
@@ -23,8 +25,7 @@ from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.telemetry.assemble import About, SampleTable, assemble, check_count
-from featuredb.video.telemetry.formats.gpmf_karma import boot_to_utc, karma_samples
-from featuredb.video.telemetry.formats.gpmf_streams import Stream, first_number, scaled, streams_of
+from featuredb.video.telemetry.formats.gpmf_streams import Stream, find, first_number, scaled, streams_of
 from featuredb.video.telemetry.formats.klv import Klv
 from featuredb.video.telemetry.values import Telemetry
 
@@ -126,11 +127,17 @@ def _parse_packets(
 
 
 def _karma_clock(parsed: list[tuple[TimedPacket, list[Stream]]], warnings: list[str]) -> float:
+    """Seconds to add to Karma's boot time for UTC, NaN where no packet tells."""
+    offsets: list[float] = []
     try:
-        return boot_to_utc([streams for _, streams in parsed])
+        for _, streams in parsed:
+            clock = find(streams, "SYST", 2)  # boot time, seconds since 1970
+            if clock is not None:
+                offsets += (clock[:, 1] - clock[:, 0]).tolist()
     except TelemetryError as error:
         warnings.append(f"Karma's clock cannot be read ({error})")
         return float("nan")
+    return float(np.median(offsets)) if offsets else float("nan")
 
 
 def _decode(
@@ -233,8 +240,17 @@ def _utc(entry: Klv | None) -> float:
     return whole.timestamp() + float(f"0.{match[2] or 0}")
 
 
-def _karma(streams: list[Stream], offset_s: float) -> Decoded | None:
-    columns = karma_samples(streams, offset_s)
-    if columns is None:
+def _karma(streams: list[Stream], boot_to_utc_s: float) -> Decoded | None:
+    """Boot time, latitude, longitude, height, relative height; fix of the receiver throughout the packet."""
+    place, receiver = find(streams, "GLPI", 9), find(streams, "GPRI", 10)
+    if place is None:
         return None
-    return Decoded(columns, len(columns["latitude_deg"]))
+    fixed = receiver is None or bool((receiver[:, 8] >= _MIN_FIX).all())
+    columns = {
+        "latitude_deg": place[:, 1] if fixed else np.full(len(place), np.nan),
+        "longitude_deg": place[:, 2] if fixed else np.full(len(place), np.nan),
+        "height_m": place[:, 3],
+        "relative_height_m": place[:, 4],
+        "clock_s": place[:, 0] + boot_to_utc_s,
+    }
+    return Decoded(columns, len(place))
