@@ -14,11 +14,10 @@ from featuredb.video.frames import open_video
 from tests.support.films import HEIGHT, KINDS, WIDTH, film, read, shown, write_film
 
 
-@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_frame_comes_in_order_at_its_time(tmp_path: Path, kind: str, threads: int) -> None:
+def test_every_frame_comes_in_order_at_its_time(tmp_path: Path, kind: str) -> None:
     path = film(tmp_path, kind)
-    with open_video(path, VideoOptions(threads=threads)) as video:
+    with open_video(path) as video:
         frames = list(video)
         report = video.report
     assert [shown(frame.gray) for frame in frames] == list(range(30))
@@ -103,10 +102,8 @@ def test_tags_of_a_phone(tmp_path: Path) -> None:
     )
     with open_video(path) as video:
         info = video.info
-    assert (info.name, info.make, info.model, info.codec) == ("IMG_0001.mov", "Apple", "iPhone 12", "h264")
+    assert (info.name, info.make, info.model) == ("IMG_0001.mov", "Apple", "iPhone 12")
     assert info.creation_time == datetime(2024, 5, 6, 9, 8, 9, tzinfo=timezone(timedelta(hours=2)))
-    assert info.tags["com.apple.quicktime.model"] == "iPhone 12"
-    assert info.container.startswith("mov,mp4")
     assert info.frame_count == 12
     assert info.duration_s == pytest.approx(12 / 25)
     assert not info.live
@@ -136,7 +133,7 @@ def test_karma(shared_data: Path) -> None:
             assert frame.gray.shape == (480, 854)
         report = video.report
     assert (info.width, info.height, info.rotation_deg, info.frame_count) == (854, 480, 0, 362)
-    assert (info.make, info.codec) == ("GoPro", "h264")
+    assert info.make == "GoPro"
     assert info.creation_time == datetime(2017, 4, 17, 19, 27, 57, tzinfo=UTC)
     assert info.frame_rate_hz == pytest.approx(30_000 / 1001)
     assert count == 362
@@ -202,8 +199,7 @@ def test_memory_stays_bounded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"threads": 1.5},
-        {"threads": 0},
+        {"max_side_px": 1.5},
         {"max_side_px": 0},
         {"fps": 0.0},
         {"fps": float("nan")},
