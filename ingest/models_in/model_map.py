@@ -1,5 +1,6 @@
 """A model of another program becomes a map of a database, with its place on Earth or without one."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -18,7 +19,6 @@ from featuredb.maps.unplaced_map import AnyMap, MapKind, NoPlace
 from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.map_builder import MapIdentity, MapOptions, build_map, build_unplaced_map
-from ingest.models_in.json_values import read_json
 from ingest.models_in.place import (
     Place,
     Stated,
@@ -150,7 +150,12 @@ def read_georeference(folder: Path, place: Path) -> dict[str, Any] | None:
     path = georeference_file(folder, place)
     if path is None:
         return None
-    document = read_json(path)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise IngestError(
+            f"{path}: expected JSON, found something else ({error}); export it again"
+        ) from error
     if not isinstance(document, dict) or not isinstance(document.get("map"), dict):
         raise IngestError(f"{path}: expected a geo-reference as `featuredb export` writes it")
     images = document.get("images", [])
