@@ -28,7 +28,7 @@ from ingest.models_in.place import (
     place_of_georeference,
 )
 from ingest.models_in.source import NAMES, open_model
-from ingest.models_in.stored import DescribedAnew, ModelSource
+from ingest.models_in.stored import ModelFeatures, ModelSource
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.sfm.extract import PhotoFeatures
@@ -92,10 +92,9 @@ def map_of_model(folder: Path, options: ModelOptions) -> AnyMap:
     ours = document is not None and document["map"].get("extractor_fingerprint")
     if ours and not anew:
         fingerprint = str(ours)  # of whatever extractor that map was made by
-    with source.open_features(fingerprint) as stored:
-        features: Sequence[PhotoFeatures] = stored
-        if anew:
-            features = DescribedAnew(stored, [photo.path for photo in photos])
+    with source.open_keypoints() as keypoints:
+        files = [photo.path for photo in photos] if anew else None
+        features = ModelFeatures(source.stored, keypoints, fingerprint, files)
         identity = _identity(folder, source, photos, options, document)
         kept = MapOptions(
             min_track_length=options.min_track_length, height_datum=said or options.height_datum

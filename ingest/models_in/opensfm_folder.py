@@ -33,7 +33,7 @@ from ingest.models_in.opensfm_parts import (
     read_json,
     read_tracks,
 )
-from ingest.models_in.stored import Keypoints, ModelSource, StoredFeatures, StoredModel
+from ingest.models_in.stored import Keypoints, ModelSource, StoredModel
 
 TRACKS, REFERENCE, CONFIG = "tracks.csv", "reference_lla.json", "config.yaml"
 # OpenDroneMap writes projected coordinates over reconstruction.json, and keeps what it was as the first.
@@ -43,25 +43,6 @@ _OUTLIER = 0.0025
 _MOST_OUTLIERS, _MOST_UNSEEN = 0.5, 0.1  # more, and the files do not belong together
 _OF_VLFEAT = ("HAHOG", "DSPSIFT")  # the first is OpenSfM's default, the second OpenDroneMap's
 _SAME_DEG, _SAME_M = 1e-9, 1e-3
-
-
-class OpensfmFeatures(StoredFeatures):
-    """Keypoints of the tracks; without orientations and descriptors, which OpenSfM keeps in its own way."""
-
-    def __init__(
-        self, stored: StoredModel, diameters: Sequence[NDArray[np.float32]], fingerprint: str
-    ) -> None:
-        """
-        Args:
-            diameters: for each image, (k,) of its keypoints in pixels.
-        """
-        super().__init__(stored, fingerprint)
-        self._diameters = diameters
-
-    def keypoints(self, index: int, *, with_descriptors: bool = True) -> Keypoints:
-        """See the base class."""
-        xy = self.stored.xy[index].astype(np.float32)
-        return Keypoints(xy=xy, scale=self._diameters[index], angle=None, descriptors=None)
 
 
 def opensfm_folder(folder: Path) -> Path | None:
@@ -111,11 +92,17 @@ def read_opensfm(place: Path, chosen: int | None = None) -> ModelSource:
     size = _sizes(parts)[tracks.image] * _diameter_over_size(place / CONFIG)
     reference = _reference(found, place, path)
     diameters = [(tracks.scale * size)[r].astype(np.float32) for r in rows]
+
+    def keypoints(index: int, with_descriptors: bool) -> Keypoints:
+        """Without orientations and descriptors, which OpenSfM keeps in its own way."""
+        xy = stored.xy[index].astype(np.float32)
+        return Keypoints(xy=xy, scale=diameters[index], angle=None, descriptors=None)
+
     return ModelSource(
         format="opensfm",
         place=place,
         stored=stored,
-        open_features=lambda fingerprint: nullcontext(OpensfmFeatures(stored, diameters, fingerprint)),
+        open_keypoints=lambda: nullcontext(keypoints),
         has_descriptors=False,
         reference=reference,
         gps=tuple(_gps(shots[i][1], reference, f"{path}: shot {shots[i][0]!r}") for i in images),
