@@ -6,7 +6,6 @@ whose time does not advance are left out. A file without any position is refused
 
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,46 +65,48 @@ class SampleTable:
         return np.array(self._columns[name], dtype=np.float64)
 
 
-@dataclass(slots=True, kw_only=True)
-class About:
-    """What a reader knows about its samples beside their values; see `Telemetry`."""
+def assemble(
+    table: SampleTable,
+    *,
+    source: str,
+    origin: str,
+    warnings: list[str],
+    height_datum: HeightDatum = "unknown",
+    clock: Clock = "none",
+    in_video_time: bool = True,
+    from_first: bool = False,
+    sort: bool = False,
+) -> Telemetry:
+    """The telemetry of raw samples; for what is not said here see `Telemetry`.
 
-    source: str
-    origin: str
-    height_datum: HeightDatum = "unknown"
-    clock: Clock = "none"
-    in_video_time: bool = True
-    from_first: bool = False  # times are made to count from the first sample
-    sort: bool = False  # by time, for formats that do not promise an order
-    warnings: list[str] = field(default_factory=list)
-
-
-def assemble(table: SampleTable, about: About) -> Telemetry:
-    """The telemetry of raw samples.
+    Args:
+        warnings: what the reader has found; receives what is found here.
+        clock: of the samples that have a reading of it.
+        from_first: times are made to count from the first sample.
+        sort: by time, for formats that do not promise an order.
 
     Raises:
         TelemetryError: no samples, too many, or none with a position.
     """
     if not len(table):
-        raise TelemetryError(f"{about.origin}: no samples of telemetry in it")
-    check_count(len(table), about.origin)
-    warnings = about.warnings
+        raise TelemetryError(f"{origin}: no samples of telemetry in it")
+    check_count(len(table), origin)
     with np.errstate(over="ignore", invalid="ignore"):
         times = table.column("times_s")
-        if about.from_first:
-            times = _since_first(times, about.sort)
-        rows = _rows_in_time(times, about.sort, warnings)
+        if from_first:
+            times = _since_first(times, sort)
+        rows = _rows_in_time(times, sort, warnings)
         columns = {name: table.column(name)[rows] for name in _FIELDS} | {"times_s": times[rows]}
         latitude, longitude = _positions(columns["latitude_deg"], columns["longitude_deg"], warnings)
         if not np.isfinite(latitude).any():
             reasons = "; ".join(warnings[:3])
             raise TelemetryError(
-                f"{about.origin} ({about.source}): {len(rows)} samples, none with a position"
+                f"{origin} ({source}): {len(rows)} samples, none with a position"
                 + (f" ({reasons})" if reasons else "")
                 + "; give another log of the flight (GPX or CSV)"
             )
-        clock = _within(columns["clock_s"], _CLOCK_RANGE_S, "clock readings", warnings)
-        _tell_jumps(columns["times_s"], latitude, longitude, clock, warnings)
+        clock_s = _within(columns["clock_s"], _CLOCK_RANGE_S, "clock readings", warnings)
+        _tell_jumps(columns["times_s"], latitude, longitude, clock_s, warnings)
         return Telemetry(
             times_s=columns["times_s"],
             latitude_deg=latitude,
@@ -115,12 +116,12 @@ def assemble(table: SampleTable, about: About) -> Telemetry:
                 columns["relative_height_m"], _RELATIVE_HEIGHT_RANGE_M, "relative heights", warnings
             ),
             gimbal_ypr_deg=_gimbal_angles(columns, warnings),
-            clock_s=clock,
-            height_datum=about.height_datum,
-            clock=about.clock if np.isfinite(clock).any() else "none",
-            in_video_time=about.in_video_time,
-            source=about.source,
-            origin=about.origin,
+            clock_s=clock_s,
+            height_datum=height_datum,
+            clock=clock if np.isfinite(clock_s).any() else "none",
+            in_video_time=in_video_time,
+            source=source,
+            origin=origin,
             warnings=tuple(warnings[:MAX_WARNINGS]),
         )
 

@@ -15,7 +15,7 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import About, SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
 from featuredb.video.telemetry.formats.csv_time import TimeColumns, time_columns
 from featuredb.video.telemetry.formats.table_values import UNITS, column_name, number
 from featuredb.video.telemetry.formats.text import decode_text
@@ -161,7 +161,8 @@ def _telemetry(
         datum, values["height_m"] = "ellipsoidal", values["ellipsoidal_height"]
     table = SampleTable()
     table.extend(values, len(times.times_s))
-    about = About(
+    return assemble(
+        table,
         source="CSV",
         origin=origin,
         clock=times.clock,
@@ -171,7 +172,6 @@ def _telemetry(
         sort=True,
         warnings=warnings,
     )
-    return assemble(table, about)
 
 
 def _numbers(texts: list[str], quantity: str, origin: str, warnings: list[str]) -> FloatArray:

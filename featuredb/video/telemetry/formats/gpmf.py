@@ -24,7 +24,7 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import About, SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
 from featuredb.video.telemetry.formats.gpmf_streams import Stream, find, first_number, scaled, streams_of
 from featuredb.video.telemetry.formats.klv import Klv
 from featuredb.video.telemetry.values import Telemetry
@@ -98,14 +98,14 @@ def read_gpmf(packets: Sequence[TimedPacket], origin: str = "GPMF track") -> Tel
     datums = {samples.datum for _, samples in decoded}
     for _, samples in decoded:
         warnings += [line for line in samples.warnings if line not in warnings]
-    about = About(
+    return assemble(
+        table,
         source=f"GPMF {source}",
         origin=origin,
         clock="utc",
         height_datum=datums.pop() if len(datums) == 1 else "unknown",
         warnings=warnings,
     )
-    return assemble(table, about)
 
 
 def _parse_packets(

@@ -8,7 +8,7 @@ import math
 from xml.parsers import expat
 
 from featuredb.errors import TelemetryError
-from featuredb.video.telemetry.assemble import About, SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
 from featuredb.video.telemetry.formats.table_values import number
 from featuredb.video.telemetry.formats.text import parse_wall_clock
 from featuredb.video.telemetry.values import Telemetry
@@ -117,7 +117,8 @@ class _Reader:
             warnings.append(
                 f"{self._local} times name no zone; GPX's times are UTC, so they are taken for it"
             )
-        about = About(
+        return assemble(
+            self._table,
             source="GPX",
             origin=self._origin,
             clock="utc",
@@ -126,4 +127,3 @@ class _Reader:
             sort=True,
             warnings=warnings,
         )
-        return assemble(self._table, about)

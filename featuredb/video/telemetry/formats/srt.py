@@ -13,7 +13,7 @@ import numpy as np
 
 from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import METRES_PER_DEGREE, About, SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import METRES_PER_DEGREE, SampleTable, assemble, check_count
 from featuredb.video.telemetry.axis_order import ThirdValue, decide_order
 from featuredb.video.telemetry.formats.srt_blocks import Subtitle, is_cut_off, lacks_words, split_blocks
 from featuredb.video.telemetry.formats.srt_fields import BlockFields, looks_like_telemetry, parse_block
@@ -68,7 +68,8 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
     dialects = list(dict.fromkeys(fields.dialect for fields in parsed if fields.dialect))
     if len(dialects) > 1:
         warnings.append(f"{len(dialects)} dialects in one file: recordings of several drones were joined")
-    about = About(
+    return assemble(
+        table,
         source="SRT, " + " + ".join(dialects),
         origin=origin,
         clock="local",
@@ -76,7 +77,6 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
         from_first=not in_video_time,
         warnings=warnings,
     )
-    return assemble(table, about)
 
 
 def _sample_of(blocks: Sequence[Subtitle]) -> str:
