@@ -269,7 +269,6 @@ def _info(
     frame_size = fitted_size(*size, options.max_side_px)
     texts = {**container.metadata, **stream.metadata}
     camera = camera_tags({name.lower(): value for name, value in texts.items()})
-    rate = _rate(stream)
     return VideoInfo(
         name=opening.name,
         width=size[0],
@@ -277,7 +276,6 @@ def _info(
         frame_width=frame_size[0],
         frame_height=frame_size[1],
         rotation_deg=clockwise_deg,
-        frame_rate_hz=float(rate) if rate else None,
         duration_s=None if opening.live else _duration_s(container, stream),
         frame_count=stream.frames if stream.frames > 0 else None,
         creation_time=camera.creation_time,

@@ -67,7 +67,6 @@ class VideoInfo:
         width, height: pixels at full size, upright, that is after rotation.
         frame_width, frame_height: pixels of the frames that are delivered; less where max_side_px says so.
         rotation_deg: 0, 90, 180 or 270 degrees by which the stored pictures were turned clockwise.
-        frame_rate_hz: nominal frames per second, or None; only the frames' times are to be relied on.
         duration_s: stated length, or None for live sources and files that do not say.
         frame_count: number of frames that the file's index lists, or None.
         creation_time: when the recording was started by the camera's clock, or None. Said to be UTC, but
@@ -84,7 +83,6 @@ class VideoInfo:
     frame_width: int
     frame_height: int
     rotation_deg: int = 0
-    frame_rate_hz: float | None = None
     duration_s: float | None = None
     frame_count: int | None = None
     creation_time: datetime | None = None
@@ -100,7 +98,7 @@ class VideoInfo:
             raise InvalidValueError(f"expected sides of at least one pixel, found {sides}")
         if self.rotation_deg not in (0, 90, 180, 270):
             raise InvalidValueError(f"rotation_deg: expected 0, 90, 180 or 270, found {self.rotation_deg}")
-        for name in ("frame_rate_hz", "duration_s", "frame_count"):
+        for name in ("duration_s", "frame_count"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise InvalidValueError(f"{name}: expected a positive number or None, found {value}")

@@ -86,7 +86,6 @@ class FolderVideo(Video):
                 height=self._size[1],
                 frame_width=self._frame_size[0],
                 frame_height=self._frame_size[1],
-                frame_rate_hz=rate,
                 duration_s=len(timed) / rate if rate else None,
                 frame_count=len(timed),
                 make=exif.make or None,

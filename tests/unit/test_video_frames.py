@@ -28,7 +28,6 @@ def test_every_frame_comes_in_order_at_its_time(tmp_path: Path, kind: str) -> No
     )
     # A transport stream begins at any time of its clock, which is taken off but for the codec's delay.
     assert start_s == pytest.approx(0.0, abs=0.1 if kind == "ts" else 1e-9)
-    assert video.info.frame_rate_hz == pytest.approx(25.0)
     assert (video.info.width, video.info.height, video.info.rotation_deg) == (WIDTH, HEIGHT, 0)
     assert (report.delivered, report.undecodable, report.damaged, report.missing) == (30, 0, 0, 0)
     assert report.whole, report.complaints()
@@ -135,7 +134,6 @@ def test_karma(shared_data: Path) -> None:
     assert (info.width, info.height, info.rotation_deg, info.frame_count) == (854, 480, 0, 362)
     assert info.make == "GoPro"
     assert info.creation_time == datetime(2017, 4, 17, 19, 27, 57, tzinfo=UTC)
-    assert info.frame_rate_hz == pytest.approx(30_000 / 1001)
     assert count == 362
     assert times == pytest.approx([i * 1001 / 30_000 for i in range(362)], abs=1e-4)
     assert report.whole, report.complaints()
