@@ -118,7 +118,8 @@ def size_of(path: Path) -> int:
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:
-    """Write a document for people and programs: indented, no NaN."""
+    """Write a document for people and programs, in a folder that is made: indented, no NaN."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
         json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )

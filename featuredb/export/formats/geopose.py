@@ -29,14 +29,12 @@ def write_geopose(job: ExportJob) -> Exported:
 
 
 def _write_map(folder: Path, feature_map: FeatureMap) -> None:
-    (folder / BASIC).mkdir(parents=True)
     shots = list(shots_of(feature_map))
     names = _file_names(shots)
     for shot, name in zip(shots, names, strict=True):
         write_json(folder / BASIC / name, basic_ypr(shot.geopose))
     timed = [(s.unix_ms, s, name) for s, name in zip(shots, names, strict=True) if s.unix_ms is not None]
     if timed:
-        (folder / ADVANCED).mkdir()
         for unix_ms, shot, name in timed:
             write_json(folder / ADVANCED / name, advanced(shot.geopose, unix_ms))
         timed.sort(key=lambda row: (row[0], row[1].number))
