@@ -8,9 +8,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from featuredb.export.attribution import attribution_of, folder_name, write_attribution
-from featuredb.export.job import Exported, ExportJob, write_json
-from featuredb.export.map_folders import folder_for_each
+from featuredb.export.attribution import attribution_of, write_attribution
+from featuredb.export.job import Exported, ExportJob, folder_for_each, folder_name, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.geo.geopose_documents import advanced, basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
