@@ -13,6 +13,7 @@ from featuredb.export.attribution import Attribution, attribution_of, write_attr
 from featuredb.export.formats.colmap import image_names
 from featuredb.export.job import Exported, ExportJob, folder_name, whole_or_nothing, write_csv
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
+from featuredb.features.exif.gps import RADIUS_68
 from featuredb.features.exif.gps_write import with_gps
 from featuredb.features.exif.write import gps_directory
 from featuredb.features.exif.xmp_write import with_properties
@@ -21,7 +22,6 @@ from featuredb.features.jpeg_segments import with_app1
 from featuredb.file_digest import file_sha256
 
 FILES_TABLE = "files.csv"
-_RADIUS_68 = 1.5096  # of a circular normal distribution, in units of the deviation of one axis
 # What the receiver said of its own position no longer belongs to the position that is written.
 _STALE = (
     *("drone-dji:RtkFlag", "drone-dji:RtkStdLat", "drone-dji:RtkStdLon", "drone-dji:RtkStdHgt"),
@@ -110,7 +110,7 @@ def _gps(shot: PosedPhoto) -> dict[int, object]:
         (shot.geopose.latitude_deg, shot.geopose.longitude_deg, altitude),
         "ellipsoid" if datum.startswith("ellipsoidal") else "sea_level",
         heading_deg=shot.geopose.heading_pitch_roll_deg[0],
-        error_m=float(_RADIUS_68 * ((east**2 + north**2) / 2.0) ** 0.5),
+        error_m=float(RADIUS_68 * ((east**2 + north**2) / 2.0) ** 0.5),
     )
 
 

@@ -15,7 +15,7 @@ DEFAULT_SIGMA_VERTICAL_M = 10.0
 # User equivalent range error by which a dilution of precision becomes metres, single frequency.
 RANGE_ERROR_M = 3.0
 # Radius of 68 % of a circular normal distribution, in units of the deviation of one axis.
-_RADIUS_68 = math.sqrt(-2.0 * math.log(1.0 - 0.68))
+RADIUS_68 = math.sqrt(-2.0 * math.log(1.0 - 0.68))
 _SIGMA_RANGE_M = (0.005, 1000.0)
 _SAME_DEG = 2e-5  # 2 m: EXIF's whole tenths of seconds
 _DJI_RTK_FLOAT_OR_FIXED = (34.0, 50.0)
@@ -95,7 +95,7 @@ def gps_sigmas(gps: Ifd, xmp: dict[str, float], warnings: list[str]) -> tuple[fl
         if max(stated, vertical) <= high:
             return max(stated, low), max(vertical, low)
         warnings.append(f"XMP: an accuracy of {stated}, {vertical} is absurd")
-    for tag, factor, source in ((31, 1 / _RADIUS_68, "positioning_error"), (11, RANGE_ERROR_M, "dop")):
+    for tag, factor, source in ((31, 1 / RADIUS_68, "positioning_error"), (11, RANGE_ERROR_M, "dop")):
         value = gps.number(tag)
         if value is None or value == 0:
             continue

@@ -30,7 +30,7 @@ _NULL_ISLAND_DEG = 1e-6
 # As for photos: from below the Dead Sea's shore to above airliners; above take-off the same span downwards.
 _HEIGHT_RANGE_M = (-500.0, 20_000.0)
 _RELATIVE_HEIGHT_RANGE_M = (-9_000.0, 20_000.0)
-_CLOCK_RANGE_S = (315_532_800.0, 4_102_444_800.0)  # 1980, when GPS time begins, to 2100
+CLOCK_RANGE_S = (315_532_800.0, 4_102_444_800.0)  # 1980, when GPS time begins, to 2100
 # A clock that advances by so much more or less than the video between two samples: a cut, or it was set anew.
 _CLOCK_JUMP_S = 2.0
 # No drone and no car: 50 m and 150 m/s between one reading of the receiver and the next.
@@ -105,7 +105,7 @@ def assemble(
                 + (f" ({reasons})" if reasons else "")
                 + "; give another log of the flight (GPX or CSV)"
             )
-        clock_s = _within(columns["clock_s"], _CLOCK_RANGE_S, "clock readings", warnings)
+        clock_s = _within(columns["clock_s"], CLOCK_RANGE_S, "clock readings", warnings)
         _tell_jumps(columns["times_s"], latitude, longitude, clock_s, warnings)
         return Telemetry(
             times_s=columns["times_s"],
