@@ -19,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.features.exif.gps_write import GpsFields, with_gps
+from featuredb.features.exif.gps_write import with_gps
+from featuredb.features.exif.write import gps_directory
 from featuredb.features.image_header import read_header
 from featuredb.features.jpeg_segments import with_app1
 from featuredb.geometry.arrays import FloatArray
@@ -100,15 +101,8 @@ def tagged(data: bytes, truth: Truth, place: FloatArray, error_m: float, words: 
     header = read_header(data)
     assert header.exif is not None
     latitude, longitude, height = (float(v) for v in truth.frame.geodetic_from_enu(place))
-    fields = GpsFields(
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        altitude_m=height,
-        reference="ellipsoid",
-        heading_deg=0.0,
-        error_m=error_m,
-    )
-    return with_app1(data, with_gps(data[slice(*header.exif)], fields), _XMP.format(words=words).encode())
+    gps = gps_directory((latitude, longitude, height), "ellipsoid", heading_deg=0.0, error_m=error_m)
+    return with_app1(data, with_gps(data[slice(*header.exif)], gps), _XMP.format(words=words).encode())
 
 
 def ingested(database: Path, source: Path, truth: Truth, way: str) -> dict[str, float]:

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
-from urllib.parse import quote
 
 from featuredb.export.job import write_csv
 from featuredb.export.selection import licence_of
@@ -43,9 +42,3 @@ def attribution_of(feature_map: AnyMap) -> list[Attribution]:
 def write_attribution(folder: Path, rows: Iterable[Attribution]) -> None:
     """The table of the photos in a folder."""
     write_csv(folder / ATTRIBUTION, Attribution._fields, rows)
-
-
-def folder_name(map_id: str) -> str:
-    """A map's id as the name of a folder or file: what file systems may not like is percent-encoded."""
-    name = quote(map_id, safe=" +@,=")
-    return name.replace(".", "%2E", 1) if name.startswith(".") else name

@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
+from urllib.parse import quote
 
 from featuredb.errors import ExportError
 from featuredb.export.selection import Selection, exported, selected_any, selected_maps
@@ -18,6 +19,7 @@ from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store.database import Database
 from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary
 
+_Kind = TypeVar("_Kind", FeatureMap, AnyMap)
 Told = Callable[[int, int], None]
 """Called with the number of maps written and their total."""
 
@@ -110,6 +112,26 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def folder_name(map_id: str) -> str:
+    """A map's id as the name of a folder or file: what file systems may not like is percent-encoded."""
+    name = quote(map_id, safe=" +@,=")
+    return name.replace(".", "%2E", 1) if name.startswith(".") else name
+
+
+def folder_for_each(job: ExportJob, maps: Iterable[_Kind], write: Callable[[Path, _Kind], None]) -> Exported:
+    """Make `job.out` with a folder for every map, which `write` makes and fills.
+
+    Raises:
+        ExportError: there is something at `job.out`; and what `write` raises.
+    """
+    with whole_or_nothing(job.out) as part:
+        part.mkdir()
+        for feature_map in maps:
+            write(part / folder_name(feature_map.map_id), feature_map)
+            del feature_map  # or it would stay while the next one is loaded
+        return job.exported(part)
+
+
 def size_of(path: Path) -> int:
     """Bytes of a file, or of all files below a folder."""
     if path.is_file():
@@ -118,7 +140,8 @@ def size_of(path: Path) -> int:
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:
-    """Write a document for people and programs: indented, no NaN."""
+    """Write a document for people and programs, in a folder that is made: indented, no NaN."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
         json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )

@@ -2,8 +2,8 @@
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from fractions import Fraction
-from types import MappingProxyType
 from typing import Any, cast
 
 import av
@@ -14,7 +14,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from featuredb.errors import VideoError
-from featuredb.video.decoding import Decoder, FilmClock, ReadingTally
+from featuredb.video.decoding import Decoder, FilmClock
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
 from featuredb.video.opening import Opening, Source, coded_pixels, open_input, opening_of
 from featuredb.video.pixels import PixelReader
@@ -52,11 +52,11 @@ def _opened(container: InputContainer, opening: Opening, options: VideoOptions) 
     stream = _largest_stream(container, opening.name)
     _check_size(opening.name, stream.width, stream.height, options)
     context = stream.codec_context
-    # Libav 8.1's H.265 decoder can wait for ever on a damaged frame that another of its threads decodes.
-    context.thread_type = "SLICE" if context.name == "hevc" else "AUTO"
-    context.thread_count = options.threads
+    # One thread leaves the other cores to the caller, who has more to do, and loses the least of a damaged
+    # film: each further one may lose another frame, and delays a live source by a frame.
+    context.thread_count = 1
     context.options = {"max_pixels": str(coded_pixels(options))}
-    tally = ReadingTally()
+    tally = VideoReport()
     decoder = Decoder(container, stream, _clock(container, stream), tally, opening.name)
     pictures = decoder.pictures()
     first = next(pictures, None)
@@ -92,7 +92,7 @@ class ContainerVideo(Video):
         container: InputContainer,
         decoder: Decoder,
         begun: tuple[tuple[float, av.VideoFrame], Iterator[tuple[float, av.VideoFrame]]],
-        tally: ReadingTally,
+        tally: VideoReport,
         expected: tuple[int | None, float | None],
         options: VideoOptions,
     ) -> None:
@@ -107,8 +107,13 @@ class ContainerVideo(Video):
 
     @property
     def report(self) -> VideoReport:
-        packets, last_s = self._expected
-        return self._tally.report(packets if self._options.start_s is None else None, last_s)
+        tally, (packets, end_s) = self._tally, self._expected
+        missing, short_by_s = 0, 0.0
+        if tally.at_end and packets is not None and self._options.start_s is None:
+            missing = max(0, packets - tally.packets)
+        if tally.at_end and end_s is not None and tally.last_s is not None:
+            short_by_s = max(0.0, end_s - tally.last_s)
+        return replace(tally, missing=missing, short_by_s=short_by_s)
 
     def close(self) -> None:
         self._decoder.stop()
@@ -160,7 +165,6 @@ class ContainerVideo(Video):
             index=index,
             time_s=time_s,
             gray=gray,
-            damaged=picture.is_corrupt,
             make_rgb=lambda: _converted(rgb, picture, name),
         )
 
@@ -264,9 +268,7 @@ def _info(
         size = size[::-1]
     frame_size = fitted_size(*size, options.max_side_px)
     texts = {**container.metadata, **stream.metadata}
-    tags = {name.lower(): value for name, value in texts.items()}
-    camera = camera_tags(tags)
-    rate = _rate(stream)
+    camera = camera_tags({name.lower(): value for name, value in texts.items()})
     return VideoInfo(
         name=opening.name,
         width=size[0],
@@ -274,16 +276,11 @@ def _info(
         frame_width=frame_size[0],
         frame_height=frame_size[1],
         rotation_deg=clockwise_deg,
-        frame_rate_hz=float(rate) if rate else None,
         duration_s=None if opening.live else _duration_s(container, stream),
         frame_count=stream.frames if stream.frames > 0 else None,
-        codec=stream.codec_context.name,
-        container=container.format.name,
         creation_time=camera.creation_time,
         make=camera.make,
         model=camera.model,
-        encoder=camera.encoder,
-        tags=MappingProxyType(tags),
         live=opening.live,
     )
 

@@ -10,7 +10,7 @@ not do by itself, and is done here:
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from fractions import Fraction
 
 import av
@@ -26,37 +26,6 @@ _MAX_UNDECODABLE_IN_A_ROW = 5_000
 _MAX_READ_ERRORS_IN_A_ROW = 20
 # One or two frames swap times in films with sloppy clocks; a clock that was set back stays behind.
 _MAX_BACKWARD_IN_A_ROW = 250
-
-
-@dataclass(slots=True)
-class ReadingTally:
-    """Counts of one reading; see `VideoReport` for what they mean."""
-
-    delivered: int = 0
-    decoded: int = 0
-    undecodable: int = 0
-    damaged: int = 0
-    out_of_order: int = 0
-    times_guessed: int = 0
-    longest_gap_s: float = 0.0
-    last_s: float | None = None
-    at_end: bool = False
-    packets: int = 0
-
-    def report(self, frame_count: int | None, end_s: float | None) -> VideoReport:
-        """The counts as a value.
-
-        Args:
-            frame_count: packets that the whole film has; None where that is not known or was not asked for.
-            end_s: when the film's last frame should end, on its clock; None likewise.
-        """
-        counts = asdict(self)
-        packets, missing, short_by_s = counts.pop("packets"), 0, 0.0
-        if self.at_end and frame_count is not None:
-            missing = max(0, frame_count - packets)
-        if self.at_end and end_s is not None and self.last_s is not None:
-            short_by_s = max(0.0, end_s - self.last_s)
-        return VideoReport(**counts, missing=missing, short_by_s=short_by_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +70,7 @@ class Decoder:
     """
 
     def __init__(
-        self, container: InputContainer, stream: VideoStream, clock: FilmClock, tally: ReadingTally, name: str
+        self, container: InputContainer, stream: VideoStream, clock: FilmClock, tally: VideoReport, name: str
     ) -> None:
         self._container, self._stream = container, stream
         self._clock, self._tally, self._name = clock, tally, name

@@ -26,9 +26,6 @@ class VideoOptions:
     Attributes:
         start_s, end_s: only frames with start_s <= time_s < end_s; None for the film's own start and end.
         max_side_px: frames are made smaller so that no side is longer; None for full size.
-        threads: of the decoder. One leaves the other cores to the caller, who has more to do, and loses the
-            least of a damaged film; each further one may lose another frame behind a damage at the very end,
-            and delays a live source by a frame.
         timeout_s: how long a URL or a device may be silent, when it is opened and between its packets.
         fps: frames per second of a folder that has no file of times.
         input_options: libav's options of the format, e.g. {"video_size": "1280x720"}.
@@ -38,7 +35,6 @@ class VideoOptions:
     start_s: float | None = None
     end_s: float | None = None
     max_side_px: int | None = None
-    threads: int = 1
     timeout_s: float = 10.0
     fps: float | None = None
     input_options: Mapping[str, str] = field(default_factory=lambda: NO_TAGS)
@@ -47,7 +43,7 @@ class VideoOptions:
     max_full_pixels: int = 16_384 * 8_192
 
     def __post_init__(self) -> None:
-        for name in ("threads", "max_side_px", "max_full_side_px", "max_full_pixels"):
+        for name in ("max_side_px", "max_full_side_px", "max_full_pixels"):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int) or value < 1):
                 raise InvalidValueError(f"{name}: expected a whole number of at least 1, found {value!r}")
@@ -71,18 +67,13 @@ class VideoInfo:
         width, height: pixels at full size, upright, that is after rotation.
         frame_width, frame_height: pixels of the frames that are delivered; less where max_side_px says so.
         rotation_deg: 0, 90, 180 or 270 degrees by which the stored pictures were turned clockwise.
-        frame_rate_hz: nominal frames per second, or None; only the frames' times are to be relied on.
         duration_s: stated length, or None for live sources and files that do not say.
         frame_count: number of frames that the file's index lists, or None.
-        codec: libav's name of the codec, e.g. "h264"; "pictures" for a folder.
-        container: libav's names of the container format, e.g. "matroska,webm"; "folder".
         creation_time: when the recording was started by the camera's clock, or None. Said to be UTC, but
             many action cameras write their local time.
         make, model: of the camera, where a tag says so.
         camera_key: by which maps know the lens (featuredb.features.exif), "" where the camera is not named.
         focal_px: by EXIF of a folder's pictures, for the full size; None: not said.
-        encoder: program or chip that made the stream, where a tag says so.
-        tags: all text tags of the container and the stream by lower-case name, the stream's first.
         live: whether the source cannot be read twice or sought in: URLs, devices, pipes.
     """
 
@@ -92,18 +83,13 @@ class VideoInfo:
     frame_width: int
     frame_height: int
     rotation_deg: int = 0
-    frame_rate_hz: float | None = None
     duration_s: float | None = None
     frame_count: int | None = None
-    codec: str
-    container: str
     creation_time: datetime | None = None
     make: str | None = None
     model: str | None = None
     camera_key: str = ""
     focal_px: float | None = None
-    encoder: str | None = None
-    tags: Mapping[str, str] = field(default_factory=lambda: NO_TAGS)
     live: bool = False
 
     def __post_init__(self) -> None:
@@ -112,7 +98,7 @@ class VideoInfo:
             raise InvalidValueError(f"expected sides of at least one pixel, found {sides}")
         if self.rotation_deg not in (0, 90, 180, 270):
             raise InvalidValueError(f"rotation_deg: expected 0, 90, 180 or 270, found {self.rotation_deg}")
-        for name in ("frame_rate_hz", "duration_s", "frame_count"):
+        for name in ("duration_s", "frame_count"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise InvalidValueError(f"{name}: expected a positive number or None, found {value}")
@@ -127,14 +113,12 @@ class VideoFrame:
             there that could be decoded.
         time_s: seconds on the film's own clock, from the frame's own time stamp.
         gray: (h, w) uint8, 0 black to 255 white, read-only.
-        damaged: whether the decoder had to make up parts of the picture.
         make_rgb: makes the colours; holds on to the decoded picture (1.5 bytes a pixel at full size).
     """
 
     index: int
     time_s: float
     gray: NDArray[np.uint8]
-    damaged: bool = False
     make_rgb: Callable[[], NDArray[np.uint8]] = field(repr=False)
 
     def __post_init__(self) -> None:
@@ -157,9 +141,9 @@ class VideoFrame:
         return self.make_rgb()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class VideoReport:
-    """What reading a film has come to so far.
+    """What reading a film has come to so far; counted up by its reader, who gives copies away.
 
     Attributes:
         delivered: frames that were handed out.
@@ -171,6 +155,7 @@ class VideoReport:
         longest_gap_s: longest time between two decoded frames; 0 before the second one.
         last_s: time of the last decoded frame, or None.
         at_end: whether the end of the file, folder or stream was reached.
+        packets: of the film that were read, whole or not.
         missing: frames that the file's index lists but that are not there; known at the end of whole films.
         short_by_s: how much earlier than the stated length the last frame ends; known at the end, where
             it is more than rounding; sound that runs on counts as length, too.
@@ -185,6 +170,7 @@ class VideoReport:
     longest_gap_s: float = 0.0
     last_s: float | None = None
     at_end: bool = False
+    packets: int = 0
     missing: int = 0
     short_by_s: float = 0.0
 

@@ -86,21 +86,18 @@ class FolderVideo(Video):
                 height=self._size[1],
                 frame_width=self._frame_size[0],
                 frame_height=self._frame_size[1],
-                frame_rate_hz=rate,
                 duration_s=len(timed) / rate if rate else None,
                 frame_count=len(timed),
                 make=exif.make or None,
                 model=exif.model or None,
                 camera_key=exif.camera_key,
                 focal_px=exif.focal_px,
-                codec="pictures",
-                container="folder",
             )
         )
 
     @property
     def report(self) -> VideoReport:
-        return self._report
+        return replace(self._report)
 
     def close(self) -> None:
         self._closed = True
@@ -116,21 +113,19 @@ class FolderVideo(Video):
                     f"{self._size[0]}x{self._size[1]}; put pictures of another size in a folder of their own"
                 )
             yield self._frame(index, time_s, name)
-        self._report = replace(self._report, at_end=self._options.end_s is None)
+        self._report.at_end = self._options.end_s is None
 
     def _frame(self, index: int, time_s: float, name: str) -> VideoFrame:
         try:
             gray = self._fitted(decode_gray(self._folder / name, self._limits))
         except ImageError as error:
             raise self._broken(name, error) from error
-        done, last_s = self._report, self._report.last_s
-        self._report = replace(
-            done,
-            delivered=done.delivered + 1,
-            decoded=done.decoded + 1,
-            longest_gap_s=max(done.longest_gap_s, time_s - last_s if last_s is not None else 0.0),
-            last_s=time_s,
-        )
+        done = self._report
+        done.delivered += 1
+        done.decoded += 1
+        if done.last_s is not None:
+            done.longest_gap_s = max(done.longest_gap_s, time_s - done.last_s)
+        done.last_s = time_s
         return VideoFrame(index=index, time_s=time_s, gray=gray, make_rgb=lambda: self._rgb(name))
 
     def _rgb(self, name: str) -> NDArray[np.uint8]:

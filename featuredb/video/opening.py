@@ -50,10 +50,10 @@ class Opening:
 
     name: str
     target: Any
-    path: Path | None
-    input_format: str | None
     input_options: dict[str, str]
     live: bool
+    path: Path | None = None
+    input_format: str | None = None
 
 
 def opening_of(source: Source, options: VideoOptions) -> Opening:
@@ -70,8 +70,6 @@ def opening_of(source: Source, options: VideoOptions) -> Opening:
     return Opening(
         name=str(getattr(source, "name", "the open file")),
         target=source,
-        path=None,
-        input_format=None,
         input_options={"format_whitelist": _FILE_FORMATS, **options.input_options},
         live=not (callable(seekable) and seekable()),
     )
@@ -92,8 +90,6 @@ def _address(url: str, options: VideoOptions) -> Opening:
     return Opening(
         name=name,
         target=url,
-        path=None,
-        input_format=None,
         input_options={**given, **options.input_options},
         live=True,
     )

@@ -16,11 +16,10 @@ _STREAM_NAMES = ("encoder", "handler_name", "comment")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraTags:
-    """Make and model of the camera, the encoder's name and the time of recording; each None if not said."""
+    """Make and model of the camera and the time of recording; each None if not said."""
 
     make: str | None
     model: str | None
-    encoder: str | None
     creation_time: datetime | None
 
 
@@ -29,7 +28,6 @@ def camera_tags(tags: Mapping[str, str]) -> CameraTags:
     return CameraTags(
         make=_first(tags, _MAKE) or _maker(tags),
         model=_first(tags, _MODEL),
-        encoder=_first(tags, ("encoder", "com.apple.quicktime.software", "software")),
         creation_time=_creation_time(tags),
     )
 

@@ -1,6 +1,5 @@
 """Writes films: H.264 in mp4, which browsers, phones and our own reader play."""
 
-import logging
 import math
 import os
 import secrets
@@ -21,15 +20,10 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError, VideoError
 from featuredb.video.film import NO_TAGS
 
-logger = logging.getLogger(__name__)
-
-_H264, _MPEG4 = "libx264", "mpeg4"
-# The ticks of films with times of their own: every usual rate is a whole number of them (29.97 Hz is 2002),
-# and MPEG-4 part 2 allows no more than 65535 a second.
+# The ticks of films with times of their own: every usual rate is a whole number of them (29.97 Hz is 2002).
 _TICKS_HZ = 60_000
 _RATE_ROUNDING_HZ = 1e-3  # 23.976 and 29.97 are rounded by less
 _MAX_CRF = 51
-_MPEG4_SCALES = (2, 31)  # its best and worst quantiser
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,9 +58,6 @@ class VideoWriter:
         width, height: of every picture, pixels; even numbers, as 4:2:0 halves the colours.
         fps: frames per second, or None where each frame comes with its own time.
 
-    Attributes:
-        codec: libav's name of the encoder: libx264, or mpeg4 where this build of libav has no libx264.
-
     Raises:
         InvalidValueError: another suffix, odd or empty sizes, a rate that is none.
     """
@@ -93,7 +84,6 @@ class VideoWriter:
             )
         self.path, self.width, self.height, self.options = path, width, height, options
         self._rate = None if fps is None else _exact_rate(fps)
-        self.codec = _encoder()
         self._temporary = path.with_name(f".{path.stem}.{os.getpid()}.{secrets.token_hex(4)}.part")
         self._to_yuv = VideoReformatter()
         self._container: OutputContainer | None = None
@@ -186,27 +176,20 @@ class VideoWriter:
 
     def _added_stream(self, container: OutputContainer) -> VideoStream:
         container.metadata.update(self.options.tags)
-        stream = container.add_stream(self.codec, rate=self._rate or 30)
-        if not isinstance(stream, VideoStream):
-            raise VideoError(f"{self.codec} is no encoder of video")
+        stream = container.add_stream("libx264", rate=self._rate or 30)
         stream.width, stream.height, stream.pix_fmt = self.width, self.height, "yuv420p"
         context = stream.codec_context
         context.time_base = self._time_base
         context.thread_count = 1  # so that the same frames give the same bytes
         context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
-        if self.codec == _H264:
-            # x264's macroblock tree reads memory that it has not set (seen with core 165, most often with
-            # small pictures): without it the same frames give the same bytes.
-            given = {"crf": str(self.options.crf), "preset": self.options.preset, "x264-params": "mbtree=0"}
-            context.options = given
-            if self._rate is None:
-                # With frames reordered, uneven times make an mp4 too short: its length is of decoding times.
-                context.options |= {"bf": "0"}
-        else:
-            best, worst = _MPEG4_SCALES
-            # Libav's fixed scale is set on each picture, which PyAV does not let us do.
-            context.qmin = context.qmax = round(best + self.options.crf / _MAX_CRF * (worst - best))
+        # x264's macroblock tree reads memory that it has not set (seen with core 165, most often with small
+        # pictures): without it the same frames give the same bytes.
+        given = {"crf": str(self.options.crf), "preset": self.options.preset, "x264-params": "mbtree=0"}
+        if self._rate is None:
+            # With frames reordered, uneven times make an mp4 too short: its length is of decoding times.
+            given["bf"] = "0"
+        context.options = given
         return stream
 
     def _finish(self) -> None:
@@ -241,18 +224,3 @@ def _exact_rate(fps: float) -> Fraction:
     if television and abs(fps - television) < _RATE_ROUNDING_HZ:
         return television
     return Fraction(fps).limit_denominator(1001)
-
-
-def _encoder() -> str:
-    """The best encoder that this build of libav has."""
-    try:
-        av.Codec(_H264, "w")
-    except av.codec.codec.UnknownCodecError:
-        logger.warning(
-            "this build of libav has no %s (some leave it out for its licence); films are written as %s, "
-            "and are larger",
-            _H264,
-            _MPEG4,
-        )
-        return _MPEG4
-    return _H264

@@ -6,54 +6,43 @@ pycolmap brings a database that it opens to its own version; so the tables are r
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import IngestError
-from ingest.models_in.stored import Keypoints, StoredFeatures, StoredModel, as_rootsift, scale_and_angle
+from ingest.models_in.stored import Keypoints, ReadKeypoints, StoredModel, as_rootsift, scale_and_angle
 
 _SAME_PLACE_PX = 0.01  # text models have as many digits as one likes, keypoints are float32
 _UNDEFINED, _SIFT = -1, 0  # of COLMAP's kinds of features
 
 
-class ColmapFeatures(StoredFeatures):
-    """Features of the model's images from the database."""
-
-    def __init__(self, database: sqlite3.Connection, stored: StoredModel, fingerprint: str) -> None:
-        super().__init__(stored, fingerprint)
-        self._database = database
-
-    def keypoints(self, index: int, *, with_descriptors: bool = True) -> Keypoints:
-        """Of one image, checked against the model; without descriptors where they are not asked for.
-
-        Raises:
-            IngestError: the database has no such image, other keypoints than the model, or other descriptors
-                than RootSIFT.
-        """
-        name, xy = self.stored.names[index], self.stored.xy[index]
-        found = self._database.execute("SELECT image_id FROM images WHERE name = ?", (name,)).fetchone()
-        if found is None:
-            raise IngestError(f"{name}: expected this image of the model in COLMAP's database, found none")
-        (image_id,) = found
-        stored = _blob(self._database, "keypoints", image_id, np.dtype("<f4"))
-        rows = np.zeros((0, 4), np.float32) if stored is None else stored.astype(np.float32)
-        if rows.shape[0] != len(xy) or (len(xy) and np.abs(rows[:, :2] - xy).max() > _SAME_PLACE_PX):
-            raise IngestError(
-                f"{name}: COLMAP's database and model disagree: {len(rows)} keypoints and {len(xy)} 2D "
-                "points, or other places; give the database that the model was made with"
-            )
-        scale, angle = scale_and_angle(rows, f"{name} in COLMAP's database")
-        descriptors = None
-        if with_descriptors:
-            descriptors = _descriptors(self._database, name, image_id, len(xy))
-        return Keypoints(xy=xy.astype(np.float32), scale=scale, angle=angle, descriptors=descriptors)
+def _keypoints(
+    database: sqlite3.Connection, stored: StoredModel, index: int, with_descriptors: bool
+) -> Keypoints:
+    """Of one image; see `ReadKeypoints`."""
+    name, xy = stored.names[index], stored.xy[index]
+    found = database.execute("SELECT image_id FROM images WHERE name = ?", (name,)).fetchone()
+    if found is None:
+        raise IngestError(f"{name}: expected this image of the model in COLMAP's database, found none")
+    (image_id,) = found
+    blob = _blob(database, "keypoints", image_id, np.dtype("<f4"))
+    rows = np.zeros((0, 4), np.float32) if blob is None else blob.astype(np.float32)
+    if rows.shape[0] != len(xy) or (len(xy) and np.abs(rows[:, :2] - xy).max() > _SAME_PLACE_PX):
+        raise IngestError(
+            f"{name}: COLMAP's database and model disagree: {len(rows)} keypoints and {len(xy)} 2D points, "
+            "or other places; give the database that the model was made with"
+        )
+    scale, angle = scale_and_angle(rows, f"{name} in COLMAP's database")
+    descriptors = _descriptors(database, name, image_id, len(xy)) if with_descriptors else None
+    return Keypoints(xy=xy.astype(np.float32), scale=scale, angle=angle, descriptors=descriptors)
 
 
 @contextmanager
-def open_features(path: Path, stored: StoredModel, fingerprint: str) -> Iterator[ColmapFeatures]:
-    """The features in COLMAP's database at `path`.
+def open_keypoints(path: Path, stored: StoredModel) -> Iterator[ReadKeypoints]:
+    """The keypoints in COLMAP's database at `path`.
 
     Raises:
         IngestError: there is none.
@@ -66,7 +55,7 @@ def open_features(path: Path, stored: StoredModel, fingerprint: str) -> Iterator
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
             database.execute("SELECT count(*) FROM keypoints")
-            yield ColmapFeatures(database, stored, fingerprint)
+            yield partial(_keypoints, database, stored)
     except sqlite3.DatabaseError as error:
         raise IngestError(f"{path}: expected COLMAP's database, found something else ({error})") from error
 

@@ -1,5 +1,6 @@
 """A model of another program becomes a map of a database, with its place on Earth or without one."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -18,7 +19,6 @@ from featuredb.maps.unplaced_map import AnyMap, MapKind, NoPlace
 from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.map_builder import MapIdentity, MapOptions, build_map, build_unplaced_map
-from ingest.models_in.json_values import read_json
 from ingest.models_in.place import (
     Place,
     Stated,
@@ -28,7 +28,7 @@ from ingest.models_in.place import (
     place_of_georeference,
 )
 from ingest.models_in.source import NAMES, open_model
-from ingest.models_in.stored import DescribedAnew, ModelSource
+from ingest.models_in.stored import ModelFeatures, ModelSource
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.sfm.extract import PhotoFeatures
@@ -92,10 +92,9 @@ def map_of_model(folder: Path, options: ModelOptions) -> AnyMap:
     ours = document is not None and document["map"].get("extractor_fingerprint")
     if ours and not anew:
         fingerprint = str(ours)  # of whatever extractor that map was made by
-    with source.open_features(fingerprint) as stored:
-        features: Sequence[PhotoFeatures] = stored
-        if anew:
-            features = DescribedAnew(stored, [photo.path for photo in photos])
+    with source.open_keypoints() as keypoints:
+        files = [photo.path for photo in photos] if anew else None
+        features = ModelFeatures(source.stored, keypoints, fingerprint, files)
         identity = _identity(folder, source, photos, options, document)
         kept = MapOptions(
             min_track_length=options.min_track_length, height_datum=said or options.height_datum
@@ -150,7 +149,12 @@ def read_georeference(folder: Path, place: Path) -> dict[str, Any] | None:
     path = georeference_file(folder, place)
     if path is None:
         return None
-    document = read_json(path)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise IngestError(
+            f"{path}: expected JSON, found something else ({error}); export it again"
+        ) from error
     if not isinstance(document, dict) or not isinstance(document.get("map"), dict):
         raise IngestError(f"{path}: expected a geo-reference as `featuredb export` writes it")
     images = document.get("images", [])

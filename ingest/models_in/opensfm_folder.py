@@ -6,14 +6,14 @@ leaves them out by their residual whenever it reads them; so does this.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from featuredb.errors import IngestError, InvalidValueError
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
@@ -24,9 +24,16 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
-from ingest.models_in.json_values import mapping, member, number, numbers, read_json
-from ingest.models_in.opensfm_parts import OpensfmTracks, camera_from_opensfm, read_tracks
-from ingest.models_in.stored import Keypoints, ModelSource, StoredFeatures, StoredModel
+from ingest.models_in.opensfm_parts import (
+    OpensfmReconstruction,
+    OpensfmReference,
+    OpensfmShot,
+    OpensfmTracks,
+    camera_from_opensfm,
+    read_json,
+    read_tracks,
+)
+from ingest.models_in.stored import Keypoints, ModelSource, StoredModel
 
 TRACKS, REFERENCE, CONFIG = "tracks.csv", "reference_lla.json", "config.yaml"
 # OpenDroneMap writes projected coordinates over reconstruction.json, and keeps what it was as the first.
@@ -35,27 +42,7 @@ _RECONSTRUCTIONS = ("reconstruction.topocentric.json", "reconstruction.json")
 _OUTLIER = 0.0025
 _MOST_OUTLIERS, _MOST_UNSEEN = 0.5, 0.1  # more, and the files do not belong together
 _OF_VLFEAT = ("HAHOG", "DSPSIFT")  # the first is OpenSfM's default, the second OpenDroneMap's
-_UNKNOWN_DOP = 15.0  # what OpenSfM writes where a photo does not say
 _SAME_DEG, _SAME_M = 1e-9, 1e-3
-
-
-class OpensfmFeatures(StoredFeatures):
-    """Keypoints of the tracks; without orientations and descriptors, which OpenSfM keeps in its own way."""
-
-    def __init__(
-        self, stored: StoredModel, diameters: Sequence[NDArray[np.float32]], fingerprint: str
-    ) -> None:
-        """
-        Args:
-            diameters: for each image, (k,) of its keypoints in pixels.
-        """
-        super().__init__(stored, fingerprint)
-        self._diameters = diameters
-
-    def keypoints(self, index: int, *, with_descriptors: bool = True) -> Keypoints:
-        """See the base class."""
-        xy = self.stored.xy[index].astype(np.float32)
-        return Keypoints(xy=xy, scale=self._diameters[index], angle=None, descriptors=None)
 
 
 def opensfm_folder(folder: Path) -> Path | None:
@@ -77,44 +64,48 @@ def read_opensfm(place: Path, chosen: int | None = None) -> ModelSource:
             a lens that maps do not have.
     """
     path = next(place / name for name in _RECONSTRUCTIONS if (place / name).is_file())
-    document = _chosen(read_json(path), chosen, path)
-    cameras = mapping(member(document, "cameras", str(path)), f"{path}: cameras")
-    shots = mapping(member(document, "shots", str(path)), f"{path}: shots")
-    points = mapping(member(document, "points", str(path)), f"{path}: points")
-    if not shots or not points:
-        raise IngestError(f"{path}: expected shots and points, found {len(shots)} and {len(points)}")
-    camera_names = list(cameras)
+    found = _chosen(read_json(path, TypeAdapter(list[OpensfmReconstruction])), chosen, path)
+    shots, points = list(found.shots.items()), list(found.points.values())
+    unknown = sorted({shot.camera for _, shot in shots} - found.cameras.keys())
+    if unknown:
+        raise IngestError(
+            f"{path}: shots: expected cameras of {list(found.cameras)[:5]}, found {unknown[:5]}"
+        )
+    camera_names = list(found.cameras)
     camera_rows, camera_of = np.unique(
-        [_camera_of(shot, name, camera_names, path) for name, shot in shots.items()], return_inverse=True
+        [camera_names.index(shot.camera) for _, shot in shots], return_inverse=True
     )
-    # Cameras that no shot has may be lenses that maps do not have.
-    used = [_camera(camera_names[row], cameras, path) for row in camera_rows]
-    poses = [_pose(shot, f"{path}: shot {name!r}") for name, shot in shots.items()]
-    xyz = np.array([_point(p, "coordinates", f"{path}: point {k!r}") for k, p in points.items()])
-    rgb = np.array([_point(p, "color", f"{path}: point {k!r}") for k, p in points.items()])
-    tracks = read_tracks(
-        place / TRACKS,
-        {name: row for row, name in enumerate(shots)},
-        {key: row for row, key in enumerate(points)},
-    )
+    used = [
+        camera_from_opensfm(found.cameras[camera_names[row]], f"{path}: camera {camera_names[row]!r}")
+        for row in camera_rows
+    ]
+    poses = [_pose(shot, f"{path}: shot {name!r}") for name, shot in shots]
+    xyz = np.array([point.coordinates for point in points])
+    rgb = np.array([point.color for point in points])
+    tracks = read_tracks(place / TRACKS, list(found.shots), list(found.points))
     parts = _Parts(
         cameras=used, camera_rows=camera_rows, camera_of=camera_of, poses=poses, xyz=xyz, tracks=tracks
     )
     xy = _pixels(parts)
     kept = _kept(parts, xy, place / TRACKS)
-    stored, rows, images = _stored(parts, xy, kept, list(shots), np.clip(np.rint(rgb), 0, 255))
+    stored, rows, images = _stored(parts, xy, kept, list(found.shots), np.clip(np.rint(rgb), 0, 255))
     size = _sizes(parts)[tracks.image] * _diameter_over_size(place / CONFIG)
-    reference = _reference(document, place, path)
-    told = list(shots.items())
+    reference = _reference(found, place, path)
     diameters = [(tracks.scale * size)[r].astype(np.float32) for r in rows]
+
+    def keypoints(index: int, with_descriptors: bool) -> Keypoints:
+        """Without orientations and descriptors, which OpenSfM keeps in its own way."""
+        xy = stored.xy[index].astype(np.float32)
+        return Keypoints(xy=xy, scale=diameters[index], angle=None, descriptors=None)
+
     return ModelSource(
         format="opensfm",
         place=place,
         stored=stored,
-        open_features=lambda fingerprint: nullcontext(OpensfmFeatures(stored, diameters, fingerprint)),
+        open_keypoints=lambda: nullcontext(keypoints),
         has_descriptors=False,
         reference=reference,
-        gps=tuple(_gps(told[i][1], reference, f"{path}: shot {told[i][0]!r}") for i in images),
+        gps=tuple(_gps(shots[i][1], reference, f"{path}: shot {shots[i][0]!r}") for i in images),
         files=tuple(p for p in (path, place / TRACKS, place / REFERENCE, place / CONFIG) if p.is_file()),
     )
 
@@ -131,49 +122,26 @@ class _Parts:
     tracks: OpensfmTracks
 
 
-def _chosen(document: Any, chosen: int | None, path: Path) -> dict[str, Any]:
-    if not isinstance(document, list) or not document:
+def _chosen(found: Sequence[OpensfmReconstruction], chosen: int | None, path: Path) -> OpensfmReconstruction:
+    if not found:
         raise IngestError(f"{path}: expected a list of reconstructions, found none; is this OpenSfM's file?")
-    if chosen is None and len(document) > 1:
-        shots = [
-            len(r["shots"]) if isinstance(r, dict) and isinstance(r.get("shots"), dict) else 0
-            for r in document
-        ]
+    if chosen is None and len(found) > 1:
         raise IngestError(
-            f"{path}: expected one reconstruction, found {len(document)} of {shots} shots; choose one by "
-            f"--reconstruction 0 to {len(document) - 1}"
+            f"{path}: expected one reconstruction, found {len(found)} of {[len(r.shots) for r in found]} "
+            f"shots; choose one by --reconstruction 0 to {len(found) - 1}"
         )
-    if chosen is not None and not 0 <= chosen < len(document):
+    if chosen is not None and not 0 <= chosen < len(found):
         raise IngestError(
-            f"--reconstruction {chosen}: expected one of the {len(document)} in {path}, counted from 0"
+            f"--reconstruction {chosen}: expected one of the {len(found)} in {path}, counted from 0"
         )
-    return mapping(document[chosen or 0], f"{path}: reconstruction {chosen or 0}")
+    return found[chosen or 0]
 
 
-def _camera_of(shot: Any, name: str, cameras: list[str], path: Path) -> int:
-    where = f"{path}: shot {name!r}"
-    camera = member(mapping(shot, where), "camera", where)
-    if camera not in cameras:
-        raise IngestError(f"{where}: expected one of the cameras {cameras[:5]}, found {camera!r}")
-    return cameras.index(camera)
-
-
-def _camera(name: str, cameras: Mapping[str, Any], path: Path) -> Camera:
-    where = f"{path}: camera {name!r}"
-    return camera_from_opensfm(mapping(cameras[name], where), where)
-
-
-def _pose(shot: Mapping[str, Any], where: str) -> Rigid3:
-    rotation = numbers(member(shot, "rotation", where), 3, f"{where}, rotation")
-    translation = numbers(member(shot, "translation", where), 3, f"{where}, translation")
+def _pose(shot: OpensfmShot, where: str) -> Rigid3:
     try:
-        return Rigid3(rotation=so3_exp(rotation), translation=np.array(translation))
+        return Rigid3(rotation=so3_exp(shot.rotation), translation=np.array(shot.translation))
     except (InvalidValueError, ValueError) as error:
-        raise IngestError(f"{where}: expected a pose, found {rotation}, {translation}: {error}") from error
-
-
-def _point(point: Any, what: str, where: str) -> list[float]:
-    return numbers(member(mapping(point, where), what, where), 3, f"{where}, {what}")
+        raise IngestError(f"{where}: expected a pose, found {shot!r:.200}: {error}") from error
 
 
 def _sizes(parts: _Parts) -> FloatArray:
@@ -272,18 +240,18 @@ def _diameter_over_size(config: Path) -> float:
     return 2.0 if found is None or found[1].upper() in _OF_VLFEAT else 1.0
 
 
-def _reference(document: Mapping[str, Any], place: Path, path: Path) -> LocalFrame | None:
+def _reference(found: OpensfmReconstruction, place: Path, path: Path) -> LocalFrame | None:
     """Of the reconstruction itself, or of the data set.
 
     Raises:
         IngestError: broken, or the two contradict each other.
     """
-    found: dict[str, LocalFrame] = {}
-    if document.get("reference_lla") is not None:
-        found[str(path)] = _frame(document["reference_lla"], f"{path}: reference_lla")
+    frames: list[LocalFrame] = []
+    if found.reference_lla is not None:
+        frames.append(_frame(found.reference_lla, f"{path}: reference_lla"))
     if (place / REFERENCE).is_file():
-        found[REFERENCE] = _frame(read_json(place / REFERENCE), str(place / REFERENCE))
-    frames = list(found.values())
+        of_set = read_json(place / REFERENCE, TypeAdapter(OpensfmReference))
+        frames.append(_frame(of_set, str(place / REFERENCE)))
     if len(frames) == 2 and not _same(*frames):
         raise IngestError(
             f"{place / REFERENCE}: expected the reference of {path}, {frames[0]}, found {frames[1]}; remove "
@@ -292,14 +260,9 @@ def _reference(document: Mapping[str, Any], place: Path, path: Path) -> LocalFra
     return frames[0] if frames else None
 
 
-def _frame(value: Any, where: str) -> LocalFrame:
-    told = mapping(value, where)
-    latitude, longitude, altitude = (
-        number(member(told, name, where), f"{where}, {name}")
-        for name in ("latitude", "longitude", "altitude")
-    )
+def _frame(told: OpensfmReference, where: str) -> LocalFrame:
     try:
-        return LocalFrame(latitude_deg=latitude, longitude_deg=longitude, height_m=altitude)
+        return LocalFrame(latitude_deg=told.latitude, longitude_deg=told.longitude, height_m=told.altitude)
     except InvalidValueError as error:
         raise IngestError(f"{where}: {error}") from error
 
@@ -312,21 +275,17 @@ def _same(one: LocalFrame, other: LocalFrame) -> bool:
     )
 
 
-def _gps(shot: Mapping[str, Any], reference: LocalFrame | None, where: str) -> GeoPrior | None:
-    """What the shot's photo said of its position: `gps_position` in the frame, `gps_dop` in metres."""
-    if reference is None or shot.get("gps_position") is None:
+def _gps(shot: OpensfmShot, reference: LocalFrame | None, where: str) -> GeoPrior | None:
+    """What the shot's photo said of its position, on Earth."""
+    if reference is None or shot.gps_position is None:
         return None
-    position = numbers(shot["gps_position"], 3, f"{where}, gps_position")
-    dop = shot.get("gps_dop", _UNKNOWN_DOP)
-    sigmas = (
-        numbers(dop, 3, f"{where}, gps_dop") if isinstance(dop, list) else [number(dop, f"{where}, gps_dop")]
-    )
-    horizontal = max(sigmas[:2])
-    vertical = (
-        sigmas[2] if len(sigmas) == 3 else horizontal * DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
-    )
+    if isinstance(shot.gps_dop, tuple):
+        horizontal, vertical = max(shot.gps_dop[:2]), shot.gps_dop[2]
+    else:
+        horizontal = shot.gps_dop
+        vertical = horizontal * DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
     try:
-        latitude, longitude, height = (float(v) for v in reference.geodetic_from_enu(position))
+        latitude, longitude, height = (float(v) for v in reference.geodetic_from_enu(shot.gps_position))
         return GeoPrior(
             latitude_deg=latitude,
             longitude_deg=longitude,

@@ -1,27 +1,149 @@
-"""Observations of OpenSfM's `tracks.csv`, and its lenses as this system's.
+"""OpenSfM's files as it writes them, checked: reconstructions and references, lenses, observations.
 
 Reference: OpenSfM, doc/source/geometry.rst. Lengths are over the longer side of the image, the principal
 point counts from its middle; `featuredb.export.formats.opensfm_camera` is the way back.
 """
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
+from pyarrow import csv
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from featuredb.errors import IngestError, InvalidValueError
+from featuredb.export.formats.opensfm_camera import LENS_TERMS
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from ingest.models_in.json_values import member, number
 
-_HEADER = "OPENSFM_TRACKS_VERSION_v"
-_COLUMNS = {"1": 9, "2": 11}  # version 2 adds segmentation and instance
-_LONGEST_LINE = 8192
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Vector = tuple[_Number, _Number, _Number]
+_Kind = TypeVar("_Kind")
+
+_UNKNOWN_DOP = 15.0  # what OpenSfM writes where a photo does not say
+
+
+class OpensfmReference(BaseModel):
+    """Origin of the topocentric frame: degrees, and metres above the ellipsoid of WGS84."""
+
+    latitude: _Number
+    longitude: _Number
+    altitude: _Number
+
+
+class OpensfmShot(BaseModel):
+    """A photo: its camera's name, the rotation vector and translation from the frame to the camera, what it
+    said of its position in the frame, and that position's deviation in metres, together or along each axis.
+    """
+
+    camera: str
+    rotation: _Vector
+    translation: _Vector
+    gps_position: _Vector | None = None
+    gps_dop: _Number | _Vector = _UNKNOWN_DOP
+
+
+class OpensfmPoint(BaseModel):
+    """A point in the frame, and its red, green, blue from 0 to 255."""
+
+    coordinates: _Vector
+    color: _Vector
+
+
+class OpensfmReconstruction(BaseModel):
+    """One reconstruction; cameras as they are, since one that no shot has may be a lens that maps lack."""
+
+    cameras: dict[str, dict[str, Any]]
+    shots: dict[str, OpensfmShot] = Field(min_length=1)
+    points: dict[str, OpensfmPoint] = Field(min_length=1)
+    reference_lla: OpensfmReference | None = None
+
+
+def read_json(path: Path, kind: TypeAdapter[_Kind]) -> _Kind:
+    """A file's document.
+
+    Raises:
+        IngestError: it cannot be read, or is something else.
+    """
+    try:
+        return kind.validate_json(path.read_bytes())
+    except OSError as error:
+        raise IngestError(f"{path}: expected OpenSfM's JSON, cannot be read: {error}") from error
+    except ValidationError as error:
+        raise IngestError(f"{path}: {_wrong(error)}") from error
+
+
+def _wrong(error: ValidationError) -> str:
+    """The first thing that is wrong with a document, and what to do."""
+    first = error.errors(include_url=False)[0]
+    where = "".join(f"{step}: " for step in first["loc"])
+    return f"{where}{first['msg']}, found {first['input']!r:.100}; export the model again"
+
+
+class _Lens(BaseModel):
+    """An entry of `cameras`: the names of all projection types that maps have."""
+
+    projection_type: Literal[
+        "perspective", "fisheye", "brown", "radial", "simple_radial", "fisheye_opencv"
+    ] = "perspective"
+    width: int
+    height: int
+    focal: _Number | None = None
+    focal_x: _Number | None = None
+    focal_y: _Number | None = None
+    c_x: _Number = 0.0
+    c_y: _Number = 0.0
+    k1: _Number = 0.0
+    k2: _Number = 0.0
+    k3: _Number = 0.0
+    k4: _Number = 0.0
+    p1: _Number = 0.0
+    p2: _Number = 0.0
+
+
+def camera_from_opensfm(entry: Mapping[str, Any], where: str) -> Camera:
+    """An entry of `cameras` in reconstruction.json.
+
+    Raises:
+        IngestError: values that are missing or cannot be, or a lens that maps do not have.
+    """
+    try:
+        lens = _Lens.model_validate(entry)
+    except ValidationError as error:
+        raise IngestError(f"{where}: {_wrong(error)}, or undistort its images to a simpler camera") from error
+    size, middle = max(lens.width, lens.height), (lens.width / 2.0, lens.height / 2.0)
+    one_focal = {"perspective": "RADIAL", "fisheye": "RADIAL_FISHEYE"}.get(lens.projection_type)
+    x, y = (lens.focal, lens.focal) if one_focal else (lens.focal_x, lens.focal_y)
+    if x is None or y is None:
+        raise IngestError(
+            f"{where}: expected {'focal' if one_focal else 'focal_x and focal_y'}, found {sorted(entry)}; "
+            "export the model again"
+        )
+    pinhole: tuple[float, ...] = (x * size, *middle)
+    model = one_focal or ("FULL_OPENCV" if lens.k3 else "OPENCV")
+    if not one_focal:
+        pinhole = (x * size, y * size, lens.c_x * size + middle[0], lens.c_y * size + middle[1])
+    if lens.projection_type == "fisheye_opencv":
+        model = "OPENCV_FISHEYE"
+    terms = [getattr(lens, name) for name in LENS_TERMS[model][1]]
+    none = (0.0, 0.0, 0.0) if model == "FULL_OPENCV" else ()  # its k4 to k6, which OpenSfM does not have
+    try:
+        return Camera(model=model, width=lens.width, height=lens.height, params=(*pinhole, *terms, *none))
+    except InvalidValueError as error:
+        raise IngestError(f"{where}: {error}; export the model again") from error
+
+
+_COLUMNS = ("image", "track", "feature", "x", "y", "scale", "red", "green", "blue")
+_VERSIONS = {  # by the first line of the file
+    "OPENSFM_TRACKS_VERSION_v1": _COLUMNS,
+    "OPENSFM_TRACKS_VERSION_v2": (*_COLUMNS, "segmentation", "instance"),
+}
+_READ = {"image": pa.string(), "track": pa.string(), **dict.fromkeys(("x", "y", "scale"), pa.float64())}
 _MOST = 0.5 + 1e-9  # normalised coordinates count from the middle of the image, over its longer side
 
 
@@ -40,124 +162,45 @@ class OpensfmTracks:
     scale: FloatArray
 
 
-def read_tracks(path: Path, image_row: Mapping[str, int], track_row: Mapping[str, int]) -> OpensfmTracks:
+def read_tracks(path: Path, images: Sequence[str], tracks: Sequence[str]) -> OpensfmTracks:
     """The observations of these images that see these tracks; others are no part of the reconstruction.
 
     Raises:
         IngestError: not such a file, of a version without scales, or broken: a line of other columns, a value
             that is no number, or cannot be.
     """
-    images: list[int] = []
-    tracks: list[int] = []
-    values: list[tuple[float, float, float]] = []
     try:
-        with path.open(encoding="utf-8") as file:
-            lines = iter(lambda: file.readline(_LONGEST_LINE), "")
-            columns = _columns(next(lines, ""), path)
-            for image, track, value in _rows(lines, columns, path):
-                if image in image_row and track in track_row:
-                    images.append(image_row[image])
-                    tracks.append(track_row[track])
-                    values.append(value)
-    except (OSError, UnicodeDecodeError) as error:
-        raise IngestError(f"{path}: expected OpenSfM's tracks, cannot be read: {error}") from error
-    table = np.array(values, dtype=np.float64).reshape(-1, 3)
+        with path.open("rb") as file:
+            header = file.readline(100).decode(errors="replace").strip()
+        if header not in _VERSIONS:
+            raise IngestError(
+                f"{path}: expected {' or '.join(_VERSIONS)} in the first line, found {header[:60]!r}: other "
+                "versions have no scales to describe keypoints by; create the tracks by a newer OpenSfM"
+            )
+        table = csv.read_csv(
+            path,
+            csv.ReadOptions(skip_rows=1, column_names=_VERSIONS[header], use_threads=False),
+            csv.ParseOptions(delimiter="\t", quote_char=False),
+            csv.ConvertOptions(column_types=_READ, include_columns=list(_READ)),
+        )
+    except (OSError, pa.ArrowInvalid) as error:
+        raise IngestError(
+            f"{path}: expected OpenSfM's tracks, cannot be read: {error}; if it was cut off, copy it again"
+        ) from error
+    values = np.column_stack([table[name].to_numpy() for name in ("x", "y", "scale")])
+    # Whatever is no number is NaN, and no comparison is true of it.
+    good = (np.abs(values[:, :2]) <= _MOST).all(axis=1) & (values[:, 2] > 0.0) & (values[:, 2] <= 1.0)
+    if not good.all():
+        row = int(np.argmin(good))
+        raise IngestError(
+            f"{path}, line {row + 2}: expected x and y within -0.5 and 0.5 and a scale in (0, 1], over the "
+            f"longer side of the image, found {values[row].tolist()}; export the tracks again"
+        )
+    image, track = (
+        pc.index_in(table[name], pa.array(known, pa.string())).fill_null(-1).to_numpy().astype(np.int64)
+        for name, known in (("image", images), ("track", tracks))
+    )
+    ours = (image >= 0) & (track >= 0)
     return OpensfmTracks(
-        image=np.array(images, dtype=np.int64),
-        track=np.array(tracks, dtype=np.int64),
-        xy=table[:, :2],
-        scale=table[:, 2],
+        image=image[ours], track=track[ours], xy=values[ours, :2], scale=np.ascontiguousarray(values[ours, 2])
     )
-
-
-def _columns(header: str, path: Path) -> int:
-    version = header.strip().removeprefix(_HEADER)
-    if not header.startswith(_HEADER) or version not in _COLUMNS:
-        raise IngestError(
-            f"{path}: expected {_HEADER}1 or {_HEADER}2 in the first line, found {header[:60].strip()!r}: "
-            "other versions have no scales to describe keypoints by; create the tracks by a newer OpenSfM"
-        )
-    return _COLUMNS[version]
-
-
-def _rows(
-    lines: Iterator[str], columns: int, path: Path
-) -> Iterator[tuple[str, str, tuple[float, float, float]]]:
-    """Image, track and x, y, scale of each line, checked."""
-    for row, line in zip(count(2), lines, strict=False):
-        parts = line.rstrip("\r\n").split("\t")
-        if len(parts) != columns:
-            raise IngestError(
-                f"{path}, line {row}: expected {columns} columns, found {len(parts)}: the file is cut "
-                "off or broken; copy or export it again"
-            )
-        image, track, feature = parts[:3]
-        if not (track.isdecimal() and feature.isdecimal()):
-            raise IngestError(
-                f"{path}, line {row}: expected the numbers of a track and a feature, from 0, found "
-                f"{track[:40]!r} and {feature[:40]!r}; export the tracks again"
-            )
-        try:
-            x, y, scale = (float(part) for part in parts[3:6])
-        except ValueError:
-            x = y = scale = math.nan
-        if not (abs(x) <= _MOST and abs(y) <= _MOST and 0.0 < scale <= 1.0):  # false for NaN too
-            raise IngestError(
-                f"{path}, line {row}: expected x and y within -0.5 and 0.5 and a scale in (0, 1], over "
-                f"the longer side of the image, found {', '.join(p[:40] for p in parts[3:6])}; export the "
-                "tracks again"
-            )
-        yield image, track, (x, y, scale)
-
-
-_ONE_FOCAL = ("perspective", "fisheye")
-_TWO_FOCALS = ("brown", "radial", "simple_radial", "fisheye_opencv")
-
-
-def camera_from_opensfm(entry: Mapping[str, Any], where: str) -> Camera:
-    """An entry of `cameras` in reconstruction.json.
-
-    Raises:
-        IngestError: values that are missing or cannot be, or a lens that maps do not have.
-    """
-    kind = entry.get("projection_type", "perspective")
-    if kind not in (*_ONE_FOCAL, *_TWO_FOCALS):
-        raise IngestError(
-            f"{where}: expected a lens of {', '.join((*_ONE_FOCAL, *_TWO_FOCALS))}, found {kind!r}; "
-            "undistort the images to a simpler camera first"
-        )
-    width, height = (number(member(entry, name, where), f"{where}, {name}") for name in ("width", "height"))
-    size = max(width, height)
-
-    def given(name: str) -> float:
-        return number(entry.get(name, 0.0), f"{where}, {name}")
-
-    def required(name: str) -> float:
-        return number(member(entry, name, where), f"{where}, {name}")
-
-    k = [given(f"k{i}") for i in range(1, 5)]
-    if kind in _ONE_FOCAL:
-        focal = required("focal") * size
-        model = "RADIAL" if kind == "perspective" else "RADIAL_FISHEYE"
-        return _camera(model, width, height, (focal, width / 2.0, height / 2.0, k[0], k[1]), where)
-    pinhole = (
-        required("focal_x") * size,
-        required("focal_y") * size,
-        given("c_x") * size + width / 2.0,
-        given("c_y") * size + height / 2.0,
-    )
-    if kind == "fisheye_opencv":
-        return _camera("OPENCV_FISHEYE", width, height, (*pinhole, *k), where)
-    lens = (*pinhole, k[0], k[1], given("p1"), given("p2"))
-    if k[2]:
-        return _camera("FULL_OPENCV", width, height, (*lens, k[2], 0.0, 0.0, 0.0), where)
-    return _camera("OPENCV", width, height, lens, where)
-
-
-def _camera(model: str, width: float, height: float, params: tuple[float, ...], where: str) -> Camera:
-    try:
-        if width != int(width) or height != int(height):
-            raise InvalidValueError(f"expected whole pixels, found {width}x{height}")
-        return Camera(model=model, width=int(width), height=int(height), params=params)
-    except InvalidValueError as error:
-        raise IngestError(f"{where}: {error}; export the model again") from error

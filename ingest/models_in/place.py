@@ -9,7 +9,7 @@ import numpy as np
 from featuredb.errors import FeatureDbError, IngestError
 from featuredb.export.georeference import FORMAT, GEOREFERENCE
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geo.utm import utm_epsg, zone_of
+from featuredb.geo.utm import geodetic_from_utm, utm_epsg, zone_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
@@ -212,7 +212,7 @@ def _to_local(model: Model, centers: FloatArray, stated: Stated) -> tuple[Sim3, 
         frame = _rounded(somewhere.geodetic_from_enu(from_ecef.act(middle)))
         return _rigid(frame.ecef_from_enu().inverse().matrix()), frame, 0.0
     utm = np.concatenate([centers, model.xyz]) + stated.origin
-    frame = _rounded(_at(middle + stated.origin, stated.epsg))
+    frame = _rounded(geodetic_from_utm(middle + stated.origin, stated.epsg))
     enu = frame.enu_from_utm(utm, stated.epsg)
     fitted = similarity_closed_form(utm - stated.origin, enu)
     if fitted is None:
@@ -244,10 +244,8 @@ def _rigid(matrix: FloatArray) -> Sim3:
     return Sim3(scale=1.0, rotation=matrix[:3, :3], translation=matrix[:3, 3])
 
 
-def _rounded(lat_lon_h: Any) -> LocalFrame:
+def _rounded(lat_lon_h: FloatArray) -> LocalFrame:
     """A frame whose origin does not hang on the last digit."""
-    if isinstance(lat_lon_h, LocalFrame):
-        lat_lon_h = (lat_lon_h.latitude_deg, lat_lon_h.longitude_deg, lat_lon_h.height_m)
     latitude, longitude, height = (float(v) for v in lat_lon_h)
     return LocalFrame(
         latitude_deg=round(latitude, 5), longitude_deg=round(longitude, 5), height_m=round(height)

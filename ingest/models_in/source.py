@@ -1,11 +1,12 @@
 """The formats of models that come in, and what each of them gives."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from featuredb.errors import IngestError
 from featuredb.export.formats.colmap import DATABASE
-from ingest.models_in.colmap_database import open_features
+from ingest.models_in.colmap_database import open_keypoints
 from ingest.models_in.colmap_folder import model_folder, read_colmap
 from ingest.models_in.opensfm_folder import opensfm_folder, read_opensfm
 from ingest.models_in.stored import ModelFormat, ModelSource
@@ -46,7 +47,7 @@ def _colmap(folder: Path, database: Path | None) -> ModelSource:
         stored=stored,
         files=(*sorted(place.glob("*.bin")), *sorted(place.glob("*.txt"))),
         feature_files=(path,) if path.is_file() else (),
-        open_features=lambda fingerprint: open_features(path, stored, fingerprint),
+        open_keypoints=partial(open_keypoints, path, stored),
     )
 
 

@@ -1,9 +1,8 @@
 """What every format of models gives: the model as arrays, and the keypoints and descriptors of its images."""
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +15,7 @@ from featuredb.features.describe import describe_at
 from featuredb.features.features import DESCRIPTOR_SIZE, Features
 from featuredb.features.orientation import orientations_at
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
 from ingest.sfm.extract import LazyFeatures, PhotoFeatures
@@ -65,67 +65,9 @@ class Keypoints:
     descriptors: NDArray[np.uint8] | None
 
 
-class StoredFeatures(LazyFeatures):
-    """Features of the model's images, each read when it is asked for, and not kept."""
-
-    def __init__(self, stored: StoredModel, fingerprint: str) -> None:
-        self.stored, self._fingerprint = stored, fingerprint
-
-    @abstractmethod
-    def keypoints(self, index: int, *, with_descriptors: bool = True) -> Keypoints:
-        """Of one image, checked against the model; without descriptors where they are not asked for.
-
-        Raises:
-            IngestError: the files have other keypoints than the model, or other descriptors than RootSIFT.
-        """
-
-    def read(self, index: int) -> PhotoFeatures:
-        found = self.keypoints(index)
-        if found.descriptors is None or found.angle is None:
-            raise IngestError(
-                f"{self.stored.names[index]}: the model's files have no descriptors of it; give --photos and "
-                "--descriptors photos"
-            )
-        return self.features(index, found, found.angle, found.descriptors)
-
-    def __len__(self) -> int:
-        return len(self.stored.names)
-
-    def features(
-        self,
-        index: int,
-        keypoints: Keypoints,
-        angle: NDArray[np.float32],
-        descriptors: NDArray[np.uint8],
-        shape: tuple[int, ...] | None = None,
-    ) -> PhotoFeatures:
-        """The keypoints with these orientations and descriptors.
-
-        Args:
-            shape: (height, width) of the photo, where it has been read.
-
-        Raises:
-            IngestError: the photo is of another size than the camera.
-        """
-        camera = self.stored.model.cameras[int(self.stored.model.camera_of[index])]
-        if shape is not None and shape[:2] != (camera.height, camera.width):
-            raise IngestError(
-                f"{self.stored.names[index]}: expected {camera.width}x{camera.height} pixels as the model's "
-                f"camera has, found {shape[1]}x{shape[0]}; give the photos that the model was made of"
-            )
-        return PhotoFeatures(
-            features=Features(
-                xy=keypoints.xy,
-                scale=keypoints.scale,
-                angle=angle,
-                response=np.ones(len(keypoints.xy), np.float32),
-                descriptors=descriptors,
-                width=camera.width,
-                height=camera.height,
-                fingerprint=self._fingerprint,
-            ),
-            rgb=self.stored.keypoint_colours(index),
-        )
+ReadKeypoints = Callable[[int, bool], Keypoints]
+"""Keypoints of an image by its number, checked against the model, and whether with descriptors; raises
+IngestError where the files have other keypoints than the model, or other descriptors than RootSIFT."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -135,7 +77,7 @@ class ModelSource:
     Attributes:
         place: the folder that it was found in.
         files: what it was read from. feature_files: what its features will be.
-        open_features: given the fingerprint of their extractor.
+        open_keypoints: of its images.
         has_descriptors: whether the format keeps descriptors that can be compared with ours.
         photos: where the format has its photos, None where that is anywhere.
         reference: the frame of the model's coordinates, without its accuracy; None: the files do not say.
@@ -147,7 +89,7 @@ class ModelSource:
     place: Path
     stored: StoredModel
     files: tuple[Path, ...]
-    open_features: Callable[[str], AbstractContextManager[StoredFeatures]]
+    open_keypoints: Callable[[], AbstractContextManager[ReadKeypoints]]
     feature_files: tuple[Path, ...] = ()
     has_descriptors: bool = True
     photos: Path | None = None
@@ -199,29 +141,72 @@ def as_rootsift(data: NDArray[np.generic], name: str, count: int) -> NDArray[np.
     return data.astype(np.uint8)
 
 
-class DescribedAnew(LazyFeatures):
-    """Features of the model's images with this extractor's own descriptors, and its own orientations where
-    the model's files have none; one photo in memory at a time."""
+class ModelFeatures(LazyFeatures):
+    """Features of the model's images, each read when it is asked for, and not kept.
 
-    def __init__(self, stored: StoredFeatures, photos: Sequence[Path]) -> None:
-        self._stored, self._photos = stored, tuple(photos)
+    Args:
+        fingerprint: of the extractor whose descriptors they have.
+        photos: of the images, to make descriptors anew at the keypoints, and orientations where the model's
+            files have none; None: descriptors are those of the files.
+    """
+
+    def __init__(
+        self,
+        stored: StoredModel,
+        keypoints: ReadKeypoints,
+        fingerprint: str,
+        photos: Sequence[Path] | None = None,
+    ) -> None:
+        self._stored, self._keypoints, self._fingerprint = stored, keypoints, fingerprint
+        self._photos = photos
 
     def read(self, index: int) -> PhotoFeatures:
-        keypoints = self._stored.keypoints(index, with_descriptors=False)
-        if not (keypoints.scale > 0).all():
+        stored, name = self._stored, self._stored.names[index]
+        found = self._keypoints(index, self._photos is None)
+        if self._photos is not None:
+            found = self._described(found, index, self._photos[index])
+        if found.descriptors is None or found.angle is None:
             raise IngestError(
-                f"{self._stored.stored.names[index]}: expected keypoints with scales > 0, found "
-                f"{keypoints.scale.min()}; give a model of features that have scales"
+                f"{name}: the model's files have no descriptors of it; give --photos and --descriptors photos"
+            )
+        camera = self._camera(index)
+        return PhotoFeatures(
+            features=Features(
+                xy=found.xy,
+                scale=found.scale,
+                angle=found.angle,
+                response=np.ones(len(found.xy), np.float32),
+                descriptors=found.descriptors,
+                width=camera.width,
+                height=camera.height,
+                fingerprint=self._fingerprint,
+            ),
+            rgb=stored.keypoint_colours(index),
+        )
+
+    def _described(self, found: Keypoints, index: int, photo: Path) -> Keypoints:
+        name, camera = self._stored.names[index], self._camera(index)
+        if not (found.scale > 0).all():
+            raise IngestError(
+                f"{name}: expected keypoints with scales > 0, found {found.scale.min()}; give a model of "
+                "features that have scales"
             )
         try:
-            gray = decode_gray(self._photos[index].read_bytes(), INGEST_LIMITS)
-            angle = keypoints.angle
-            if angle is None:
-                angle = orientations_at(gray, keypoints.xy, keypoints.scale)
-            descriptors = describe_at(gray, keypoints.xy, keypoints.scale, angle)
+            gray = decode_gray(photo.read_bytes(), INGEST_LIMITS)
+            angle = orientations_at(gray, found.xy, found.scale) if found.angle is None else found.angle
+            descriptors = describe_at(gray, found.xy, found.scale, angle)
         except (ImageError, OSError) as error:
-            raise IngestError(f"{self._photos[index]}: cannot be described anew: {error}") from error
-        return self._stored.features(index, keypoints, angle, descriptors, gray.shape)
+            raise IngestError(f"{photo}: cannot be described anew: {error}") from error
+        if gray.shape != (camera.height, camera.width):
+            raise IngestError(
+                f"{name}: expected {camera.width}x{camera.height} pixels as the model's camera has, found "
+                f"{gray.shape[1]}x{gray.shape[0]}; give the photos that the model was made of"
+            )
+        return replace(found, angle=angle, descriptors=descriptors)
+
+    def _camera(self, index: int) -> Camera:
+        model = self._stored.model
+        return model.cameras[int(model.camera_of[index])]
 
     def __len__(self) -> int:
-        return len(self._stored)
+        return len(self._stored.names)

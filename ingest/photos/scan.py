@@ -33,7 +33,7 @@ from ingest.photos.table import PhotoTable, TableRow, is_table, missing_reason, 
 from ingest.photos.walk import ExaminedFile, FoundFile, read_cache, walk, write_cache
 
 # Raised when the same file would be judged differently, so that old caches are not used.
-_VERSION = 2
+_VERSION = 3
 # The cache is written after so many files, or a quarter of those that it has: writing it stays linear.
 _SAVE_EVERY = 200
 

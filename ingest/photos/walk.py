@@ -101,7 +101,6 @@ def _refused(name: str, path: Path, code: str, reason: str) -> FoundFile:
 
 
 _log = logging.getLogger(__name__)
-_TIMES = ("capture_time", "gps_time")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,9 +134,8 @@ def write_cache(path: Path, key: str, examined: dict[str, ExaminedFile]) -> None
     """
     files = {name: dataclasses.asdict(e) for name, e in examined.items()}
     for record in files.values():
-        for field in _TIMES if record["exif"] else ():
-            time = record["exif"][field]
-            record["exif"][field] = time.isoformat() if time else None
+        if record["exif"] and record["exif"]["capture_time"]:
+            record["exif"]["capture_time"] = record["exif"]["capture_time"].isoformat()
     write_json(path, {"key": key, "files": files})
 
 
@@ -159,8 +157,8 @@ def _from_json(record: dict[str, Any]) -> ExaminedFile:
     exif = record.pop("exif")
     if exif is None:
         return ExaminedFile(**record)
-    for field in _TIMES:
-        exif[field] = datetime.fromisoformat(exif[field]) if exif[field] else None
+    time = exif["capture_time"]
+    exif["capture_time"] = datetime.fromisoformat(time) if time else None
     exif["warnings"] = tuple(exif["warnings"])
     exif["angles"] = CameraAngles(**exif["angles"]) if exif["angles"] else None
     return ExaminedFile(**record, exif=ExifInfo(**exif))

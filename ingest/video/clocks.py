@@ -23,7 +23,7 @@ from ingest.video.film_time import (
     reading,
     utc_text,
 )
-from ingest.video.lag import Lag
+from ingest.video.lag import Lag, not_clear
 from ingest.video.match import Match, match_movement
 from ingest.video.motion import Motion
 
@@ -87,7 +87,7 @@ def lay_on_film(motion: Motion, telemetry: Telemetry, film: FilmTime) -> Lag:
         # A person who is wrong by an hour can be told so, and need not be by a week.
         search = (max(search[0], film.told_s - _HALF_DAY_S), min(search[1], film.told_s + _HALF_DAY_S))
     elif high - low > _MAX_SEARCH_S:
-        return _refused(
+        return not_clear(
             f"{log_text(telemetry)}: too long to look for a film in; cut it to the day of the flight, or "
             f"{_OVERRIDE}"
         )
@@ -99,7 +99,7 @@ def lay_on_film(motion: Motion, telemetry: Telemetry, film: FilmTime) -> Lag:
         close = match_movement(motion, telemetry, near)
         return _near_told(match, close, telemetry, film, film.told_s)
     if match is None:
-        return _refused(
+        return not_clear(
             f"{log_text(telemetry)}; {film.name} has less than {_LEAST_S:.0f} s of movement in "
             f"common with it, too little to tell where in it the film begins: {_OVERRIDE}"
         )
@@ -111,7 +111,7 @@ def _found(match: Match, telemetry: Telemetry, film: FilmTime) -> Lag:
     found = best_beginning(match)
     start, correlation = found.lag_s, found.correlation
     if found.lead < _MARGIN or correlation < _MIN_CORRELATION:
-        return _refused(
+        return not_clear(
             f"the movements of picture and receiver do not tell where {film.name} begins in all of the log: "
             f"they correlate by {correlation:.2f} if it does {at_text(start, telemetry)}, and by "
             f"{found.rival_correlation:.2f} {at_text(found.rival_s, telemetry)}; {log_text(telemetry)}. "
@@ -126,7 +126,7 @@ def _found(match: Match, telemetry: Telemetry, film: FilmTime) -> Lag:
     assert film.created is not None
     ahead = film.created.timestamp() - (clock_offset_s(telemetry) or 0.0) - start
     if np.abs(start - expected).min() > _DRIFT_S:
-        return _refused(
+        return not_clear(
             f"{said}, but {film.name} was made at {utc_text(film.created.timestamp())} by its own clock, "
             f"{ahead:+.0f} s from there, and that is no time zone; if that clock is wrong, give --film-start "
             f"{moment_text(start, telemetry)}",
@@ -145,7 +145,7 @@ def _near_told(
         far = best_beginning(match)
         clear = far.lead >= _MARGIN and far.correlation >= _MIN_CORRELATION
         if clear and abs(far.lag_s - told) > _TOLD_S:
-            return _refused(
+            return not_clear(
                 f"--film-start says that {film.name} begins {at_text(told, telemetry)}; picture and receiver "
                 f"move alike only if it begins {at_text(far.lag_s, telemetry)} (correlation "
                 f"{far.correlation:.2f}). Give --film-start {moment_text(far.lag_s, telemetry)}, or "
@@ -209,7 +209,3 @@ def best_beginning(match: Match) -> Beginning:
         rival_correlation=float(better[rival]),
         lead=float(min(behind[rival], evidence[best])),
     )
-
-
-def _refused(reason: str, correlation: float = float("nan")) -> Lag:
-    return Lag(late_s=None, correlation=correlation, message=reason)

@@ -8,6 +8,7 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.video.telemetry.assemble import CLOCK_RANGE_S
 from featuredb.video.telemetry.formats.text import parse_wall_clock
 from featuredb.video.telemetry.values import Telemetry
 
@@ -16,7 +17,6 @@ from featuredb.video.telemetry.values import Telemetry
 _ZONES_H = (*(0.5 * k for k in range(-24, 29)), 5.75, 8.75, 12.75, 13.75)
 # Before this year a clock was not set: containers count from 1904 or 1970, chips from 1980 or 2000.
 _FIRST_YEAR = 2005
-_CLOCKS_S = (315_532_800.0, 4_102_444_800.0)  # 1980 to 2100, as in telemetry
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +57,7 @@ def film_start(text: str, telemetry: Telemetry) -> float:
     clock = parse_wall_clock(text)
     if (
         clock is None
-        or not _CLOCKS_S[0] < clock.seconds < _CLOCKS_S[1]
+        or not CLOCK_RANGE_S[0] < clock.seconds < CLOCK_RANGE_S[1]
         or not re.fullmatch(r"\s*\d{4}-\d\d-\d\d[ T][\d:.,]+\s?(Z|UTC|[+-]\d\d:?\d\d)?\s*", text)
     ):
         raise InvalidValueError(

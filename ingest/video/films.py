@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from featuredb.errors import FeatureDbError, TelemetryError, VideoError
+from featuredb.video.telemetry.read import SIDECAR_SUFFIXES
 from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest
@@ -16,7 +17,6 @@ from ingest.report.films import FilmOutcome
 from ingest.video.stills import Stills, StillsOptions, make_stills
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts")
-_BESIDE = (".srt", ".gpx", ".csv")  # telemetry, looked for by each film's name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +66,7 @@ def find_films(named: Sequence[Path]) -> FilmFiles:
         bad = Counter(f.reason for f in found if f.reason_code)
         notes += [f"{path}: {count} not looked at: {reason}" for reason, count in bad.items()]
         others = len(found) - len(films) - sum(bad.values())
-        others -= sum(f.path.suffix.lower() in _BESIDE and not f.reason_code for f in found)
+        others -= sum(f.path.suffix.lower() in SIDECAR_SUFFIXES and not f.reason_code for f in found)
         if others:
             notes.append(f"{path}: {others} files are no films by their names ({', '.join(FILM_SUFFIXES)})")
     if not paths:

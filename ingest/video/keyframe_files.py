@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
@@ -27,45 +26,36 @@ from ingest.workspace import atomic_file
 _QUALITY = 95  # of JPEG; films are compressed already, and what it adds should not be seen
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Encoding:
-    """How keyframes are written.
-
-    Attributes:
-        video: how the film is read: the same stretch as when keyframes were chosen.
-        unnamed: the camera's model where the film does not say; no two films have the same.
-    """
-
-    video: VideoOptions
-    unnamed: str
-
-
 def write_keyframes(
     film: Path,
     folder: Path,
     choice: KeyframeChoice,
     told: tuple[Sequence[Position | None], Sequence[GimbalAngles | None]],
-    encoding: Encoding,
     progress: Progress,
+    *,
+    video: VideoOptions,
+    unnamed: str,
 ) -> None:
     """Write the chosen frames as `folder`/NNNNNN.jpg, each named by its number in the film.
 
     Args:
         told: position and gimbal angles of each.
+        video: how the film is read: the same stretch as when keyframes were chosen.
+        unnamed: the camera's model where the film does not say; no two films have the same.
 
     Raises:
         VideoError: the film does not give the same frames again.
     """
     wanted = {index: k for k, index in enumerate(choice.index)}
     left = len(wanted)
-    with open_video(film, encoding.video) as video:
-        for frame in video:
+    with open_video(film, video) as opened:
+        for frame in opened:
             k = wanted.get(frame.index)
             if k is None:
                 continue
-            camera = _camera(video.info, encoding.unnamed, choice.shot[k])
+            camera = _camera(opened.info, unnamed, choice.shot[k])
             with atomic_file(folder / keyframe_name(frame.index)) as file:
-                file.write_bytes(_jpeg(frame, video.info, camera, told[0][k], told[1][k]))
+                file.write_bytes(_jpeg(frame, opened.info, camera, told[0][k], told[1][k]))
             left -= 1
             progress("keyframes", len(wanted) - left, len(wanted))
             if not left:

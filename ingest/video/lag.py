@@ -33,29 +33,29 @@ class Lag:
     message: str
 
 
+def not_clear(message: str, correlation: float = float("nan")) -> Lag:
+    """That the lag is not known, and why."""
+    return Lag(late_s=None, correlation=correlation, message=message)
+
+
 def estimate_lag(motion: Motion, telemetry: Telemetry) -> Lag:
     """The lag of the telemetry behind the picture."""
     match = match_movement(motion, telemetry, (-_MOST_S, _MOST_S))
     if match is None:
-        return Lag(late_s=None, correlation=float("nan"), message="too few samples to tell the lag")
+        return not_clear("too few samples to tell the lag")
     lags, found = match.lags_s, match.speed
     if not np.isfinite(found).any():
-        return Lag(
-            late_s=None,
-            correlation=float("nan"),
-            message=f"picture and telemetry have no {LEAST_S:g} s in common to tell the lag by",
-        )
+        return not_clear(f"picture and telemetry have no {LEAST_S:g} s in common to tell the lag by")
     best = int(np.nanargmax(found))
     aside = round(0.5 / STEP_S)
     drops = [found[best] - found[k] for k in (best - aside, best + aside) if 0 <= k < len(lags)]
     drop = float(np.nanmin(drops)) if np.isfinite(drops).any() else 0.0
     correlation = float(found[best])
     if len(drops) < 2 or correlation < _MIN_CORRELATION or drop < _MIN_DROP:
-        return Lag(
-            late_s=None,
-            correlation=correlation,
-            message=f"speeds of picture and telemetry do not tell the lag (correlation {correlation:.2f}, "
+        return not_clear(
+            f"speeds of picture and telemetry do not tell the lag (correlation {correlation:.2f}, "
             f"{drop:.3f} less half a second off)",
+            correlation,
         )
     late = round(float(lags[best]), 3)
     return Lag(

@@ -20,7 +20,7 @@ from ingest.report.films import ShotOutcome
 from ingest.video.burnt_in import BurntIn
 from ingest.video.clocks import check_overlap
 from ingest.video.film_time import FilmTime
-from ingest.video.keyframe_files import Encoding, clean_keyframes, keyframe_name, write_keyframes
+from ingest.video.keyframe_files import clean_keyframes, keyframe_name, write_keyframes
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes, shots_of
 from ingest.video.motion import FrameKind, Motion, measure_motion
 from ingest.video.positions import angles_at, digest_of_telemetry, lateness, positions_at
@@ -132,11 +132,8 @@ def make_stills(
         notes += said
     places, heights = positions_at(telemetry, choice, late_s)
     angles = angles_at(telemetry, choice, late_s)
-    encoding = Encoding(
-        video=_video_options(options, None),
-        unnamed=unnamed_model(content),
-    )
-    write_keyframes(film, folder, choice, (places, angles), encoding, progress)
+    stretch, unnamed = _video_options(options, None), unnamed_model(content)
+    write_keyframes(film, folder, choice, (places, angles), progress, video=stretch, unnamed=unnamed)
     burnt_in = clean_keyframes(folder, choice, _MOTION_SIDE_PX)
     shots = tuple(_with_findings(number, shot, burnt_in) for number, shot in enumerate(shots))
     made = Stills(

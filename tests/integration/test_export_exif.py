@@ -25,9 +25,10 @@ from featuredb.export.formats.exif import with_pose, write_exif
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.features.exif.gps_write import GpsFields, with_gps
+from featuredb.features.exif.gps_write import with_gps
 from featuredb.features.exif.read import parse_exif, read_exif
 from featuredb.features.exif.tiff_ifd import TiffReader
+from featuredb.features.exif.write import gps_directory
 from featuredb.features.exif.xmp_write import with_properties
 from featuredb.features.image_header import read_header
 from featuredb.maps.feature_map import FeatureMap
@@ -145,7 +146,6 @@ def test_copies_have_the_pose_and_the_very_picture(tmp_path: Path) -> None:
         assert (found.angles.yaw_deg or 0.0) % 360 == pytest.approx(heading, abs=1e-4)
         assert found.angles.pitch_deg == pytest.approx(pitch, abs=1e-4)
         assert found.angles.roll_deg == pytest.approx(roll, abs=1e-4)
-        assert found.sigma_source == "stated"
         assert found.sigma_vertical_m == pytest.approx(max(shot.sigma_enu_m[2], 0.005), abs=1e-3)
         per_axis = np.sqrt((shot.sigma_enu_m[:2] ** 2).mean())
         assert found.sigma_horizontal_m == pytest.approx(max(per_axis, 0.005), abs=1e-3)
@@ -218,15 +218,12 @@ def test_both_byte_orders_and_every_quadrant(order: str, has_gps: bool) -> None:
         body += struct.pack(order + "HHII", 0x8825, 4, 1, 9999)  # a pointer to nowhere
     tiff = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8) + body + b"\0" * 4
     for lat, lon, h in ((10.123456789, 20.0, 5.5), (-33.9, -151.2, -3.25)):
-        fields = GpsFields(
-            latitude_deg=lat, longitude_deg=lon, altitude_m=h, reference="ellipsoid", heading_deg=359.99999,
-            error_m=0.25,
-        )  # fmt: skip
-        out = with_gps(tiff, fields)
+        out = with_gps(tiff, gps_directory((lat, lon, h), "ellipsoid", heading_deg=359.99999, error_m=0.25))
         found = parse_exif(out, b"", 64, 48)
         assert found.make == "DJI"
-        assert found.latitude_deg == pytest.approx(lat, abs=1e-9)
-        assert found.longitude_deg == pytest.approx(lon, abs=1e-9)
+        # A hundred-thousandth of an arc second is 0.3 mm.
+        assert found.latitude_deg == pytest.approx(lat, abs=2e-9)
+        assert found.longitude_deg == pytest.approx(lon, abs=2e-9)
         assert (found.altitude_m, found.altitude_reference) == (pytest.approx(h), "ellipsoid")
         gps = TiffReader(out).read(TiffReader(out).read(TiffReader(out).first_offset).number(0x8825))
         assert gps.number(17) == 0.0
@@ -263,7 +260,7 @@ def test_a_drones_photo_keeps_its_makers_note_and_picture(shared_data: Path, sho
         before.make, before.model, before.focal_px, before.capture_time,
     )  # fmt: skip
     assert after.relative_altitude_m == before.relative_altitude_m
-    assert after.latitude_deg == pytest.approx(shot.geopose.latitude_deg, abs=1e-9)
+    assert after.latitude_deg == pytest.approx(shot.geopose.latitude_deg, abs=2e-9)
     notes = [
         Image.open(io.BytesIO(d)).getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.MakerNote.value]
         for d in (original, data)

@@ -125,8 +125,8 @@ def test_no_accuracy_is_made_up(tmp_path: Path, field_map: FeatureMap, photos: P
 
 def diameters(read: ModelSource) -> list[NDArray[np.float32]]:
     """Of each image's keypoints, pixels."""
-    with read.open_features("") as features:
-        return [features.keypoints(k).scale for k in range(len(features))]
+    with read.open_keypoints() as keypoints:
+        return [keypoints(k, False).scale for k in range(len(read.stored.names))]
 
 
 @pytest.mark.parametrize("version", [1, 2])

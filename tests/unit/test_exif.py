@@ -4,7 +4,7 @@ import io
 import math
 import random
 import struct
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import datetime, timedelta, timezone
 from typing import Any
 
 import numpy as np
@@ -67,7 +67,6 @@ def test_all_kinds_of_values_from_a_file() -> None:
     assert (found.make, found.model, found.serial, found.orientation) == ("Maker", "Model X", "S1", 6)
     assert (found.artist, found.copyright) == ("A. Person", "CC BY 4.0")
     assert found.capture_time == datetime(2024, 5, 6, 7, 8, 9, 250_000, tzinfo=timezone(timedelta(hours=2)))
-    assert found.gps_time == datetime(2024, 5, 6, 5, 8, 9, 500_000, tzinfo=UTC)
     assert found.latitude_deg == pytest.approx(46 + 50 / 60 + 33.3855 / 3600, abs=1e-9)
     assert found.longitude_deg == pytest.approx(-(91 + 59 / 60 + 40.4156 / 3600), abs=1e-9)
     assert found.altitude_m == pytest.approx(198.309, abs=1e-6)
@@ -193,7 +192,6 @@ class TestPosition:
 
     def test_sigma_by_positioning_error_is_a_68_percent_radius(self) -> None:
         found = info(None, None, gps_tags(t31=5.0))
-        assert found.sigma_source == "positioning_error"
         inside = 1 - math.exp(-0.5 * (5.0 / found.sigma_horizontal_m) ** 2)  # of a circular normal
         assert inside == pytest.approx(0.68, abs=1e-6)
 
@@ -202,7 +200,7 @@ class TestPosition:
 
     def test_absurd_errors_give_the_default(self) -> None:
         found = info(None, None, gps_tags(t31=1e8))
-        assert found.sigma_source == "default"
+        assert found.sigma_horizontal_m == DEFAULT_SIGMA_HORIZONTAL_M
         assert found.warnings
 
 
@@ -231,7 +229,7 @@ def test_dji_values_as_attributes_and_elements() -> None:
     found = info(None, None, gps_tags(), xmp=XMP)
     assert found.angles is not None
     assert (found.relative_altitude_m, found.angles.yaw_deg, found.angles.pitch_deg) == (39.8, -45.0, -89.9)
-    assert (found.sigma_horizontal_m, found.sigma_vertical_m, found.sigma_source) == (0.015, 0.03, "rtk")
+    assert (found.sigma_horizontal_m, found.sigma_vertical_m) == (0.015, 0.03)
 
 
 def angles_of(xmp: bytes, make: str = "") -> CameraAngles | None:
@@ -287,12 +285,12 @@ def test_a_compass_tells_only_yaw() -> None:
 
 def test_autel_has_djis_names_in_a_namespace_of_its_own() -> None:
     found = info(None, None, gps_tags(), xmp=XMP.replace(b"drone-dji:", b"drone:"))
-    assert (found.sigma_horizontal_m, found.sigma_vertical_m, found.sigma_source) == (0.015, 0.03, "rtk")
+    assert (found.sigma_horizontal_m, found.sigma_vertical_m) == (0.015, 0.03)
 
 
 def test_dji_single_point_solution_is_not_rtk() -> None:
     found = info(None, None, gps_tags(), xmp=XMP.replace(b'RtkFlag="50"', b'RtkFlag="16"'))
-    assert found.sigma_source == "default"
+    assert found.sigma_horizontal_m == DEFAULT_SIGMA_HORIZONTAL_M
 
 
 @pytest.mark.parametrize("longitude", ["GpsLongitude", "GpsLongtitude"])
@@ -307,10 +305,10 @@ def test_a_position_in_xmp_is_finer_than_one_of_cut_off_seconds(longitude: str) 
 def test_accuracies_as_pix4d_names_them() -> None:
     xmp = b'<x Camera:GPSXYAccuracy="0.021"><Camera:GPSZAccuracy>0.04</Camera:GPSZAccuracy></x>'
     found = info(None, None, gps_tags(), xmp=xmp)
-    assert (found.sigma_horizontal_m, found.sigma_vertical_m, found.sigma_source) == (0.021, 0.04, "stated")
-    assert info(None, None, gps_tags(), xmp=xmp.replace(b"Camera", b"camera")).sigma_source == "stated"
+    assert (found.sigma_horizontal_m, found.sigma_vertical_m) == (0.021, 0.04)
+    assert info(None, None, gps_tags(), xmp=xmp.replace(b"Camera", b"camera")).sigma_vertical_m == 0.04
     absurd = info(None, None, gps_tags(), xmp=b'<x Camera:GPSXYAccuracy="99999"/>')
-    assert absurd.sigma_source == "default"
+    assert absurd.sigma_horizontal_m == DEFAULT_SIGMA_HORIZONTAL_M
     assert any("absurd" in warning for warning in absurd.warnings)
 
 

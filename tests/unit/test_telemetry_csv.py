@@ -39,7 +39,6 @@ def test_airdata() -> None:
     # 1500 feet above the sea, not the 100 of the column altitude(feet).
     np.testing.assert_allclose(value.height_m, 457.2, rtol=0, atol=1e-9)
     assert value.height_datum == "unknown"
-    assert value.aircraft_ypr_deg[0].tolist() == [-10.0, 1.5, -2.5]
     assert value.gimbal_ypr_deg[0].tolist() == [10.0, -90.0, 0.0]
     assert value.clock == "utc"
     # The truth at the first row was NOON + 0.7 s; whole seconds and rows of 0.2 s tell it within 0.1 s.
@@ -58,7 +57,6 @@ def test_airdata() -> None:
         ("Latitude", "latitude", ""),
         ("time_ms", "time", "ms"),
         ("datetime(utc)", "datetime", "utc"),
-        ("focal_35mm", "focal_35mm", ""),
         ("m", "m", ""),
     ],
 )
@@ -121,7 +119,6 @@ def test_separators_commas_and_quotes(text: str) -> None:
         assert value.latitude_deg.tolist() == [47.5, 47.50001]
         assert value.longitude_deg.tolist() == [8.25, 8.25]
         assert value.height_m.tolist() == [430.5, 431.0]
-        assert value.resolution_m == pytest.approx(1.11, abs=0.01)
 
 
 def test_only_a_name_says_that_times_are_the_films() -> None:
@@ -141,14 +138,6 @@ def test_only_a_name_says_that_times_are_the_films() -> None:
 def test_order_of_columns_is_that_of_the_names() -> None:
     value = read_csv(b"lon,time_s,lat\n-8.5,0,47.25\n")
     assert (value.latitude_deg[0], value.longitude_deg[0]) == (47.25, -8.5)
-
-
-def test_accuracies_become_deviations_of_one_axis() -> None:
-    value = read_csv(b"time_s,lat,lon,accuracy\n0,1,2,6\n")
-    # 68 % of a circular normal distribution lie within 1.51 deviations.
-    assert value.sigma_m[0] == pytest.approx(6 / np.sqrt(-2 * np.log(0.32)), rel=1e-3)
-    assert read_csv(b"time_s,lat,lon,hdop\n0,1,2,1.5\n").sigma_m[0] == 4.5
-    assert read_csv(b"time_s,lat,lon,sigma_m,hdop\n0,1,2,0.25,9\n").sigma_m[0] == 0.25
 
 
 def test_ellipsoidal_heights_are_taken_first() -> None:

@@ -104,7 +104,6 @@ def test_gps5() -> None:
     np.testing.assert_allclose(value.longitude_deg, [8.00002, 8.00003, 8.00004, 8.00005], rtol=0, atol=1e-9)
     np.testing.assert_allclose(value.height_m, [500.0, 501.0, 502.0, 503.0], rtol=0, atol=1e-9)
     assert value.height_datum == "ellipsoidal"
-    assert value.sigma_m.tolist() == [4.5] * 4
     assert value.clock == "utc"
     start = datetime(2024, 5, 31, 11, 59, 59, 500_000, tzinfo=UTC).timestamp()
     np.testing.assert_allclose(value.clock_s, start + 1.001 * np.arange(4) / 4, rtol=0, atol=1e-6)
@@ -129,7 +128,6 @@ def test_gps5_in_two_dimensions_has_no_height_and_without_a_fix_no_place() -> No
 def test_positions_of_unknown_freshness_are_told() -> None:
     value = read_gpmf([packet(device(gps5(PLACES).replace(b"GPSF", b"GPSX").replace(b"GPSP", b"GPSY")))])
     assert value.has_position.all()
-    assert np.isnan(value.sigma_m).all()
     assert any("GPSF" in line for line in value.warnings)
 
 
@@ -150,7 +148,7 @@ def test_the_last_packet_keeps_the_usual_distance() -> None:
     np.testing.assert_allclose(np.diff(value.times_s), 0.25, rtol=0, atol=1e-12)
 
 
-def test_gps9_has_its_own_clock_fix_and_dilution() -> None:
+def test_gps9_has_its_own_clock_and_fix() -> None:
     begin = datetime(2024, 2, 29, 23, 59, 59, 900_000, tzinfo=UTC)
     rows = [
         (47.1, 8.2, 500.0, begin, 0.0, 0),
@@ -161,7 +159,6 @@ def test_gps9_has_its_own_clock_fix_and_dilution() -> None:
     assert value.source == "GPMF GPS9"
     assert value.has_position.tolist() == [False, True, True]
     np.testing.assert_allclose(value.latitude_deg[1:], [47.1, -47.2], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(value.sigma_m[1:], [6.0, 3.75], rtol=0, atol=1e-9)
     np.testing.assert_allclose(
         value.clock_s[1:], [begin.timestamp() + 0.1, begin.timestamp() + 0.2], atol=1e-6
     )
@@ -276,9 +273,6 @@ def test_karma(shared_data: Path) -> None:
     np.testing.assert_allclose(
         [value.latitude_deg[0], value.longitude_deg[0]], [33.12537, -117.33107], atol=1e-5
     )
-    # The heading of the one message is the yaw of the other.
-    turn = value.aircraft_ypr_deg[:, 0] - expected[:, 8] * 0.01
-    np.testing.assert_allclose((turn + 180.0) % 360.0 - 180.0, 0.0, atol=2.0)
     # The container was made at 19:27:57 UTC, says its own tag.
     made = datetime(2017, 4, 17, 19, 27, 57, tzinfo=UTC).timestamp()
     assert 0.0 < value.clock_s[0] - made < 1.0
@@ -286,6 +280,5 @@ def test_karma(shared_data: Path) -> None:
     assert value.times_s[0] == 0.0
     assert 11.5 < value.times_s[-1] < 12.08  # the film has 12.078 s
     np.testing.assert_allclose(np.diff(value.clock_s), 0.25, atol=0.01)
-    assert (value.sigma_m == 2.1).all()
     assert value.height_datum == "unknown"
     assert np.isnan(value.gimbal_ypr_deg).all()

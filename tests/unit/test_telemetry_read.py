@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from featuredb.errors import TelemetryError
 from featuredb.video.telemetry import read_telemetry, telemetry_of_video
-from featuredb.video.telemetry.assemble import MAX_SAMPLES, About, SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import MAX_SAMPLES, SampleTable, assemble, check_count
 from featuredb.video.telemetry.formats import text as telemetry_text
 from tests.support.telemetry_files import device, gps5, mov_text, write_mp4
 
@@ -189,9 +189,9 @@ def test_nothing_but_unknown_places_is_refused() -> None:
     table = SampleTable()
     table.add({"times_s": 0.0, "latitude_deg": 91.0, "longitude_deg": 0.0})
     with pytest.raises(TelemetryError, match=r"none with a position \(1 positions out of range"):
-        assemble(table, About(source="test", origin="a"))
+        assemble(table, source="test", origin="a", warnings=[])
     with pytest.raises(TelemetryError, match="no samples"):
-        assemble(SampleTable(), About(source="test", origin="a"))
+        assemble(SampleTable(), source="test", origin="a", warnings=[])
 
 
 def test_absurd_values_become_unknown() -> None:
@@ -199,17 +199,17 @@ def test_absurd_values_become_unknown() -> None:
     table.add(
         {
             "times_s": 0.0, "latitude_deg": 47.0, "longitude_deg": 8.0, "height_m": 1e6,
-            "relative_height_m": -1e5, "sigma_m": -1.0, "focal_35mm": 0.0, "clock_s": 0.0,
+            "relative_height_m": -1e5, "clock_s": 0.0,
             "gimbal_yaw": 350.0, "gimbal_pitch": 1e9,
         }
     )  # fmt: skip
-    value = assemble(table, About(source="test", origin="a", clock="utc"))
+    value = assemble(table, source="test", origin="a", warnings=[], clock="utc")
     assert value.gimbal_ypr_deg[0, 0] == -10.0
-    for column in (value.height_m, value.relative_height_m, value.sigma_m, value.focal_35mm, value.clock_s):
+    for column in (value.height_m, value.relative_height_m, value.clock_s):
         assert column[0] != column[0]
     assert value.gimbal_ypr_deg[0, 1] != value.gimbal_ypr_deg[0, 1]
     assert value.clock == "none"
-    assert len(value.warnings) == 6
+    assert len(value.warnings) == 4
 
 
 @settings(deadline=None, max_examples=100, derandomize=True)

@@ -27,10 +27,9 @@ def telemetry(times: list[float], **columns: object) -> Telemetry:
 
 def test_columns_left_out_are_not_known_and_arrays_are_read_only() -> None:
     value = telemetry([0.0, 1.0, 2.0])
-    assert value.height_m.shape == value.focal_35mm.shape == (3,)
+    assert value.height_m.shape == value.clock_s.shape == (3,)
     assert value.gimbal_ypr_deg.shape == (3, 3)
     assert np.isnan(value.gimbal_ypr_deg).all()
-    assert np.isnan(value.sigma_m).all()
     assert value.clock == "none"
     assert value.height_datum == "unknown"
     with pytest.raises(ValueError, match="read-only"):
@@ -46,8 +45,6 @@ def test_columns_left_out_are_not_known_and_arrays_are_read_only() -> None:
         ({"latitude_deg": np.array([47.0])}, "shape"),
         ({"height_m": np.array([np.inf, 1.0])}, "infinity"),
         ({"height_m": np.array(["a", "b"])}, "numbers"),
-        ({"sigma_m": np.array([0.0, 1.0])}, "above 0"),
-        ({"focal_35mm": np.array([24.0, -1.0])}, "above 0"),
         ({"gimbal_ypr_deg": np.zeros((2, 2))}, "shape"),
         ({"height_datum": "sea"}, "height datum"),
         ({"clock": "utc"}, "readings"),

@@ -36,8 +36,7 @@ def test_a_folder_in_natural_order_at_a_rate(tmp_path: Path) -> None:
     assert [frame.time_s for frame in frames] == [0.0, 0.25, 0.5, 0.75, 1.0, 1.25]
     np.testing.assert_array_equal(frames[4].rgb(), picture(4))
     info = video.info
-    assert (info.width, info.height, info.frame_count, info.container) == (WIDTH, HEIGHT, 6, "folder")
-    assert info.frame_rate_hz == pytest.approx(4.0)
+    assert (info.width, info.height, info.frame_count) == (WIDTH, HEIGHT, 6)
     assert video.report.delivered == 6
     assert video.report.whole
 

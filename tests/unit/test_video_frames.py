@@ -14,11 +14,10 @@ from featuredb.video.frames import open_video
 from tests.support.films import HEIGHT, KINDS, WIDTH, film, read, shown, write_film
 
 
-@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_frame_comes_in_order_at_its_time(tmp_path: Path, kind: str, threads: int) -> None:
+def test_every_frame_comes_in_order_at_its_time(tmp_path: Path, kind: str) -> None:
     path = film(tmp_path, kind)
-    with open_video(path, VideoOptions(threads=threads)) as video:
+    with open_video(path) as video:
         frames = list(video)
         report = video.report
     assert [shown(frame.gray) for frame in frames] == list(range(30))
@@ -29,7 +28,6 @@ def test_every_frame_comes_in_order_at_its_time(tmp_path: Path, kind: str, threa
     )
     # A transport stream begins at any time of its clock, which is taken off but for the codec's delay.
     assert start_s == pytest.approx(0.0, abs=0.1 if kind == "ts" else 1e-9)
-    assert video.info.frame_rate_hz == pytest.approx(25.0)
     assert (video.info.width, video.info.height, video.info.rotation_deg) == (WIDTH, HEIGHT, 0)
     assert (report.delivered, report.undecodable, report.damaged, report.missing) == (30, 0, 0, 0)
     assert report.whole, report.complaints()
@@ -103,10 +101,8 @@ def test_tags_of_a_phone(tmp_path: Path) -> None:
     )
     with open_video(path) as video:
         info = video.info
-    assert (info.name, info.make, info.model, info.codec) == ("IMG_0001.mov", "Apple", "iPhone 12", "h264")
+    assert (info.name, info.make, info.model) == ("IMG_0001.mov", "Apple", "iPhone 12")
     assert info.creation_time == datetime(2024, 5, 6, 9, 8, 9, tzinfo=timezone(timedelta(hours=2)))
-    assert info.tags["com.apple.quicktime.model"] == "iPhone 12"
-    assert info.container.startswith("mov,mp4")
     assert info.frame_count == 12
     assert info.duration_s == pytest.approx(12 / 25)
     assert not info.live
@@ -136,9 +132,8 @@ def test_karma(shared_data: Path) -> None:
             assert frame.gray.shape == (480, 854)
         report = video.report
     assert (info.width, info.height, info.rotation_deg, info.frame_count) == (854, 480, 0, 362)
-    assert (info.make, info.codec) == ("GoPro", "h264")
+    assert info.make == "GoPro"
     assert info.creation_time == datetime(2017, 4, 17, 19, 27, 57, tzinfo=UTC)
-    assert info.frame_rate_hz == pytest.approx(30_000 / 1001)
     assert count == 362
     assert times == pytest.approx([i * 1001 / 30_000 for i in range(362)], abs=1e-4)
     assert report.whole, report.complaints()
@@ -202,8 +197,7 @@ def test_memory_stays_bounded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"threads": 1.5},
-        {"threads": 0},
+        {"max_side_px": 1.5},
         {"max_side_px": 0},
         {"fps": 0.0},
         {"fps": float("nan")},

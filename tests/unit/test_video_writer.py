@@ -1,6 +1,5 @@
 """Written films: they show what was given at its times, appear whole or not at all, and come out the same."""
 
-import logging
 from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
@@ -55,9 +54,12 @@ def test_a_film_shows_what_was_written(tmp_path: Path) -> None:
     ("fps", "exact"), [(29.97, 30_000 / 1001), (23.976, 24_000 / 1001), (30.0, 30.0), (0.5, 0.5)]
 )
 def test_rates_mean_what_they_round(tmp_path: Path, fps: float, exact: float) -> None:
-    with open_video(_write(tmp_path / "film.mp4", fps=fps)) as video:
-        frames = list(video)
-    assert video.info.frame_rate_hz == pytest.approx(exact, rel=1e-9)
+    path = _write(tmp_path / "film.mp4", fps=fps)
+    with av.open(str(path)) as container:
+        rate = container.streams.video[0].average_rate
+        assert rate is not None
+        assert float(rate) == pytest.approx(exact, rel=1e-9)
+    frames = read(path)
     assert frames[-1].time_s == pytest.approx(11 / exact, rel=1e-5)
 
 
@@ -97,13 +99,13 @@ def test_colours_and_greys(tmp_path: Path) -> None:
         )
 
 
-def _check_quality(folder: Path) -> None:
+def test_quality_and_size(tmp_path: Path) -> None:
     """The better the quality that is asked for, the larger the film, and the nearer to what was written."""
     noise = np.random.default_rng(3).integers(0, 256, (HEIGHT // 2, WIDTH // 2), dtype=np.uint8)
     noise = np.ascontiguousarray(noise.repeat(2, 0).repeat(2, 1))
     sizes, errors = [], []
     for crf in (5, 20, 40):
-        path = folder / f"{crf}.mp4"
+        path = tmp_path / f"{crf}.mp4"
         with VideoWriter(
             path, width=WIDTH, height=HEIGHT, fps=25.0, options=VideoWriterOptions(crf=crf)
         ) as writer:
@@ -112,10 +114,6 @@ def _check_quality(folder: Path) -> None:
         errors.append(np.abs(read(path)[0].gray.astype(int) - noise).mean())
     assert sizes[0] > 1.3 * sizes[1] > 1.3**2 * sizes[2]
     assert errors[0] < errors[1] < errors[2]
-
-
-def test_quality_and_size(tmp_path: Path) -> None:
-    _check_quality(tmp_path)
 
 
 def test_the_same_frames_give_the_same_bytes_whatever_memory_holds(tmp_path: Path) -> None:
@@ -233,19 +231,3 @@ def test_wrong_frames_are_refused(tmp_path: Path) -> None:
     assert [frame.time_s for frame in read(path)] == [1.0]
     with pytest.raises(VideoError, match="not open"):
         writer.write(picture(0), 2.0)
-
-
-@pytest.mark.parametrize("fps", [25.0, None])
-def test_without_x264_films_are_mpeg4(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, fps: float | None
-) -> None:
-    monkeypatch.setattr("featuredb.video.writer._H264", "no_such_encoder")
-    with caplog.at_level(logging.WARNING):
-        path = _write(tmp_path / "film.mp4", fps=fps)
-    assert "no no_such_encoder" in caplog.text
-    with open_video(path) as video:
-        frames = list(video)
-    assert video.info.codec == "mpeg4"
-    assert [shown(frame.gray) for frame in frames] == list(range(12))
-    assert frames[-1].time_s == pytest.approx(11 * (0.04 if fps else 0.1), abs=1e-4)
-    _check_quality(tmp_path)

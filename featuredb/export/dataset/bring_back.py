@@ -1,13 +1,14 @@
 """A dataset back into a database: the same maps, in quarantine unless somebody vouches for the dataset."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from featuredb.errors import ExportError
 from featuredb.export.dataset.own_frame import load_own, own_rows
 from featuredb.export.dataset.read import Row, load_map, open_dataset
+from featuredb.export.job import Told
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
 from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
 from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
@@ -17,8 +18,6 @@ from featuredb.store.decode import read_rows
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import MapSummary, UnplacedSummary
 from featuredb.store.tables import MAPS
-
-Told = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -53,13 +53,6 @@ def file_name(name: str) -> str:
     )
 
 
-def write_json(path: Path, document: Any) -> None:
-    """Write JSON in the one way that makes equal documents equal bytes."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8")
-
-
 def read_description(folder: Path) -> dict[str, Any]:
     """The folder's `dataset.json`.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.contents import Contents, MapEntry
-from featuredb.export.job import ExportJob
+from featuredb.export.job import ExportJob, write_json
 from featuredb.export.selection import licence_is
 from featuredb.extras import require
 from featuredb.geo.tiles import tiles_touching
@@ -57,7 +57,7 @@ def write_scans(job: ExportJob, contents: Contents, folder: Path) -> list[dict[s
         if tiles:
             written.append(_known(scan) | {"tiles": tiles})
     if written:
-        layout.write_json(folder / SCANS, {"scans": written})
+        write_json(folder / SCANS, {"scans": written})
     return written
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.contents import Contents, MapEntry
+from featuredb.export.job import write_json
 from featuredb.geo.crs.wkt import utm_projjson
 
 STAC_VERSION = "1.0.0"
@@ -62,8 +63,8 @@ def write_catalogue(contents: Contents, description: Mapping[str, Any], folder: 
         "links": [*(_link("item", f"./{name}") for name in items), _link("root", "./collection.json")],
     }
     for name, entry in items.items():
-        layout.write_json(folder / layout.STAC / name, _item(entry, collection["id"]))
-    layout.write_json(folder / COLLECTION, collection)
+        write_json(folder / layout.STAC / name, _item(entry, collection["id"]))
+    write_json(folder / COLLECTION, collection)
 
 
 def _asset(href: str, title: str, kind: str, role: str) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from featuredb.export.dataset.partitions import PartitionFiles
 from featuredb.export.dataset.picture import write_picture
 from featuredb.export.dataset.stac import write_catalogue
 from featuredb.export.dataset.sums import write_sums
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing
+from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_json
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
@@ -63,7 +63,7 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
         if with_lidar:
             contents.scans.extend(write_scans(job, contents, folder))
         description = _description(job, contents, own)
-        layout.write_json(folder / layout.DESCRIPTION, description)
+        write_json(folder / layout.DESCRIPTION, description)
         write_picture(contents, folder / layout.PICTURE)
         write_datasheet(contents, description, folder)
         write_catalogue(contents, description, folder)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
-from featuredb.export.job import Exported, ExportJob
-from featuredb.export.map_folders import folder_for_each
+from featuredb.export.job import Exported, ExportJob, folder_for_each
 from featuredb.maps.feature_map import MapImage
 from featuredb.maps.unplaced_map import AnyMap
 

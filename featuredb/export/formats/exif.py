@@ -9,18 +9,19 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from featuredb.errors import ExportError, FeatureDbError, ImageError
-from featuredb.export.attribution import Attribution, attribution_of, folder_name, write_attribution
+from featuredb.export.attribution import Attribution, attribution_of, write_attribution
 from featuredb.export.formats.colmap import image_names
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_csv
+from featuredb.export.job import Exported, ExportJob, folder_name, whole_or_nothing, write_csv
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
-from featuredb.features.exif.gps_write import GpsFields, with_gps
+from featuredb.features.exif.gps import RADIUS_68
+from featuredb.features.exif.gps_write import with_gps
+from featuredb.features.exif.write import gps_directory
 from featuredb.features.exif.xmp_write import with_properties
 from featuredb.features.image_header import read_header
 from featuredb.features.jpeg_segments import with_app1
 from featuredb.file_digest import file_sha256
 
 FILES_TABLE = "files.csv"
-_RADIUS_68 = 1.5096  # of a circular normal distribution, in units of the deviation of one axis
 # What the receiver said of its own position no longer belongs to the position that is written.
 _STALE = (
     *("drone-dji:RtkFlag", "drone-dji:RtkStdLat", "drone-dji:RtkStdLon", "drone-dji:RtkStdHgt"),
@@ -98,20 +99,18 @@ def with_pose(data: bytes, shot: PosedPhoto) -> bytes:
         raise ImageError(f"a {header.format} file; only JPEG is written", "unsupported")
     tiff = data[slice(*header.exif)] if header.exif else b""
     xmp = data[slice(*header.xmp)] if header.xmp else b""
-    return with_app1(data, with_gps(tiff, gps_fields(shot)), with_properties(xmp, properties(shot), _STALE))
+    return with_app1(data, with_gps(tiff, _gps(shot)), with_properties(xmp, properties(shot), _STALE))
 
 
-def gps_fields(shot: PosedPhoto) -> GpsFields:
+def _gps(shot: PosedPhoto) -> dict[int, object]:
     """The position; heights above sea level where they are, or can be converted to, such."""
     altitude, datum = altitude_of(shot)
     east, north, _ = shot.sigma_enu_m
-    return GpsFields(
-        latitude_deg=shot.geopose.latitude_deg,
-        longitude_deg=shot.geopose.longitude_deg,
-        altitude_m=altitude,
-        reference="ellipsoid" if datum.startswith("ellipsoidal") else "sea_level",
+    return gps_directory(
+        (shot.geopose.latitude_deg, shot.geopose.longitude_deg, altitude),
+        "ellipsoid" if datum.startswith("ellipsoidal") else "sea_level",
         heading_deg=shot.geopose.heading_pitch_roll_deg[0],
-        error_m=float(_RADIUS_68 * ((east**2 + north**2) / 2.0) ** 0.5),
+        error_m=float(RADIUS_68 * ((east**2 + north**2) / 2.0) ** 0.5),
     )
 
 

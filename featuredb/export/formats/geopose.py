@@ -8,9 +8,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from featuredb.export.attribution import attribution_of, folder_name, write_attribution
-from featuredb.export.job import Exported, ExportJob, write_json
-from featuredb.export.map_folders import folder_for_each
+from featuredb.export.attribution import attribution_of, write_attribution
+from featuredb.export.job import Exported, ExportJob, folder_for_each, folder_name, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.geo.geopose_documents import advanced, basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
@@ -29,14 +28,12 @@ def write_geopose(job: ExportJob) -> Exported:
 
 
 def _write_map(folder: Path, feature_map: FeatureMap) -> None:
-    (folder / BASIC).mkdir(parents=True)
     shots = list(shots_of(feature_map))
     names = _file_names(shots)
     for shot, name in zip(shots, names, strict=True):
         write_json(folder / BASIC / name, basic_ypr(shot.geopose))
     timed = [(s.unix_ms, s, name) for s, name in zip(shots, names, strict=True) if s.unix_ms is not None]
     if timed:
-        (folder / ADVANCED).mkdir()
         for unix_ms, shot, name in timed:
             write_json(folder / ADVANCED / name, advanced(shot.geopose, unix_ms))
         timed.sort(key=lambda row: (row[0], row[1].number))

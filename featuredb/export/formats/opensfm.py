@@ -15,8 +15,7 @@ from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.formats.colmap import image_names
 from featuredb.export.formats.opensfm_camera import opensfm_camera
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
-from featuredb.export.job import Exported, ExportJob, write_json
-from featuredb.export.map_folders import folder_for_each
+from featuredb.export.job import Exported, ExportJob, folder_for_each, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.geometry.rotation import so3_log
 from featuredb.maps.feature_map import FeatureMap, MapImage

@@ -10,6 +10,20 @@ from featuredb.errors import ExportError
 from featuredb.geometry.camera import Camera
 
 _CENTRED = 1e-12  # of the longer side
+# COLMAP's model: OpenSfM's, and its names of the terms behind the pinhole's, in COLMAP's order. They are of
+# the same powers of the tangent, or of a fisheye's angle.
+LENS_TERMS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": ("brown", ()),
+    "PINHOLE": ("brown", ()),
+    "SIMPLE_RADIAL": ("brown", ("k1",)),
+    "RADIAL": ("brown", ("k1", "k2")),
+    "OPENCV": ("brown", ("k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": ("brown", ("k1", "k2", "p1", "p2", "k3")),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye_opencv", ("k1",)),
+    "RADIAL_FISHEYE": ("fisheye_opencv", ("k1", "k2")),
+    "OPENCV_FISHEYE": ("fisheye_opencv", ("k1", "k2", "k3", "k4")),
+}
+_ALL_TERMS = {"brown": ("k1", "k2", "k3", "p1", "p2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
 
 
 def opensfm_camera(camera: Camera) -> dict[str, Any]:
@@ -22,13 +36,19 @@ def opensfm_camera(camera: Camera) -> dict[str, Any]:
     """
     size = max(camera.width, camera.height)
     pinhole = camera.to_pycolmap()
+    kind, names = LENS_TERMS.get(camera.model, ("", ()))
+    given = [camera.params[i] for i in pinhole.extra_params_idxs()]
+    if not kind or any(given[len(names) :]):
+        raise ExportError(
+            f"OpenSfM has no camera for {camera.model} with the terms {given}; export as colmap instead"
+        )
+    terms = dict.fromkeys(_ALL_TERMS[kind], 0.0) | dict(zip(names, given, strict=False))
     lens = {
         "focal_x": pinhole.focal_length_x / size,
         "focal_y": pinhole.focal_length_y / size,
         "c_x": (pinhole.principal_point_x - camera.width / 2.0) / size,
         "c_y": (pinhole.principal_point_y - camera.height / 2.0) / size,
     }
-    kind, terms = _distortion(camera)
     common = {"projection_type": kind, "width": camera.width, "height": camera.height}
     centred = abs(lens["c_x"]) < _CENTRED and abs(lens["c_y"]) < _CENTRED
     plain = not (terms.get("p1") or terms.get("p2") or terms.get("k3"))
@@ -40,29 +60,3 @@ def opensfm_camera(camera: Camera) -> dict[str, Any]:
             "k2": terms["k2"],
         }
     return common | lens | terms
-
-
-def _distortion(camera: Camera) -> tuple[str, dict[str, float]]:
-    """OpenSfM's model and its terms, of the same powers of the tangent, or of a fisheye's angle, as ours."""
-    k = camera.params
-    none = {"k1": 0.0, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0}
-    match camera.model:
-        case "SIMPLE_PINHOLE" | "PINHOLE":
-            return "brown", none
-        case "SIMPLE_RADIAL":
-            return "brown", none | {"k1": k[3]}
-        case "RADIAL":
-            return "brown", none | {"k1": k[3], "k2": k[4]}
-        case "OPENCV":
-            return "brown", none | {"k1": k[4], "k2": k[5], "p1": k[6], "p2": k[7]}
-        case "FULL_OPENCV" if not any(k[9:12]):
-            return "brown", {"k1": k[4], "k2": k[5], "k3": k[8], "p1": k[6], "p2": k[7]}
-        case "SIMPLE_RADIAL_FISHEYE":
-            return "fisheye_opencv", {"k1": k[3], "k2": 0.0, "k3": 0.0, "k4": 0.0}
-        case "RADIAL_FISHEYE":
-            return "fisheye_opencv", {"k1": k[3], "k2": k[4], "k3": 0.0, "k4": 0.0}
-        case "OPENCV_FISHEYE":
-            return "fisheye_opencv", {"k1": k[4], "k2": k[5], "k3": k[6], "k4": k[7]}
-    raise ExportError(
-        f"OpenSfM has no camera for {camera.model} with k4, k5, k6 of {k[9:12]}; export as colmap instead"
-    )

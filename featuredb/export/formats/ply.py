@@ -10,9 +10,8 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.export.attribution import folder_name
 from featuredb.export.formats.point_files import MapList, Zone, sigma_m, zones_of
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing
+from featuredb.export.job import Exported, ExportJob, folder_name, whole_or_nothing
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import PointColumns
 from featuredb.maps.unplaced_map import UnplacedMap

@@ -1,7 +1,6 @@
-"""Where and when a photo's satellite receiver says it was, from EXIF's GPS directory (EXIF 3.0, 4.6.6)."""
+"""Where a photo's satellite receiver says it was, from EXIF's GPS directory (EXIF 3.0, 4.6.6)."""
 
 import math
-from datetime import UTC, datetime, timedelta
 from typing import Literal
 
 from featuredb.features.exif.tiff_ifd import Ifd
@@ -16,23 +15,10 @@ DEFAULT_SIGMA_VERTICAL_M = 10.0
 # User equivalent range error by which a dilution of precision becomes metres, single frequency.
 RANGE_ERROR_M = 3.0
 # Radius of 68 % of a circular normal distribution, in units of the deviation of one axis.
-_RADIUS_68 = math.sqrt(-2.0 * math.log(1.0 - 0.68))
+RADIUS_68 = math.sqrt(-2.0 * math.log(1.0 - 0.68))
 _SIGMA_RANGE_M = (0.005, 1000.0)
 _SAME_DEG = 2e-5  # 2 m: EXIF's whole tenths of seconds
 _DJI_RTK_FLOAT_OR_FIXED = (34.0, 50.0)
-
-
-def gps_time(gps: Ifd, warnings: list[str]) -> datetime | None:
-    clock, day = gps.numbers(7), gps.text(29)
-    if not clock or not day:
-        return None
-    try:
-        hours, minutes, seconds = clock[:3]
-        start = datetime.strptime(day[:10].replace("-", ":"), "%Y:%m:%d").replace(tzinfo=UTC)
-        return start + timedelta(hours=hours, minutes=minutes, seconds=seconds)
-    except (ValueError, OverflowError):
-        warnings.append(f"EXIF GPS: {day[:20]!r} {clock[:3]} is not a time")
-        return None
 
 
 def gps_position(gps: Ifd, warnings: list[str]) -> tuple[float, float] | None:
@@ -96,25 +82,25 @@ def gps_altitude(gps: Ifd, warnings: list[str]) -> tuple[float | None, AltitudeR
     return (-abs(value) if code in (1, 3) else value), reference
 
 
-def gps_sigmas(gps: Ifd, xmp: dict[str, float], warnings: list[str]) -> tuple[float, float, str]:
-    """Deviations of the position (horizontal per axis, vertical) in metres, and their source."""
+def gps_sigmas(gps: Ifd, xmp: dict[str, float], warnings: list[str]) -> tuple[float, float]:
+    """Deviations of the position (horizontal per axis, vertical) in metres."""
     low, high = _SIGMA_RANGE_M
     std = [xmp.get(name, 0.0) for name in ("RtkStdLat", "RtkStdLon", "RtkStdHgt")]
     if xmp.get("RtkFlag") in _DJI_RTK_FLOAT_OR_FIXED and min(std) > 0:
-        return min(max(std[0], std[1], low), high), min(max(std[2], low), high), "rtk"
+        return min(max(std[0], std[1], low), high), min(max(std[2], low), high)
     ratio = DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
     stated = xmp.get("GPSXYAccuracy", 0.0)
     if stated > 0:
         vertical = xmp.get("GPSZAccuracy", 0.0) or ratio * stated
         if max(stated, vertical) <= high:
-            return max(stated, low), max(vertical, low), "stated"
+            return max(stated, low), max(vertical, low)
         warnings.append(f"XMP: an accuracy of {stated}, {vertical} is absurd")
-    for tag, factor, source in ((31, 1 / _RADIUS_68, "positioning_error"), (11, RANGE_ERROR_M, "dop")):
+    for tag, factor, source in ((31, 1 / RADIUS_68, "positioning_error"), (11, RANGE_ERROR_M, "dop")):
         value = gps.number(tag)
         if value is None or value == 0:
             continue
         sigma = value * factor
         if low <= sigma <= high:
-            return sigma, ratio * sigma, source
+            return sigma, ratio * sigma
         warnings.append(f"EXIF GPS: {source} {value} is absurd")
-    return DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M, "default"
+    return DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M

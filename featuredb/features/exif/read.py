@@ -18,7 +18,6 @@ from featuredb.features.exif.gps import (
     gps_altitude,
     gps_position,
     gps_sigmas,
-    gps_time,
 )
 from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
 from featuredb.features.image_header import ImageHeader, read_header
@@ -39,7 +38,7 @@ _XMP_NAMES = (  # of numbers, by an expression for their namespace
     (
         "drone(?:-dji)?",
         (
-            *("RelativeAltitude", "AbsoluteAltitude", "RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
+            *("RelativeAltitude", "RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
             *("GpsLatitude", "GpsLongitude", "GpsLongtitude"),
         ),
     ),
@@ -67,12 +66,10 @@ class ExifInfo:
         orientation: EXIF orientation 1..8.
         focal_px: focal length in pixels of the image as stored.
         capture_time: when taken; timezone-aware only where the photo gives its offset.
-        gps_time: time of the position fix, UTC.
         latitude_deg, longitude_deg: WGS84 degrees, both or none.
         altitude_m: metres above `altitude_reference`, which for drones is often neither.
         sigma_horizontal_m, sigma_vertical_m: one standard deviation per axis of the position.
-        sigma_source: what the deviations come from: rtk, stated, positioning_error, dop or default.
-        relative_altitude_m, absolute_altitude_m: DJI: above take-off, and as in EXIF.
+        relative_altitude_m: DJI: above take-off.
         angles: how the camera was turned.
         artist, copyright: attribution.
         warnings: what was wrong, for people.
@@ -86,16 +83,13 @@ class ExifInfo:
     orientation: int = 1
     focal_px: float | None = None
     capture_time: datetime | None = None
-    gps_time: datetime | None = None
     latitude_deg: float | None = None
     longitude_deg: float | None = None
     altitude_m: float | None = None
     altitude_reference: AltitudeReference = "unknown"
     sigma_horizontal_m: float = DEFAULT_SIGMA_HORIZONTAL_M
     sigma_vertical_m: float = DEFAULT_SIGMA_VERTICAL_M
-    sigma_source: str = "default"
     relative_altitude_m: float | None = None
-    absolute_altitude_m: float | None = None
     angles: CameraAngles | None = None
     artist: str = ""
     copyright: str = ""
@@ -138,7 +132,7 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: in
     position = finer_position(gps_position(gps, warnings), values)
     altitude, reference = gps_altitude(gps, warnings) if position else (None, "unknown")
     orientation = orientation or _orientation(main, warnings)
-    sigma_h, sigma_v, source = gps_sigmas(gps, values, warnings)
+    sigma_h, sigma_v = gps_sigmas(gps, values, warnings)
     return ExifInfo(
         width=width,
         height=height,
@@ -148,16 +142,13 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: in
         orientation=orientation,
         focal_px=_focal_px(exif, width, height, warnings),
         capture_time=_capture_time(main, exif, warnings),
-        gps_time=gps_time(gps, warnings),
         latitude_deg=position[0] if position else None,
         longitude_deg=position[1] if position else None,
         altitude_m=altitude,
         altitude_reference=reference,
         sigma_horizontal_m=sigma_h,
         sigma_vertical_m=sigma_v,
-        sigma_source=source,
         relative_altitude_m=values.get("RelativeAltitude"),
-        absolute_altitude_m=values.get("AbsoluteAltitude"),
         angles=camera_angles(gps, values, main.text(271), orientation, warnings),
         artist=main.text(315)[:_MAX_TEXT],
         copyright=main.text(33432)[:_MAX_TEXT],

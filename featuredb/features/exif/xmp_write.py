@@ -7,7 +7,6 @@ from xml.sax.saxutils import escape
 NAMESPACES = {
     "drone-dji": "http://www.dji.com/drone-dji/1.0/",
     "Camera": "http://pix4d.com/camera/1.0/",
-    "dc": "http://purl.org/dc/elements/1.1/",
     "featuredb": "urn:featuredb:photo:1.0",
 }
 _END = b"</rdf:RDF>"

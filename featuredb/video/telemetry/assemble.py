@@ -6,7 +6,6 @@ whose time does not advance are left out. A file without any position is refused
 
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +20,17 @@ from featuredb.video.telemetry.values import Clock, Telemetry
 MAX_SAMPLES = 2_000_000
 MAX_WARNINGS = 20
 
-# Metres of one standard deviation per axis for a dilution of precision of 1: the user equivalent range error
-# of a single-frequency receiver, the same as for photos (`featuredb.features.exif.gps`).
-RANGE_ERROR_M = 3.0
-# Radius of 68 % of a circular normal distribution, in deviations of one axis: sqrt(-2 ln 0.32).
-RADIUS_68 = 1.5096
 METRES_PER_DEGREE = 111_195.0  # of a great circle of the mean Earth
 
 _FIELDS = (
-    "times_s", "latitude_deg", "longitude_deg", "height_m", "relative_height_m", "sigma_m", "clock_s",
-    "focal_35mm", "gimbal_yaw", "gimbal_pitch", "gimbal_roll", "aircraft_yaw", "aircraft_pitch",
-    "aircraft_roll",
+    "times_s", "latitude_deg", "longitude_deg", "height_m", "relative_height_m", "clock_s",
+    "gimbal_yaw", "gimbal_pitch", "gimbal_roll",
 )  # fmt: skip
 _NULL_ISLAND_DEG = 1e-6
 # As for photos: from below the Dead Sea's shore to above airliners; above take-off the same span downwards.
 _HEIGHT_RANGE_M = (-500.0, 20_000.0)
 _RELATIVE_HEIGHT_RANGE_M = (-9_000.0, 20_000.0)
-_SIGMA_RANGE_M = (0.005, 1000.0)
-_FOCAL_RANGE_MM = (4.0, 5000.0)  # circular fisheye to the longest zoom
-_CLOCK_RANGE_S = (315_532_800.0, 4_102_444_800.0)  # 1980, when GPS time begins, to 2100
+CLOCK_RANGE_S = (315_532_800.0, 4_102_444_800.0)  # 1980, when GPS time begins, to 2100
 # A clock that advances by so much more or less than the video between two samples: a cut, or it was set anew.
 _CLOCK_JUMP_S = 2.0
 # No drone and no car: 50 m and 150 m/s between one reading of the receiver and the next.
@@ -56,7 +47,7 @@ class SampleTable:
         return len(self._columns["times_s"])
 
     def add(self, row: Mapping[str, float]) -> None:
-        """One sample: fields of `TelemetrySamples`, angles as gimbal_yaw, aircraft_pitch and so on."""
+        """One sample: fields of `TelemetrySamples`, angles as gimbal_yaw, gimbal_pitch, gimbal_roll."""
         for name, column in self._columns.items():
             column.append(row.get(name, float("nan")))
 
@@ -74,47 +65,48 @@ class SampleTable:
         return np.array(self._columns[name], dtype=np.float64)
 
 
-@dataclass(slots=True, kw_only=True)
-class About:
-    """What a reader knows about its samples beside their values; see `Telemetry`."""
+def assemble(
+    table: SampleTable,
+    *,
+    source: str,
+    origin: str,
+    warnings: list[str],
+    height_datum: HeightDatum = "unknown",
+    clock: Clock = "none",
+    in_video_time: bool = True,
+    from_first: bool = False,
+    sort: bool = False,
+) -> Telemetry:
+    """The telemetry of raw samples; for what is not said here see `Telemetry`.
 
-    source: str
-    origin: str
-    height_datum: HeightDatum = "unknown"
-    clock: Clock = "none"
-    in_video_time: bool = True
-    from_first: bool = False  # times are made to count from the first sample
-    resolution_m: float = float("nan")
-    sort: bool = False  # by time, for formats that do not promise an order
-    warnings: list[str] = field(default_factory=list)
-
-
-def assemble(table: SampleTable, about: About) -> Telemetry:
-    """The telemetry of raw samples.
+    Args:
+        warnings: what the reader has found; receives what is found here.
+        clock: of the samples that have a reading of it.
+        from_first: times are made to count from the first sample.
+        sort: by time, for formats that do not promise an order.
 
     Raises:
         TelemetryError: no samples, too many, or none with a position.
     """
     if not len(table):
-        raise TelemetryError(f"{about.origin}: no samples of telemetry in it")
-    check_count(len(table), about.origin)
-    warnings = about.warnings
+        raise TelemetryError(f"{origin}: no samples of telemetry in it")
+    check_count(len(table), origin)
     with np.errstate(over="ignore", invalid="ignore"):
         times = table.column("times_s")
-        if about.from_first:
-            times = _since_first(times, about.sort)
-        rows = _rows_in_time(times, about.sort, warnings)
+        if from_first:
+            times = _since_first(times, sort)
+        rows = _rows_in_time(times, sort, warnings)
         columns = {name: table.column(name)[rows] for name in _FIELDS} | {"times_s": times[rows]}
         latitude, longitude = _positions(columns["latitude_deg"], columns["longitude_deg"], warnings)
         if not np.isfinite(latitude).any():
             reasons = "; ".join(warnings[:3])
             raise TelemetryError(
-                f"{about.origin} ({about.source}): {len(rows)} samples, none with a position"
+                f"{origin} ({source}): {len(rows)} samples, none with a position"
                 + (f" ({reasons})" if reasons else "")
                 + "; give another log of the flight (GPX or CSV)"
             )
-        clock = _within(columns["clock_s"], _CLOCK_RANGE_S, "clock readings", warnings)
-        _tell_jumps(columns["times_s"], latitude, longitude, clock, warnings)
+        clock_s = _within(columns["clock_s"], CLOCK_RANGE_S, "clock readings", warnings)
+        _tell_jumps(columns["times_s"], latitude, longitude, clock_s, warnings)
         return Telemetry(
             times_s=columns["times_s"],
             latitude_deg=latitude,
@@ -123,17 +115,13 @@ def assemble(table: SampleTable, about: About) -> Telemetry:
             relative_height_m=_within(
                 columns["relative_height_m"], _RELATIVE_HEIGHT_RANGE_M, "relative heights", warnings
             ),
-            sigma_m=_within(columns["sigma_m"], _SIGMA_RANGE_M, "accuracies", warnings),
-            gimbal_ypr_deg=_angles(columns, "gimbal", warnings),
-            aircraft_ypr_deg=_angles(columns, "aircraft", warnings),
-            clock_s=clock,
-            focal_35mm=_within(columns["focal_35mm"], _FOCAL_RANGE_MM, "focal lengths", warnings),
-            height_datum=about.height_datum,
-            clock=about.clock if np.isfinite(clock).any() else "none",
-            in_video_time=about.in_video_time,
-            resolution_m=about.resolution_m,
-            source=about.source,
-            origin=about.origin,
+            gimbal_ypr_deg=_gimbal_angles(columns, warnings),
+            clock_s=clock_s,
+            height_datum=height_datum,
+            clock=clock if np.isfinite(clock_s).any() else "none",
+            in_video_time=in_video_time,
+            source=source,
+            origin=origin,
             warnings=tuple(warnings[:MAX_WARNINGS]),
         )
 
@@ -145,11 +133,6 @@ def check_count(samples: int, origin: str) -> None:
             f"{origin}: more than {MAX_SAMPLES} samples, that is more than nine hours at 60 a second; "
             "cut the file to the part that belongs to the video"
         )
-
-
-def resolution_of_decimals(decimals: int) -> float:
-    """Metres north of one unit of the last of so many decimals of a degree; NaN for a negative number."""
-    return METRES_PER_DEGREE * 10.0 ** -min(decimals, 15) if decimals >= 0 else float("nan")
 
 
 def _since_first(times_s: FloatArray, earliest: bool) -> FloatArray:
@@ -201,10 +184,10 @@ def _within(values: FloatArray, limits: tuple[float, float], what: str, warnings
     return np.where(good, values, np.nan)
 
 
-def _angles(columns: Mapping[str, FloatArray], of: str, warnings: list[str]) -> FloatArray:
+def _gimbal_angles(columns: Mapping[str, FloatArray], warnings: list[str]) -> FloatArray:
     """(n, 3) yaw, pitch, roll in [-180, 180)."""
     parts = [
-        wrap_degrees(_within(columns[f"{of}_{axis}"], (-720.0, 720.0), f"{of} angles", warnings))
+        wrap_degrees(_within(columns[f"gimbal_{axis}"], (-720.0, 720.0), "gimbal angles", warnings))
         for axis in ("yaw", "pitch", "roll")
     ]
     return np.stack(parts, axis=1)

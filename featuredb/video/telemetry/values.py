@@ -18,8 +18,7 @@ CLOCKS: tuple[Clock, ...] = get_args(Clock)
 # in 3 s, as much as its receiver does.
 _MAX_GAP_S = 3.0
 
-_SCALARS = ("height_m", "relative_height_m", "sigma_m", "clock_s", "focal_35mm")
-_ANGLES = ("gimbal_ypr_deg", "aircraft_ypr_deg")
+_SCALARS = ("height_m", "relative_height_m", "clock_s")
 
 
 def _not_known() -> FloatArray:
@@ -35,11 +34,8 @@ class TelemetrySamples:
         latitude_deg, longitude_deg: (n,) float64, WGS84 degrees; in one sample both are known or neither.
         height_m: (n,) metres above the datum that `Telemetry.height_datum` names.
         relative_height_m: (n,) metres above the place of take-off.
-        sigma_m: (n,) one standard deviation of the horizontal position per axis, as told by the receiver.
         gimbal_ypr_deg: (n, 3) yaw clockwise from true north, pitch (-90 looks down), roll of the camera.
-        aircraft_ypr_deg: (n, 3) the same of the aircraft's body.
         clock_s: (n,) wall clock, seconds since 1970-01-01T00:00:00 of the clock that `Telemetry.clock` names.
-        focal_35mm: (n,) 35 mm equivalent focal length, millimetres.
     """
 
     times_s: FloatArray
@@ -47,11 +43,8 @@ class TelemetrySamples:
     longitude_deg: FloatArray
     height_m: FloatArray = field(default_factory=_not_known)
     relative_height_m: FloatArray = field(default_factory=_not_known)
-    sigma_m: FloatArray = field(default_factory=_not_known)
     gimbal_ypr_deg: FloatArray = field(default_factory=_not_known)
-    aircraft_ypr_deg: FloatArray = field(default_factory=_not_known)
     clock_s: FloatArray = field(default_factory=_not_known)
-    focal_35mm: FloatArray = field(default_factory=_not_known)
 
     def __post_init__(self) -> None:
         times = frozen_array("TelemetrySamples.times_s", self.times_s, (None,))
@@ -61,12 +54,8 @@ class TelemetrySamples:
             checked[name] = _column(name, getattr(self, name), (n,))
         for name in _SCALARS:
             checked[name] = _column(name, getattr(self, name), (n,), optional=True)
-        for name in _ANGLES:
-            checked[name] = _column(name, getattr(self, name), (n, 3), optional=True)
+        checked["gimbal_ypr_deg"] = _column("gimbal_ypr_deg", self.gimbal_ypr_deg, (n, 3), optional=True)
         _check_positions(checked["latitude_deg"], checked["longitude_deg"])
-        for name in ("sigma_m", "focal_35mm"):
-            if (checked[name] <= 0.0).any():
-                raise InvalidValueError(f"TelemetrySamples.{name}: expected values above 0 or NaN")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
@@ -92,8 +81,6 @@ class Telemetry(TelemetrySamples):
         clock: what `clock_s` shows: "utc", "local" (the time of day on somebody's wall, zone not known), or
             "none". Local time is never taken for UTC.
         in_video_time: whether `times_s` is time of the video.
-        resolution_m: metres north that one unit of the last written digit of latitude is worth, NaN when not
-            known; four decimals are steps of 11 m, whatever the receiver knew.
         source: format and dialect.
         origin: the file and, where it holds several things, what in it.
         warnings: what was wrong or had to be decided, for people.
@@ -102,7 +89,6 @@ class Telemetry(TelemetrySamples):
     height_datum: HeightDatum = "unknown"
     clock: Clock = "none"
     in_video_time: bool = True
-    resolution_m: float = float("nan")
     source: str
     origin: str = ""
     warnings: tuple[str, ...] = ()
@@ -145,20 +131,14 @@ class Telemetry(TelemetrySamples):
                 self.times_s, values, wanted, max_gap_s=_MAX_GAP_S, reach_s=reach, circle=circle
             )
 
-        def turned(degrees: FloatArray) -> FloatArray:
-            return np.stack([line(degrees[:, axis], circle=True) for axis in range(3)], axis=1)
-
         return TelemetrySamples(
             times_s=wanted,
             latitude_deg=line(self.latitude_deg),
             longitude_deg=line(self.longitude_deg, circle=True),
             height_m=line(self.height_m),
             relative_height_m=line(self.relative_height_m),
-            sigma_m=line(self.sigma_m),
-            gimbal_ypr_deg=turned(self.gimbal_ypr_deg),
-            aircraft_ypr_deg=turned(self.aircraft_ypr_deg),
+            gimbal_ypr_deg=np.stack([line(angle, circle=True) for angle in self.gimbal_ypr_deg.T], axis=1),
             clock_s=line(self.clock_s),
-            focal_35mm=line(self.focal_35mm),
         )
 
 

@@ -15,17 +15,9 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import (
-    RADIUS_68,
-    RANGE_ERROR_M,
-    About,
-    SampleTable,
-    assemble,
-    check_count,
-    resolution_of_decimals,
-)
+from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
 from featuredb.video.telemetry.formats.csv_time import TimeColumns, time_columns
-from featuredb.video.telemetry.formats.table_values import UNITS, column_name, decimals_of, number
+from featuredb.video.telemetry.formats.table_values import UNITS, column_name, number
 from featuredb.video.telemetry.formats.text import decode_text
 from featuredb.video.telemetry.values import Telemetry
 
@@ -53,13 +45,6 @@ _NAMES: dict[str, tuple[str, tuple[str, ...]]] = {
     "gimbal_yaw": ("angle", ("gimbal_yaw", "gimbal_heading", "gb_yaw", "camera_yaw")),
     "gimbal_pitch": ("angle", ("gimbal_pitch", "gb_pitch", "camera_pitch")),
     "gimbal_roll": ("angle", ("gimbal_roll", "gb_roll", "camera_roll")),
-    "aircraft_yaw": ("angle", ("compass_heading", "heading", "yaw", "osd_yaw", "aircraft_yaw")),
-    "aircraft_pitch": ("angle", ("pitch", "osd_pitch", "aircraft_pitch")),
-    "aircraft_roll": ("angle", ("roll", "osd_roll", "aircraft_roll")),
-    "sigma_m": ("length", ("sigma", "sigma_horizontal", "horizontal_sigma", "std_horizontal")),
-    "accuracy": ("length", ("accuracy", "horizontal_accuracy", "h_acc", "hacc")),
-    "hdop": ("", ("hdop", "gps_hdop")),
-    "focal_35mm": ("focal", ("focal_35mm", "focal_length_35mm", "focal_length_in_35mm_film")),
 }  # fmt: skip
 _MAX_COLUMNS = 2000
 # A table in which so many coordinates are no numbers has other columns than their names say.
@@ -117,7 +102,6 @@ def _known_columns(header: list[str], origin: str) -> dict[str, tuple[int, float
     names = [column_name(cell) for cell in header]
     found: dict[str, tuple[int, float]] = {}
     for quantity, (kind, aliases) in _NAMES.items():
-        # "altitude_msl_m" has an ending that is a unit, "focal_35mm" one that is not.
         whole = [name.base for name in names]
         index = next((whole.index(alias) for alias in aliases if alias in whole), None)
         if index is None:
@@ -132,12 +116,12 @@ def _known_columns(header: list[str], origin: str) -> dict[str, tuple[int, float
         of, factor = UNITS.get(unit, ("", 0.0)) if unit else (kind, 1.0)
         if of == "frame" and kind == "angle":
             of = kind
-        if of != kind and not (kind == "focal" and unit == "mm"):
+        if of != kind:
             raise TelemetryError(
                 f"{origin}: the column {header[index]!r} has the unit {unit!r}; expected one of "
-                f"{', '.join(sorted(key for key, (of, _) in UNITS.items() if of == kind)) or 'none'}"
+                f"{', '.join(sorted(key for key, (of, _) in UNITS.items() if of == kind))}"
             )
-        found[quantity] = index, 1.0 if kind == "focal" else factor
+        found[quantity] = index, factor
     return found
 
 
@@ -172,25 +156,22 @@ def _telemetry(
     }
     times = timing.read(cells, origin, warnings)
     values["times_s"], values["clock_s"] = times.times_s, times.clock_s
-    values.setdefault("sigma_m", _sigma(values))
     datum: HeightDatum = "unknown"
     if "ellipsoidal_height" in values:
         datum, values["height_m"] = "ellipsoidal", values["ellipsoidal_height"]
     table = SampleTable()
     table.extend(values, len(times.times_s))
-    texts = cells[columns["latitude_deg"][0]]
-    about = About(
+    return assemble(
+        table,
         source="CSV",
         origin=origin,
         clock=times.clock,
         height_datum=datum,
         in_video_time=times.in_film,
         from_first=times.from_clock,
-        resolution_m=resolution_of_decimals(max(decimals_of(_with_point(text)) for text in texts)),
         sort=True,
         warnings=warnings,
     )
-    return assemble(table, about)
 
 
 def _numbers(texts: list[str], quantity: str, origin: str, warnings: list[str]) -> FloatArray:
@@ -210,11 +191,3 @@ def _numbers(texts: list[str], quantity: str, origin: str, warnings: list[str]) 
 def _with_point(text: str) -> str:
     """A number with a decimal comma, as tables with semicolons have, with a point instead."""
     return text.replace(",", ".") if re.fullmatch(r"\s*[+-]?\d+,\d+\s*", text) else text
-
-
-def _sigma(values: dict[str, FloatArray]) -> FloatArray:
-    if "accuracy" in values:  # the radius within which 68 % lie, as telephones tell it
-        return np.asarray(values["accuracy"] / RADIUS_68)
-    if "hdop" in values:
-        return np.asarray(RANGE_ERROR_M * values["hdop"])
-    return np.full(len(values["times_s"]), np.nan)

@@ -2,14 +2,16 @@
 
 | stream | rate | what is used |
 |---|---|---|
-| GPS9 (HERO11, 13, MAX2) | 10 Hz | latitude, longitude, height, day, second, DOP and fix of every sample |
-| GPS5 (HERO5 to 11) | 18 Hz | latitude, longitude, height; GPSF, GPSP and GPSU once a packet |
-| Karma's GLPI, GPRI, ATTD, SYST | 4 Hz | `gpmf_karma.py` |
+| GPS9 (HERO11, 13, MAX2) | 10 Hz | latitude, longitude, height, day, second and fix of every sample |
+| GPS5 (HERO5 to 11) | 18 Hz | latitude, longitude, height; GPSF and GPSU once a packet |
+| Karma's GLPI, GPRI, SYST | 4 Hz | MAVLink's messages GLOBAL_POSITION_INT, GPS_RAW_INT, SYSTEM_TIME |
 
 A camera that writes several is read by the first of them. Everything else (ACCL, GYRO, CORI, GRAV, ...) is
 skipped. GoPro's heights: without the entry GPSA they are above the ellipsoid (the parser's author, issue 4 of
 gopro/gpmf-parser: UBX-M8030, "height above the ellipsoid"), with GPSA "MSLV" above a mean sea level that
-nobody names, hence "unknown"; so are GPS9's without GPSA.
+nobody names, hence "unknown"; so are GPS9's without GPSA. Karma's positions are the autopilot's own (GLPI);
+whether there is a fix comes from the receiver (GPRI). Its attitude (ATTD) is the aircraft's and not read: the
+camera hangs in a gimbal whose angles are not written.
 """
 
 import re
@@ -22,18 +24,14 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import RANGE_ERROR_M, About, SampleTable, assemble, check_count
-from featuredb.video.telemetry.formats.gpmf_karma import boot_to_utc, karma_samples
-from featuredb.video.telemetry.formats.gpmf_streams import Stream, first_number, scaled, streams_of
+from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
+from featuredb.video.telemetry.formats.gpmf_streams import Stream, find, first_number, scaled, streams_of
 from featuredb.video.telemetry.formats.klv import Klv
 from featuredb.video.telemetry.values import Telemetry
 
 _EPOCH_2000_S = datetime(2000, 1, 1, tzinfo=UTC).timestamp()
 _MIN_FIX = 2  # 0 no fix, 2 in two dimensions, 3 in three
 _FIX_3D = 3
-# GPSP is a dilution of precision in hundredths. u-blox receivers report that of position (PDOP), which is not
-# smaller than the horizontal one: times the range error it errs to the careful side.
-_GPSP_UNIT = 0.01
 _GPSU = re.compile(r"([0-9]{12})(?:\.([0-9]{1,3}))?")
 
 
@@ -100,14 +98,14 @@ def read_gpmf(packets: Sequence[TimedPacket], origin: str = "GPMF track") -> Tel
     datums = {samples.datum for _, samples in decoded}
     for _, samples in decoded:
         warnings += [line for line in samples.warnings if line not in warnings]
-    about = About(
+    return assemble(
+        table,
         source=f"GPMF {source}",
         origin=origin,
         clock="utc",
         height_datum=datums.pop() if len(datums) == 1 else "unknown",
         warnings=warnings,
     )
-    return assemble(table, about)
 
 
 def _parse_packets(
@@ -129,11 +127,17 @@ def _parse_packets(
 
 
 def _karma_clock(parsed: list[tuple[TimedPacket, list[Stream]]], warnings: list[str]) -> float:
+    """Seconds to add to Karma's boot time for UTC, NaN where no packet tells."""
+    offsets: list[float] = []
     try:
-        return boot_to_utc([streams for _, streams in parsed])
+        for _, streams in parsed:
+            clock = find(streams, "SYST", 2)  # boot time, seconds since 1970
+            if clock is not None:
+                offsets += (clock[:, 1] - clock[:, 0]).tolist()
     except TelemetryError as error:
         warnings.append(f"Karma's clock cannot be read ({error})")
         return float("nan")
+    return float(np.median(offsets)) if offsets else float("nan")
 
 
 def _decode(
@@ -179,8 +183,8 @@ def _gps9(streams: list[Stream]) -> Decoded | None:
         values = scaled(stream, "GPS9", 9)
         if values is None:
             continue
-        fix, dop = values[:, 8], values[:, 7]
-        columns = _fixed(values, fix, dop)
+        fix = values[:, 8]
+        columns = _fixed(values, fix)
         columns["clock_s"] = np.where(
             fix >= _MIN_FIX, _EPOCH_2000_S + 86_400.0 * values[:, 5] + values[:, 6], np.nan
         )
@@ -190,7 +194,7 @@ def _gps9(streams: list[Stream]) -> Decoded | None:
 
 
 def _gps5(streams: list[Stream]) -> Decoded | None:
-    """Latitude, longitude, height, two speeds; fix, dilution and time once for the packet."""
+    """Latitude, longitude, height, two speeds; fix and time once for the packet."""
     for stream in streams:
         values = scaled(stream, "GPS5", 5)
         if values is None:
@@ -201,20 +205,19 @@ def _gps5(streams: list[Stream]) -> Decoded | None:
             warnings.append("GPS5 without its fix status (GPSF): whether positions are fresh is not known")
             fix = _FIX_3D
         n = len(values)
-        columns = _fixed(values, np.full(n, fix), np.full(n, _GPSP_UNIT * first_number(stream, "GPSP")))
+        columns = _fixed(values, np.full(n, fix))
         start = _utc(stream.get("GPSU")) if fix >= _MIN_FIX else float("nan")
         return Decoded(columns, n, start, datum, warnings)
     return None
 
 
-def _fixed(values: FloatArray, fix: FloatArray, dop: FloatArray) -> dict[str, FloatArray]:
+def _fixed(values: FloatArray, fix: FloatArray) -> dict[str, FloatArray]:
     """Positions of samples with a fix, heights of those with a fix in three dimensions."""
     known, deep = fix >= _MIN_FIX, fix >= _FIX_3D
     return {
         "latitude_deg": np.where(known, values[:, 0], np.nan),
         "longitude_deg": np.where(known, values[:, 1], np.nan),
         "height_m": np.where(deep, values[:, 2], np.nan),
-        "sigma_m": np.where(known & (dop > 0.0), RANGE_ERROR_M * dop, np.nan),
     }
 
 
@@ -237,8 +240,17 @@ def _utc(entry: Klv | None) -> float:
     return whole.timestamp() + float(f"0.{match[2] or 0}")
 
 
-def _karma(streams: list[Stream], offset_s: float) -> Decoded | None:
-    columns = karma_samples(streams, offset_s)
-    if columns is None:
+def _karma(streams: list[Stream], boot_to_utc_s: float) -> Decoded | None:
+    """Boot time, latitude, longitude, height, relative height; fix of the receiver throughout the packet."""
+    place, receiver = find(streams, "GLPI", 9), find(streams, "GPRI", 10)
+    if place is None:
         return None
-    return Decoded(columns, len(columns["latitude_deg"]))
+    fixed = receiver is None or bool((receiver[:, 8] >= _MIN_FIX).all())
+    columns = {
+        "latitude_deg": place[:, 1] if fixed else np.full(len(place), np.nan),
+        "longitude_deg": place[:, 2] if fixed else np.full(len(place), np.nan),
+        "height_m": place[:, 3],
+        "relative_height_m": place[:, 4],
+        "clock_s": place[:, 0] + boot_to_utc_s,
+    }
+    return Decoded(columns, len(place))

@@ -8,20 +8,13 @@ import math
 from xml.parsers import expat
 
 from featuredb.errors import TelemetryError
-from featuredb.video.telemetry.assemble import (
-    RANGE_ERROR_M,
-    About,
-    SampleTable,
-    assemble,
-    check_count,
-    resolution_of_decimals,
-)
-from featuredb.video.telemetry.formats.table_values import decimals_of, number
+from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
+from featuredb.video.telemetry.formats.table_values import number
 from featuredb.video.telemetry.formats.text import parse_wall_clock
 from featuredb.video.telemetry.values import Telemetry
 
 # Elements of a point whose text counts. `fix` is "none", "2d", "3d", "dgps" or "pps".
-_TEXTS = ("ele", "time", "hdop", "fix")
+_TEXTS = ("ele", "time", "fix")
 _MAX_TEXT = 200
 _MAX_DEPTH = 100
 
@@ -57,7 +50,7 @@ class _Reader:
         self._path: list[str] = []
         self._point: dict[str, str] | None = None
         self._table = SampleTable()
-        self._points, self._timeless, self._local, self._decimals = 0, 0, 0, -1
+        self._points, self._timeless, self._local = 0, 0, 0
 
     def doctype(self, *_: object) -> None:
         raise TelemetryError(
@@ -98,7 +91,6 @@ class _Reader:
             return
         self._local += not clock.is_utc
         fixed = point.get("fix", "").strip() != "none"
-        self._decimals = max(self._decimals, decimals_of(point["lat"]))
         self._table.add(
             {
                 "times_s": clock.seconds,
@@ -106,7 +98,6 @@ class _Reader:
                 "latitude_deg": number(point["lat"]) if fixed else math.nan,
                 "longitude_deg": number(point["lon"]) if fixed else math.nan,
                 "height_m": number(point.get("ele", "")),
-                "sigma_m": RANGE_ERROR_M * number(point.get("hdop", "")),
             }
         )
 
@@ -126,14 +117,13 @@ class _Reader:
             warnings.append(
                 f"{self._local} times name no zone; GPX's times are UTC, so they are taken for it"
             )
-        about = About(
+        return assemble(
+            self._table,
             source="GPX",
             origin=self._origin,
             clock="utc",
             in_video_time=False,
             from_first=True,
-            resolution_m=resolution_of_decimals(self._decimals),
             sort=True,
             warnings=warnings,
         )
-        return assemble(self._table, about)

@@ -13,13 +13,7 @@ import numpy as np
 
 from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import (
-    About,
-    SampleTable,
-    assemble,
-    check_count,
-    resolution_of_decimals,
-)
+from featuredb.video.telemetry.assemble import METRES_PER_DEGREE, SampleTable, assemble, check_count
 from featuredb.video.telemetry.axis_order import ThirdValue, decide_order
 from featuredb.video.telemetry.formats.srt_blocks import Subtitle, is_cut_off, lacks_words, split_blocks
 from featuredb.video.telemetry.formats.srt_fields import BlockFields, looks_like_telemetry, parse_block
@@ -62,10 +56,11 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
     blocks, parsed = [blocks[row] for row in whole], [parsed[row] for row in whole]
     clocks = _clocks(blocks)
     times, in_video_time = _times(blocks, clocks, origin, warnings)
-    step_m = resolution_of_decimals(max((fields.decimals for fields in parsed), default=-1))
+    decimals = max(fields.decimals for fields in parsed)
     _place_pairs(parsed, origin, warnings)
     _tell_heights(parsed, warnings)
-    if step_m > _COARSE_M:
+    step_m = METRES_PER_DEGREE * 10.0**-decimals
+    if decimals >= 0 and step_m > _COARSE_M:
         warnings.append(f"coordinates are written in steps of {step_m:.0f} m")
     table = SampleTable()
     for time, clock, fields in zip(times, clocks, parsed, strict=True):
@@ -73,16 +68,15 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
     dialects = list(dict.fromkeys(fields.dialect for fields in parsed if fields.dialect))
     if len(dialects) > 1:
         warnings.append(f"{len(dialects)} dialects in one file: recordings of several drones were joined")
-    about = About(
+    return assemble(
+        table,
         source="SRT, " + " + ".join(dialects),
         origin=origin,
         clock="local",
         in_video_time=in_video_time,
         from_first=not in_video_time,
-        resolution_m=step_m,
         warnings=warnings,
     )
-    return assemble(table, about)
 
 
 def _sample_of(blocks: Sequence[Subtitle]) -> str:

@@ -21,7 +21,7 @@ from featuredb.video.telemetry.axis_order import ThirdValue
 _NUMBER = r"[+-]?\d{1,12}(?:\.\d{0,15})?"
 _GROUP = re.compile(r"\[([^\[\]]{0,300})\]")
 _PAIR = re.compile(rf"([A-Za-z_]+)\s*:\s*({_NUMBER})(?![\d.]|,\d)")
-_TUPLE = re.compile(r"(?<![A-Za-z.])(GPS|HOME|F\.PRY|G\.PRY)\s*\(([^()]{0,200})\)")
+_TUPLE = re.compile(r"(?<![A-Za-z.])(GPS|HOME|G\.PRY)\s*\(([^()]{0,200})\)")
 _COORDINATE = re.compile(rf"^(?:([NSEW])\s*:?\s*)?({_NUMBER})\s*(m?)$", re.IGNORECASE)
 _BAROMETER = re.compile(rf"\b(?:BAROMETER\s*[:(]|Hb:)\s*({_NUMBER})(?=[Mm\s)]|$)")
 _HEIGHT = re.compile(rf"(?<![A-Za-z.])H\s+({_NUMBER})\s*m\b")
@@ -34,7 +34,6 @@ _NAMES = {
     "latitude": "latitude_deg", "longitude": "longitude_deg", "longtitude": "longitude_deg",
     "altitude": "height_m", "abs_alt": "height_m", "rel_alt": "relative_height_m",
     "gb_yaw": "gimbal_yaw", "gb_pitch": "gimbal_pitch", "gb_roll": "gimbal_roll",
-    "yaw": "aircraft_yaw", "pitch": "aircraft_pitch", "roll": "aircraft_roll",
 }  # fmt: skip
 _NAN = float("nan")
 
@@ -88,34 +87,24 @@ def parse_block(text: str) -> BlockFields:
 
 def _read_groups(text: str, fields: BlockFields) -> None:
     """The named values in closed square brackets."""
-    zoom, focal = 1.0, _NAN
     for group in _GROUP.findall(text):
         for name, number in _PAIR.findall(group):
             key, value = name.lower(), float(number)
             fields.dialect = "bracketed"
-            if key == "focal_len":
-                # Tenths of a millimetre where there is no point: 240 is 24 mm.
-                focal = value / 10.0 if "." not in number and value >= 100.0 else value
-            elif key == "dzoom_ratio":
-                zoom = value / 10_000.0 if value >= 1000.0 else value
-            elif key in _NAMES:
+            if key in _NAMES:
                 fields.row[_NAMES[key]] = value
                 if key in ("latitude", "longitude", "longtitude"):
                     fields.decimals = max(fields.decimals, len(number.partition(".")[2]))
                 fields.altitude_unnamed |= key == "altitude"
-    # Whether the focal length that is written contains the digital zoom differs between models.
-    if zoom == 1.0 and focal == focal:
-        fields.row["focal_35mm"] = focal
 
 
 def _read_tuple(name: str, parts: list[str], fields: BlockFields) -> None:
-    """Values in round brackets: GPS(a, b, c), HOME(a, b, c), F.PRY and G.PRY (pitch, roll, yaw)."""
-    if name.endswith("PRY"):
+    """Values in round brackets: GPS(a, b, c), HOME(a, b, c), G.PRY (pitch, roll, yaw of the gimbal)."""
+    if name == "G.PRY":
         angles = [_COORDINATE.match(part.strip().rstrip("°� ")) for part in parts]
-        of = "gimbal" if name == "G.PRY" else "aircraft"
         for axis, angle in zip(("pitch", "roll", "yaw"), angles, strict=False):
             if angle:
-                fields.row[f"{of}_{axis}"] = float(angle[2])
+                fields.row[f"gimbal_{axis}"] = float(angle[2])
         return
     if len(parts) > 3:  # decimal commas, for example; what is then a number is not to be guessed
         return

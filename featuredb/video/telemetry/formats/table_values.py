@@ -36,11 +36,6 @@ def number(text: str) -> float:
     return float(stripped) if _NUMBER.fullmatch(stripped) else math.nan
 
 
-def decimals_of(text: str) -> int:
-    """Digits after the point of a number, -1 without a point."""
-    return len(text.strip().partition(".")[2]) if "." in text else -1
-
-
 def column_name(text: str) -> ColumnName:
     """The name and the unit of "Height_above_takeoff(feet)", "OSD.yaw [360]" or "rel_alt_m"."""
     match = _BRACKET.match(text.strip())
