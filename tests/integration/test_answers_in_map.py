@@ -69,9 +69,7 @@ def _that_may_be_bent() -> UnplacedMap:
 @pytest.fixture(scope="module")
 def localiser(tmp_path_factory: pytest.TempPathFactory) -> Localiser:
     database = Database.create(tmp_path_factory.mktemp("adrift") / "db")
-    database.commit_maps(
-        [_without_place(), _that_may_be_bent(), planar_map(texture_seed=2, map_id="placed")]
-    )
+    database.commit_maps([_without_place(), _that_may_be_bent(), planar_map(texture_seed=2, map_id="placed")])
     return Localiser.open(database)
 
 
