@@ -26,7 +26,8 @@ from ingest.executor import Progress, no_progress
 from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, place_map
 from ingest.register.anchor.files import PhotoFiles, find_photos, load_proposals, save_proposals
 from ingest.register.anchor.frames import TriedFrames, try_frames
-from ingest.register.anchor.report import AnchorReport, write_anchor_report
+from ingest.register.anchor.page import write_anchor_report
+from ingest.register.anchor.report import AnchorReport
 from ingest.register.anchor.start.first_place import (
     MARGIN_M,
     FirstPlace,
@@ -74,7 +75,7 @@ class Anchoring:
 
     Attributes:
         report: everything about the registration and placement.
-        page: to flick through, None where there are no frames. report_page: path of the report.
+        page: the report, in which frames are flicked through.
         placed: whether the map is in the database at its new place. version: of the database since;
             version_before: the last one that shows the old place.
         flagged: maps that were quarantined, because this one had placed them.
@@ -83,10 +84,7 @@ class Anchoring:
     """
 
     report: AnchorReport
-    map_id: str
-    out: Path
-    page: Path | None
-    report_page: Path
+    page: Path
     placed: bool = False
     version: int = -1
     version_before: int = -1
@@ -174,20 +172,15 @@ def _finished(
         result=result,
         notes=tuple(notes),
     )
-    page, report_page = write_anchor_report(
-        job.out, report, job.feature_map, job.cloud, job.rgb, _confirm_command(database, job)
-    )
-    done = Anchoring(
-        report=report, map_id=job.summary.map_id, out=job.out, page=page, report_page=report_page
-    )
+    command = _confirm_command(database, job)
+    page = write_anchor_report(job.out, report, job.feature_map, job.cloud, job.rgb, command)
+    done = Anchoring(report=report, page=page)
     if result is None:
         saved = {f.image.image_id: f.registration for f in tried.accepted}
         save_proposals(job.out, _state(job), saved)
         names = tuple(f.image.name for f in tried.accepted)
-        command = _confirm_command(database, job).replace(
-            "{image}", f" {_CONFIRM} ".join(shlex.quote(name) for name in names)
-        )
-        return replace(done, proposed=names, command=command)
+        confirmed = f" {_CONFIRM} ".join(shlex.quote(name) for name in names)
+        return replace(done, proposed=names, command=command.replace("{image}", confirmed))
     if result.feature_map is None:
         return done
     committed = database.commit_map(
@@ -208,7 +201,7 @@ def _confirm_command(database: Database, job: _Job) -> str:
     for option in job.request.storage_options:
         words += ["--storage-option", option]
     if job.first is not None:  # where it was put for the proposals is found again by the same words
-        words += job.first.files.words()
+        words += job.request.start.words()
     for scan_id in job.request.scan_ids:
         words += ["--scan", scan_id]
     words += ["--out", str(job.out)]
@@ -310,7 +303,8 @@ def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
     if job.first is not None:
         starts, notes = dict(job.first.starts), list(job.first.notes)
     else:
-        found = started_images(feature_map, request.start, feature_map.frame, feature_map.epsg)
+        told = request.start.read()
+        found = started_images(feature_map, told, feature_map.frame, feature_map.epsg)
         starts = {f.image.image_id: f.prior for f in found}
         notes = [f.note for f in found]
     for image_id in starts:

@@ -13,17 +13,14 @@ from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from ingest.register.anchor.start.files import read_picks, read_pose
+from ingest.register.anchor.start.files import RoughPose, read_picks, read_pose
 from ingest.register.anchor.start.picks import Picks, pose_from_picks
 from ingest.register.anchor.start.priors import (
     MIN_SIGMA_HORIZONTAL_M,
     MIN_SIGMA_VERTICAL_M,
-    RoughPose,
     height_shift,
     image_named,
-    look_at_angles,
     prior_from_map,
-    prior_from_rough_pose,
 )
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
 from tools.worlds.clouds import build_cloud
@@ -47,11 +44,11 @@ def picks_at(pose: Rigid3, count: int = 9, noise_px: float = 1.0, seed: int = 0)
 def test_picks_give_the_pose() -> None:
     truth = looking_down()
     picks, points = picks_at(truth)
-    found = pose_from_picks(picks, points, CAMERA, truth)
-    assert np.linalg.norm(found.prior.cam_from_local.center - truth.center) < 0.3
-    assert found.prior.cam_from_local.angle_to_deg(truth) < 0.3
-    assert found.outliers == []
-    assert MIN_SIGMA_HORIZONTAL_M <= found.prior.sigma_horizontal_m < 2.0
+    prior, fit = pose_from_picks(picks, points, CAMERA, truth)
+    assert np.linalg.norm(prior.cam_from_local.center - truth.center) < 0.3
+    assert prior.cam_from_local.angle_to_deg(truth) < 0.3
+    assert fit.wrong == ()
+    assert MIN_SIGMA_HORIZONTAL_M <= prior.sigma_horizontal_m < 2.0
 
 
 def test_an_outlier_among_the_picks_is_named_and_left_out() -> None:
@@ -59,9 +56,9 @@ def test_an_outlier_among_the_picks_is_named_and_left_out() -> None:
     picks, points = picks_at(truth)
     pixels = picks.pixels.copy()
     pixels[4] += (150.0, -90.0)
-    found = pose_from_picks(replace(picks, pixels=pixels), points, CAMERA, truth)
-    assert found.outliers == [4]
-    assert np.linalg.norm(found.prior.cam_from_local.center - truth.center) < 0.3
+    prior, fit = pose_from_picks(replace(picks, pixels=pixels), points, CAMERA, truth)
+    assert fit.wrong == (4,)
+    assert np.linalg.norm(prior.cam_from_local.center - truth.center) < 0.3
 
 
 def test_the_covariance_of_picked_poses_is_honest() -> None:
@@ -71,9 +68,9 @@ def test_the_covariance_of_picked_poses_is_honest() -> None:
     for seed in range(30):
         picks, points = picks_at(truth, count=8, noise_px=sigma_px, seed=seed)
         rng = np.random.default_rng(1000 + seed)
-        found = pose_from_picks(picks, points + rng.normal(0, 0.2, points.shape), CAMERA, truth)
-        error = (truth @ found.prior.cam_from_local.inverse()).log()
-        squared.append(float(error @ np.linalg.solve(found.covariance, error)))
+        _, fit = pose_from_picks(picks, points + rng.normal(0, 0.2, points.shape), CAMERA, truth)
+        error = (truth @ fit.cam_from_local.inverse()).log()
+        squared.append(float(error @ np.linalg.solve(fit.covariance, error)))
     # Six degrees of freedom; residuals of few picks make it a little conservative.
     assert 2.0 < np.mean(squared) < 7.5
 
@@ -119,16 +116,13 @@ def test_a_rough_pose_looks_where_it_says() -> None:
     feature_map = random_map(1)
     utm = np.array([EASTING + 40.0, NORTHING - 20.0, HEIGHT + 90.0])
     target = np.array([EASTING + 80.0, NORTHING + 50.0, HEIGHT])
-    yaw, pitch = look_at_angles(utm, target)
-    prior = prior_from_rough_pose(
-        RoughPose(image="x", utm=utm, yaw_deg=yaw, pitch_deg=pitch), feature_map.frame, feature_map.epsg
-    )
+    place = dict(zip(("easting", "northing", "height"), utm.tolist(), strict=True))
+    rough = RoughPose.model_validate(place | {"look_at": target.tolist()})
+    prior = rough.prior(feature_map.frame, feature_map.epsg)
     seen = prior.cam_from_local.act(feature_map.frame.enu_from_utm(target, EPSG))
     assert seen[2] > 0
     # UTM's scale and the Earth's curvature leave centimetres in a hundred metres.
     np.testing.assert_allclose(seen[:2] / seen[2], 0.0, atol=2e-3)
-    with pytest.raises(RegistrationError, match="own position"):
-        look_at_angles(utm, utm)
 
 
 def flat_map(sigma: float = 0.02) -> FeatureMap:
@@ -225,8 +219,7 @@ def test_files_of_poses(tmp_path: Path) -> None:
     path.write_text('{"easting": 0, "northing": 0, "height": 10, "look_at": [10, 0, 0], "sigma_tilt_deg": 2}')
     pose = read_pose(path, "b.jpg")
     assert pose.image == "b.jpg"
-    assert pose.yaw_deg == pytest.approx(90.0)
-    assert pose.pitch_deg == pytest.approx(-45.0)
+    assert pose.angles() == pytest.approx((90.0, -45.0))
     assert pose.sigma_tilt_deg == 2.0
 
 
@@ -237,6 +230,7 @@ def test_files_of_poses(tmp_path: Path) -> None:
         ('{"easting": 1, "northing": 2, "height": 3}', "give yaw_deg and pitch_deg, or look_at"),
         ('{"easting": 1, "northing": 2, "height": 3, "yaw_deg": 1, "pitch_deg": 100}', "pitch_deg"),
         ('{"easting": 1, "northing": 2, "height": 3, "pitch_deg": 1, "look_at": [1, 2, 3]}', "not both"),
+        ('{"easting": 1, "northing": 2, "height": 3, "look_at": [1, 2, 3]}', "own position"),
         ('{"easting": 1, "northing": 2, "height": 3, "jaw_deg": 1}', "jaw_deg"),
         ('{"easting": 1, "northing": 2, "height": 3, "yaw_deg": 1, "pitch_deg": 0}', "names no photo"),
     ],

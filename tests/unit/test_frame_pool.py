@@ -8,7 +8,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.features.matching import filled, lift, pool_features, source_image
+from ingest.register.frame.features.matching import filled, lift, pool_features
+from ingest.register.frame.sources import source_image
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=320, height=240, params=(300.0, 160.0, 120.0, -0.05))
 POSE = Rigid3(rotation=so3_exp([0.2, -0.1, 0.5]), translation=np.array([3.0, -2.0, 5.0]))
@@ -51,11 +52,10 @@ def test_silhouettes_holes_and_voids_are_not_trusted() -> None:
     assert good.tolist() == [False, False, False, False, True, False]
 
 
-@pytest.mark.parametrize("upright", [True, False])
-def test_pool_leaves_out_the_border_of_what_is_seen(upright: bool) -> None:
+def test_pool_leaves_out_the_border_of_what_is_seen() -> None:
     depth = np.full((240, 320), 40.0, np.float32)
     depth[:, :100] = np.nan
-    pool = pool_features(rendering(depth), "rgb", upright, 5000)
+    pool = pool_features(rendering(depth), "rgb")
     pixels = CAMERA.project(POSE.act(pool.points))
     assert len(pool) > 100
     assert len(pool.descriptors) == len(pool)

@@ -5,7 +5,6 @@ confirm most.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.dense.confirmation import PictureConfirmation
 from ingest.register.frame.dense.fit import (
@@ -16,33 +15,23 @@ from ingest.register.frame.dense.fit import (
 )
 from ingest.register.frame.features.search import (
     FrameHypothesis,
-    RenderGroup,
     fan_groups,
-    guided,
-    oriented_features_suffice,
     search,
-    star_groups,
+    star_group,
 )
 from ingest.register.frame.prior_fit import loosened
-from ingest.register.frame.verdict import MIN_CONFIRMATION_PIECES, MIN_JOINT_LOG_NFA
-from ingest.register.frame.views import FULL_CIRCLE_SIGMA_DEG, FrameViews
-from ingest.register.frame_registration import FramePrior, RenderSource
+from ingest.register.frame.sources import available_sources, searched_sources
+from ingest.register.frame.verdict import DECISIVE_LOG_NFA, SURE_CONFIRMATION_LOG_NFA, beyond_doubt
+from ingest.register.frame.views import FrameViews
+from ingest.register.frame_registration import FramePrior
 
 _MIN_LOG_NFA = 2.0  # a pose with less evidence among the features' matches is not looked into
-_DECISIVE_LOG_NFA = 60.0  # one with so much, if the pictures confirm it, ends the search
-# And so does one that the pictures confirm so strongly. Three of four right poses do; wrong ones reached 8.
-_SURE_CONFIRMATION_LOG_NFA = 20.0
 # A pose of the dense search with less evidence of the pictures is not fitted. Before the fit right ones had
 # 0.6 and more, of those at wrong places one in ten.
 _PROMISING_LOG_NFA = 0.5
 # So many times at most the best pose is searched and fitted again, where it is not confirmed, but has that
 # much evidence.
 _MORE_LOOKS = 2
-# First radius around a predicted place in which a match is looked for, share of the longer side; the second
-# is a third of it.
-_GUIDED_RADIUS_REL = 0.012
-
-_GUIDED_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,14 +52,7 @@ def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> J
         if start.kind == "dense" and begun.confirmation.log_nfa < _PROMISING_LOG_NFA:
             continue
         judged.append(polished(views, loose, begun.found, clock))
-        confirmation = judged[-1].confirmation
-        # Decisive features stand alone where the pictures have too little to compare.
-        silent = confirmation.pieces < MIN_CONFIRMATION_PIECES
-        if start.log_nfa >= _DECISIVE_LOG_NFA and (confirmation.confirmed or silent):
-            return judged[-1]
-        joint = start.log_nfa + confirmation.log_nfa
-        sure = confirmation.log_nfa >= _SURE_CONFIRMATION_LOG_NFA
-        if confirmation.confirmed and (sure or joint >= MIN_JOINT_LOG_NFA):
+        if beyond_doubt(start.log_nfa, judged[-1].confirmation):
             return judged[-1]
     best = max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
     return best and _looked_again(views, prior, best, clock)
@@ -91,84 +73,38 @@ def _looked_again(views: FrameViews, prior: FramePrior, judged: Judged, clock: S
     return best
 
 
-def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
-    """What can be rendered of a scan, most telling first."""
-    sources: list[RenderSource] = []
-    if cloud.rgb is not None:
-        sources.append("rgb")
-    if cloud.intensity is not None:
-        sources.append("intensity")
-    return (*sources, "shaded")
-
-
 def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator[FrameHypothesis]:
     """Poses to begin with, made as they are asked for: by source, features first, then dense templates."""
     with clock.stage("render star"):
-        star = star_groups(views, prior)
-    fan: list[RenderGroup] | None = None
-    for source in _searched(available_sources(views.cloud)):
-        for upright in _kinds(prior):
-            if upright and fan is None:
-                with clock.stage("render fan"):
-                    fan = fan_groups(views, prior)
-            groups = [*star, *(fan or [])] if upright else star
-            with clock.stage(f"search {source} {'upright' if upright else 'oriented'}"):
-                found = search(views, groups, source, upright)
-            if found is not None and found.log_nfa >= _MIN_LOG_NFA:
-                yield found
+        groups = [star_group(views, prior), *fan_groups(views, prior)]
+    for source in searched_sources(views.cloud):
+        with clock.stage(f"search {source} features"):
+            found = search(views, groups, source)
+        if found is not None and found.log_nfa >= _MIN_LOG_NFA:
+            yield found
         with clock.stage(f"search {source} dense"):
             dense = dense_hypotheses(views, prior, source)
         yield from dense
 
 
-def _searched(sources: tuple[RenderSource, ...]) -> tuple[RenderSource, ...]:
-    """Shaded relief has nothing to match and few edges (docs/measurements/descriptors.md): where the scan has
-    more to show, poses are compared with it, but not searched.
-    """
-    telling = tuple(source for source in sources if source != "shaded")
-    return telling or sources
-
-
 def by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
     """The pose with the source that agrees best with the photo there, whichever it was found by."""
     own = Judged(found=found, confirmation=confirmed(views, found))
-    if found.log_nfa >= _DECISIVE_LOG_NFA:
+    if found.log_nfa >= DECISIVE_LOG_NFA:
         return own
     others = [
         replace(found, source=source) for source in available_sources(views.cloud) if source != found.source
     ]
     judged = [own, *(Judged(found=other, confirmation=confirmed(views, other)) for other in others)]
     # Relief shows what stands and nothing of the ground: it is asked instead of others only beyond doubt.
-    sure = _SURE_CONFIRMATION_LOG_NFA
+    sure = SURE_CONFIRMATION_LOG_NFA
     heard = [j for j in judged if j is own or j.found.source != "shaded" or j.confirmation.log_nfa >= sure]
     return max(heard, key=lambda j: j.confirmation.log_nfa)
 
 
 def polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock: StageClock) -> Judged:
-    """Fitted by guided features where colours are rendered, else by pieces; and shown to the pictures."""
-    by_features = found.source == "rgb" and found.kind != "dense"
+    """Fitted to pieces of a render, and shown to the pictures."""
     with clock.stage("fit"):
-        if by_features:
-            fitted = _guided(views, prior, found)
-        else:
-            fitted = dense_fitted(views, prior, found, views.options.dense_fit) or found
+        fitted = dense_fitted(views, prior, found, views.options.dense_fit) or found
     with clock.stage("confirm"):
         return Judged(found=fitted, confirmation=confirmed(views, fitted))
-
-
-def _guided(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis:
-    side = max(views.camera.width, views.camera.height)
-    for turn in range(_GUIDED_ROUNDS):
-        better = guided(views, prior, found, _GUIDED_RADIUS_REL * side / 3.0**turn)
-        if better is None:
-            break
-        found = better
-    return found
-
-
-def _kinds(prior: FramePrior) -> tuple[bool, ...]:
-    """Upright features first where the heading is known; without, those with orientation cost less."""
-    unknown = prior.sigma_heading_deg >= FULL_CIRCLE_SIGMA_DEG
-    if not unknown:
-        return (True, False)
-    return (False, True) if oriented_features_suffice(prior) else (True,)

@@ -89,12 +89,13 @@ def fit_near(
     views = _views(gray, camera, prior, cloud, options, clock)
     if isinstance(views, FrameRegistration):
         return views
-    start, loose = unmatched(prior.cam_from_local, camera, source, "oriented"), loosened(prior)
+    start, loose = unmatched(prior.cam_from_local, camera, source), loosened(prior)
     judged = polished(views, loose, start, clock)
     if not judged.confirmation.confirmed:
         # Other light, other seasons: what agreed for the frames before need not for this one.
-        other = by_agreement(views, replace(start, kind="dense"))
-        judged = polished(views, loose, other.found, clock)
+        other = by_agreement(views, start).found
+        if other.source != source:
+            judged = polished(views, loose, other, clock)
     found, confirmation = judged.found, judged.confirmation
     if not confirmation.confirmed:
         return _refused("NOT_CONFIRMED", confirmation.message, {}, clock)
@@ -134,7 +135,6 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageC
         refusal = verdict(evidence)
     figures = asdict(evidence) | {
         "matched_by": found.kind,
-        "confirmation": asdict(judged.confirmation),
         "depth_m": views.look.depth_m,
         "spacing_m": views.look.spacing_m,
         "focal_px": found.pose.camera.focal_px,
@@ -178,7 +178,7 @@ def left_perturbation(covariance: FloatArray, cam_from_local: Rigid3) -> FloatAr
 def _evidence(
     views: FrameViews, prior: FramePrior, judged: Judged, covariance: FloatArray | None
 ) -> FrameEvidence:
-    found, confirmation = judged.found, judged.confirmation
+    found = judged.found
     cells, agreement = 0, 0.0
     renderings = views.renders([found.pose.cam_from_local], MIN_SIDE_PX)
     if renderings:
@@ -190,10 +190,7 @@ def _evidence(
         inliers=len(found.inliers),
         candidates=found.candidates,
         log_nfa=found.log_nfa,
-        confirmed=confirmation.confirmed,
-        confirmation_pieces=confirmation.pieces,
-        confirmation_log_nfa=confirmation.log_nfa,
-        confirmation_message=confirmation.message,
+        confirmation=judged.confirmation,
         cells=cells,
         agreement=agreement,
         rival_share=found.rival_share,
@@ -205,7 +202,7 @@ def _evidence(
 
 def _compared(views: FrameViews, prior: FramePrior, judged: Judged, evidence: FrameEvidence) -> FrameEvidence:
     """With how well the photo agrees with the scan at places where it cannot be."""
-    pose, enough = judged.found.pose.cam_from_local, highest_elsewhere(evidence.confirmation_log_nfa)
+    pose, enough = judged.found.pose.cam_from_local, highest_elsewhere(evidence.confirmation.log_nfa)
     places, log_nfa = agreement_elsewhere(
         views, prior, pose, judged.found.source, MAX_PLACES_ELSEWHERE, enough
     )
