@@ -18,8 +18,8 @@ from ingest.register.anchor.frames import TriedFrames
 from ingest.register.anchor.page import anchor_page
 from ingest.register.anchor.pictures import edges_of, scan_view
 from ingest.register.anchor.proposals import propose_frames, small_camera
-from ingest.register.block import block_of_map
 from ingest.register.anchor.report import AnchorReport
+from ingest.register.block import block_of_map
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from ingest.register.structure.map_move import map_move, map_residuals
 from tests.support.maps import random_map

@@ -25,19 +25,17 @@ from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.features.matching import pool_features
+from ingest.register.frame.sources import available_sources
 from ingest.register.frame.verdict import MIN_COVER
-from ingest.register.frame.views import SPACING_PX
 from ingest.register.frame_registration import RenderSource
-from ingest.register.structure.similarity import similarities
 from reloc.localise.acceptance import log_nfa
 
 _SIDE_PX = 1000  # of a picture from above; the next one overlaps it by half
 _VIEWS = (
     8  # along a side, at most: a picture shows a quarter of a side, or what the scan's points are fine for
 )
-_FEATURES = 3000  # of each
+_SPACING_PX = 1.5  # between scan points: splats show nothing finer
 _MOST_DESCRIPTORS = 30_000  # of the map: more say the same again, and take longer
 _NEIGHBOURS = 8  # one point of the map has a descriptor in each photo: the next point must be among them
 _MAX_RATIO = 0.85  # as localisation has it
@@ -94,7 +92,7 @@ def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundFromAbove
 
 def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> FoundFromAbove | None:
     wide_m = _wide_m(cloud)
-    pools = [pool_features(view, source, False, _FEATURES) for view in _views(cloud, wide_m)]
+    pools = [pool_features(view, source, upright=False) for view in _views(cloud, wide_m)]
     if not pools:
         return None
     places = np.concatenate([pool.points for pool in pools])
@@ -114,7 +112,7 @@ def _wide_m(cloud: PointCloud) -> float:
     """What a picture shows: as fine as the scan's points are dense, and no more than so many pictures."""
     plan = np.ptp(cloud.xyz[:, :2], axis=0)
     spacing = float(np.sqrt(np.prod(plan) / len(cloud)))
-    return max(_SIDE_PX * spacing / SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
+    return max(_SIDE_PX * spacing / _SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
 
 
 def _views(cloud: PointCloud, wide_m: float) -> Iterator[Rendering]:
@@ -153,7 +151,7 @@ def _most_fitting(own: FloatArray, local: FloatArray, tolerance_m: float) -> Sim
     best, most = None, 0
     for batch in range(1, _BATCHES + 1):
         rows = rng.integers(0, len(own), (_BATCH, _SAMPLE))
-        scale, rotation, translation, usable = similarities(own[rows], local[rows])
+        scale, rotation, translation, usable = _similarities(own[rows], local[rows])
         if usable.any():
             scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
             off = (scale[:, None, None] * rotation).reshape(-1, 3) @ own[scored].T + translation.reshape(
@@ -169,6 +167,29 @@ def _most_fitting(own: FloatArray, local: FloatArray, tolerance_m: float) -> Sim
         if batch * _BATCH * np.log1p(-min(right, 1.0 - 1e-12)) < np.log(_MISSED):
             break
     return best
+
+
+def _similarities(
+    source: FloatArray, target: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Umeyama's solution for k sets of m pairs (k, m, 3) at once.
+
+    Returns:
+        scale (k,), rotation (k, 3, 3), translation (k, 3), and which sets determine them (k,).
+    """
+    source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+    a, b = source - source_mean[:, None], target - target_mean[:, None]
+    u, values, vt = np.linalg.svd(np.swapaxes(b, 1, 2) @ a)
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    values[:, 2] *= sign
+    u[:, :, 2] *= sign[:, None]
+    rotation = u @ vt
+    variance = (a**2).sum(axis=(1, 2))
+    scale = values.sum(axis=1) / np.where(variance > 0, variance, 1.0)
+    # Collinear points leave the rotation about their line open.
+    usable = (variance > 1e-12) & (values[:, 1] > 1e-3 * values[:, 0]) & (scale > 0)
+    translation = target_mean - scale[:, None] * np.einsum("kij,kj->ki", rotation, source_mean)
+    return scale, rotation, translation, usable
 
 
 def _judged(

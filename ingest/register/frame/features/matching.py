@@ -1,7 +1,7 @@
 """Features of renders, pooled with the scan points that they show, and their matches with a photo."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -41,14 +41,17 @@ class Pool:
         return len(self.points)
 
 
-def pool_features(rendering: Rendering, source: RenderSource) -> Pool:
+def pool_features(rendering: Rendering, source: RenderSource, *, upright: bool = True) -> Pool:
     """Features of a render, lifted to the scan by its depth.
+
+    Args:
+        upright: without orientation; else they match at any turn.
 
     Raises:
         InvalidValueError: the scan does not have `source`.
     """
     image = filled(source_image(rendering, source), rendering.valid)
-    features = extract(image, _EXTRACTOR)
+    features = extract(image, replace(_EXTRACTOR, upright=upright))
     points, good = lift(rendering, features.xy, _MAX_DEPTH_STEP)
     clear = cv2.distanceTransform(np.pad(rendering.valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     column = np.clip(features.xy[:, 0].astype(np.int64), 0, image.shape[1] - 1)
