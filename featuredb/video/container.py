@@ -158,7 +158,6 @@ class ContainerVideo(Video):
                 f"{_said(stored)}; split the film there, as each part needs a camera of its own"
             )
         gray = _converted(self._pixels.gray, picture, self.info.name)
-        self._tally.delivered += 1
         self._tally.damaged += picture.is_corrupt
         name, rgb = self.info.name, self._pixels.rgb  # and not the whole film, which frames may outlive
         return VideoFrame(

@@ -146,7 +146,6 @@ class VideoReport:
     """What reading a film has come to so far; counted up by its reader, who gives copies away.
 
     Attributes:
-        delivered: frames that were handed out.
         decoded: frames that were decoded, also those outside the asked stretch.
         undecodable: packets (each a frame) that could not be decoded, or are only there in part.
         damaged: frames that were handed out although parts of them are made up.
@@ -161,7 +160,6 @@ class VideoReport:
             it is more than rounding; sound that runs on counts as length, too.
     """
 
-    delivered: int = 0
     decoded: int = 0
     undecodable: int = 0
     damaged: int = 0

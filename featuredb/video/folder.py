@@ -121,7 +121,6 @@ class FolderVideo(Video):
         except ImageError as error:
             raise self._broken(name, error) from error
         done = self._report
-        done.delivered += 1
         done.decoded += 1
         if done.last_s is not None:
             done.longest_gap_s = max(done.longest_gap_s, time_s - done.last_s)

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyarrow import csv
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
@@ -197,10 +196,14 @@ def read_tracks(path: Path, images: Sequence[str], tracks: Sequence[str]) -> Ope
             f"longer side of the image, found {values[row].tolist()}; export the tracks again"
         )
     image, track = (
-        pc.index_in(table[name], pa.array(known, pa.string())).fill_null(-1).to_numpy().astype(np.int64)
-        for name, known in (("image", images), ("track", tracks))
+        np.array([known.get(value, -1) for value in table[name].to_pylist()], dtype=np.int64)
+        for name, known in (("image", _rows(images)), ("track", _rows(tracks)))
     )
     ours = (image >= 0) & (track >= 0)
     return OpensfmTracks(
         image=image[ours], track=track[ours], xy=values[ours, :2], scale=np.ascontiguousarray(values[ours, 2])
     )
+
+
+def _rows(names: Sequence[str]) -> dict[str, int]:
+    return {name: row for row, name in enumerate(names)}

@@ -26,7 +26,7 @@ class _Film(Video):
 
     @property
     def report(self) -> VideoReport:
-        return VideoReport(delivered=self.read)
+        return VideoReport(decoded=self.read)
 
     def close(self) -> None:
         self._known = []
@@ -57,7 +57,7 @@ def test_frames_are_those_of_the_film_however_far_it_is_read_ahead(
     for frame, same in zip(found, expected, strict=True):
         np.testing.assert_array_equal(frame.gray, same.gray)
     assert report.whole
-    assert report.delivered == 50
+    assert report.decoded == 50
     assert ahead.seconds > 0.0
 
 

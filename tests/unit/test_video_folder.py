@@ -37,7 +37,7 @@ def test_a_folder_in_natural_order_at_a_rate(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames[4].rgb(), picture(4))
     info = video.info
     assert (info.width, info.height, info.frame_count) == (WIDTH, HEIGHT, 6)
-    assert video.report.delivered == 6
+    assert video.report.decoded == 6
     assert video.report.whole
 
 

@@ -29,7 +29,7 @@ def test_every_frame_comes_in_order_at_its_time(tmp_path: Path, kind: str) -> No
     # A transport stream begins at any time of its clock, which is taken off but for the codec's delay.
     assert start_s == pytest.approx(0.0, abs=0.1 if kind == "ts" else 1e-9)
     assert (video.info.width, video.info.height, video.info.rotation_deg) == (WIDTH, HEIGHT, 0)
-    assert (report.delivered, report.undecodable, report.damaged, report.missing) == (30, 0, 0, 0)
+    assert (report.decoded, report.undecodable, report.damaged, report.missing) == (30, 0, 0, 0)
     assert report.whole, report.complaints()
     assert report.at_end
     assert report.longest_gap_s == pytest.approx(0.04, abs=1e-3)

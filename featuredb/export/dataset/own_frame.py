@@ -10,7 +10,6 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from featuredb.errors import ExportError
 from featuredb.export.dataset.geoparquet import TableFile
 from featuredb.export.dataset.read import check_listed, decoded, read_table
 from featuredb.maps.unplaced_map import UnplacedMap
@@ -79,11 +78,9 @@ def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> Un
     for table in _CHILDREN:
         check_listed(table_path(table), listed, folder)
     only = ds.field("map_id") == row["map_id"]
-    found = decoded(
+    return decoded(
         folder,
         dict(row),
         lambda: {t: read_table(folder / table_path(t), only=only).to_batches() for t in _CHILDREN},
+        UnplacedMap,
     )
-    if not isinstance(found, UnplacedMap):
-        raise ExportError(f"{folder}, map {found.map_id}: expected a map without a place, found one with")
-    return found

@@ -71,10 +71,12 @@ def _draw(axes: "Axes", place: list[MapEntry]) -> None:
     for entry in place:
         for ring in _rings(entry):
             axes.fill(*plain(ring), color=_AREA)
-    for size, colour, name in ((1.0, _POINT, "points_lon_lat"), (8.0, _CAMERA, "cameras_lon_lat")):
-        for entry in place:
-            east, north = plain(getattr(entry, name))
-            axes.scatter(east, north, s=size, color=colour, linewidths=0)
+    for entry in place:
+        east, north = plain(entry.points_lon_lat)
+        axes.scatter(east, north, s=1.0, color=_POINT, linewidths=0)
+    for entry in place:
+        east, north = plain(entry.cameras_lon_lat)
+        axes.scatter(east, north, s=8.0, color=_CAMERA, linewidths=0)
     axes.set_aspect(1.0 / np.cos(np.radians(middle[1])), adjustable="datalim")
     axes.ticklabel_format(useOffset=False)
     axes.tick_params(labelsize=6)

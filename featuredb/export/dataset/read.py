@@ -15,7 +15,7 @@ from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.partitions import COLUMNS
 from featuredb.export.dataset.sums import check_sums
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.unplaced_map import AnyMap
+from featuredb.maps.unplaced_map import MapKind
 from featuredb.store.decode import decode_map
 from featuredb.store.encode import content_digest
 
@@ -63,13 +63,14 @@ def load_map(folder: Path, row: Row, listed: frozenset[str]) -> FeatureMap:
     Raises:
         ExportError: its rows cannot be read, or are not the map that was exported.
     """
-    found = decoded(folder, row, lambda: {table: _rows_of(folder, table, row, listed) for table in COLUMNS})
-    if not isinstance(found, FeatureMap):
-        raise ExportError(f"{folder}, map {found.map_id}: expected a map with a place, found one without")
-    return found
+    return decoded(
+        folder, row, lambda: {table: _rows_of(folder, table, row, listed) for table in COLUMNS}, FeatureMap
+    )
 
 
-def decoded(folder: Path, row: Row, children: Callable[[], dict[str, list[pa.RecordBatch]]]) -> AnyMap:
+def decoded(
+    folder: Path, row: Row, children: Callable[[], dict[str, list[pa.RecordBatch]]], kind: type[MapKind]
+) -> MapKind:
     """The map of a row and of the rows of its tables.
 
     Raises:
@@ -80,7 +81,7 @@ def decoded(folder: Path, row: Row, children: Callable[[], dict[str, list[pa.Rec
         found = decode_map(row, children())
     except FeatureDbError as error:
         raise ExportError(f"{folder}, map {map_id}: its files do not make a map ({error})") from error
-    if content_digest(found) != row["content_digest"]:
+    if not isinstance(found, kind) or content_digest(found) != row["content_digest"]:
         raise ExportError(
             f"{folder}, map {map_id}: the files hold another map than the one that was exported "
             f"(its digest was {row['content_digest']}); get the dataset once more from its source"
