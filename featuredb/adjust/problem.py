@@ -37,6 +37,7 @@ _LOG = logging.getLogger(__name__)
 _MAX_RADIUS = 1e10  # of Levenberg-Marquardt; without any damping what nothing determines is singular
 _LETS_GO = 2.0  # sigmas beyond which a lens prior loses to photos that know: EXIF of a cropped photo
 _ANYWHERE = 1e6  # units of the block: sigma of a position of which nothing is known
+_FAR_BEHIND = 1e6  # units of the block: no camera comes so far that what was behind it is not
 _DENSE_SIZE = 1500  # shared parameters; above, the reduced system is factorised sparsely
 
 
@@ -113,7 +114,10 @@ class Problem:
             else pyceres.LinearSolverType.SPARSE_SCHUR
         )
         summary = pyceres.SolverSummary()
+        told = pyceres.logging.minloglevel
+        pyceres.logging.minloglevel = pyceres.logging.Level.ERROR.value  # steps taken back are no news
         pyceres.solve(options, self._ceres, summary)
+        pyceres.logging.minloglevel = told
         if not summary.IsSolutionUsable():
             _LOG.warning("the adjustment failed, everything stays as it was: %s", summary.BriefReport())
         return summary
@@ -316,9 +320,11 @@ def _pose(params: FloatArray) -> Rigid3:
 
 
 def _seen_by_marks_alone(block: Block, terms: Terms) -> list[int]:
-    """Photos that see marks and nothing of the block."""
-    marked = terms.marks.photo_of if terms.marks is not None else np.zeros(0, dtype=np.int64)
-    return sorted(set(marked.tolist()) - set(block.photo_of.tolist()))
+    """Photos that see marks or targets and nothing of the block."""
+    marked = {
+        photo for seen in (terms.marks, terms.targets) if seen is not None for photo in seen.photo_of.tolist()
+    }
+    return sorted(marked - set(block.photo_of.tolist()))
 
 
 def _reconstruction(block: Block, only_marks: list[int]) -> Any:
@@ -353,7 +359,7 @@ def _reconstruction(block: Block, only_marks: list[int]) -> Any:
         )
     for i, k in enumerate(only_marks):
         track = pycolmap.Track([pycolmap.TrackElement(k + 1, 0), pycolmap.TrackElement(k + 1, 1)])
-        behind = block.cam_from_block[k].inverse().act(np.array([0.0, 0.0, -1.0]))
+        behind = block.cam_from_block[k].inverse().act(np.array([0.0, 0.0, -_FAR_BEHIND]))
         result.add_point3D_with_id(
             len(block.xyz) + i + 1, pycolmap.Point3D(xyz=behind, track=track, color=colour)
         )

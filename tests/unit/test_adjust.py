@@ -261,7 +261,7 @@ def test_a_photo_that_sees_marks_alone_is_placed_by_them() -> None:
     xy = TRUE.project(true.act(xyz))
     others = block.photo_of != 2
     poses = list(block.cam_from_block)
-    poses[2] = Rigid3.exp(rng.normal(0, 0.01, 6)) @ true
+    poses[2] = Rigid3.exp(rng.normal((0, 0, 0, 0, 0, -2.0), 0.01)) @ true
     block = replace(
         block,
         cam_from_block=tuple(poses),

@@ -24,7 +24,7 @@ from ingest.register.anchor.files import PhotoFiles, find_photos
 from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
 from ingest.register.anchor.start.first_place import StartFiles, chosen_scans
 from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
-from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, least_picks, pose_from_picks
+from ingest.register.anchor.start.picks import focal_sigma_rel, least_picks, prior_of_picks
 
 _PHOTO_PX = 4096
 _GROUND_PX, _GROUND_GAP_PX, _GROUND_EMPTY = 4000, 5, 24
@@ -141,29 +141,18 @@ class PickSession:
                 {
                     "residual_px": float(fit.distances_px[i]),
                     "at": (pixels[i] - fit.residuals_px[i]).tolist(),
-                    "sigmas": float(fit.normalised[i]),
+                    "sigmas": None if i in fit.wrong else float(fit.normalised[i]),
                     "wrong": i in fit.wrong,
                     "doubtful": i in fit.doubtful,
                 }
                 for i in range(len(spots))
             ],
-            "rms_px": float(np.sqrt((fit.distances_px[fit.believed] ** 2).mean())),
-            "chi_square": fit.chi_square,
-            "redundancy": fit.redundancy,
-            "focal_px": fit.camera.focal_px,
         }
         try:
-            utm = self.cloud.frame.utm_from_enu(points, self.epsg)
-            by = pose_from_picks(
-                Picks(image=image.name, pixels=pixels, utm=utm),
-                points,
-                camera,
-                self._upright(image),
-                focal_rel,
-            )
+            prior = prior_of_picks(image.name, points, fit, self._upright(image))
         except FeatureDbError as error:
             return found | {"ready": False, "message": str(error)}
-        east, north, up = self.cloud.frame.utm_from_enu(by.prior.cam_from_local.center, self.epsg)
+        east, north, up = self.cloud.frame.utm_from_enu(prior.cam_from_local.center, self.epsg)
         wrong = (
             ""
             if not fit.wrong
@@ -172,7 +161,7 @@ class PickSession:
         return found | {
             "ready": True,
             "message": f"{wrong}Camera at {east:.1f} E, {north:.1f} N, {up:.1f} m (EPSG:{self.epsg}), to "
-            f"{by.prior.sigma_horizontal_m:.1f} m and {by.prior.sigma_tilt_deg:.1f} degrees",
+            f"{prior.sigma_horizontal_m:.1f} m and {prior.sigma_tilt_deg:.1f} degrees",
         }
 
     def overlay_png(self, image_id: int) -> bytes:

@@ -146,21 +146,20 @@ def by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) ->
     """
     image = image_named(feature_map, picks.image)
     upright = not isinstance(feature_map, UnplacedMap) or feature_map.frame.upright
-    found = pose_from_picks(
+    prior, fit = pose_from_picks(
         picks,
         frame.enu_from_utm(picks.utm, epsg),
         feature_map.cameras[image.camera_id],
         image.cam_from_local if upright else None,
         focal_sigma_rel(feature_map, image),
     )
-    believed = found.fit.believed
     note = (
         f"{image.name} starts from {len(picks.pixels)} picks, median residual "
-        f"{float(np.median(found.residuals_px[believed])):.1f} px"
+        f"{float(np.median(fit.distances_px[fit.believed])):.1f} px"
     )
-    if found.outliers:
-        note += f"; they contradict the others: line {', '.join(str(i + 1) for i in found.outliers)}"
-    return StartedImage(image=image, prior=found.prior, camera=found.camera, note=note)
+    if fit.wrong:
+        note += f"; they contradict the others: line {', '.join(str(i + 1) for i in fit.wrong)}"
+    return StartedImage(image=image, prior=prior, camera=fit.camera, note=note)
 
 
 def first_place(

@@ -17,6 +17,7 @@ from ingest.register.anchor.start.priors import (
     MIN_SIGMA_VERTICAL_M,
 )
 from ingest.register.frame_registration import FramePrior
+from reloc.tracking.pose_fit import of_camera
 
 KNOWN_FOCAL_REL = 0.03  # EXIF rounds, and reconstructions over flat ground drift from it by as much
 UNKNOWN_FOCAL_REL = 0.3
@@ -48,33 +49,6 @@ class Picks:
         object.__setattr__(self, "utm", frozen_array("Picks.utm", self.utm, (len(pixels), 3)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PickedPose:
-    """What the picks say.
-
-    Attributes:
-        prior: the pose with its deviations.
-        camera: the lens, its focal length as the picks have it.
-        covariance: (6, 6) of the left perturbation of the pose.
-        fit: residuals and tests of the picks.
-    """
-
-    prior: FramePrior
-    camera: Camera
-    covariance: FloatArray
-    fit: PickFit
-
-    @property
-    def residuals_px(self) -> FloatArray:
-        """(n,) of all picks."""
-        return self.fit.distances_px
-
-    @property
-    def outliers(self) -> list[int]:
-        """Rows of the picks that contradict the others."""
-        return list(self.fit.wrong)
-
-
 def focal_sigma_rel(feature_map: AnyMap, image: MapImage) -> float:
     """How well the focal length of a photo's camera is known, relative.
 
@@ -97,13 +71,12 @@ def pose_from_picks(
     camera: Camera,
     present: Rigid3 | None,
     focal_rel: float = KNOWN_FOCAL_REL,
-) -> PickedPose:
+) -> tuple[FramePrior, PickFit]:
     """Pose by picked correspondences, if they determine it and do not contradict each other.
 
     Args:
         points: (n, 3) the picks' coordinates in the local frame, metres.
-        present: where the map has the camera now, in the local frame, of which only the vertical counts; None
-            where the map does not know up.
+        present: see `prior_of_picks`.
         focal_rel: standard deviation of the focal length, relative.
 
     Raises:
@@ -117,68 +90,69 @@ def pose_from_picks(
             "add well-spread points"
         )
     fit = fit_picks(picks.pixels, points, camera, focal_rel)
-    _check(picks, points, fit, present)
-    assert fit is not None
-    prior = _prior(fit.cam_from_local, fit.covariance)
-    widest_deg = max(prior.sigma_tilt_deg, prior.sigma_heading_deg)
-    if prior.sigma_horizontal_m > _MAX_PICK_SIGMA_M or widest_deg > _MAX_PICK_SIGMA_DEG:
-        raise RegistrationError(
-            f"picks of {picks.image}: they leave the pose open to {prior.sigma_horizontal_m:.0f} m and "
-            f"{widest_deg:.0f} degrees; spread them over the photo"
-        )
-    to_left = np.kron(np.eye(2), -fit.cam_from_local.rotation)
-    return PickedPose(
-        prior=prior, camera=fit.camera, covariance=to_left @ fit.covariance @ to_left.T, fit=fit
-    )
+    if fit is None:
+        raise RegistrationError(_contradictory(picks.image, ""))
+    return prior_of_picks(picks.image, points, fit, present), fit
 
 
-def _check(picks: Picks, points: FloatArray, fit: PickFit | None, present: Rigid3 | None) -> None:
-    """Refuse what contradicts itself or the map.
+def prior_of_picks(image: str, points: FloatArray, fit: PickFit, present: Rigid3 | None) -> FramePrior:
+    """The pose of fitted picks with its deviations.
+
+    Args:
+        points: (n, 3) the picks' coordinates in the local frame, metres.
+        present: where the map has the camera now, in the local frame, of which only the vertical counts; None
+            where the map does not know up.
 
     Raises:
-        RegistrationError
+        RegistrationError: contradictory or badly spread picks.
     """
-    if fit is None or not fit.consistent:
-        far = "" if fit is None else f"; they miss one pose by up to {fit.distances_px.max():.0f} px"
-        raise RegistrationError(
-            f"picks of {picks.image}: they contradict each other{far}; check the order of the columns "
-            "(pixel x, pixel y, easting, northing, height), the zone, the heights and the photo, or add "
-            "picks: of eight, two wrong ones are found"
-        )
+    pose = fit.cam_from_local
+    if not fit.consistent:
+        far = f"; they miss one pose by up to {fit.distances_px.max():.0f} px"
+        raise RegistrationError(_contradictory(image, far))
     if fit.doubtful:
         raise RegistrationError(
-            f"picks of {picks.image}: one of {', '.join(str(i + 1) for i in fit.doubtful)} is wrong, and the "
+            f"picks of {image}: one of {', '.join(str(i + 1) for i in fit.doubtful)} is wrong, and the "
             "others do not tell which; add a pick"
         )
     if fit.other_pose:
         raise RegistrationError(
-            f"picks of {picks.image}: two poses explain them equally well; add a pick, best where the ground "
+            f"picks of {image}: two poses explain them equally well; add a pick, best where the ground "
             "is higher or lower"
         )
-    axis_up = float(fit.cam_from_local.rotation[2, 2])
-    if axis_up > 0.5 and fit.cam_from_local.center[2] < float(points[:, 2].min()):
+    if pose.rotation[2, 2] > 0.5 and pose.center[2] < float(points[:, 2].min()):
         raise RegistrationError(
-            f"picks of {picks.image}: the camera would look at the scan from below; are easting and "
+            f"picks of {image}: the camera would look at the scan from below; are easting and "
             "northing, or pixel x and y, swapped?"
         )
-    if present is None:
-        return
-    cosine = fit.cam_from_local.rotation[:, 2] @ present.rotation[:, 2]
-    tilt = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    if tilt > _MAX_PICK_TILT_DEG:
-        raise RegistrationError(
-            f"picks of {picks.image}: they turn the camera's vertical by {tilt:.0f} degrees against the map; "
-            "are easting and northing, or pixel x and y, swapped?"
-        )
-
-
-def _prior(pose: Rigid3, covariance: FloatArray) -> FramePrior:
-    """From a covariance of rotation about the local axes and centre."""
-    sigma = np.sqrt(np.diag(covariance))
-    return FramePrior(
+    if present is not None:
+        cosine = pose.rotation[:, 2] @ present.rotation[:, 2]
+        tilt = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        if tilt > _MAX_PICK_TILT_DEG:
+            raise RegistrationError(
+                f"picks of {image}: they turn the camera's vertical by {tilt:.0f} degrees against the map; "
+                "are easting and northing, or pixel x and y, swapped?"
+            )
+    sigma = np.sqrt(np.diag(of_camera(pose, fit.covariance)))
+    angles = np.maximum(np.degrees(sigma[:3]), MIN_SIGMA_ANGLE_DEG)
+    prior = FramePrior(
         cam_from_local=pose,
         sigma_horizontal_m=max(float(sigma[3:5].max()), MIN_SIGMA_HORIZONTAL_M),
         sigma_vertical_m=max(float(sigma[5]), MIN_SIGMA_VERTICAL_M),
-        sigma_heading_deg=max(float(np.degrees(sigma[2])), MIN_SIGMA_ANGLE_DEG),
-        sigma_tilt_deg=max(float(np.degrees(sigma[:2].max())), MIN_SIGMA_ANGLE_DEG),
+        sigma_heading_deg=float(angles[2]),
+        sigma_tilt_deg=float(angles[:2].max()),
+    )
+    if prior.sigma_horizontal_m > _MAX_PICK_SIGMA_M or angles.max() > _MAX_PICK_SIGMA_DEG:
+        raise RegistrationError(
+            f"picks of {image}: they leave the pose open to {prior.sigma_horizontal_m:.0f} m and "
+            f"{angles.max():.0f} degrees; spread them over the photo"
+        )
+    return prior
+
+
+def _contradictory(image: str, far: str) -> str:
+    return (
+        f"picks of {image}: they contradict each other{far}; check the order of the columns "
+        "(pixel x, pixel y, easting, northing, height), the zone, the heights and the photo, or add "
+        "picks: of eight, two wrong ones are found"
     )
