@@ -47,10 +47,8 @@ def test_random_matches_are_hardly_ever_kept() -> None:
 
 def test_rotation_beyond_the_limit_supports_nothing() -> None:
     photo, reference, true = matches(0.1, seed=5, turn_deg=90.0, zoom=1.0)
-    narrow = consistent_matches(photo, reference, SIDE, AREA, 45.0)
-    wide = consistent_matches(photo, reference, SIDE, AREA, 180.0)
-    assert (narrow & true).sum() < 0.1 * true.sum()
-    assert (wide & true).sum() > 0.7 * true.sum()
+    found = consistent_matches(photo, reference, SIDE, AREA)
+    assert (found & true).sum() < 0.1 * true.sum()
 
 
 def test_copies_of_one_keypoint_do_not_support_each_other() -> None:

@@ -51,11 +51,10 @@ def test_silhouettes_holes_and_voids_are_not_trusted() -> None:
     assert good.tolist() == [False, False, False, False, True, False]
 
 
-@pytest.mark.parametrize("upright", [True, False])
-def test_pool_leaves_out_the_border_of_what_is_seen(upright: bool) -> None:
+def test_pool_leaves_out_the_border_of_what_is_seen() -> None:
     depth = np.full((240, 320), 40.0, np.float32)
     depth[:, :100] = np.nan
-    pool = pool_features(rendering(depth), "rgb", upright, 5000)
+    pool = pool_features(rendering(depth), "rgb")
     pixels = CAMERA.project(POSE.act(pool.points))
     assert len(pool) > 100
     assert len(pool.descriptors) == len(pool)

@@ -16,16 +16,13 @@ from ingest.register.frame.dense.fit import (
 )
 from ingest.register.frame.features.search import (
     FrameHypothesis,
-    RenderGroup,
     fan_groups,
-    guided,
-    oriented_features_suffice,
     search,
-    star_groups,
+    star_group,
 )
 from ingest.register.frame.prior_fit import loosened
 from ingest.register.frame.verdict import MIN_CONFIRMATION_PIECES, MIN_JOINT_LOG_NFA
-from ingest.register.frame.views import FULL_CIRCLE_SIGMA_DEG, FrameViews
+from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 _MIN_LOG_NFA = 2.0  # a pose with less evidence among the features' matches is not looked into
@@ -38,11 +35,6 @@ _PROMISING_LOG_NFA = 0.5
 # So many times at most the best pose is searched and fitted again, where it is not confirmed, but has that
 # much evidence.
 _MORE_LOOKS = 2
-# First radius around a predicted place in which a match is looked for, share of the longer side; the second
-# is a third of it.
-_GUIDED_RADIUS_REL = 0.012
-
-_GUIDED_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,18 +96,12 @@ def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
 def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator[FrameHypothesis]:
     """Poses to begin with, made as they are asked for: by source, features first, then dense templates."""
     with clock.stage("render star"):
-        star = star_groups(views, prior)
-    fan: list[RenderGroup] | None = None
+        groups = [star_group(views, prior), *fan_groups(views, prior)]
     for source in _searched(available_sources(views.cloud)):
-        for upright in _kinds(prior):
-            if upright and fan is None:
-                with clock.stage("render fan"):
-                    fan = fan_groups(views, prior)
-            groups = [*star, *(fan or [])] if upright else star
-            with clock.stage(f"search {source} {'upright' if upright else 'oriented'}"):
-                found = search(views, groups, source, upright)
-            if found is not None and found.log_nfa >= _MIN_LOG_NFA:
-                yield found
+        with clock.stage(f"search {source} features"):
+            found = search(views, groups, source)
+        if found is not None and found.log_nfa >= _MIN_LOG_NFA:
+            yield found
         with clock.stage(f"search {source} dense"):
             dense = dense_hypotheses(views, prior, source)
         yield from dense
@@ -145,30 +131,8 @@ def by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
 
 
 def polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock: StageClock) -> Judged:
-    """Fitted by guided features where colours are rendered, else by pieces; and shown to the pictures."""
-    by_features = found.source == "rgb" and found.kind != "dense"
+    """Fitted to pieces of a render, and shown to the pictures."""
     with clock.stage("fit"):
-        if by_features:
-            fitted = _guided(views, prior, found)
-        else:
-            fitted = dense_fitted(views, prior, found, views.options.dense_fit) or found
+        fitted = dense_fitted(views, prior, found, views.options.dense_fit) or found
     with clock.stage("confirm"):
         return Judged(found=fitted, confirmation=confirmed(views, fitted))
-
-
-def _guided(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis:
-    side = max(views.camera.width, views.camera.height)
-    for turn in range(_GUIDED_ROUNDS):
-        better = guided(views, prior, found, _GUIDED_RADIUS_REL * side / 3.0**turn)
-        if better is None:
-            break
-        found = better
-    return found
-
-
-def _kinds(prior: FramePrior) -> tuple[bool, ...]:
-    """Upright features first where the heading is known; without, those with orientation cost less."""
-    unknown = prior.sigma_heading_deg >= FULL_CIRCLE_SIGMA_DEG
-    if not unknown:
-        return (True, False)
-    return (False, True) if oriented_features_suffice(prior) else (True,)

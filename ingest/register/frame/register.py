@@ -89,12 +89,13 @@ def fit_near(
     views = _views(gray, camera, prior, cloud, options, clock)
     if isinstance(views, FrameRegistration):
         return views
-    start, loose = unmatched(prior.cam_from_local, camera, source, "oriented"), loosened(prior)
+    start, loose = unmatched(prior.cam_from_local, camera, source), loosened(prior)
     judged = polished(views, loose, start, clock)
     if not judged.confirmation.confirmed:
         # Other light, other seasons: what agreed for the frames before need not for this one.
-        other = by_agreement(views, replace(start, kind="dense"))
-        judged = polished(views, loose, other.found, clock)
+        other = by_agreement(views, start).found
+        if other.source != source:
+            judged = polished(views, loose, other, clock)
     found, confirmation = judged.found, judged.confirmation
     if not confirmation.confirmed:
         return _refused("NOT_CONFIRMED", confirmation.message, {}, clock)

@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.verdict import MIN_COVER
 from ingest.register.frame_registration import FramePrior, RenderSource
 
-SPACING_PX = 1.5  # renders are no finer than this many pixels between scan points: splats show nothing more
-MIN_SIDE_PX = 400  # and at least; smaller pictures show too little
+# Renders for features: so many pixels between scan points, since splats show nothing more, and at most that
+# longer side.
+_FEATURES_SPACING_PX, _FEATURES_SIDE_PX = 1.5, 960
+MIN_SIDE_PX = 400  # of any render; smaller pictures show too little
 
 _LOOK_SIDE_PX = 200  # of the first look, which only measures distance and cover
 _LOOK_WIDER = 2.0  # and sees so many times as far to every side: the prior may look past the scan
@@ -81,18 +84,22 @@ class FrameViews:
         options: FrameOptions,
     ) -> None:
         self.gray, self.camera, self.cloud, self.look, self.options = gray, camera, cloud, look, options
-        self._features: dict[tuple[bool, int], Features] = {}
 
     @property
     def spacing_full_px(self) -> float:
         """Distance of neighbouring scan points, in pixels of the full-size photo."""
         return self.look.spacing_m * self.camera.focal_px / self.look.depth_m
 
-    def side_px(self, most_px: int) -> int:
-        """Longer side of renders: no finer than the scan, no smaller than features need."""
+    def side_px(self, spacing_px: float, most_px: int) -> int:
+        """Longer side of renders in which neighbouring scan points are `spacing_px` apart, within bounds."""
         side = max(self.camera.width, self.camera.height)
-        by_scan = round(SPACING_PX * side / max(self.spacing_full_px, 1e-6))
+        by_scan = round(spacing_px * side / max(self.spacing_full_px, 1e-6))
         return int(np.clip(by_scan, min(MIN_SIDE_PX, side), min(most_px, side)))
+
+    @property
+    def features_side_px(self) -> int:
+        """Longer side of the renders that features are found in."""
+        return self.side_px(_FEATURES_SPACING_PX, _FEATURES_SIDE_PX)
 
     def render_camera(self, side_px: int) -> Camera:
         """The photo's camera, shrunk."""
@@ -111,28 +118,24 @@ class FrameViews:
             made = list(threads.map(lambda pose: render(self.cloud, camera, pose, single), poses))
         return [r for r in made if r.valid.mean() >= MIN_COVER]
 
-    def photo_features(self, upright: bool, side_px: int, count: int) -> Features:
-        """Features of the photo at about the size of the renders; kept for the next call."""
-        key = (upright, side_px)
-        if key not in self._features:
-            self._features[key] = extract(
-                self.gray,
-                ExtractorOptions(
-                    max_side_px=max(side_px, 64),
-                    max_features=count,
-                    oversample=1.5,
-                    contrast_threshold=0.01,
-                    upright=upright,
-                ),
-            )
-        return self._features[key]
+    @cached_property
+    def features(self) -> Features:
+        """Of the photo, without orientation, at about the size of the renders."""
+        return extract(
+            self.gray,
+            ExtractorOptions(
+                max_side_px=max(round(1.25 * self.features_side_px), 64),
+                max_features=5000,
+                oversample=1.5,
+                contrast_threshold=0.01,
+                upright=True,
+            ),
+        )
 
-    def pools(
-        self, renderings: Sequence[Rendering], source: RenderSource, upright: bool, count: int
-    ) -> list[Pool]:
+    def pools(self, renderings: Sequence[Rendering], source: RenderSource) -> list[Pool]:
         """Features of each render with their scan points."""
         with ThreadPoolExecutor(self._threads()) as threads:
-            return list(threads.map(lambda r: pool_features(r, source, upright, count), renderings))
+            return list(threads.map(lambda r: pool_features(r, source), renderings))
 
     def _threads(self) -> int:
         return self.options.threads or min(len(os.sched_getaffinity(0)), 4)

@@ -22,7 +22,7 @@ from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
 from ingest.register.frame.options import DenseFitOptions
 from ingest.register.frame.prior_fit import fitted_under_prior
-from ingest.register.frame.views import MIN_SIDE_PX, FrameViews
+from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import refine_pose
@@ -31,7 +31,7 @@ _WINDOW_PX = 12  # radius of the score map against whose spread a place is judge
 # Height of a place in standard deviations of its map. Low: the robust loss weighs them, and a piece that has
 # structure along one direction only still says where it is across.
 _MIN_SCORE = 1.5
-_TOLERANCE_PX = 4.0  # of an inlier
+_TOLERANCE_PX = 4.0  # of an inlier, in the render
 _MAX_PIECES = 400  # per round
 
 
@@ -77,7 +77,7 @@ def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource)
     """The best few poses that dense templates find around the prior; no matches behind them yet."""
     found = register_dense(views.gray, views.camera, prior, views.cloud, source)
     return [
-        replace(unmatched(pose.cam_from_local, views.camera, source, "dense"), candidates=pose.pieces)
+        replace(unmatched(pose.cam_from_local, views.camera, source), candidates=pose.pieces)
         for pose in found[:_FINALISTS]
     ]
 
@@ -116,13 +116,14 @@ def _fit_round(
     piece_px: int,
     near_px: int,
 ) -> FrameHypothesis | None:
-    renderings = views.renders([start.pose.cam_from_local], dense_side_px(views, spacing_px))
+    side_px = views.side_px(spacing_px, _MAX_SIDE_PX)
+    renderings = views.renders([start.pose.cam_from_local], side_px)
     if not renderings:
         return None
     matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px)
     if len(matches) < _MIN_PLACES:
         return None
-    settings = dense_pose_options(views, spacing_px)
+    settings = PoseOptions(tolerance_rel=_TOLERANCE_PX / side_px)
     pose = refine_pose(matches.pixels, matches.points, start.pose, settings)
     pose = fitted_under_prior(matches, pose, prior, settings)
     inliers = independent(views.camera, matches.take(pose.inliers))
@@ -134,22 +135,9 @@ def _moved_px(views: FrameViews, before: FrameHypothesis, after: FrameHypothesis
     here, there = (
         views.camera.project(found.pose.cam_from_local.act(after.matches.points)) for found in (before, after)
     )
-    scale = dense_side_px(views, views.options.dense_fit.spacing_px[-1]) / max(
-        views.camera.width, views.camera.height
-    )
-    return float(np.median(np.linalg.norm(here - there, axis=1))) * scale
-
-
-def dense_pose_options(views: FrameViews, spacing_px: float) -> PoseOptions:
-    """Inlier tolerance of the fit, as a share of the longer side."""
-    return PoseOptions(tolerance_rel=_TOLERANCE_PX / dense_side_px(views, spacing_px))
-
-
-def dense_side_px(views: FrameViews, spacing_px: float) -> int:
-    """Longer side of renders in which neighbouring scan points are `spacing_px` apart."""
-    side = max(views.camera.width, views.camera.height)
-    wanted = round(spacing_px * side / max(views.spacing_full_px, 1e-6))
-    return int(np.clip(wanted, min(MIN_SIDE_PX, side), min(_MAX_SIDE_PX, side)))
+    side_px = views.side_px(views.options.dense_fit.spacing_px[-1], _MAX_SIDE_PX)
+    moved = float(np.median(np.linalg.norm(here - there, axis=1)))
+    return moved * side_px / max(views.camera.width, views.camera.height)
 
 
 def confirmed(views: FrameViews, found: FrameHypothesis) -> PictureConfirmation:

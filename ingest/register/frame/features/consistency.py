@@ -24,7 +24,7 @@ _MIN_GAP_REL = 0.006  # none nearer; keypoints of one structure agree with each 
 # the reach.
 _TOLERANCE = 0.15
 _TOLERANCE_FLOOR_REL = 0.002  # and at least this share of the longer side, the noise of keypoints
-MAX_TURN_DEG = 45.0  # largest rotation between photo and reference
+_MAX_TURN_DEG = 45.0  # largest rotation between photo and reference
 _MAX_ZOOM = 2.0  # largest change of scale between them, either way
 # -log10 of the expected number of matches, among all, that random neighbours would support as well. Three
 # false ones do not disturb RANSAC.
@@ -36,7 +36,6 @@ def consistent_matches(
     reference: FloatArray,
     side_px: float,
     area_px: float,
-    max_turn_deg: float = MAX_TURN_DEG,
 ) -> NDArray[np.bool_]:
     """Which matches (m,) have more neighbours that one similarity moves than chance gives them.
 
@@ -49,7 +48,6 @@ def consistent_matches(
         photo: (m, 2) pixels. reference: (m, 2) where the matched scan points appear in one common view;
             rows that are not finite are supported by nothing.
         side_px: longer side of the photo. area_px: over which false matches are spread in the reference.
-        max_turn_deg: largest rotation between photo and reference.
 
     Raises:
         MissingExtraError: numba is not installed.
@@ -72,7 +70,7 @@ def consistent_matches(
             _MIN_GAP_REL * side_px,
             _TOLERANCE,
             _TOLERANCE_FLOOR_REL * side_px,
-            np.radians(max_turn_deg),
+            np.radians(_MAX_TURN_DEG),
             np.log(_MAX_ZOOM),
             area_px,
         )

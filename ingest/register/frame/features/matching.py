@@ -1,26 +1,25 @@
 """Features of renders, pooled with the scan points that they show, and their matches with a photo."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.nearest import nearest
 from featuredb.render.rendering import Rendering
 from featuredb.render.shading import shaded_relief
 from ingest.register.frame_registration import RenderSource
 
 # The product's, with a lower contrast threshold than photos get, since renders are smooth.
-_EXTRACTOR = ExtractorOptions(max_side_px=1600, oversample=1.5, contrast_threshold=0.008)
+_EXTRACTOR = ExtractorOptions(
+    max_side_px=1600, max_features=3000, oversample=1.5, contrast_threshold=0.008, upright=True
+)
 # A feature whose surroundings differ by more than this share in depth lies on a silhouette: what it shows is
 # two things, and its depth is a guess.
 _MAX_DEPTH_STEP = 0.04
@@ -43,14 +42,14 @@ class Pool:
         return len(self.points)
 
 
-def pool_features(rendering: Rendering, source: RenderSource, upright: bool, most: int) -> Pool:
-    """At most so many features of a render, lifted to the scan by its depth.
+def pool_features(rendering: Rendering, source: RenderSource) -> Pool:
+    """Features of a render, lifted to the scan by its depth.
 
     Raises:
         InvalidValueError: the scan does not have `source`.
     """
     image = filled(source_image(rendering, source), rendering.valid)
-    features = extract(image, replace(_EXTRACTOR, max_features=most, upright=upright))
+    features = extract(image, _EXTRACTOR)
     points, good = lift(rendering, features.xy, _MAX_DEPTH_STEP)
     clear = cv2.distanceTransform(np.pad(rendering.valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     column = np.clip(features.xy[:, 0].astype(np.int64), 0, image.shape[1] - 1)
@@ -160,54 +159,3 @@ def pooled_matches(features: Features, pool: Pool, same_place_m: float, max_rati
     other = np.where(apart.any(axis=1), squared[np.arange(len(row)), apart.argmax(axis=1)], squared[:, -1])
     keep = np.flatnonzero((squared[:, 0] < max_ratio**2 * other) & (row[:, 0] >= 0))
     return FrameMatches(pixels=features.xy[keep].astype(np.float64), points=pool.points[row[keep, 0]])
-
-
-def guided_matches(
-    features: Features,
-    pool: Pool,
-    camera: Camera,
-    cam_from_local: Rigid3,
-    radius_px: float,
-    same_place_m: float,
-    max_ratio: float,
-) -> FrameMatches:
-    """Each feature's best pooled one among those that a pose puts within `radius_px` of it.
-
-    A match must be the best of both its ends, and beat the next place within the radius by the ratio.
-    """
-    projected = camera.project(cam_from_local.act(pool.points))
-    seen = np.flatnonzero(np.isfinite(projected).all(axis=1))
-    if len(features) == 0 or len(seen) == 0:
-        return joined([])
-    k = min(24, len(seen))
-    found = cKDTree(projected[seen]).query(features.xy, k=k, distance_upper_bound=radius_px)
-    distance, near = (np.asarray(part).reshape(len(features), k) for part in found)
-    missing = ~np.isfinite(distance)
-    row = seen[np.where(missing, 0, near)]
-    squared = np.empty(row.shape, np.float32)
-    wanted = features.descriptors.astype(np.float32)
-    for column in range(k):
-        difference = pool.descriptors[row[:, column]].astype(np.float32) - wanted
-        squared[:, column] = np.einsum("nd,nd->n", difference, difference)
-    squared[missing] = np.inf
-    best = squared.argmin(axis=1)
-    lowest = squared[np.arange(len(row)), best]
-    chosen = row[np.arange(len(row)), best]
-    apart = np.linalg.norm(pool.points[row] - pool.points[chosen][:, None], axis=2) > same_place_m
-    other = np.where(apart, squared, np.inf).min(axis=1)
-    keep = np.isfinite(lowest) & (lowest < max_ratio**2 * other)
-    keep &= _best_of_their_place(pool.points[chosen], lowest, keep, same_place_m / 4.0)
-    return FrameMatches(pixels=features.xy[keep].astype(np.float64), points=pool.points[chosen[keep]])
-
-
-def _best_of_their_place(
-    points: FloatArray, squared: NDArray[np.float32], among: NDArray[np.bool_], cell_m: float
-) -> NDArray[np.bool_]:
-    """Of the matches that claim one place of the scan, the one with the most similar descriptor."""
-    rows = np.flatnonzero(among)
-    rows = rows[np.argsort(squared[rows], kind="stable")]
-    cells = np.floor(points[rows] / cell_m).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    result = np.zeros(len(points), dtype=bool)
-    result[rows[first]] = True
-    return result

@@ -1,7 +1,7 @@
 """From a coarse prior to a first pose: star renders, pooled features, consistent matches, LO-RANSAC."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -9,11 +9,9 @@ import numpy as np
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.features.consistency import MAX_TURN_DEG, consistent_matches
-from ingest.register.frame.features.matching import FrameMatches, Pool, guided_matches, joined, pooled_matches
-from ingest.register.frame.prior_fit import fitted_under_prior
+from ingest.register.frame.features.consistency import consistent_matches
+from ingest.register.frame.features.matching import FrameMatches, Pool, joined, pooled_matches
 from ingest.register.frame.views import (
-    FULL_CIRCLE_SIGMA_DEG,
     FrameViews,
     fan_headings_deg,
     star_poses,
@@ -25,13 +23,6 @@ from reloc.localise.lens_prior import LensPriors
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
 
-# Longer side of the renders of the first round and of those from the pose found, at most.
-_SEARCH_SIDE_PX = 960
-_FINAL_SIDE_PX = 1600
-# Per render, and of the photo.
-_SEARCH_FEATURES = 3000
-_FINAL_FEATURES = 6000
-_PHOTO_FEATURES = 5000
 _MAX_RATIO = 0.97  # of descriptor distances, best to next place. Loose: true ones are among the bad.
 _SAME_PLACE = 0.01  # pool points nearer than this share of their distance from the camera are one place
 # Inlier tolerance as a share of the longer side (4 pixels at 1600), where points are denser than pixels;
@@ -39,9 +30,8 @@ _SAME_PLACE = 0.01  # pool points nearer than this share of their distance from 
 _TOLERANCE_REL = 0.0025
 _MAX_TOLERANCE_REL = 0.006
 
-MatchKind = Literal["upright", "oriented", "dense"]
+MatchKind = Literal["features", "dense"]
 
-_NADIR_COSINE = 0.87  # within 30 degrees of straight down a heading is a rotation of the image
 # One structure's keypoints at several scales lie this close, share of the longer side (3 px at 1600).
 _SAME_STRUCTURE_REL = 0.002
 
@@ -74,20 +64,19 @@ class RenderGroup:
     """Renders whose features share one reference view.
 
     Attributes:
-        reference: pose in which neighbourhood is judged. max_turn_deg: how far the photo may be turned to it.
+        reference: pose in which neighbourhood is judged.
     """
 
     reference: Rigid3
     renderings: Sequence[Rendering]
-    max_turn_deg: float
 
 
-def star_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
-    """Renders of the star around the prior: for features with orientation, and upright ones."""
+def star_group(views: FrameViews, prior: FramePrior) -> RenderGroup:
+    """Renders of the star around the prior."""
     poses = star_poses(prior, views.look.depth_m, views.camera)
-    turn = 180.0 if _any_heading(prior) else MAX_TURN_DEG
-    renderings = views.renders(poses, views.side_px(_SEARCH_SIDE_PX))
-    return [RenderGroup(reference=prior.cam_from_local, renderings=renderings, max_turn_deg=turn)]
+    return RenderGroup(
+        reference=prior.cam_from_local, renderings=views.renders(poses, views.features_side_px)
+    )
 
 
 def fan_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
@@ -95,65 +84,25 @@ def fan_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
     groups = []
     for angle in fan_headings_deg(prior.sigma_heading_deg)[1:]:
         pose = turned_about_vertical(prior.cam_from_local, angle)
-        renderings = views.renders([pose], views.side_px(_SEARCH_SIDE_PX))
-        groups.append(RenderGroup(reference=pose, renderings=renderings, max_turn_deg=MAX_TURN_DEG))
+        groups.append(RenderGroup(reference=pose, renderings=views.renders([pose], views.features_side_px)))
     return groups
 
 
-def oriented_features_suffice(prior: FramePrior) -> bool:
-    """Whether an unknown heading is a mere rotation of the image, as in nadir photos."""
-    return bool(prior.cam_from_local.rotation[2, 2] < -_NADIR_COSINE)
-
-
-def search(
-    views: FrameViews, groups: Sequence[RenderGroup], source: RenderSource, upright: bool
-) -> FrameHypothesis | None:
-    """A pose from one source and one kind of features, or None where no pose has matches behind it."""
-    features = views.photo_features(upright, round(1.25 * views.side_px(_SEARCH_SIDE_PX)), _PHOTO_FEATURES)
+def search(views: FrameViews, groups: Sequence[RenderGroup], source: RenderSource) -> FrameHypothesis | None:
+    """A pose from the features of one source, or None where no pose has matches behind it."""
     raw, kept = [], []
     for group in groups:
-        pools = views.pools(group.renderings, source, upright, _SEARCH_FEATURES)
+        pools = views.pools(group.renderings, source)
         if not pools:
             continue
-        matches = pooled_matches(features, joined_pools(pools), _SAME_PLACE * views.look.depth_m, _MAX_RATIO)
+        same_place_m = _SAME_PLACE * views.look.depth_m
+        matches = pooled_matches(views.features, joined_pools(pools), same_place_m, _MAX_RATIO)
         raw.append(matches)
         kept.append(_consistent(views, matches, group))
-    return _hypothesis(views, joined(raw), joined(kept), source, upright)
+    return _hypothesis(views, joined(raw), joined(kept), source)
 
 
-def guided(
-    views: FrameViews, prior: FramePrior, start: FrameHypothesis, radius_px: float
-) -> FrameHypothesis | None:
-    """The pose from matches looked for where `start` predicts them, on a render from its pose."""
-    side_px = views.side_px(_FINAL_SIDE_PX)
-    renderings = views.renders([start.pose.cam_from_local], side_px)
-    if not renderings:
-        return None
-    pool = joined_pools(views.pools(renderings, start.source, True, _FINAL_FEATURES))
-    features = views.photo_features(True, round(1.25 * side_px), _FINAL_FEATURES)
-    matches = guided_matches(
-        features,
-        pool,
-        start.pose.camera,
-        start.pose.cam_from_local,
-        radius_px,
-        _SAME_PLACE * views.look.depth_m,
-        _MAX_RATIO,
-    )
-    settings = pose_options(views)
-    pose = estimate_pose(matches.pixels, matches.points, start.pose.camera, "request", settings)
-    if pose is None:
-        return None
-    pose = refine_pose(matches.pixels, matches.points, pose, settings)
-    pose = fitted_under_prior(matches, pose, prior, settings)
-    return replace(
-        start, pose=pose, matches=matches, inliers=independent(views.camera, matches.take(pose.inliers))
-    )
-
-
-def unmatched(
-    cam_from_local: Rigid3, camera: Camera, source: RenderSource, kind: MatchKind
-) -> FrameHypothesis:
+def unmatched(cam_from_local: Rigid3, camera: Camera, source: RenderSource) -> FrameHypothesis:
     """A pose that no matches stand behind yet."""
     pose = PoseHypothesis(
         cam_from_local=cam_from_local,
@@ -165,7 +114,7 @@ def unmatched(
     return FrameHypothesis(
         pose=pose,
         source=source,
-        kind=kind,
+        kind="dense",
         matches=joined([]),
         inliers=joined([]),
         candidates=0,
@@ -199,13 +148,12 @@ def _consistent(views: FrameViews, matches: FrameMatches, group: RenderGroup) ->
         reference,
         float(max(camera.width, camera.height)),
         float(camera.width * camera.height),
-        group.max_turn_deg,
     )
     return matches.take(found)
 
 
 def _hypothesis(
-    views: FrameViews, raw: FrameMatches, kept: FrameMatches, source: RenderSource, upright: bool
+    views: FrameViews, raw: FrameMatches, kept: FrameMatches, source: RenderSource
 ) -> FrameHypothesis | None:
     settings = pose_options(views)
     pose = estimate_pose(kept.pixels, kept.points, views.camera, "request", settings)
@@ -218,7 +166,7 @@ def _hypothesis(
     return FrameHypothesis(
         pose=pose,
         source=source,
-        kind="upright" if upright else "oriented",
+        kind="features",
         matches=kept,
         inliers=independent(views.camera, kept.take(pose.inliers)),
         candidates=len(raw),
@@ -245,7 +193,3 @@ def independent(camera: Camera, inliers: FrameMatches) -> FrameMatches:
     """Those inliers that are measurements of their own."""
     gap = _SAME_STRUCTURE_REL * max(camera.width, camera.height)
     return inliers.take(independent_inliers(inliers.pixels, inliers.points, gap))
-
-
-def _any_heading(prior: FramePrior) -> bool:
-    return prior.sigma_heading_deg >= FULL_CIRCLE_SIGMA_DEG
