@@ -175,7 +175,7 @@ def _one(
         error_m=error,
         message=f"{found.reason}: {found.message}" if found.reason else "",
         matched_by=evidence.get("matched_by", ""),
-        log_nfa=evidence.get("confirmation_log_nfa", 0.0),
+        log_nfa=evidence.get("confirmation", {}).get("log_nfa", 0.0),
         elsewhere_log_nfa=evidence.get("elsewhere_log_nfa", 0.0),
         seconds=seconds,
         pose=tried,

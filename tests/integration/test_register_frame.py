@@ -17,9 +17,9 @@ from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.laser.airborne import scan_town
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.town.town import make_town
-from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
+from ingest.register.frame.sources import available_sources
 from ingest.register.frame.views import turned_about_vertical
 from ingest.register.frame_registration import FramePrior
 from tools.worlds.clouds import build_cloud
@@ -143,8 +143,8 @@ def test_intensity_alone_from_a_wrong_prior() -> None:
     pose = Rigid3.from_matrix(found.evidence["pose_tried"])
     assert np.linalg.norm(pose.center - here.truth.center) < 0.6
     assert pose.angle_to_deg(here.truth) < 0.6
-    assert found.evidence["confirmed"]
-    assert found.evidence["confirmation_log_nfa"] > 9.0  # more than photos of other towns reach
+    assert found.evidence["confirmation"]["confirmed"]
+    assert found.evidence["confirmation"]["log_nfa"] > 9.0  # more than photos of other towns reach
 
 
 @pytest.mark.slow

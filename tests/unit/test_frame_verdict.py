@@ -8,6 +8,7 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
+from ingest.register.frame.dense.confirmation import PictureConfirmation
 from ingest.register.frame.prior_fit import prior_sigmas
 from ingest.register.frame.register import left_perturbation
 from ingest.register.frame.verdict import (
@@ -19,14 +20,12 @@ from ingest.register.frame.verdict import (
 )
 from ingest.register.frame_registration import FramePrior
 
+CONFIRMED = PictureConfirmation(confirmed=True, pieces=150, agreeing=90, log_nfa=45.0, cells=16, message="")
 GOOD = FrameEvidence(
     inliers=200,
     candidates=1500,
     log_nfa=30.0,
-    confirmed=True,
-    confirmation_pieces=150,
-    confirmation_log_nfa=45.0,
-    confirmation_message="",
+    confirmation=CONFIRMED,
     cells=60,
     agreement=0.7,
     rival_share=0.1,
@@ -43,8 +42,8 @@ def test_good_evidence_is_believed() -> None:
     ("change", "reason"),
     [
         ({"inliers": 12}, "TOO_FEW_MATCHES"),
-        ({"confirmed": False, "confirmation_message": "no"}, "NOT_CONFIRMED"),
-        ({"confirmation_log_nfa": 8.4, "log_nfa": 5.0}, "NOT_CONFIRMED"),
+        ({"confirmation": replace(CONFIRMED, confirmed=False, message="no")}, "NOT_CONFIRMED"),
+        ({"confirmation": replace(CONFIRMED, log_nfa=8.4), "log_nfa": 5.0}, "NOT_CONFIRMED"),
         ({"cells": 4}, "NO_CONSISTENT_POSE"),
         ({"agreement": 0.1}, "NO_CONSISTENT_POSE"),
         ({"rival_share": 0.6}, "AMBIGUOUS"),
@@ -52,13 +51,13 @@ def test_good_evidence_is_believed() -> None:
         ({"prior_sigmas": 9.0}, "CONTRADICTS_PRIOR"),
     ],
 )
-def test_each_gate_fires(change: dict[str, float], reason: str) -> None:
+def test_each_gate_fires(change: dict[str, object], reason: str) -> None:
     refusal = verdict(replace(GOOD, **change))  # type: ignore[arg-type]
     assert refusal is not None
     assert refusal[0] == reason
 
 
-MIDDLING = replace(GOOD, log_nfa=0.0, confirmation_log_nfa=9.0)
+MIDDLING = replace(GOOD, log_nfa=0.0, confirmation=replace(CONFIRMED, log_nfa=9.0))
 
 
 def test_middling_evidence_is_believed_where_other_places_show_much_less() -> None:
@@ -76,7 +75,7 @@ def test_relief_needs_evidence_of_its_own() -> None:
     refusal = verdict(relief)
     assert refusal is not None
     assert refusal[0] == "NOT_CONFIRMED"
-    assert verdict(replace(relief, confirmation_log_nfa=25.0)) is None
+    assert verdict(replace(relief, confirmation=replace(CONFIRMED, log_nfa=25.0))) is None
 
 
 def test_features_and_pictures_add_up() -> None:
@@ -85,7 +84,7 @@ def test_features_and_pictures_add_up() -> None:
 
 
 def test_middling_evidence_far_from_the_prior_is_refused() -> None:
-    asked = replace(MIDDLING, places_elsewhere=5, confirmation_log_nfa=7.7)
+    asked = replace(MIDDLING, places_elsewhere=5, confirmation=replace(CONFIRMED, log_nfa=7.7))
     assert verdict(replace(asked, prior_sigmas=2.4)) is None
     assert weighed_log_nfa(replace(asked, prior_sigmas=2.4)) == 7.7
     refusal = verdict(replace(asked, prior_sigmas=4.7))
@@ -98,13 +97,15 @@ def test_middling_evidence_far_from_the_prior_is_refused() -> None:
 def test_elsewhere_is_asked_only_where_it_decides() -> None:
     assert not asks_elsewhere(GOOD)
     assert not asks_elsewhere(replace(MIDDLING, inliers=12))
-    assert not asks_elsewhere(replace(MIDDLING, confirmed=False))
+    assert not asks_elsewhere(replace(MIDDLING, confirmation=replace(MIDDLING.confirmation, confirmed=False)))
 
 
 def test_decisive_features_bear_silent_pictures_but_no_contradiction() -> None:
-    silent = replace(GOOD, log_nfa=900.0, confirmed=False, confirmation_pieces=10, confirmation_log_nfa=0.0)
+    silent = replace(
+        GOOD, log_nfa=900.0, confirmation=replace(CONFIRMED, confirmed=False, pieces=10, log_nfa=0.0)
+    )
     assert verdict(silent) is None
-    contradicted = replace(silent, confirmation_pieces=150)
+    contradicted = replace(silent, confirmation=replace(CONFIRMED, confirmed=False, log_nfa=0.0))
     assert verdict(contradicted) is not None
     assert verdict(replace(silent, log_nfa=20.0)) is not None
 

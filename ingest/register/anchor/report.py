@@ -256,8 +256,11 @@ def _pictures(
 
 
 def _evidence_line(evidence: Mapping[str, Any]) -> str:
+    pictures = {f"confirmation {k}": v for k, v in evidence.get("confirmation", {}).items()}
     shown = {
-        k: v for k, v in evidence.items() if isinstance(v, (int, float, str)) and not isinstance(v, bool)
+        k: v
+        for k, v in {**evidence, **pictures}.items()
+        if isinstance(v, (int, float, str)) and not isinstance(v, bool)
     }
     return ", ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in shown.items())
 

@@ -5,7 +5,6 @@ confirm most.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.dense.confirmation import PictureConfirmation
 from ingest.register.frame.dense.fit import (
@@ -21,14 +20,12 @@ from ingest.register.frame.features.search import (
     star_group,
 )
 from ingest.register.frame.prior_fit import loosened
-from ingest.register.frame.verdict import MIN_CONFIRMATION_PIECES, MIN_JOINT_LOG_NFA
+from ingest.register.frame.sources import available_sources, searched_sources
+from ingest.register.frame.verdict import DECISIVE_LOG_NFA, SURE_CONFIRMATION_LOG_NFA, beyond_doubt
 from ingest.register.frame.views import FrameViews
-from ingest.register.frame_registration import FramePrior, RenderSource
+from ingest.register.frame_registration import FramePrior
 
 _MIN_LOG_NFA = 2.0  # a pose with less evidence among the features' matches is not looked into
-_DECISIVE_LOG_NFA = 60.0  # one with so much, if the pictures confirm it, ends the search
-# And so does one that the pictures confirm so strongly. Three of four right poses do; wrong ones reached 8.
-_SURE_CONFIRMATION_LOG_NFA = 20.0
 # A pose of the dense search with less evidence of the pictures is not fitted. Before the fit right ones had
 # 0.6 and more, of those at wrong places one in ten.
 _PROMISING_LOG_NFA = 0.5
@@ -55,14 +52,7 @@ def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> J
         if start.kind == "dense" and begun.confirmation.log_nfa < _PROMISING_LOG_NFA:
             continue
         judged.append(polished(views, loose, begun.found, clock))
-        confirmation = judged[-1].confirmation
-        # Decisive features stand alone where the pictures have too little to compare.
-        silent = confirmation.pieces < MIN_CONFIRMATION_PIECES
-        if start.log_nfa >= _DECISIVE_LOG_NFA and (confirmation.confirmed or silent):
-            return judged[-1]
-        joint = start.log_nfa + confirmation.log_nfa
-        sure = confirmation.log_nfa >= _SURE_CONFIRMATION_LOG_NFA
-        if confirmation.confirmed and (sure or joint >= MIN_JOINT_LOG_NFA):
+        if beyond_doubt(start.log_nfa, judged[-1].confirmation):
             return judged[-1]
     best = max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
     return best and _looked_again(views, prior, best, clock)
@@ -83,21 +73,11 @@ def _looked_again(views: FrameViews, prior: FramePrior, judged: Judged, clock: S
     return best
 
 
-def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
-    """What can be rendered of a scan, most telling first."""
-    sources: list[RenderSource] = []
-    if cloud.rgb is not None:
-        sources.append("rgb")
-    if cloud.intensity is not None:
-        sources.append("intensity")
-    return (*sources, "shaded")
-
-
 def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator[FrameHypothesis]:
     """Poses to begin with, made as they are asked for: by source, features first, then dense templates."""
     with clock.stage("render star"):
         groups = [star_group(views, prior), *fan_groups(views, prior)]
-    for source in _searched(available_sources(views.cloud)):
+    for source in searched_sources(views.cloud):
         with clock.stage(f"search {source} features"):
             found = search(views, groups, source)
         if found is not None and found.log_nfa >= _MIN_LOG_NFA:
@@ -107,25 +87,17 @@ def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator
         yield from dense
 
 
-def _searched(sources: tuple[RenderSource, ...]) -> tuple[RenderSource, ...]:
-    """Shaded relief has nothing to match and few edges (docs/measurements/descriptors.md): where the scan has
-    more to show, poses are compared with it, but not searched.
-    """
-    telling = tuple(source for source in sources if source != "shaded")
-    return telling or sources
-
-
 def by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
     """The pose with the source that agrees best with the photo there, whichever it was found by."""
     own = Judged(found=found, confirmation=confirmed(views, found))
-    if found.log_nfa >= _DECISIVE_LOG_NFA:
+    if found.log_nfa >= DECISIVE_LOG_NFA:
         return own
     others = [
         replace(found, source=source) for source in available_sources(views.cloud) if source != found.source
     ]
     judged = [own, *(Judged(found=other, confirmation=confirmed(views, other)) for other in others)]
     # Relief shows what stands and nothing of the ground: it is asked instead of others only beyond doubt.
-    sure = _SURE_CONFIRMATION_LOG_NFA
+    sure = SURE_CONFIRMATION_LOG_NFA
     heard = [j for j in judged if j is own or j.found.source != "shaded" or j.confirmation.log_nfa >= sure]
     return max(heard, key=lambda j: j.confirmation.log_nfa)
 

@@ -135,7 +135,6 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageC
         refusal = verdict(evidence)
     figures = asdict(evidence) | {
         "matched_by": found.kind,
-        "confirmation": asdict(judged.confirmation),
         "depth_m": views.look.depth_m,
         "spacing_m": views.look.spacing_m,
         "focal_px": found.pose.camera.focal_px,
@@ -179,7 +178,7 @@ def left_perturbation(covariance: FloatArray, cam_from_local: Rigid3) -> FloatAr
 def _evidence(
     views: FrameViews, prior: FramePrior, judged: Judged, covariance: FloatArray | None
 ) -> FrameEvidence:
-    found, confirmation = judged.found, judged.confirmation
+    found = judged.found
     cells, agreement = 0, 0.0
     renderings = views.renders([found.pose.cam_from_local], MIN_SIDE_PX)
     if renderings:
@@ -191,10 +190,7 @@ def _evidence(
         inliers=len(found.inliers),
         candidates=found.candidates,
         log_nfa=found.log_nfa,
-        confirmed=confirmation.confirmed,
-        confirmation_pieces=confirmation.pieces,
-        confirmation_log_nfa=confirmation.log_nfa,
-        confirmation_message=confirmation.message,
+        confirmation=judged.confirmation,
         cells=cells,
         agreement=agreement,
         rival_share=found.rival_share,
@@ -206,7 +202,7 @@ def _evidence(
 
 def _compared(views: FrameViews, prior: FramePrior, judged: Judged, evidence: FrameEvidence) -> FrameEvidence:
     """With how well the photo agrees with the scan at places where it cannot be."""
-    pose, enough = judged.found.pose.cam_from_local, highest_elsewhere(evidence.confirmation_log_nfa)
+    pose, enough = judged.found.pose.cam_from_local, highest_elsewhere(evidence.confirmation.log_nfa)
     places, log_nfa = agreement_elsewhere(
         views, prior, pose, judged.found.source, MAX_PLACES_ELSEWHERE, enough
     )

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from ingest.register.frame.dense.confirmation import MIN_PIECES, PictureConfirmation
 from ingest.register.frame_registration import FrameReason
 
 # Where the line is, by right and wrong registrations of the simulated town:
@@ -17,16 +18,16 @@ MIN_INLIERS = 20  # fewer independent inliers are never believed
 # Smallest share of the parts of the photo where the scan should be seen that hold inliers.
 _MIN_AGREEMENT = 0.2
 _MIN_CELLS = 6  # and the smallest number of such parts, of a hundred: a pose needs width
-# Features with that much evidence among their unguided matches need no confirmation where the pictures have
-# fewer than MIN_CONFIRMATION_PIECES pieces to compare.
-_MIN_LOG_NFA_ALONE = 60.0
-MIN_CONFIRMATION_PIECES = 25
+# Features with that much evidence among their matches need no confirmation where the pictures have too few
+# pieces to compare.
+DECISIVE_LOG_NFA = 60.0
 # Evidence of the pictures with which a pose needs no features. It is the best of very many that were tried,
-# and towns resemble each other: of 20 photos of another town the strongest reached 14.3.
-MIN_CONFIRMATION_LOG_NFA = 20.0
+# and towns resemble each other: of 20 photos of another town the strongest reached 14.3. Three of four right
+# poses have it.
+SURE_CONFIRMATION_LOG_NFA = 20.0
 # Or evidence of features and pictures together; features spoke for none of the wrong poses that were
 # measured.
-MIN_JOINT_LOG_NFA = 30.0
+_SURE_JOINT_LOG_NFA = 30.0
 # With less, it must be so many times what the photo reaches at places of the scan where it cannot be
 # (`elsewhere`), of which MAX_PLACES_ELSEWHERE are tried and _MIN_PLACES_ELSEWHERE must be there. Right poses
 # had 10 times as much and more, those of photos of another town up to 3 times as much with all places tried,
@@ -54,8 +55,7 @@ class FrameEvidence:
     Attributes:
         inliers: independent correspondences that agree with the pose.
         candidates, log_nfa: matches of the first round and the evidence among them.
-        confirmed, confirmation_pieces, confirmation_log_nfa, confirmation_message:
-            see ingest.register.frame.dense.confirmation.
+        confirmation: what the pictures say.
         cells: parts of the photo (of a hundred) that hold inliers. agreement: their share of those where the
             scan is seen.
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
@@ -69,10 +69,7 @@ class FrameEvidence:
     inliers: int
     candidates: int
     log_nfa: float
-    confirmed: bool
-    confirmation_pieces: int
-    confirmation_log_nfa: float
-    confirmation_message: str
+    confirmation: PictureConfirmation
     cells: int
     agreement: float
     rival_share: float
@@ -96,7 +93,7 @@ def weighed_log_nfa(evidence: FrameEvidence) -> float:
     -log10 of the density, from that at the mean squared distance of six axes on: nearer ones gain nothing.
     """
     against = max(0.0, evidence.prior_sigmas**2 - 6.0) / (2.0 * math.log(10.0))
-    return evidence.confirmation_log_nfa - against
+    return evidence.confirmation.log_nfa - against
 
 
 def highest_elsewhere(log_nfa: float) -> float:
@@ -109,12 +106,9 @@ def verdict(evidence: FrameEvidence) -> tuple[FrameReason, str] | None:
     e = evidence
     if e.inliers < MIN_INLIERS:
         return "TOO_FEW_MATCHES", f"{e.inliers} independent inliers, {MIN_INLIERS} needed"
-    # Pictures that show too little of the scan to be asked contradict nothing;
-    # decisive features need no help.
-    silent = e.confirmation_pieces < MIN_CONFIRMATION_PIECES and e.log_nfa >= _MIN_LOG_NFA_ALONE
-    if not e.confirmed and not silent:
-        return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation_message}"
-    refusal = None if _suffices(e) else _against_elsewhere(e)
+    if not _borne_out(e.log_nfa, e.confirmation):
+        return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation.message}"
+    refusal = None if beyond_doubt(e.log_nfa, e.confirmation) else _against_elsewhere(e)
     if refusal is not None:
         return refusal
     if e.cells < _MIN_CELLS or e.agreement < _MIN_AGREEMENT:
@@ -140,13 +134,18 @@ def verdict(evidence: FrameEvidence) -> tuple[FrameReason, str] | None:
     return None
 
 
-def _suffices(e: FrameEvidence) -> bool:
-    """Whether the evidence needs no comparison with other places."""
-    return (
-        e.log_nfa >= _MIN_LOG_NFA_ALONE
-        or e.confirmation_log_nfa >= MIN_CONFIRMATION_LOG_NFA
-        or e.log_nfa + e.confirmation_log_nfa >= MIN_JOINT_LOG_NFA
+def beyond_doubt(log_nfa: float, confirmation: PictureConfirmation) -> bool:
+    """Whether features and pictures need no comparison with other places."""
+    return _borne_out(log_nfa, confirmation) and (
+        log_nfa >= DECISIVE_LOG_NFA
+        or confirmation.log_nfa >= SURE_CONFIRMATION_LOG_NFA
+        or log_nfa + confirmation.log_nfa >= _SURE_JOINT_LOG_NFA
     )
+
+
+def _borne_out(log_nfa: float, confirmation: PictureConfirmation) -> bool:
+    """Pictures with too little of the scan to be asked contradict nothing: decisive features need no help."""
+    return confirmation.confirmed or (confirmation.pieces < MIN_PIECES and log_nfa >= DECISIVE_LOG_NFA)
 
 
 def _against_elsewhere(e: FrameEvidence) -> tuple[FrameReason, str] | None:
@@ -154,19 +153,19 @@ def _against_elsewhere(e: FrameEvidence) -> tuple[FrameReason, str] | None:
         return (
             "NOT_CONFIRMED",
             f"the pictures agree too little at a pose that few features speak for: evidence of "
-            f"10^-{e.confirmation_log_nfa:.1f}, 10^-{MIN_CONFIRMATION_LOG_NFA:g} needed",
+            f"10^-{e.confirmation.log_nfa:.1f}, 10^-{SURE_CONFIRMATION_LOG_NFA:g} needed",
         )
     weighed = weighed_log_nfa(e)
     if weighed < _MIN_WEIGHED_LOG_NFA:
         return (
             "NOT_CONFIRMED",
-            f"the pictures agree with 10^-{e.confirmation_log_nfa:.1f}, {e.prior_sigmas:.1f} deviations from "
+            f"the pictures agree with 10^-{e.confirmation.log_nfa:.1f}, {e.prior_sigmas:.1f} deviations from "
             f"the prior, which leaves 10^-{weighed:.1f}; 10^-{_MIN_WEIGHED_LOG_NFA:g} needed",
         )
-    if e.elsewhere_log_nfa > highest_elsewhere(e.confirmation_log_nfa):
+    if e.elsewhere_log_nfa > highest_elsewhere(e.confirmation.log_nfa):
         return (
             "AMBIGUOUS",
-            f"evidence of 10^-{e.confirmation_log_nfa:.1f} at the pose found, and of "
+            f"evidence of 10^-{e.confirmation.log_nfa:.1f} at the pose found, and of "
             f"10^-{e.elsewhere_log_nfa:.1f} at a place of the scan where the photo cannot be",
         )
     return None

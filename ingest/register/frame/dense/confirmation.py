@@ -24,7 +24,6 @@ from ingest.register.frame.dense.pictures import (
     finest_side_px,
     oriented_gradients,
     pinhole_view,
-    source_picture,
     with_margin,
 )
 from ingest.register.frame.dense.score_maps import (
@@ -34,6 +33,7 @@ from ingest.register.frame.dense.score_maps import (
     peaks,
     search_around,
 )
+from ingest.register.frame.sources import source_image
 from ingest.register.frame_registration import RenderSource
 
 _OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not
@@ -43,7 +43,7 @@ _OVERLAP = 2  # pieces that overlap by half say about half as much as ones that 
 _SIDE_PX = 480  # longer side of the view on which pieces are compared, where the scan is dense enough
 _SEARCH_PX = 16  # radius of the window in which a piece is searched
 _NEAR_PX = 3.0  # a piece agrees with the pose when its best place is this near
-_MIN_PIECES = 25  # fewer pieces with structure cannot confirm anything
+MIN_PIECES = 25  # fewer pieces with structure cannot confirm anything
 _PIECES = TemplateOptions(size_px=40, spacing_px=20, max_count=600)  # overlapping by half
 # A pose is refused when less than that share of the lower half of the pieces, by height, agrees while of the
 # upper half that many times as many do, and the halves lie that far apart: then what stands on the ground was
@@ -112,14 +112,14 @@ def confirm_pose(
     view = pinhole_view(photo_gray, camera, min(_SIDE_PX, finest))
     maps = _maps(view, cam_from_local, cloud, source)
     n = len(maps)
-    if n < _MIN_PIECES:
+    if n < MIN_PIECES:
         return PictureConfirmation(
             confirmed=False,
             pieces=n,
             agreeing=0,
             log_nfa=0.0,
             cells=0,
-            message=f"only {n} pieces of the picture have structure, {_MIN_PIECES} are needed",
+            message=f"only {n} pieces of the picture have structure, {MIN_PIECES} are needed",
         )
     places, _ = peaks(maps.maps)
     off = places - _SEARCH_PX
@@ -146,7 +146,7 @@ def confirm_pose(
 def _maps(view: PinholeView, pose: Rigid3, cloud: PointCloud, source: RenderSource) -> ScoreMaps:
     margin = _PIECES.size_px // 2
     rendering = render(cloud, with_margin(view.camera, margin), pose, RenderOptions(threads=1))
-    channels = oriented_gradients(source_picture(rendering, source), rendering.valid)
+    channels = oriented_gradients(source_image(rendering, source), rendering.valid)
     templates = cut_templates(channels, rendering, _PIECES)
     photo = oriented_gradients(view.image, view.valid)
     return search_around(templates, photo, view.camera, pose, _SEARCH_PX)

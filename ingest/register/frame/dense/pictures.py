@@ -16,13 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
-from featuredb.render.rendering import Rendering
-from featuredb.render.shading import shaded_relief
-from ingest.register.frame_registration import RenderSource
 
 FloatImage = NDArray[np.float32]
 
@@ -137,24 +133,6 @@ def with_margin(camera: Camera, margin_px: int) -> Camera:
 
 
 _CELL_M = 2.0  # holds several points of any airborne scan, and is small beside gaps between flight lines
-_LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-
-
-def source_picture(rendering: Rendering, source: RenderSource) -> FloatImage:
-    """The grey picture (h, w) float32, 0..255, of a rendering.
-
-    Raises:
-        InvalidValueError: the scan has no such values.
-    """
-    if source == "rgb" and rendering.rgb is not None:
-        return np.asarray(rendering.rgb.astype(np.float32) @ _LUMA, dtype=np.float32)
-    if source == "intensity" and rendering.intensity is not None:
-        return rendering.intensity.astype(np.float32)
-    if source == "shaded":
-        return shaded_relief(rendering).astype(np.float32)
-    raise InvalidValueError(
-        f"source_picture: expected a source that the scan has, found {source!r}; see available_sources()"
-    )
 
 
 def plan_spacing_m(cloud: PointCloud) -> float:

@@ -25,7 +25,6 @@ from ingest.register.frame.dense.pictures import (
     finest_side_px,
     oriented_gradients,
     pinhole_view,
-    source_picture,
     viewing_distance_m,
     with_margin,
 )
@@ -38,6 +37,7 @@ from ingest.register.frame.dense.score_maps import (
     search_everywhere,
 )
 from ingest.register.frame.prior_fit import prior_sigmas
+from ingest.register.frame.sources import source_image
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 # Longer side of the photo's view at each octave, coarse to fine. Octaves finer than the scan's points allow
@@ -132,7 +132,7 @@ def score_maps_of(
 ) -> ScoreMaps:
     """Renders at a pose and searches the pieces in the photo, all over it if `radius_px` is None."""
     rendering = render(cloud, with_margin(view.camera, margin_px), cam_from_local, RenderOptions(threads=1))
-    picture = source_picture(rendering, source)
+    picture = source_image(rendering, source)
     channels = oriented_gradients(picture, rendering.valid)
     templates = cut_templates(channels, rendering, TemplateOptions())
     photo = oriented_gradients(view.image, view.valid)

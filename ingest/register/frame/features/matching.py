@@ -7,13 +7,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.nearest import nearest
 from featuredb.render.rendering import Rendering
-from featuredb.render.shading import shaded_relief
+from ingest.register.frame.sources import source_image
 from ingest.register.frame_registration import RenderSource
 
 # The product's, with a lower contrast threshold than photos get, since renders are smooth.
@@ -56,21 +55,6 @@ def pool_features(rendering: Rendering, source: RenderSource) -> Pool:
     row = np.clip(features.xy[:, 1].astype(np.int64), 0, image.shape[0] - 1)
     good &= clear[row, column] >= _CLEAR_OF_VOID * 0.5 * features.scale
     return Pool(points=points[good], descriptors=features.descriptors[good])
-
-
-def source_image(rendering: Rendering, source: RenderSource) -> NDArray[np.uint8]:
-    """(h, w) uint8, what the render shows by one of the scan's properties.
-
-    Raises:
-        InvalidValueError: the scan does not have it.
-    """
-    if source == "shaded":
-        return shaded_relief(rendering)
-    if source == "rgb" and rendering.rgb is not None:
-        return np.asarray(cv2.cvtColor(rendering.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-    if source == "intensity" and rendering.intensity is not None:
-        return rendering.intensity
-    raise InvalidValueError(f"source_image: expected a scan with {source}, found one without")
 
 
 def filled(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
