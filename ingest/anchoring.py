@@ -26,7 +26,8 @@ from ingest.executor import Progress, no_progress
 from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, place_map
 from ingest.register.anchor.files import PhotoFiles, find_photos, load_proposals, save_proposals
 from ingest.register.anchor.frames import TriedFrames, try_frames
-from ingest.register.anchor.report import AnchorReport, write_anchor_report
+from ingest.register.anchor.page import write_anchor_report
+from ingest.register.anchor.report import AnchorReport
 from ingest.register.anchor.start.first_place import (
     MARGIN_M,
     FirstPlace,
@@ -74,7 +75,7 @@ class Anchoring:
 
     Attributes:
         report: everything about the registration and placement.
-        page: to flick through, None where there are no frames. report_page: path of the report.
+        page: the report, in which frames are flicked through.
         placed: whether the map is in the database at its new place. version: of the database since;
             version_before: the last one that shows the old place.
         flagged: maps that were quarantined, because this one had placed them.
@@ -83,10 +84,7 @@ class Anchoring:
     """
 
     report: AnchorReport
-    map_id: str
-    out: Path
-    page: Path | None
-    report_page: Path
+    page: Path
     placed: bool = False
     version: int = -1
     version_before: int = -1
@@ -174,20 +172,15 @@ def _finished(
         result=result,
         notes=tuple(notes),
     )
-    page, report_page = write_anchor_report(
-        job.out, report, job.feature_map, job.cloud, job.rgb, _confirm_command(database, job)
-    )
-    done = Anchoring(
-        report=report, map_id=job.summary.map_id, out=job.out, page=page, report_page=report_page
-    )
+    command = _confirm_command(database, job)
+    page = write_anchor_report(job.out, report, job.feature_map, job.cloud, job.rgb, command)
+    done = Anchoring(report=report, page=page)
     if result is None:
         saved = {f.image.image_id: f.registration for f in tried.accepted}
         save_proposals(job.out, _state(job), saved)
         names = tuple(f.image.name for f in tried.accepted)
-        command = _confirm_command(database, job).replace(
-            "{image}", f" {_CONFIRM} ".join(shlex.quote(name) for name in names)
-        )
-        return replace(done, proposed=names, command=command)
+        confirmed = f" {_CONFIRM} ".join(shlex.quote(name) for name in names)
+        return replace(done, proposed=names, command=command.replace("{image}", confirmed))
     if result.feature_map is None:
         return done
     committed = database.commit_map(

@@ -1,4 +1,4 @@
-"""Building blocks of pages for people: no network, no scripts, pictures inside."""
+"""Building blocks of pages for people: no network, pictures inside."""
 
 import base64
 import json
@@ -33,14 +33,15 @@ pre{font-size:12px;white-space:pre-wrap;overflow-wrap:anywhere}
 """
 
 
-def page(title: str, parts: Iterable[str]) -> str:
-    """A whole page of parts that are HTML already."""
+def page(title: str, parts: Iterable[str], style: str = "", script: str = "") -> str:
+    """A whole page of parts that are HTML already; with style and script of its own where it has some."""
+    scripts = f"<script>{script}</script>" if script else ""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body><main>"
+        f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head><body><main>"
         + "\n".join(parts)
-        + "</main></body></html>\n"
+        + f"</main>{scripts}</body></html>\n"
     )
 
 
@@ -71,9 +72,10 @@ def table(
     return f"<table>{f'<thead><tr>{header}</tr></thead>' if head else ''}<tbody>{body}</tbody></table>"
 
 
-def picture(png: bytes, words: str) -> str:
-    """A PNG inside the page."""
-    return f'<img alt="{escape(words)}" src="data:image/png;base64,{base64.b64encode(png).decode("ascii")}">'
+def picture(image: bytes, words: str, form: str = "png", kind: str = "") -> str:
+    """A PNG or JPEG inside the page, of a class of the page's style."""
+    data = base64.b64encode(image).decode("ascii")
+    return f'<img class="{kind}" alt="{escape(words)}" src="data:image/{form};base64,{data}">'
 
 
 def note(text: str) -> str:

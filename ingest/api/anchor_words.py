@@ -18,7 +18,7 @@ def anchoring_text(done: Anchoring, database: str) -> str:
     if done.placed and result is not None and result.before is not None and result.after is not None:
         move = result.checks["move"]
         lines.append(
-            f"map {done.map_id} is placed by its scan: version {done.version}; moved "
+            f"map {report.map_id} is placed by its scan: version {done.version}; moved "
             f"{move['horizontal_m']:.2f} m in plan and {move['up_m']:+.2f} m up; its points lie "
             f"{result.after.median_m:.3f} m (median) from the scan, {result.before.median_m:.2f} m before"
         )
@@ -31,7 +31,7 @@ def anchoring_text(done: Anchoring, database: str) -> str:
         lines.append(f"  {done.command}")
     else:
         lines.append(_nothing(done))
-    lines.append(f"report: {done.report_page}")
+    lines.append(f"report: {done.page}")
     return "\n".join(lines) + "\n"
 
 

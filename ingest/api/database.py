@@ -166,7 +166,7 @@ class FeatureDatabase:
         with progress_bars(quiet) as progress:
             anchored = anchor(self.store, request, progress)
         return Aligned(
-            map_id=anchored.map_id,
+            map_id=anchored.report.map_id,
             placed=anchored.placed,
             report=anchored,
             text=anchoring_text(anchored, self.url),

@@ -14,8 +14,11 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.files import load_proposals, save_proposals
-from ingest.register.anchor.pictures import FramePicture, edges_of, flick_page, overlay_rgb, scan_view
+from ingest.register.anchor.frames import TriedFrames
+from ingest.register.anchor.page import anchor_page
+from ingest.register.anchor.pictures import edges_of, scan_view
 from ingest.register.anchor.proposals import propose_frames, small_camera
+from ingest.register.anchor.report import AnchorReport
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from ingest.register.structure.map_move import map_move, map_residuals, viewing_distance_m
 from tests.support.maps import random_map
@@ -178,23 +181,29 @@ def test_edges_lie_where_depth_and_colour_change_and_not_at_the_scans_border() -
 
 def test_the_page_needs_no_network_and_escapes_names() -> None:
     feature_map = seeing_map([down(0, 0)])
-    view = scan_view(town(feature_map), CAMERA, down(0, 0))
-    photo = np.full((600, 800, 3), 120, np.uint8)
-    assert overlay_rgb(photo, view).shape == (600, 800, 3)
-    frame = FramePicture(
-        name="<b>.jpg",
-        photo_rgb=photo,
-        view=view,
-        verdict="good",
-        headline="found",
-        command="featuredb 'x y'",
+    image = replace(feature_map.images[0], name="<b>.jpg")
+    feature_map = replace(feature_map, images=(image,), name="Field & wood", cameras=(CAMERA,))
+    tried = TriedFrames.of_registrations(feature_map, {image.image_id: registration()})
+    report = AnchorReport(
+        map_id="m",
+        map_name=feature_map.name,
+        database="db",
+        photos="photos",
+        scan_ids=("s",),
+        epsg=feature_map.epsg,
+        datum_before="unknown",
+        datum_after="egm96",
+        tried=tried,
+        result=None,
     )
-    text = flick_page("Frames & more", "Look.", [frame, frame])
+    photo = np.full((600, 800, 3), 120, np.uint8)
+    text = anchor_page(report, feature_map, town(feature_map), lambda _: photo, "featuredb --confirm {image}")
     assert "http" not in text
     assert "<b>.jpg" not in text
-    assert "&lt;b&gt;.jpg" in text
-    assert text.count("data:image/jpeg;base64,") == 4
-    assert text.count("data:image/png;base64,") == 2
+    assert "featuredb --confirm &#x27;&lt;b&gt;.jpg&#x27;" in text
+    assert "Anchoring of Field &amp; wood" in text
+    assert text.count("data:image/jpeg;base64,") == 2
+    assert text.count("data:image/png;base64,") == 1
 
 
 def test_small_cameras_keep_the_picture() -> None:

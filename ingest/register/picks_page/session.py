@@ -214,7 +214,7 @@ class PickSession:
                 "undo": f"featuredb rollback {self.database.url} {done.version_before}"
                 if done.placed
                 else "",
-                "report": str(done.report_page),
+                "report": str(done.page),
             }
 
     def _request(self, image: MapImage, confirm: tuple[str, ...] = ()) -> AnchorRequest:
