@@ -201,7 +201,7 @@ def _confirm_command(database: Database, job: _Job) -> str:
     for option in job.request.storage_options:
         words += ["--storage-option", option]
     if job.first is not None:  # where it was put for the proposals is found again by the same words
-        words += job.first.files.words()
+        words += job.request.start.words()
     for scan_id in job.request.scan_ids:
         words += ["--scan", scan_id]
     words += ["--out", str(job.out)]
@@ -303,7 +303,8 @@ def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
     if job.first is not None:
         starts, notes = dict(job.first.starts), list(job.first.notes)
     else:
-        found = started_images(feature_map, request.start, feature_map.frame, feature_map.epsg)
+        told = request.start.read()
+        found = started_images(feature_map, told, feature_map.frame, feature_map.epsg)
         starts = {f.image.image_id: f.prior for f in found}
         notes = [f.note for f in found]
     for image_id in starts:

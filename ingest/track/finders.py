@@ -15,8 +15,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.lidar.load import PlanBox, load_cloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, list_scans
-from ingest.register.anchor.start.files import read_pose
-from ingest.register.anchor.start.priors import RoughPose, prior_from_rough_pose
+from ingest.register.anchor.start.files import RoughPose, read_pose
 from ingest.track.scan_ground import ScanFinder, ScanGround
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
@@ -146,7 +145,7 @@ def _finder(
             f"scan {', '.join(ids)} has no points around where the film is looked for; is the pose's zone "
             f"that of the scan, EPSG:{scans[0].epsg}? `featuredb lidar list` tells where scans lie"
         )
-    first = None if rough is None else prior_from_rough_pose(rough, frame, scans[0].epsg)
+    first = None if rough is None else rough.prior(frame, scans[0].epsg)
     return ScanFinder(cloud, ids[0], scans[0].epsg, first)
 
 

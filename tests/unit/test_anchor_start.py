@@ -13,17 +13,14 @@ from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from ingest.register.anchor.start.files import read_picks, read_pose
+from ingest.register.anchor.start.files import RoughPose, read_picks, read_pose
 from ingest.register.anchor.start.picks import Picks, pose_from_picks
 from ingest.register.anchor.start.priors import (
     MIN_SIGMA_HORIZONTAL_M,
     MIN_SIGMA_VERTICAL_M,
-    RoughPose,
     height_shift,
     image_named,
-    look_at_angles,
     prior_from_map,
-    prior_from_rough_pose,
 )
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
 from tools.worlds.clouds import build_cloud
@@ -119,16 +116,13 @@ def test_a_rough_pose_looks_where_it_says() -> None:
     feature_map = random_map(1)
     utm = np.array([EASTING + 40.0, NORTHING - 20.0, HEIGHT + 90.0])
     target = np.array([EASTING + 80.0, NORTHING + 50.0, HEIGHT])
-    yaw, pitch = look_at_angles(utm, target)
-    prior = prior_from_rough_pose(
-        RoughPose(image="x", utm=utm, yaw_deg=yaw, pitch_deg=pitch), feature_map.frame, feature_map.epsg
-    )
+    place = dict(zip(("easting", "northing", "height"), utm.tolist(), strict=True))
+    rough = RoughPose.model_validate(place | {"look_at": target.tolist()})
+    prior = rough.prior(feature_map.frame, feature_map.epsg)
     seen = prior.cam_from_local.act(feature_map.frame.enu_from_utm(target, EPSG))
     assert seen[2] > 0
     # UTM's scale and the Earth's curvature leave centimetres in a hundred metres.
     np.testing.assert_allclose(seen[:2] / seen[2], 0.0, atol=2e-3)
-    with pytest.raises(RegistrationError, match="own position"):
-        look_at_angles(utm, utm)
 
 
 def flat_map(sigma: float = 0.02) -> FeatureMap:
@@ -225,8 +219,7 @@ def test_files_of_poses(tmp_path: Path) -> None:
     path.write_text('{"easting": 0, "northing": 0, "height": 10, "look_at": [10, 0, 0], "sigma_tilt_deg": 2}')
     pose = read_pose(path, "b.jpg")
     assert pose.image == "b.jpg"
-    assert pose.yaw_deg == pytest.approx(90.0)
-    assert pose.pitch_deg == pytest.approx(-45.0)
+    assert pose.angles() == pytest.approx((90.0, -45.0))
     assert pose.sigma_tilt_deg == 2.0
 
 
@@ -237,6 +230,7 @@ def test_files_of_poses(tmp_path: Path) -> None:
         ('{"easting": 1, "northing": 2, "height": 3}', "give yaw_deg and pitch_deg, or look_at"),
         ('{"easting": 1, "northing": 2, "height": 3, "yaw_deg": 1, "pitch_deg": 100}', "pitch_deg"),
         ('{"easting": 1, "northing": 2, "height": 3, "pitch_deg": 1, "look_at": [1, 2, 3]}', "not both"),
+        ('{"easting": 1, "northing": 2, "height": 3, "look_at": [1, 2, 3]}', "own position"),
         ('{"easting": 1, "northing": 2, "height": 3, "jaw_deg": 1}', "jaw_deg"),
         ('{"easting": 1, "northing": 2, "height": 3, "yaw_deg": 1, "pitch_deg": 0}', "names no photo"),
     ],

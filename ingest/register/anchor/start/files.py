@@ -9,10 +9,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from featuredb.errors import RegistrationError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera_angles import cam_from_enu
+from featuredb.geometry.rigid3 import Rigid3
 from ingest.register.anchor.start.picks import Picks
-from ingest.register.anchor.start.priors import RoughPose, look_at_angles
+from ingest.register.frame_registration import FramePrior
 
-_HOW_ROUGH = {"roll_deg", "sigma_horizontal_m", "sigma_vertical_m", "sigma_heading_deg", "sigma_tilt_deg"}
 _COLUMNS = ("x", "y", "easting", "northing", "height")
 
 
@@ -82,10 +85,22 @@ def _pick(
     return name, values
 
 
-class _PoseFile(BaseModel):
-    """A rough pose as a person writes it."""
+class RoughPose(BaseModel):
+    """A rough pose as a person writes it for one photo.
 
-    model_config = ConfigDict(extra="forbid")
+    Attributes:
+        image: the photo's name.
+        easting, northing, height: of the camera, in the zone of the map (or, without one, of the scan) and
+            the scan's datum.
+        yaw_deg: clockwise from grid north: where the optical axis points in plan; of a camera that looks
+            straight down, where the top of the photo points.
+        pitch_deg: of the optical axis above the horizon; -90 looks straight down.
+        roll_deg: of the camera about its optical axis, clockwise as the camera sees it.
+        look_at: easting, northing, height of what the middle of the photo shows, instead of the pitch.
+        sigma_horizontal_m, sigma_vertical_m, sigma_heading_deg, sigma_tilt_deg: how rough.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
     image: str | None = None
     easting: FiniteFloat
     northing: FiniteFloat
@@ -100,19 +115,47 @@ class _PoseFile(BaseModel):
     sigma_tilt_deg: float = Field(default=5.0, gt=0, le=90)
 
     @model_validator(mode="after")
-    def _one_direction(self) -> "_PoseFile":
+    def _one_direction(self) -> "RoughPose":
         if self.look_at is None and (self.yaw_deg is None or self.pitch_deg is None):
             raise ValueError("give yaw_deg and pitch_deg, or look_at")
         if self.look_at is not None and self.pitch_deg is not None:
             raise ValueError("give pitch_deg or look_at, not both")
+        if self.look_at is not None and np.linalg.norm(np.subtract(self.look_at, self.utm)) < 1e-3:
+            raise ValueError("look_at is the camera's own position; give a point that it looks at")
         return self
+
+    @property
+    def utm(self) -> FloatArray:
+        """(3,) easting, northing, height."""
+        return np.array([self.easting, self.northing, self.height])
+
+    def angles(self) -> tuple[float, float]:
+        """Yaw and pitch in degrees, by look_at where it is given."""
+        if self.look_at is None:
+            assert self.yaw_deg is not None
+            assert self.pitch_deg is not None
+            return self.yaw_deg, self.pitch_deg
+        east, north, up = np.asarray(self.look_at) - self.utm
+        yaw, pitch = np.degrees([np.arctan2(east, north), np.arctan2(up, np.hypot(east, north))])
+        return self.yaw_deg if self.yaw_deg is not None and pitch < -89.0 else float(yaw), float(pitch)
+
+    def prior(self, frame: LocalFrame, epsg: int) -> FramePrior:
+        """The pose, given in a UTM zone, in a local frame."""
+        center = frame.enu_from_utm(self.utm, epsg)
+        rotation = cam_from_enu(*self.angles(), self.roll_deg) @ frame.grid_from_enu(center, epsg)
+        return FramePrior(
+            cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
+            sigma_horizontal_m=self.sigma_horizontal_m,
+            sigma_vertical_m=self.sigma_vertical_m,
+            sigma_heading_deg=self.sigma_heading_deg,
+            sigma_tilt_deg=self.sigma_tilt_deg,
+        )
 
 
 def read_pose(path: Path, image: str | None) -> RoughPose:
     """A rough pose from a JSON file: easting, northing, height, and yaw_deg, pitch_deg, roll_deg or look_at.
 
-    `look_at` is easting, northing, height of what the middle of the photo shows; `yaw_deg` with it says where
-    the top of the photo points where the camera looks straight down.
+    `yaw_deg` with `look_at` says where the top of the photo points where the camera looks straight down.
 
     Args:
         image: the photo, where the file names none.
@@ -122,7 +165,7 @@ def read_pose(path: Path, image: str | None) -> RoughPose:
     """
     try:
         document: Any = json.loads(path.read_text(encoding="utf-8"))
-        pose = _PoseFile.model_validate(document)
+        pose = RoughPose.model_validate(document)
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise RegistrationError(f"pose {path}: cannot be read as JSON ({error})") from error
     except ValidationError as error:
@@ -136,18 +179,4 @@ def read_pose(path: Path, image: str | None) -> RoughPose:
     name = pose.image or image
     if not name:
         raise RegistrationError(f"pose {path}: names no photo; add image, or give --image")
-    utm = np.array([pose.easting, pose.northing, pose.height])
-    if pose.look_at is not None:
-        yaw, pitch = look_at_angles(utm, np.array(pose.look_at))
-        yaw = pose.yaw_deg if pose.yaw_deg is not None and pitch < -89.0 else yaw
-    else:
-        assert pose.yaw_deg is not None
-        assert pose.pitch_deg is not None
-        yaw, pitch = pose.yaw_deg, pose.pitch_deg
-    return RoughPose(
-        image=name,
-        utm=utm,
-        yaw_deg=yaw,
-        pitch_deg=pitch,
-        **pose.model_dump(include=_HOW_ROUGH),
-    )
+    return pose.model_copy(update={"image": name})

@@ -9,7 +9,6 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError, RegistrationError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import load_cloud
 from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
@@ -18,10 +17,10 @@ from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, list_scans
-from ingest.register.anchor.start.files import read_picks, read_pose
+from ingest.register.anchor.start.files import RoughPose, read_picks, read_pose
 from ingest.register.anchor.start.from_above import found_from_above
 from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks
-from ingest.register.anchor.start.priors import RoughPose, image_named, prior_from_rough_pose
+from ingest.register.anchor.start.priors import image_named
 from ingest.register.frame_registration import FramePrior
 from ingest.register.place_map import place_by_photo
 
@@ -92,6 +91,15 @@ class StartFiles:
         named = (("pose", self.pose), ("picks", self.picks), ("image", self.image), ("near", self.near))
         return [f"--{option}={value}" for option, value in named if value is not None]
 
+    def read(self) -> list[RoughPose | Picks]:
+        """What they say of single photos.
+
+        Raises:
+            RegistrationError: they cannot be read.
+        """
+        rough = [] if self.pose is None else [read_pose(self.pose, self.image)]
+        return [*rough, *([] if self.picks is None else read_picks(self.picks, self.image))]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StartedImage:
@@ -110,7 +118,6 @@ class FirstPlace:
     Attributes:
         feature_map: the map there; a start, not a placement. cloud: the scan around it, in its frame.
         starts: priors of the person's photos by image id. notes: a line on each, or on how it was found.
-        files: that said it.
     """
 
     feature_map: FeatureMap
@@ -118,32 +125,28 @@ class FirstPlace:
     scan_ids: tuple[str, ...]
     starts: Mapping[int, FramePrior]
     notes: tuple[str, ...]
-    files: StartFiles
 
 
 def started_images(
-    feature_map: AnyMap, files: StartFiles, frame: LocalFrame, epsg: int
+    feature_map: AnyMap, told: Sequence[RoughPose | Picks], frame: LocalFrame, epsg: int
 ) -> list[StartedImage]:
-    """The photos that a person's files put somewhere.
+    """The photos that a person has put somewhere.
 
     Args:
-        frame: of the priors. epsg: zone of the files' coordinates.
+        told: by `StartFiles.read`, in the zone `epsg`. frame: of the priors.
 
     Raises:
-        RegistrationError: the files cannot be read, or picks do not determine a pose.
+        RegistrationError: no such photo, or picks do not determine a pose.
     """
-    rough = [] if files.pose is None else [read_pose(files.pose, files.image)]
-    picks = [] if files.picks is None else read_picks(files.picks, files.image)
-    found = [_by_pose(feature_map, pose, frame, epsg, str(files.pose)) for pose in rough]
-    return found + [by_picks(feature_map, p, frame, epsg) for p in picks]
+    return [
+        _by_picks(feature_map, one, frame, epsg)
+        if isinstance(one, Picks)
+        else _by_pose(feature_map, one, frame, epsg)
+        for one in told
+    ]
 
 
-def by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -> StartedImage:
-    """The photo where its picks put it.
-
-    Raises:
-        RegistrationError: they do not determine the pose, or contradict each other.
-    """
+def _by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -> StartedImage:
     image = image_named(feature_map, picks.image)
     upright = not isinstance(feature_map, UnplacedMap) or feature_map.frame.upright
     prior, fit = pose_from_picks(
@@ -178,24 +181,31 @@ def first_place(
             "--picks FILE or --pose FILE"
         )
     scans = chosen_scans(database, scan_ids)
+    ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
+    started: list[StartedImage] = []
     if files.near is not None:
-        return _found_near(database, unplaced, files, files.near, tuple(scan.scan_id for scan in scans))
-    epsg = scans[0].epsg
-    utm = _spoken_of(files)
-    east, north, up = (float(v) for v in np.median(utm, axis=0))
-    frame = LocalFrame.from_utm(east, north, up, epsg)
-    started = started_images(unplaced, files, frame, epsg)
-    ids = tuple(scan.scan_id for scan in scans)
-    return placed_by_start(database, unplaced, started, frame, ids, files)
+        feature_map, note = _found_near(database, unplaced, files.near, ids)
+        notes: tuple[str, ...] = (note,)
+    else:
+        told = files.read()
+        east, north, up = np.median(np.vstack([one.utm for one in told]), axis=0).tolist()
+        frame = LocalFrame.from_utm(east, north, up, epsg)
+        started = started_images(unplaced, told, frame, epsg)
+        feature_map = _put_by(database, unplaced, started[0], frame, ids)
+        notes = tuple(s.note for s in started)
+    return FirstPlace(
+        feature_map=feature_map,
+        cloud=load_cloud(database, feature_map.frame, plan_box(feature_map), scan_ids=ids),
+        scan_ids=ids,
+        starts={s.image.image_id: s.prior for s in started},
+        notes=notes,
+    )
 
 
 def _found_near(
-    database: Database,
-    unplaced: UnplacedMap,
-    files: StartFiles,
-    near: Circle,
-    scan_ids: tuple[str, ...],
-) -> FirstPlace:
+    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...]
+) -> tuple[FeatureMap, str]:
+    """The map where the scans near a place show the same, and a line on it."""
     frame = LocalFrame(latitude_deg=near.lat, longitude_deg=near.lon, height_m=0.0)
     reach = near.radius_m
     cloud = load_cloud(database, frame, (-reach, -reach, reach, reach), scan_ids=scan_ids)
@@ -221,47 +231,26 @@ def _found_near(
         residual_rms_m=0.0,
         evidence={"start": {"near": str(near), "no_place": unplaced.no_place.reason_code}},
     )
-    feature_map = placed_map(unplaced, placement, cloud.frame, cloud.height_datum)
-    return FirstPlace(
-        feature_map=feature_map,
-        cloud=load_cloud(database, frame, plan_box(feature_map), scan_ids=scan_ids),
-        scan_ids=scan_ids,
-        starts={},
-        notes=(f"found near {near.lat:.6f}, {near.lon:.6f}: {found.words()}",),
-        files=files,
-    )
+    note = f"found near {near.lat:.6f}, {near.lon:.6f}: {found.words()}"
+    return placed_map(unplaced, placement, cloud.frame, cloud.height_datum), note
 
 
-def placed_by_start(
+def _put_by(
     database: Database,
     unplaced: UnplacedMap,
-    started: Sequence[StartedImage],
+    started: StartedImage,
     frame: LocalFrame,
     scan_ids: tuple[str, ...],
-    files: StartFiles,
-) -> FirstPlace:
-    """The map put where the first of these photos says.
-
-    Raises:
-        RegistrationError: the photo does not see the scan from there.
-    """
-    first, reach = started[0], _FIRST_REACH_M
-    center = first.prior.cam_from_local.center
-    box = (center[0] - reach, center[1] - reach, center[0] + reach, center[1] + reach)
-    cloud = load_cloud(database, frame, box, scan_ids=scan_ids)
+) -> FeatureMap:
+    """The map where a person has put one of its photos."""
+    reach = _FIRST_REACH_M
+    x, y, _ = started.prior.cam_from_local.center.tolist()
+    cloud = load_cloud(database, frame, (x - reach, y - reach, x + reach, y + reach), scan_ids=scan_ids)
     if not len(cloud):
         raise RegistrationError(
             f"no scan of {database.url} lies within {reach:.0f} m of where the photo is put"
         )
-    feature_map = place_by_photo(unplaced, first.image, first.camera, first.prior, cloud)
-    return FirstPlace(
-        feature_map=feature_map,
-        cloud=load_cloud(database, frame, plan_box(feature_map), scan_ids=scan_ids),
-        scan_ids=scan_ids,
-        starts={s.image.image_id: s.prior for s in started},
-        notes=tuple(s.note for s in started),
-        files=files,
-    )
+    return place_by_photo(unplaced, started.image, started.camera, started.prior, cloud)
 
 
 def chosen_scans(database: Database, scan_ids: Sequence[str]) -> list[ScanSummary]:
@@ -291,19 +280,11 @@ def plan_box(feature_map: FeatureMap) -> tuple[float, float, float, float]:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def _by_pose(feature_map: AnyMap, rough: RoughPose, frame: LocalFrame, epsg: int, where: str) -> StartedImage:
-    image = image_named(feature_map, rough.image)
+def _by_pose(feature_map: AnyMap, rough: RoughPose, frame: LocalFrame, epsg: int) -> StartedImage:
+    image = image_named(feature_map, str(rough.image))
     return StartedImage(
         image=image,
-        prior=prior_from_rough_pose(rough, frame, epsg),
+        prior=rough.prior(frame, epsg),
         camera=feature_map.cameras[image.camera_id],
-        note=f"{image.name} starts from the pose in {where}",
+        note=f"{image.name} starts from the pose given for it",
     )
-
-
-def _spoken_of(files: StartFiles) -> FloatArray:
-    """(n, 3) UTM coordinates that the files name."""
-    if files.picks is not None:
-        return np.vstack([p.utm for p in read_picks(files.picks, files.image)])
-    assert files.pose is not None
-    return read_pose(files.pose, files.image).utm[None]

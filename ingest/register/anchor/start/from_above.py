@@ -25,10 +25,10 @@ from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.features.matching import pool_features
+from ingest.register.frame.sources import available_sources
 from ingest.register.frame.verdict import MIN_COVER
-from ingest.register.frame.views import SPACING_PX
+from ingest.register.frame.views import FEATURES_SPACING_PX
 from ingest.register.frame_registration import RenderSource
 from ingest.register.structure.similarity import similarities
 from reloc.localise.acceptance import log_nfa
@@ -37,7 +37,6 @@ _SIDE_PX = 1000  # of a picture from above; the next one overlaps it by half
 _VIEWS = (
     8  # along a side, at most: a picture shows a quarter of a side, or what the scan's points are fine for
 )
-_FEATURES = 3000  # of each
 _MOST_DESCRIPTORS = 30_000  # of the map: more say the same again, and take longer
 _NEIGHBOURS = 8  # one point of the map has a descriptor in each photo: the next point must be among them
 _MAX_RATIO = 0.85  # as localisation has it
@@ -94,7 +93,7 @@ def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundFromAbove
 
 def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> FoundFromAbove | None:
     wide_m = _wide_m(cloud)
-    pools = [pool_features(view, source, False, _FEATURES) for view in _views(cloud, wide_m)]
+    pools = [pool_features(view, source, upright=False) for view in _views(cloud, wide_m)]
     if not pools:
         return None
     places = np.concatenate([pool.points for pool in pools])
@@ -114,7 +113,7 @@ def _wide_m(cloud: PointCloud) -> float:
     """What a picture shows: as fine as the scan's points are dense, and no more than so many pictures."""
     plan = np.ptp(cloud.xyz[:, :2], axis=0)
     spacing = float(np.sqrt(np.prod(plan) / len(cloud)))
-    return max(_SIDE_PX * spacing / SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
+    return max(_SIDE_PX * spacing / FEATURES_SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
 
 
 def _views(cloud: PointCloud, wide_m: float) -> Iterator[Rendering]:

@@ -1,4 +1,4 @@
-"""Where the registration of a frame starts: the map's present placement, or a rough pose from a person."""
+"""Where the registration of a frame starts by the place that its map has; heights of map and scan compared."""
 
 from dataclasses import dataclass
 
@@ -6,9 +6,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from featuredb.errors import RegistrationError
-from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray, frozen_array
-from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
@@ -102,63 +99,6 @@ def prior_from_map(feature_map: FeatureMap, image: MapImage, shift: HeightShift 
         sigma_tilt_deg=max(
             float(np.degrees(np.sqrt(max(covariance[1, 1], covariance[2, 2])))), MIN_SIGMA_ANGLE_DEG
         ),
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RoughPose:
-    """A pose that a person gives for one photo.
-
-    Attributes:
-        image: the photo's name.
-        utm: (3,) easting, northing, height of the camera, in the zone of the map (or, without one, of the
-            scan) and the scan's datum.
-        yaw_deg: clockwise from grid north: where the optical axis points in plan; of a camera that looks
-            straight down, where the top of the photo points.
-        pitch_deg: of the optical axis above the horizon; -90 looks straight down.
-        roll_deg: of the camera about its optical axis, clockwise as the camera sees it.
-        sigma_horizontal_m, sigma_vertical_m, sigma_heading_deg, sigma_tilt_deg: how rough.
-    """
-
-    image: str
-    utm: FloatArray
-    yaw_deg: float
-    pitch_deg: float
-    roll_deg: float = 0.0
-    sigma_horizontal_m: float = 10.0
-    sigma_vertical_m: float = 10.0
-    sigma_heading_deg: float = 10.0
-    sigma_tilt_deg: float = 5.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "utm", frozen_array("RoughPose.utm", self.utm, (3,)))
-
-
-def prior_from_rough_pose(rough: RoughPose, frame: LocalFrame, epsg: int) -> FramePrior:
-    """The rough pose, given in a UTM zone, in a local frame."""
-    center = frame.enu_from_utm(rough.utm, epsg)
-    grid_from_local = frame.grid_from_enu(center, epsg)
-    rotation = cam_from_enu(rough.yaw_deg, rough.pitch_deg, rough.roll_deg) @ grid_from_local
-    return FramePrior(
-        cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
-        sigma_horizontal_m=rough.sigma_horizontal_m,
-        sigma_vertical_m=rough.sigma_vertical_m,
-        sigma_heading_deg=rough.sigma_heading_deg,
-        sigma_tilt_deg=rough.sigma_tilt_deg,
-    )
-
-
-def look_at_angles(utm: FloatArray, target_utm: FloatArray) -> tuple[float, float]:
-    """Yaw and pitch in degrees of a camera at `utm` (3,) that looks at `target_utm` (3,).
-
-    Raises:
-        RegistrationError: both are the same place.
-    """
-    east, north, up = np.asarray(target_utm, dtype=np.float64) - np.asarray(utm, dtype=np.float64)
-    if np.hypot(np.hypot(east, north), up) < 1e-3:
-        raise RegistrationError("pose: look_at is the camera's own position; give a point that it looks at")
-    return float(np.degrees(np.arctan2(east, north))), float(
-        np.degrees(np.arctan2(up, np.hypot(east, north)))
     )
 
 

@@ -1,7 +1,7 @@
 """Features of renders, pooled with the scan points that they show, and their matches with a photo."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,9 +16,7 @@ from ingest.register.frame.sources import source_image
 from ingest.register.frame_registration import RenderSource
 
 # The product's, with a lower contrast threshold than photos get, since renders are smooth.
-_EXTRACTOR = ExtractorOptions(
-    max_side_px=1600, max_features=3000, oversample=1.5, contrast_threshold=0.008, upright=True
-)
+_EXTRACTOR = ExtractorOptions(max_side_px=1600, max_features=3000, oversample=1.5, contrast_threshold=0.008)
 # A feature whose surroundings differ by more than this share in depth lies on a silhouette: what it shows is
 # two things, and its depth is a guess.
 _MAX_DEPTH_STEP = 0.04
@@ -41,14 +39,17 @@ class Pool:
         return len(self.points)
 
 
-def pool_features(rendering: Rendering, source: RenderSource) -> Pool:
+def pool_features(rendering: Rendering, source: RenderSource, *, upright: bool = True) -> Pool:
     """Features of a render, lifted to the scan by its depth.
+
+    Args:
+        upright: without orientations of their own; the photo is turned as the render is.
 
     Raises:
         InvalidValueError: the scan does not have `source`.
     """
     image = filled(source_image(rendering, source), rendering.valid)
-    features = extract(image, _EXTRACTOR)
+    features = extract(image, replace(_EXTRACTOR, upright=upright))
     points, good = lift(rendering, features.xy, _MAX_DEPTH_STEP)
     clear = cv2.distanceTransform(np.pad(rendering.valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     column = np.clip(features.xy[:, 0].astype(np.int64), 0, image.shape[1] - 1)
