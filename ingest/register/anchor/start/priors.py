@@ -1,4 +1,4 @@
-"""Where the registration of a frame starts by the place that its map has; heights of map and scan compared."""
+"""Where the registration of a frame starts by its map's place; heights of map and scan compared."""
 
 from dataclasses import dataclass
 
