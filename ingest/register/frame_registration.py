@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 
@@ -90,14 +90,9 @@ class FrameRegistration:
             raise InvalidValueError(
                 "FrameRegistration: expected pose, covariance and camera without a reason, or a reason alone"
             )
-        n = len(self.points_local)
         if self.covariance is not None:
-            object.__setattr__(
-                self, "covariance", frozen_array("FrameRegistration.covariance", self.covariance, (6, 6))
-            )
-        for name, columns in (("points_local", 3), ("pixels", 2)):
-            value = frozen_array(f"FrameRegistration.{name}", getattr(self, name), (n, columns))
-            object.__setattr__(self, name, value)
+            freeze(self, covariance=(6, 6))
+        freeze(self, points_local=(len(self.points_local), 3), pixels=(len(self.points_local), 2))
 
     @property
     def accepted(self) -> bool:

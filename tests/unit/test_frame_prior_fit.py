@@ -11,7 +11,6 @@ from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame.prior_fit import (
     fitted_under_prior,
     loosened,
-    moved,
     prior_information,
     prior_residual,
     prior_sigmas,
@@ -124,10 +123,3 @@ def test_few_matches_leave_the_pose() -> None:
     given = start(pose, LONG_LENS, 3)
     matches = seen_by(LONG_LENS, pose, points)
     assert fitted_under_prior(matches, given, prior_at(pose), PoseOptions()) is given
-
-
-def test_a_step_turns_and_displaces() -> None:
-    pose = moved(looking_down([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 0.1, 4.0, 5.0, 6.0]))
-    np.testing.assert_allclose(pose.center, [5.0, 7.0, 9.0], atol=1e-12)
-    local_from_cam = so3_exp([0.0, 0.0, 0.1]) @ DOWN.T
-    np.testing.assert_allclose(pose.rotation.T, local_from_cam, atol=1e-12)

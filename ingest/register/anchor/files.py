@@ -13,11 +13,12 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import MapImage
 from featuredb.maps.photo_files import PhotoFolder
 from featuredb.maps.unplaced_map import AnyMap
+from featuredb.plain_json import plain
 from ingest.register.frame_registration import FrameRegistration
 from ingest.workspace import read_json, write_json
 
 PROPOSALS = "proposals.json"
-_VERSION = 1
+_VERSION = 2
 
 
 State = tuple[str, str, str]
@@ -27,8 +28,8 @@ State = tuple[str, str, str]
 def save_proposals(folder: Path, state: State, registrations: Mapping[int, FrameRegistration]) -> None:
     """Write folder/proposals.json, atomically: accepted registrations by image id."""
     names = dict(zip(("map_id", "write_id", "scan_id"), state, strict=True))
-    frames = {str(i): _plain(r) for i, r in registrations.items() if r.accepted}
-    write_json(folder / PROPOSALS, {"version": _VERSION, **names, "frames": frames})
+    frames = {i: asdict(r) for i, r in registrations.items() if r.accepted}
+    write_json(folder / PROPOSALS, plain({"version": _VERSION, **names, "frames": frames}))
 
 
 def load_proposals(folder: Path, state: State) -> Mapping[int, FrameRegistration]:
@@ -61,37 +62,15 @@ def load_proposals(folder: Path, state: State) -> Mapping[int, FrameRegistration
     return frames
 
 
-def _plain(registration: FrameRegistration) -> dict[str, Any]:
-    pose, covariance, camera = registration.cam_from_local, registration.covariance, registration.camera
-    assert pose is not None
-    assert covariance is not None
-    assert camera is not None  # accepted
-    return {
-        "cam_from_local": pose.matrix().tolist(),
-        "covariance": covariance.tolist(),
-        "camera": asdict(camera),
-        "source": registration.source,
-        "points_local": registration.points_local.tolist(),
-        "pixels": registration.pixels.tolist(),
-        "evidence": registration.evidence,
-        "seconds": registration.seconds,
-    }
-
-
 def _registration(entry: dict[str, Any]) -> FrameRegistration:
     camera = entry["camera"]
-    return FrameRegistration(
-        cam_from_local=Rigid3.from_matrix(entry["cam_from_local"]),
-        covariance=np.array(entry["covariance"]),
-        reason=None,
-        message="",
-        camera=Camera(**camera | {"params": tuple(camera["params"])}),
-        source=entry["source"],
-        points_local=np.array(entry["points_local"]).reshape(-1, 3),
-        pixels=np.array(entry["pixels"]).reshape(-1, 2),
-        evidence=entry["evidence"],
-        seconds=entry["seconds"],
-    )
+    parts = {
+        "cam_from_local": Rigid3(**entry["cam_from_local"]),
+        "camera": camera and Camera(**camera | {"params": tuple(camera["params"])}),
+        "points_local": np.array(entry["points_local"]).reshape(-1, 3),
+        "pixels": np.array(entry["pixels"]).reshape(-1, 2),
+    }
+    return FrameRegistration(**entry | parts)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
@@ -32,6 +31,9 @@ _LOG = logging.getLogger(__name__)
 # Frames tried at most once one is registered. Where one of three registers, as low films over a scan without
 # colours, 18 leave fewer than two registered once in 150 maps.
 _MORE_TRIES = 18
+# How far a placed map's frames may be off that are registered again.
+_AGAIN_SIGMA_M = 2.0
+_AGAIN_SIGMA_DEG = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,7 +164,7 @@ def _try(
     gray = reader.full(proposal.image)
     if gray is None:
         return None
-    camera = camera_of_photo(feature_map.cameras[proposal.image.camera_id], gray)
+    camera = feature_map.cameras[proposal.image.camera_id]
     start, cpu = time.perf_counter(), time.process_time()
     registration = register_frame(gray, camera, proposal.prior, cloud)
     seconds = time.perf_counter() - start
@@ -185,40 +187,19 @@ def register_again(
     cloud: PointCloud,
     frames: Sequence[TriedFrame],
     read_gray: PhotoReader,
-    prior_sigma: tuple[float, float],
 ) -> list[TriedFrame]:
-    """Register frames anew from where a placed map has them, with its lens.
-
-    Args:
-        prior_sigma: metres and degrees, along and about all axes.
-    """
+    """Register frames anew from where a placed map has them, with its lens."""
     again = []
     reader = _Reader(read_gray)
     poses = {image.image_id: image for image in feature_map.images}
     for frame in frames:
         image = poses[frame.image.image_id]
-        prior = FramePrior.around(image.cam_from_local, *prior_sigma)
+        prior = FramePrior.around(image.cam_from_local, _AGAIN_SIGMA_M, _AGAIN_SIGMA_DEG)
         proposal = replace(frame.proposal, image=image, prior=prior)
         tried = _try(feature_map, cloud, proposal, reader)
         if tried is not None:
             again.append(tried)
     return again
-
-
-def camera_of_photo(camera: Camera, gray: NDArray[np.uint8]) -> Camera:
-    """The map's camera at the size of the pixels.
-
-    Raises:
-        ImageError: another aspect: not the pixels that the map was made of.
-    """
-    height, width = gray.shape[:2]
-    if (width, height) == (camera.width, camera.height):
-        return camera
-    raise ImageError(
-        f"expected a photo of {camera.width}x{camera.height} pixels as the map's camera has, "
-        f"found {width}x{height}",
-        "wrong_size",
-    )
 
 
 class _Reader:

@@ -21,9 +21,6 @@ _LOG = logging.getLogger(__name__)
 _LENS_ROUNDS = 4
 # Relative change of the focal length that needs no further round: 0.3 % is 0.15 m of height from 50 m.
 _LENS_SETTLED = 0.003
-# Prior of frames that are registered again.
-_AGAIN_SIGMA_M = 2.0
-_AGAIN_SIGMA_DEG = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,13 +95,7 @@ def place_in_rounds(
         )
         if change < _LENS_SETTLED or number + 1 == _LENS_ROUNDS:
             break
-        again = register_again(
-            placed,
-            cloud,
-            frames,
-            read_gray,
-            (_AGAIN_SIGMA_M, _AGAIN_SIGMA_DEG),
-        )
+        again = register_again(placed, cloud, frames, read_gray)
         kept = [frame for frame in again if frame.registration.accepted]
         if len(kept) < len(frames):
             lost = [f.image.name for f in again if not f.registration.accepted]

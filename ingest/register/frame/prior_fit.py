@@ -12,12 +12,13 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp, so3_log
+from featuredb.geometry.rotation import so3_log
 from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame_registration import FramePrior
 from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import PoseHypothesis, reprojection_errors
+from reloc.localise.self_calibration import pose_step
 
 _ROUNDS = 5  # Gauss-Newton; a step of 50 m and 3 degrees leaves a metre to the next
 _MIN_MATCHES = 6
@@ -97,7 +98,7 @@ def fitted_under_prior(
         information += slopes.T @ slopes
         pull += slopes.T @ prior_residual(here, prior)
         step = np.asarray(np.linalg.solve(information, -pull), dtype=np.float64)
-        here = moved(here, step)
+        here = pose_step(here, step)
     error = reprojection_errors(matches.pixels, matches.points, pose.camera, here)
     return replace(pose, cam_from_local=here, inliers=error < tolerance_px)
 
@@ -124,15 +125,9 @@ def _prior_slopes(pose: Rigid3, prior: FramePrior) -> FloatArray:
 
     def slope(axis: FloatArray) -> FloatArray:
         ahead, behind = (
-            prior_residual(moved(pose, axis), prior),
-            prior_residual(moved(pose, 0.0 - axis), prior),
+            prior_residual(pose_step(pose, axis), prior),
+            prior_residual(pose_step(pose, 0.0 - axis), prior),
         )
         return (ahead - behind) / 2e-5
 
     return np.stack([slope(np.asarray(axis, dtype=np.float64)) for axis in 1e-5 * np.eye(6)], axis=1)
-
-
-def moved(pose: Rigid3, step: FloatArray) -> Rigid3:
-    """The camera turned by a rotation about local axes (rad) and its centre displaced (m): step (6,)."""
-    rotation = pose.rotation @ so3_exp(-step[:3])
-    return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + step[3:]))

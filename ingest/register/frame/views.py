@@ -24,7 +24,7 @@ from ingest.register.frame_registration import FramePrior, RenderSource
 
 # Renders for features: so many pixels between scan points, since splats show nothing more, and at most that
 # longer side.
-_FEATURES_SPACING_PX, _FEATURES_SIDE_PX = 1.5, 960
+FEATURES_SPACING_PX, _FEATURES_SIDE_PX = 1.5, 960
 MIN_SIDE_PX = 400  # of any render; smaller pictures show too little
 
 _LOOK_SIDE_PX = 200  # of the first look, which only measures distance and cover
@@ -99,7 +99,7 @@ class FrameViews:
     @property
     def features_side_px(self) -> int:
         """Longer side of the renders that features are found in."""
-        return self.side_px(_FEATURES_SPACING_PX, _FEATURES_SIDE_PX)
+        return self.side_px(FEATURES_SPACING_PX, _FEATURES_SIDE_PX)
 
     def render_camera(self, side_px: int) -> Camera:
         """The photo's camera, shrunk."""

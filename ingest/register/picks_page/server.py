@@ -10,7 +10,7 @@ from importlib import resources
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field
 
 from featuredb.errors import FeatureDbError
 from ingest.register.picks_page.session import PickedSpot, PickSession
@@ -24,21 +24,10 @@ _POLICY = (
 )
 
 
-class _Pick(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-    x: FiniteFloat
-    y: FiniteFloat
-    ground_x: FiniteFloat
-    ground_y: FiniteFloat
-
-
 class _Picks(BaseModel):
     model_config = ConfigDict(extra="forbid")
     image: int
-    picks: list[_Pick] = Field(max_length=40)
-
-    def spots(self) -> list[PickedSpot]:
-        return [PickedSpot(**pick.model_dump()) for pick in self.picks]
+    picks: list[PickedSpot] = Field(max_length=40)
 
 
 def new_token() -> str:
@@ -70,11 +59,11 @@ def create_app(session: PickSession, token: str) -> FastAPI:
 
     @below.post("/api/solve")
     async def solve(picks: _Picks) -> Response:
-        return JSONResponse(await in_thread(partial(session.solve, picks.image, picks.spots())))
+        return JSONResponse(await in_thread(partial(session.solve, picks.image, picks.picks)))
 
     @below.post("/api/refine")
     async def refine(picks: _Picks) -> Response:
-        return JSONResponse(await in_thread(partial(session.refine, picks.image, picks.spots())))
+        return JSONResponse(await in_thread(partial(session.refine, picks.image, picks.picks)))
 
     @below.post("/api/confirm")
     async def confirm(picks: _Picks) -> Response:

@@ -2,13 +2,13 @@
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import cv2
 import numpy as np
+from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import INGEST_LIMITS, decode_rgb
@@ -31,14 +31,14 @@ _GROUND_PX, _GROUND_GAP_PX, _GROUND_EMPTY = 4000, 5, 24
 PICKS_FILE = "picks.csv"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PickedSpot:
-    """One pick: full-size pixel of the photo, and a place in the picture of the ground."""
+class PickedSpot(BaseModel):
+    """One pick of the page: full-size pixel of the photo, and a place in the picture of the ground."""
 
-    x: float
-    y: float
-    ground_x: float
-    ground_y: float
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    x: FiniteFloat
+    y: FiniteFloat
+    ground_x: FiniteFloat
+    ground_y: FiniteFloat
 
 
 class PickSession:

@@ -182,32 +182,30 @@ def first_place(
         )
     scans = chosen_scans(database, scan_ids)
     ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
+    started: list[StartedImage] = []
     if files.near is not None:
-        return _found_near(database, unplaced, files.near, ids)
-    told = files.read()
-    east, north, up = np.median(np.vstack([one.utm for one in told]), axis=0).tolist()
-    frame = LocalFrame.from_utm(east, north, up, epsg)
-    started = started_images(unplaced, told, frame, epsg)
-    first, reach = started[0], _FIRST_REACH_M
-    x, y, _ = first.prior.cam_from_local.center.tolist()
-    cloud = load_cloud(database, frame, (x - reach, y - reach, x + reach, y + reach), scan_ids=ids)
-    if not len(cloud):
-        raise RegistrationError(
-            f"no scan of {database.url} lies within {reach:.0f} m of where the photo is put"
-        )
-    feature_map = place_by_photo(unplaced, first.image, first.camera, first.prior, cloud)
+        feature_map, note = _found_near(database, unplaced, files.near, ids)
+        notes: tuple[str, ...] = (note,)
+    else:
+        told = files.read()
+        east, north, up = np.median(np.vstack([one.utm for one in told]), axis=0).tolist()
+        frame = LocalFrame.from_utm(east, north, up, epsg)
+        started = started_images(unplaced, told, frame, epsg)
+        feature_map = _put_by(database, unplaced, started[0], frame, ids)
+        notes = tuple(s.note for s in started)
     return FirstPlace(
         feature_map=feature_map,
-        cloud=load_cloud(database, frame, plan_box(feature_map), scan_ids=ids),
+        cloud=load_cloud(database, feature_map.frame, plan_box(feature_map), scan_ids=ids),
         scan_ids=ids,
         starts={s.image.image_id: s.prior for s in started},
-        notes=tuple(s.note for s in started),
+        notes=notes,
     )
 
 
 def _found_near(
     database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...]
-) -> FirstPlace:
+) -> tuple[FeatureMap, str]:
+    """The map where the scans near a place show the same, and a line on it."""
     frame = LocalFrame(latitude_deg=near.lat, longitude_deg=near.lon, height_m=0.0)
     reach = near.radius_m
     cloud = load_cloud(database, frame, (-reach, -reach, reach, reach), scan_ids=scan_ids)
@@ -233,14 +231,26 @@ def _found_near(
         residual_rms_m=0.0,
         evidence={"start": {"near": str(near), "no_place": unplaced.no_place.reason_code}},
     )
-    feature_map = placed_map(unplaced, placement, cloud.frame, cloud.height_datum)
-    return FirstPlace(
-        feature_map=feature_map,
-        cloud=load_cloud(database, frame, plan_box(feature_map), scan_ids=scan_ids),
-        scan_ids=scan_ids,
-        starts={},
-        notes=(f"found near {near.lat:.6f}, {near.lon:.6f}: {found.words()}",),
-    )
+    note = f"found near {near.lat:.6f}, {near.lon:.6f}: {found.words()}"
+    return placed_map(unplaced, placement, cloud.frame, cloud.height_datum), note
+
+
+def _put_by(
+    database: Database,
+    unplaced: UnplacedMap,
+    started: StartedImage,
+    frame: LocalFrame,
+    scan_ids: tuple[str, ...],
+) -> FeatureMap:
+    """The map where a person has put one of its photos."""
+    reach = _FIRST_REACH_M
+    x, y, _ = started.prior.cam_from_local.center.tolist()
+    cloud = load_cloud(database, frame, (x - reach, y - reach, x + reach, y + reach), scan_ids=scan_ids)
+    if not len(cloud):
+        raise RegistrationError(
+            f"no scan of {database.url} lies within {reach:.0f} m of where the photo is put"
+        )
+    return place_by_photo(unplaced, started.image, started.camera, started.prior, cloud)
 
 
 def chosen_scans(database: Database, scan_ids: Sequence[str]) -> list[ScanSummary]:

@@ -28,14 +28,12 @@ from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.matching import pool_features
 from ingest.register.frame.sources import available_sources
 from ingest.register.frame.verdict import MIN_COVER
+from ingest.register.frame.views import FEATURES_SPACING_PX
 from ingest.register.frame_registration import RenderSource
 from reloc.localise.acceptance import log_nfa
 
 _SIDE_PX = 1000  # of a picture from above; the next one overlaps it by half
-_VIEWS = (
-    8  # along a side, at most: a picture shows a quarter of a side, or what the scan's points are fine for
-)
-_SPACING_PX = 1.5  # between scan points: splats show nothing finer
+_VIEWS = 8  # along a side, at most; fewer where the scan's points show no more
 _MOST_DESCRIPTORS = 30_000  # of the map: more say the same again, and take longer
 _NEIGHBOURS = 8  # one point of the map has a descriptor in each photo: the next point must be among them
 _MAX_RATIO = 0.85  # as localisation has it
@@ -112,7 +110,7 @@ def _wide_m(cloud: PointCloud) -> float:
     """What a picture shows: as fine as the scan's points are dense, and no more than so many pictures."""
     plan = np.ptp(cloud.xyz[:, :2], axis=0)
     spacing = float(np.sqrt(np.prod(plan) / len(cloud)))
-    return max(_SIDE_PX * spacing / _SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
+    return max(_SIDE_PX * spacing / FEATURES_SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
 
 
 def _views(cloud: PointCloud, wide_m: float) -> Iterator[Rendering]:

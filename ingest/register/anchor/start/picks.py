@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from featuredb.errors import RegistrationError
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import MapImage
@@ -44,9 +44,7 @@ class Picks:
     utm: FloatArray
 
     def __post_init__(self) -> None:
-        pixels = frozen_array("Picks.pixels", self.pixels, (None, 2))
-        object.__setattr__(self, "pixels", pixels)
-        object.__setattr__(self, "utm", frozen_array("Picks.utm", self.utm, (len(pixels), 3)))
+        freeze(self, pixels=(None, 2), utm=(len(self.pixels), 3))
 
 
 def focal_sigma_rel(feature_map: AnyMap, image: MapImage) -> float:

@@ -16,9 +16,7 @@ from ingest.register.frame.sources import source_image
 from ingest.register.frame_registration import RenderSource
 
 # The product's, with a lower contrast threshold than photos get, since renders are smooth.
-_EXTRACTOR = ExtractorOptions(
-    max_side_px=1600, max_features=3000, oversample=1.5, contrast_threshold=0.008, upright=True
-)
+_EXTRACTOR = ExtractorOptions(max_side_px=1600, max_features=3000, oversample=1.5, contrast_threshold=0.008)
 # A feature whose surroundings differ by more than this share in depth lies on a silhouette: what it shows is
 # two things, and its depth is a guess.
 _MAX_DEPTH_STEP = 0.04
@@ -45,7 +43,7 @@ def pool_features(rendering: Rendering, source: RenderSource, *, upright: bool =
     """Features of a render, lifted to the scan by its depth.
 
     Args:
-        upright: without orientation; else they match at any turn.
+        upright: without orientations of their own; the photo is turned as the render is.
 
     Raises:
         InvalidValueError: the scan does not have `source`.
