@@ -85,10 +85,10 @@ class FrameRegistration:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        parts = (self.cam_from_local is None, self.covariance is None, self.reason is not None)
-        if len(set(parts)) != 1:
+        found = (self.cam_from_local, self.covariance, self.camera)
+        if len({self.reason is not None, *(part is None for part in found)}) != 1:
             raise InvalidValueError(
-                "FrameRegistration: expected a pose with covariance and no reason, or a reason and neither"
+                "FrameRegistration: expected pose, covariance and camera without a reason, or a reason alone"
             )
         n = len(self.points_local)
         if self.covariance is not None:

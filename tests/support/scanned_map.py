@@ -49,7 +49,7 @@ class ScannedMap:
         sigma_deg: float = 0.02,
         sigma_m: float = 0.02,
         correspondences: int = 0,
-        lens: Camera | None = None,
+        lens: Camera = CAMERA,
         seed: int = 0,
     ) -> RegisteredImage:
         """The frame at its true pose, perturbed on the left by `error` (6,)."""
@@ -62,13 +62,13 @@ class ScannedMap:
         covariance = np.diag([np.radians(sigma_deg) ** 2] * 3 + [sigma_m**2] * 3)
         return RegisteredImage(
             image_id=image,
-            camera=lens,
             registration=FrameRegistration(
                 cam_from_local=pose if error is None else Rigid3.exp(error) @ pose,
                 covariance=covariance,
                 reason=None,
                 message="",
                 source="rgb",
+                camera=lens,
                 points_local=points,
                 pixels=pixels + rng.normal(0, 0.5, pixels.shape),
             ),

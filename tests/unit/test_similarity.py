@@ -38,7 +38,6 @@ def _pairs(
     shift = rng.normal(0, frame_sigma, (frames, 3))
     noise = rng.normal(0, sigma, (count, 3)) + rng.normal(0, cell_sigma, (cell_of.max() + 1, 3))[cell_of]
     return Pairs(
-        point_index=np.arange(count),
         frame_of=frame_of,
         source=_TRUE.inverse().act(target),
         target=target + noise + shift[frame_of],

@@ -22,7 +22,7 @@ from ingest.register.anchor.frames import (
     TriedFrames,
     frames_that_agree,
 )
-from ingest.register.anchor.placing import PlaceRound, place_in_rounds, with_lens
+from ingest.register.anchor.placing import PlaceRound, place_in_rounds, registered_image
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.structure.map_move import (
     MapMove,
@@ -178,7 +178,7 @@ def _alone(
     refused: dict[str, str] = {}
     for frame in frames:
         image = frame.image
-        structure = project_structure(feature_map, [with_lens(frame, feature_map.cameras)], cloud)
+        structure = project_structure(feature_map, [registered_image(frame)], cloud)
         if not structure.accepted or structure.new_from_old is None:
             refused[image.name] = f"{structure.reason}: {structure.message}"
             continue

@@ -65,10 +65,11 @@ def _plain(registration: FrameRegistration) -> dict[str, Any]:
     pose, covariance, camera = registration.cam_from_local, registration.covariance, registration.camera
     assert pose is not None
     assert covariance is not None
+    assert camera is not None  # accepted
     return {
         "cam_from_local": pose.matrix().tolist(),
         "covariance": covariance.tolist(),
-        "camera": None if camera is None else asdict(camera),
+        "camera": asdict(camera),
         "source": registration.source,
         "points_local": registration.points_local.tolist(),
         "pixels": registration.pixels.tolist(),
@@ -84,7 +85,7 @@ def _registration(entry: dict[str, Any]) -> FrameRegistration:
         covariance=np.array(entry["covariance"]),
         reason=None,
         message="",
-        camera=None if camera is None else Camera(**camera | {"params": tuple(camera["params"])}),
+        camera=Camera(**camera | {"params": tuple(camera["params"])}),
         source=entry["source"],
         points_local=np.array(entry["points_local"]).reshape(-1, 3),
         pixels=np.array(entry["pixels"]).reshape(-1, 2),

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress
@@ -70,7 +69,7 @@ def place_in_rounds(
     rounds: list[PlaceRound] = []
     for number in range(_LENS_ROUNDS):
         lens = (placed or feature_map).cameras
-        registered = [with_lens(frame, lens) for frame in frames]
+        registered = [registered_image(frame) for frame in frames]
         start, cpu = time.perf_counter(), time.process_time()
         structure = project_structure(feature_map, registered, cloud)
         structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
@@ -123,10 +122,6 @@ def place_in_rounds(
     return placed, rounds, ""
 
 
-def with_lens(frame: TriedFrame, lens: Sequence[Camera]) -> RegisteredImage:
-    """The frame with the lens that it was registered with."""
-    return RegisteredImage(
-        image_id=frame.image.image_id,
-        registration=frame.registration,
-        camera=lens[frame.image.camera_id],
-    )
+def registered_image(frame: TriedFrame) -> RegisteredImage:
+    """A frame that was accepted, for structure projection."""
+    return RegisteredImage(image_id=frame.image.image_id, registration=frame.registration)

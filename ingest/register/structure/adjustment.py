@@ -99,15 +99,13 @@ def adjust_to_scan(
 
     Args:
         structure: an accepted placement of this map on this cloud.
-        registered: the frames with their correspondences, in the cloud's local frame. A frame without
-            correspondences takes part by the pairs of structure projection, which know no better lens than
-            the one it was registered with.
+        registered: the frames with their correspondences, in the cloud's local frame.
         begin: the map as an earlier adjustment left it, from which the solver starts.
     """
     assert structure.new_from_old is not None  # accepted
     to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
     start = whole_lens(block_of_map(feature_map).moved(structure.new_from_old @ to_cloud))
-    control = control_of(feature_map, structure, registered)
+    control = _control_of(feature_map, registered)
     if len(control.xyz) < _MIN_CONTROL:
         words = f"{len(control.xyz)} correspondences with the scan, at least {_MIN_CONTROL} are needed"
         return _refused("NO_CONTROL", words, {})
@@ -168,36 +166,15 @@ def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: Po
     )
 
 
-def control_of(
-    feature_map: FeatureMap, structure: StructurePlacement, registered: Sequence[RegisteredImage]
-) -> Marks:
-    """Scan points that the registered frames see, by their correspondences or else by their pairs."""
+def _control_of(feature_map: FeatureMap, registered: Sequence[RegisteredImage]) -> Marks:
+    """Scan points that the registered frames see, by their correspondences."""
     row_of_image = {image.image_id: row for row, image in enumerate(feature_map.images)}
-    xyz, xy, photo_of = [], [], []
-    for frame, item in enumerate(registered):
-        points, pixels = item.registration.points_local, item.registration.pixels
-        if len(points) == 0:
-            points, pixels = _pairs_as_control(feature_map, structure, frame, item.image_id)
-        xyz.append(points)
-        xy.append(pixels)
-        photo_of.append(np.full(len(points), row_of_image[item.image_id], dtype=np.int64))
+    found = [item.registration for item in registered]
     return Marks(
-        xyz=np.concatenate(xyz).reshape(-1, 3),
-        photo_of=np.concatenate(photo_of),
-        xy=np.concatenate(xy).reshape(-1, 2),
+        xyz=np.concatenate([r.points_local for r in found]),
+        photo_of=np.repeat([row_of_image[i.image_id] for i in registered], [len(r.pixels) for r in found]),
+        xy=np.concatenate([r.pixels for r in found]),
     )
-
-
-def _pairs_as_control(
-    feature_map: FeatureMap, structure: StructurePlacement, frame: int, image_id: int
-) -> tuple[FloatArray, FloatArray]:
-    assert structure.pairs is not None  # accepted
-    rows = np.flatnonzero((structure.pairs.frame_of == frame) & structure.inliers)
-    observations = feature_map.observations
-    mine = np.flatnonzero(observations.image_id == image_id)
-    row_of_point = dict(zip(observations.point_index[mine].tolist(), mine.tolist(), strict=True))
-    seen = [row_of_point[int(p)] for p in structure.pairs.point_index[rows]]
-    return structure.pairs.target[rows], observations.xy[seen].astype(np.float64)
 
 
 def _iterate(start: Block, lenses: tuple[Camera, ...], control: Marks, surface: Surface) -> Block:

@@ -37,13 +37,10 @@ class RegisteredImage:
     Attributes:
         image_id: of the map's image.
         registration: accepted, in the local frame of the cloud.
-        camera: the lens with which it was registered, where the registration does not name it itself;
-            None for the map's own.
     """
 
     image_id: int
     registration: FrameRegistration
-    camera: Camera | None = None
 
     def __post_init__(self) -> None:
         if not self.registration.accepted:
@@ -76,7 +73,7 @@ def structure_pairs(
     joined = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in (
-            *("point_index", "frame_of", "source", "target", "normals"),
+            *("frame_of", "source", "target", "normals"),
             *("covariance", "by_frame", "cell_of", "frame_covariance"),
         )
     }
@@ -92,10 +89,11 @@ def _pairs_of_frame(
     row: int,
     cloud: PointCloud,
 ) -> Pairs:
-    pose, covariance = registered.registration.cam_from_local, registered.registration.covariance
+    registration = registered.registration
+    pose, covariance, camera = registration.cam_from_local, registration.covariance, registration.camera
     assert pose is not None
-    assert covariance is not None  # accepted
-    camera = registered.registration.camera or registered.camera or feature_map.cameras[image.camera_id]
+    assert covariance is not None
+    assert camera is not None  # accepted
     width = min(_RENDER_WIDTH_PX, camera.width)
     small = camera.scaled_to(width, round(camera.height * width / camera.width))
     rendering = render(cloud, small, pose, RenderOptions(attributes=False))
@@ -114,7 +112,6 @@ def _pairs_of_frame(
     grid = np.minimum((pixels / (small.width, small.height) * _CELLS).astype(np.int64), _CELLS - 1)
     cell = row * _CELLS**2 + grid[:, 1] * _CELLS + grid[:, 0]
     return Pairs(
-        point_index=points[kept],
         frame_of=np.full(len(kept), row, dtype=np.int64),
         source=source[points[kept]],
         target=hits.points[kept],

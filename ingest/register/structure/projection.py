@@ -62,8 +62,6 @@ class StructurePlacement:
         new_from_old: similarity of the scan's local frame that moves the map from its present place to
             the new one, None when refused.
         covariance: (7, 7) of its left perturbation, None when refused.
-        pairs: the 3D/3D pairs, None without frames.
-        inliers: (n,) bool of the pairs.
         figures: what the decision rests on, JSON-able.
     """
 
@@ -71,8 +69,6 @@ class StructurePlacement:
     message: str
     new_from_old: Sim3 | None = None
     covariance: FloatArray | None = None
-    pairs: Pairs | None = None
-    inliers: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -92,38 +88,31 @@ def project_structure(
         return StructurePlacement(reason="NO_FRAMES", message="no frame is registered to the scan")
     source = feature_map.points_local(cloud.frame)
     pairs = structure_pairs(feature_map, source, registered, cloud)
-    none = np.zeros(len(pairs), dtype=bool)
     if len(pairs) < _MIN_PAIRS:
         words = f"{len(pairs)} of the map's points meet the scan, at least {_MIN_PAIRS} are needed"
-        return StructurePlacement(reason="TOO_FEW_PAIRS", message=words, pairs=pairs, inliers=none)
+        return StructurePlacement(reason="TOO_FEW_PAIRS", message=words)
     distances = _distances(pairs, registered)
     tolerance = np.maximum(_MIN_TOLERANCE_M, _TOLERANCE_REL * distances)
     start = ransac_similarity(pairs.source, pairs.target, tolerance)
     if start is None:
         words = "the pairs lie on a line or coincide"
-        return StructurePlacement(reason="NO_SIMILARITY", message=words, pairs=pairs, inliers=none)
+        return StructurePlacement(reason="NO_SIMILARITY", message=words)
     near = np.linalg.norm(pairs.target - start.act(pairs.source), axis=1) <= 2 * tolerance
     reason, message, figures = _gate_of_pairs(pairs, near, distances)
     if reason is not None:
-        return StructurePlacement(reason=reason, message=message, pairs=pairs, inliers=none, figures=figures)
+        return StructurePlacement(reason=reason, message=message, figures=figures)
     kept = _rows(pairs, near)
     fit = refine_similarity(start, kept)
     figures |= _figures_of_fit(fit, kept, feature_map, registered)
     reason, message = _gate_of_fit(fit, distances[near], figures)
-    inliers = near.copy()
-    inliers[near] = fit.inliers
     if reason is not None:
-        return StructurePlacement(
-            reason=reason, message=message, pairs=pairs, inliers=inliers, figures=figures
-        )
+        return StructurePlacement(reason=reason, message=message, figures=figures)
     figures |= _surface_figures(source, fit.target_from_source, cloud)
     return StructurePlacement(
         reason=None,
         message="placed on the scan",
         new_from_old=fit.target_from_source,
         covariance=fit.covariance,
-        pairs=pairs,
-        inliers=inliers,
         figures=figures,
     )
 
@@ -183,7 +172,6 @@ def _distances(pairs: Pairs, registered: Sequence[RegisteredImage]) -> FloatArra
 
 def _rows(pairs: Pairs, kept: NDArray[np.bool_]) -> Pairs:
     return Pairs(
-        point_index=pairs.point_index[kept],
         frame_of=pairs.frame_of[kept],
         source=pairs.source[kept],
         target=pairs.target[kept],

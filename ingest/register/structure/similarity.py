@@ -30,7 +30,6 @@ class Pairs:
     """3D/3D pairs of a map and a scan, in the scan's local frame, metres.
 
     Attributes:
-        point_index: (n,) row of the map's points.
         frame_of: (n,) index of the registered frame.
         source: (n, 3) map point at its present place.
         target: (n, 3) where the frame sees it on the scan.
@@ -41,7 +40,6 @@ class Pairs:
         frame_covariance: (f, 6, 6) of the frames' left perturbations.
     """
 
-    point_index: NDArray[np.int64]
     frame_of: NDArray[np.int64]
     source: FloatArray
     target: FloatArray
