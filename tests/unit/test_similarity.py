@@ -41,7 +41,6 @@ def _pairs(
         frame_of=frame_of,
         source=_TRUE.inverse().act(target),
         target=target + noise + shift[frame_of],
-        normals=np.tile([0.0, 0.0, 1.0], (count, 1)),
         covariance=np.tile(np.eye(3) * sigma**2, (count, 1, 1)),
         by_frame=by_frame,
         cell_of=cell_of,

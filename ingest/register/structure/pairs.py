@@ -73,7 +73,7 @@ def structure_pairs(
     joined = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in (
-            *("frame_of", "source", "target", "normals"),
+            *("frame_of", "source", "target"),
             *("covariance", "by_frame", "cell_of", "frame_covariance"),
         )
     }
@@ -115,7 +115,6 @@ def _pairs_of_frame(
         frame_of=np.full(len(kept), row, dtype=np.int64),
         source=source[points[kept]],
         target=hits.points[kept],
-        normals=hits.normals[kept],
         covariance=own + uncertainty[points[kept]],
         by_frame=by_frame,
         cell_of=cell[kept],

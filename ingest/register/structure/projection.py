@@ -25,13 +25,6 @@ from ingest.register.structure.similarity import (
     ransac_similarity,
     refine_similarity,
 )
-from ingest.register.structure.surface_fit import (
-    plane_distances,
-    reach_of,
-    surface_near,
-)
-
-_MAX_BEFORE = 4000  # points whose distance from the scan before the move is looked up
 
 StructureReason = Literal["NO_FRAMES", "TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
 
@@ -107,7 +100,6 @@ def project_structure(
     reason, message = _gate_of_fit(fit, distances[near], figures)
     if reason is not None:
         return StructurePlacement(reason=reason, message=message, figures=figures)
-    figures |= _surface_figures(source, fit.target_from_source, cloud)
     return StructurePlacement(
         reason=None,
         message="placed on the scan",
@@ -115,22 +107,6 @@ def project_structure(
         covariance=fit.covariance,
         figures=figures,
     )
-
-
-def _surface_figures(source: FloatArray, sim: Sim3, cloud: PointCloud) -> dict[str, Any]:
-    """How points (n, 3) lie on the scan's surface before the move, a sample of them, and after it."""
-    placed = sim.act(source)
-    # Points far from all others (gross errors of matching) would make the box endless.
-    low, high = np.percentile(placed, [1, 99], axis=0)
-    surface = surface_near(cloud, np.clip(placed, low, high))
-    if surface is None:
-        return {}
-    after = plane_distances(surface, placed, reach_of(surface))
-    # The nearest neighbour of what is far away costs most; a sample says as much.
-    some = np.flatnonzero(np.isfinite(after))
-    some = some[:: max(1, -(-len(some) // _MAX_BEFORE))]
-    before = plane_distances(surface, source[some], np.inf)
-    return {"surface": {"before": _summary(before), "after": _summary(after)}}
 
 
 def placed_map(feature_map: FeatureMap, structure: StructurePlacement, cloud: PointCloud) -> FeatureMap:
@@ -175,7 +151,6 @@ def _rows(pairs: Pairs, kept: NDArray[np.bool_]) -> Pairs:
         frame_of=pairs.frame_of[kept],
         source=pairs.source[kept],
         target=pairs.target[kept],
-        normals=pairs.normals[kept],
         covariance=pairs.covariance[kept],
         by_frame=pairs.by_frame[kept],
         cell_of=pairs.cell_of[kept],
@@ -222,7 +197,6 @@ def _figures_of_fit(
 ) -> dict[str, Any]:
     """What is written into the evidence."""
     residuals = np.linalg.norm(fit.residuals_m[fit.inliers], axis=1)
-    along = np.einsum("ij,ij->i", fit.residuals_m, pairs.normals)[fit.inliers]
     sim = fit.target_from_source
     middle = pairs.source[fit.inliers].mean(axis=0)
     corrections = fit.frame_corrections
@@ -232,7 +206,6 @@ def _figures_of_fit(
         "frame_images": [r.image_id for r in registered],
         "residual_rms_m": float(np.sqrt((residuals**2).mean())),
         "residual_median_m": float(np.median(residuals)),
-        "residual_across_surface_median_m": float(np.median(np.abs(along))),
         "sigma_factor": fit.spread,
         "neighbours_factor": fit.neighbours_factor,
         "scale_change": sim.scale - 1.0,
@@ -266,15 +239,3 @@ def _gate_of_fit(
             "placement"
         )
     return None, ""
-
-
-def _summary(distances: FloatArray) -> dict[str, float | int | None]:
-    near = np.abs(distances[np.isfinite(distances)])
-    if len(near) == 0:
-        return {"points": 0, "median_m": None, "rms_m": None, "p90_m": None}
-    return {
-        "points": len(near),
-        "median_m": float(np.median(near)),
-        "rms_m": float(np.sqrt((near**2).mean())),
-        "p90_m": float(np.percentile(near, 90)),
-    }

@@ -33,7 +33,6 @@ class Pairs:
         frame_of: (n,) index of the registered frame.
         source: (n, 3) map point at its present place.
         target: (n, 3) where the frame sees it on the scan.
-        normals: (n, 3) of the scan's surface there.
         covariance: (n, 3, 3) of the pair's own error, square metres.
         by_frame: (n, 3, 6) derivative of `target` by the left perturbation of the frame's pose.
         cell_of: (n,) neighbourhood of the pair; errors within one are correlated.
@@ -43,7 +42,6 @@ class Pairs:
     frame_of: NDArray[np.int64]
     source: FloatArray
     target: FloatArray
-    normals: FloatArray
     covariance: FloatArray
     by_frame: FloatArray
     cell_of: NDArray[np.int64]
