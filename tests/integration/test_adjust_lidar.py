@@ -14,9 +14,9 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.precision import linearise
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.adjustment import LidarAdjustment, adjust_to_scan, adjusted_map
+from ingest.register.structure.adjustment import LidarAdjustment, adjust_to_scan, placed_map
 from ingest.register.structure.pairs import RegisteredImage
-from ingest.register.structure.projection import StructurePlacement, placed_map, project_structure
+from ingest.register.structure.projection import StructurePlacement, project_structure
 from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map
 
 pytest.importorskip("numba")
@@ -115,7 +115,7 @@ def test_the_scan_mends_the_lens(wrong_lens: ScannedMap, frames: tuple[int, ...]
     structure, adjustment = _adjusted(wrong_lens, frames)
     assert adjustment.accepted, adjustment.message
     by_similarity = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud)
-    by_scan = adjusted_map(wrong_lens.feature_map, adjustment, wrong_lens.cloud)
+    by_scan = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud, adjustment)
     # The similarity lays the points on the ground and leaves the cameras metres too high.
     assert np.abs(_heights_off(by_similarity, wrong_lens)).min() > 3.0
     assert np.abs(_heights_off(by_scan, wrong_lens)).max() < 0.5
@@ -129,9 +129,9 @@ def test_the_scan_mends_the_lens(wrong_lens: ScannedMap, frames: tuple[int, ...]
 
 
 def test_the_adjusted_map_keeps_what_is_not_geometry(wrong_lens: ScannedMap) -> None:
-    _, adjustment = _adjusted(wrong_lens, (4,))
+    structure, adjustment = _adjusted(wrong_lens, (4,))
     before = wrong_lens.feature_map
-    after = adjusted_map(before, adjustment, wrong_lens.cloud)
+    after = placed_map(before, structure, wrong_lens.cloud, adjustment)
     assert after.map_id == before.map_id
     assert after.frame == before.frame
     assert after.height_datum == wrong_lens.cloud.height_datum
@@ -141,9 +141,9 @@ def test_the_adjusted_map_keeps_what_is_not_geometry(wrong_lens: ScannedMap) -> 
 
 
 def test_a_right_lens_stays(world: ScannedMap) -> None:
-    _, adjustment = _adjusted(world, (0, 4, 8))
+    structure, adjustment = _adjusted(world, (0, 4, 8))
     assert adjustment.accepted, adjustment.message
-    after = adjusted_map(world.feature_map, adjustment, world.cloud)
+    after = placed_map(world.feature_map, structure, world.cloud, adjustment)
     assert after.cameras[0].focal_px == pytest.approx(CAMERA.focal_px, rel=0.005)
     for image, pose in zip(after.images, world.true_poses, strict=True):
         assert np.linalg.norm(image.cam_from_local.center - pose.center) < 0.3
@@ -229,8 +229,8 @@ def test_a_lens_that_folds_is_refused(world: ScannedMap, monkeypatch: pytest.Mon
 
 
 def test_the_placement_s_similarity_is_next_to_the_truth(world: ScannedMap) -> None:
-    _, adjustment = _adjusted(world, (0, 4, 8))
-    after = adjusted_map(world.feature_map, adjustment, world.cloud)
+    structure, adjustment = _adjusted(world, (0, 4, 8))
+    after = placed_map(world.feature_map, structure, world.cloud, adjustment)
     assert np.abs(Sim3.log(after.placement.local_from_sfm)[:4]).max() < 0.01
 
 
@@ -238,8 +238,7 @@ def test_the_covariances_cover_the_cameras(wrong_lens: ScannedMap) -> None:
     """One frame's correspondences leave the lens' doubt in every camera: it is in the poses' covariances."""
     structure, adjustment = _adjusted(wrong_lens, (4,))
     assert structure.covariance is not None
-    assert adjustment.covariance is not None
-    after = adjusted_map(wrong_lens.feature_map, adjustment, wrong_lens.cloud)
+    after = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud, adjustment)
     squared = []
     for image, true in zip(after.images, wrong_lens.true_poses, strict=True):
         assert image.covariance is not None

@@ -12,8 +12,9 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from ingest.register.frame_registration import FrameRegistration
+from ingest.register.structure.adjustment import placed_map
 from ingest.register.structure.pairs import RegisteredImage, structure_pairs
-from ingest.register.structure.projection import placed_map, project_structure
+from ingest.register.structure.projection import project_structure
 from tests.support.scanned_map import FRAME, ScannedMap, plain_cloud, scanned_map
 
 pytest.importorskip("numba")

@@ -11,15 +11,9 @@ from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress
 from ingest.register.anchor.frames import TriedFrame, register_again
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.structure.adjustment import (
-    adjust_to_scan,
-    adjusted_map,
-)
+from ingest.register.structure.adjustment import adjust_to_scan, placed_map
 from ingest.register.structure.pairs import RegisteredImage
-from ingest.register.structure.projection import (
-    placed_map,
-    project_structure,
-)
+from ingest.register.structure.projection import project_structure
 
 _LOG = logging.getLogger(__name__)
 
@@ -83,7 +77,7 @@ def place_in_rounds(
         adjustment = adjust_to_scan(feature_map, structure, registered, cloud, adjusted)
         adjust_s = time.perf_counter() - start
         if adjustment.accepted:
-            placed = adjusted = adjusted_map(feature_map, adjustment, cloud)
+            placed = adjusted = placed_map(feature_map, structure, cloud, adjustment)
         elif placed is None:
             placed = placed_map(feature_map, structure, cloud)
         rounds.append(

@@ -27,8 +27,7 @@ from ingest.colmap.adjust import AdjustOptions, longest_side
 from ingest.colmap.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import RegisteredImage
-from ingest.register.structure.projection import StructurePlacement, move_in_map_frame
-from ingest.register.structure.similarity import similarities
+from ingest.register.structure.projection import StructurePlacement
 from ingest.register.structure.surface_fit import Surface, plane_distances, surface_near
 
 _LOG = logging.getLogger(__name__)
@@ -69,7 +68,6 @@ class LidarAdjustment:
     Attributes:
         reason: gate that refused it, or None; `message` says it for people.
         block: the map in the cloud's local frame, None when refused.
-        covariance: (7, 7) of what moves the whole map (left perturbation of a similarity), or None.
         poses: (6, 6) of each pose, with all that points and lenses leave open; none when refused.
         lenses: what is left open of the lenses; None when refused, or where no lens has OPENCV's parameters.
         figures: before and after, JSON-able.
@@ -78,7 +76,6 @@ class LidarAdjustment:
     reason: AdjustReason | None
     message: str
     block: Block | None
-    covariance: FloatArray | None
     poses: tuple[FloatArray, ...]
     lenses: LensUncertainty | None
     figures: dict[str, Any] = field(default_factory=dict)
@@ -131,32 +128,49 @@ def adjust_to_scan(
         reason=None,
         message="adjusted to the scan",
         block=block,
-        covariance=structure.covariance,
         poses=poses,
         lenses=lenses,
         figures=figures,
     )
 
 
-def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: PointCloud) -> FeatureMap:
-    """The map with the adjusted poses, points and lenses, in its own local frame; the scan's height datum.
+def placed_map(
+    feature_map: FeatureMap,
+    structure: StructurePlacement,
+    cloud: PointCloud,
+    adjustment: LidarAdjustment | None = None,
+) -> FeatureMap:
+    """The map at its new place: same ids, descriptors and local frame; the scan's height datum.
 
-    `local_from_sfm` becomes the similarity next to the old one; what is left over is the adjustment itself.
+    The new placement's `local_from_sfm` is the old one followed by the move of structure projection; what is
+    left over is the adjustment itself.
+
+    Args:
+        structure, adjustment: accepted ones; without an adjustment the map follows the similarity.
     """
-    assert adjustment.block is not None
-    assert adjustment.covariance is not None  # accepted
+    assert structure.new_from_old is not None
+    assert structure.covariance is not None  # accepted
     map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
-    block = adjustment.block.moved(map_from_cloud)
-    whole = _nearest_similarity(block_of_map(feature_map).centers(), block.centers())
-    _, covariance = move_in_map_frame(feature_map, Sim3.identity(), adjustment.covariance, cloud)
+    move = map_from_cloud @ structure.new_from_old @ map_from_cloud.inverse()
+    adjoint = map_from_cloud.adjoint()
+    covariance = adjoint @ structure.covariance @ adjoint.T
+    if adjustment is None:
+        block = block_of_map(feature_map).moved(move)
+        rms_m, evidence = structure.figures["residual_rms_m"], {"structure": structure.figures}
+    else:
+        assert adjustment.block is not None  # accepted
+        block = adjustment.block.moved(map_from_cloud)
+        rms_m, evidence = adjustment.figures["after"]["surface_rms_m"], {"adjustment": adjustment.figures}
     placement = Placement(
         method="lidar",
-        local_from_sfm=whole @ feature_map.placement.local_from_sfm,
-        covariance=covariance,
-        residual_rms_m=float(adjustment.figures["after"]["surface_rms_m"]),
-        evidence={"adjustment": adjustment.figures, "replaces": feature_map.placement.method},
+        local_from_sfm=move @ feature_map.placement.local_from_sfm,
+        covariance=(covariance + covariance.T) / 2,
+        residual_rms_m=float(rms_m),
+        evidence=evidence | {"replaces": feature_map.placement.method},
     )
     placed = map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
+    if adjustment is None:
+        return placed
     images = zip(placed.images, adjustment.poses, strict=True)
     uncertainty = {} if adjustment.lenses is None else adjustment.lenses.as_provenance()
     return replace(
@@ -335,15 +349,6 @@ def _folds_inside(camera: Camera) -> bool:
     return bool(camera.tan_of_fold < reach / camera.focal_px)
 
 
-def _nearest_similarity(source: FloatArray, target: FloatArray) -> Sim3:
-    """Least-squares similarity of the camera centres; the identity's neighbour where they are on a line."""
-    scale, rotation, translation, usable = similarities(source[None], target[None])
-    if not usable[0]:
-        shift = target.mean(axis=0) - source.mean(axis=0)
-        return Sim3(scale=1.0, rotation=np.eye(3), translation=shift)
-    return Sim3(scale=float(scale[0]), rotation=rotation[0], translation=translation[0])
-
-
 def _further(before: dict[str, Any], after: dict[str, Any]) -> bool:
     """Whether the median distance grew by more than three standard errors of two normal medians."""
     if before["surface_median_m"] is None:
@@ -353,6 +358,4 @@ def _further(before: dict[str, Any], after: dict[str, Any]) -> bool:
 
 
 def _refused(reason: AdjustReason, message: str, figures: dict[str, Any]) -> LidarAdjustment:
-    return LidarAdjustment(
-        reason=reason, message=message, block=None, covariance=None, poses=(), lenses=None, figures=figures
-    )
+    return LidarAdjustment(reason=reason, message=message, block=None, poses=(), lenses=None, figures=figures)

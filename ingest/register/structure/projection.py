@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import RegisteredImage, structure_pairs
 from ingest.register.structure.similarity import (
     Pairs,
@@ -107,37 +106,6 @@ def project_structure(
         covariance=fit.covariance,
         figures=figures,
     )
-
-
-def placed_map(feature_map: FeatureMap, structure: StructurePlacement, cloud: PointCloud) -> FeatureMap:
-    """The map at its new place: same ids, points, descriptors and local frame; the scan's height datum.
-
-    The new placement's `local_from_sfm` is the old one followed by the move, both in the map's frame.
-    """
-    assert structure.new_from_old is not None
-    assert structure.covariance is not None  # accepted
-    move, covariance = move_in_map_frame(feature_map, structure.new_from_old, structure.covariance, cloud)
-    placement = Placement(
-        method="lidar",
-        local_from_sfm=move @ feature_map.placement.local_from_sfm,
-        covariance=covariance,
-        residual_rms_m=float(structure.figures["residual_rms_m"]),
-        evidence={"structure": structure.figures, "replaces": feature_map.placement.method},
-    )
-    block = block_of_map(feature_map).moved(move)
-    return map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
-
-
-def move_in_map_frame(
-    feature_map: FeatureMap, new_from_old: Sim3, covariance: FloatArray, cloud: PointCloud
-) -> tuple[Sim3, FloatArray]:
-    """A move and its covariance, given in the cloud's local frame, in the map's."""
-    map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
-    adjoint = map_from_cloud.adjoint()
-    moved_covariance = adjoint @ covariance @ adjoint.T
-    return map_from_cloud @ new_from_old @ map_from_cloud.inverse(), (
-        moved_covariance + moved_covariance.T
-    ) / 2
 
 
 def _distances(pairs: Pairs, registered: Sequence[RegisteredImage]) -> FloatArray:
