@@ -20,7 +20,6 @@ from ingest.register.structure.projection import StructurePlacement, project_str
 from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map
 
 pytest.importorskip("numba")
-pytest.importorskip("small_gicp")
 
 _ADJUSTMENT = "ingest.register.structure.adjustment"
 _STIFF = LensWidths(focal_rel=1e-6, aspect_rel=0.002, center_rel=1e-6, radial=1e-6, tangential=1e-6)

@@ -366,7 +366,6 @@ def test_a_scan_in_store_has_its_say(given: Path, tmp_path: Path, up_m: float, o
 
     With heights of another datum it cannot say so, and the report tells.
     """
-    pytest.importorskip("small_gicp")
     pytest.importorskip("laspy")
     from featuredb.lidar.add import AddOptions, add_scan
 

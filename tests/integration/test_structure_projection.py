@@ -18,7 +18,6 @@ from ingest.register.structure.projection import project_structure
 from tests.support.scanned_map import FRAME, ScannedMap, plain_cloud, scanned_map
 
 pytest.importorskip("numba")
-pytest.importorskip("small_gicp")
 
 
 @pytest.fixture(autouse=True)

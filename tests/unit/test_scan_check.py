@@ -1,6 +1,5 @@
 """A map is where the scan has the ground, or it is not; the gate of growth that asks."""
 
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from featuredb.errors import MissingExtraError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
@@ -17,8 +17,6 @@ from ingest.growth.map_places import growth_of
 from ingest.growth.trust import scan_check
 from ingest.growth.trust.scan_check import checked_by_scan, cloud_gate
 from tests.support.scanned_map import ground_points, plain_cloud, scan, scanned_map
-
-pytest.importorskip("small_gicp")
 
 
 def _claim(sigma_m: float) -> FloatArray:
@@ -97,7 +95,11 @@ def test_without_the_extra_a_map_with_a_scan_waits(monkeypatch: pytest.MonkeyPat
     gate = checked_by_scan(database, known)[1]
     assert gate is not None
     assert gate.passes
-    monkeypatch.setitem(sys.modules, "small_gicp", None)
+
+    def missing(*_: object) -> PointCloud:
+        raise MissingExtraError("drawing needs numba: pip install 'featuredb[lidar]'")
+
+    monkeypatch.setattr(scan_check, "load_cloud", missing)
     checked, gate, why = checked_by_scan(database, known)
     assert gate is not None
     assert not gate.passes

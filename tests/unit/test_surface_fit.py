@@ -6,12 +6,10 @@ import pytest
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.structure.surface_fit import (
     Surface,
-    plane_distances,
+    nearest_planes,
     surface_near,
 )
 from tests.support.scanned_map import ground_points, height, plain_cloud, scan
-
-pytest.importorskip("small_gicp")
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +25,7 @@ def _ground(shift: FloatArray) -> FloatArray:
 
 def test_distances_are_those_from_the_ground(surface: Surface) -> None:
     points = _ground(np.array([0.0, 0.0, 0.3]))
-    distance = np.abs(plane_distances(surface, points, 2.0))
+    distance = np.abs(nearest_planes(surface, points, 2.0)[0])
     # A vertical offset over a slope is cos(slope) of it across the surface.
     dx = (height(points[:, 0] + 1e-3, points[:, 1]) - height(points[:, 0], points[:, 1])) / 1e-3
     dy = (height(points[:, 0], points[:, 1] + 1e-3) - height(points[:, 0], points[:, 1])) / 1e-3
@@ -35,7 +33,7 @@ def test_distances_are_those_from_the_ground(surface: Surface) -> None:
 
 
 def test_points_far_from_the_scan_have_no_distance(surface: Surface) -> None:
-    assert np.isnan(plane_distances(surface, _ground(np.array([0.0, 0.0, 30.0])), 2.0)).all()
+    assert np.isnan(nearest_planes(surface, _ground(np.array([0.0, 0.0, 30.0])), 2.0)[0]).all()
 
 
 def test_no_surface_without_a_scan_below() -> None:

@@ -27,7 +27,7 @@ from ingest.growth.values import LEAST_VIEWS, MAD
 from ingest.register.structure.surface_fit import (
     MIN_REACH_M,
     Surface,
-    plane_distances,
+    nearest_planes,
     reach_of,
     surface_near,
 )
@@ -98,8 +98,7 @@ def cloud_gate(cloud: PointCloud, points: FloatArray, covariance: FloatArray) ->
     if len(over) < _LEAST_POINTS:
         return None
     reach = reach_of(surface)
-    distances = plane_distances(surface, over, reach)
-    near = np.isfinite(distances)
+    near = np.isfinite(nearest_planes(surface, over, reach)[0])
     middle = over.mean(axis=0)
     jacobian = point_jacobian(middle)
     claim = jacobian @ covariance @ jacobian.T + np.eye(3) * _SCAN_SIGMA_M**2
@@ -133,11 +132,7 @@ class _Laid:
     def residuals(self, move: Rigid3) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Distances (n,) from the planes, normals (n, 3), places (n, 3)."""
         moved = move.act(self.points)
-        centred = np.ascontiguousarray(moved - self.surface.middle)
-        found, _ = self.surface.tree.batch_nearest_neighbor_search(centred)
-        index = np.asarray(found).astype(np.int64)
-        normals = self.surface.normals[index]
-        return np.einsum("ij,ij->i", normals, centred - self.surface.points[index]), normals, moved
+        return *nearest_planes(self.surface, moved, np.inf), moved
 
     def sigma_m(self, move: Rigid3) -> float:
         """Standard deviation of those distances that are not of something else."""

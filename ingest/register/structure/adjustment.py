@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
@@ -23,12 +22,12 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from featuredb.render.cloud import PointCloud
-from ingest.colmap.adjust import AdjustOptions, longest_side
-from ingest.colmap.precision import design_effect, linearise
+from ingest.colmap.adjust import AdjustOptions, longest_side, residuals_of
+from ingest.colmap.precision import design_effect
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement
-from ingest.register.structure.surface_fit import Surface, plane_distances, surface_near
+from ingest.register.structure.surface_fit import Surface, nearest_planes, surface_near
 
 _LOG = logging.getLogger(__name__)
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
@@ -117,8 +116,8 @@ def adjust_to_scan(
     figures = {
         "control": len(control.xyz),
         "frames": len(np.unique(control.photo_of)),
-        "before": _state(start, control, plane_distances(surface, start.xyz, _REACH_M)),
-        "after": _state(block, control, plane_distances(surface, block.xyz, _REACH_M)),
+        "before": _state(start, control, surface),
+        "after": _state(block, control, surface),
     }
     reason, message = _gate(block, figures)
     if reason is not None:
@@ -195,13 +194,11 @@ def _iterate(start: Block, lenses: tuple[Camera, ...], control: Marks, surface: 
     """Rounds of planes, standard deviations and solving until the points settle."""
     block = start
     for _ in range(_ROUNDS):
-        planes = _planes(surface, block.xyz, _REACH_M)[0]
-        sigmas = _sigmas(block, control, planes, _MIN_SIGMA_REL, _MIN_SURFACE_M)
-        problem = Problem(block, _terms(block, control, surface, lenses, sigmas))
+        problem = Problem(block, _terms(block, control, surface, lenses, _MIN_SIGMA_REL, _MIN_SURFACE_M))
         problem.solve(_STEPS, _FUNCTION_TOLERANCE)
         moved = problem.block()
         step_m, block = _step_m(block, moved), moved
-        _LOG.debug("sigmas %s, points moved %.4f m", sigmas, step_m)
+        _LOG.debug("points moved %.4f m", step_m)
         if step_m < _SETTLED_M:
             break
     return block
@@ -214,13 +211,25 @@ def _step_m(before: Block, after: Block) -> float:
 
 
 def _terms(
-    block: Block, control: Marks, surface: Surface, lenses: tuple[Camera, ...], sigmas: "_Sigmas"
+    block: Block,
+    control: Marks,
+    surface: Surface,
+    lenses: tuple[Camera, ...],
+    least_rel: float,
+    least_m: float,
 ) -> Terms:
+    """Each kind of residual weighs by its own spread as it is now.
+
+    Args:
+        least_rel: least standard deviation in pictures, over the longer side. least_m: from the surface.
+    """
+    longer = longest_side(block.cameras)
+    offset, normals = nearest_planes(surface, block.xyz, _REACH_M)
     return Terms(
-        keypoint_px=sigmas.track_px,
+        keypoint_px=max(least_rel * longer, _spread(residuals_of(block)[0])),
         lenses=tuple(lens_prior(camera, _LENS) for camera in lenses),
-        marks=replace(control, sigma_px=sigmas.control_px),
-        points=surface_priors(block.xyz, *_planes(surface, block.xyz, _REACH_M), sigmas.surface_m),
+        marks=replace(control, sigma_px=max(least_rel * longer, _spread(_control_residuals(block, control)))),
+        points=surface_priors(block.xyz, offset, normals, max(least_m, _spread(offset))),
     )
 
 
@@ -232,46 +241,13 @@ def _left_open(
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
     or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
     """
-    sigmas = _sigmas(block, control, _planes(surface, block.xyz, _REACH_M)[0], 1e-6, 1e-3)
-    found = Problem(block, _terms(block, control, surface, start.cameras, sigmas)).marginals()
-    shared = design_effect(_track_residuals(block), block.xy, block.photo_of, longest_side(block.cameras))
+    found = Problem(block, _terms(block, control, surface, start.cameras, 1e-6, 1e-3)).marginals()
+    shared = design_effect(*residuals_of(block), longest_side(block.cameras))
     factor = max(float(structure.figures["neighbours_factor"]), shared)
     lenses = [factor * _LENS_DILUTION * found.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
     uncertainty = uncertainty_of_lenses(block.cameras, lenses, photos, _LENS_DILUTION)
     return tuple(factor * found.poses(_LENS_DILUTION)), uncertainty
-
-
-def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:
-    """Signed distances (n,) from the scan's planes next to the points, NaN beyond reach; normals (n, 3)."""
-    centred = np.ascontiguousarray(xyz - surface.middle)
-    found, _ = surface.tree.batch_nearest_neighbor_search(centred)
-    return plane_distances(surface, xyz, reach_m), surface.normals[np.asarray(found).astype(np.int64)]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Sigmas:
-    """Standard deviations of one residual of each kind."""
-
-    track_px: float
-    control_px: float
-    surface_m: float
-
-
-def _sigmas(
-    block: Block,
-    control: Marks,
-    offset: FloatArray,
-    least_rel: float,
-    least_m: float,
-) -> _Sigmas:
-    """Each kind of residual weighs by its own spread as it is now."""
-    longer = longest_side(block.cameras)
-    return _Sigmas(
-        track_px=max(least_rel * longer, _spread(_track_residuals(block))),
-        control_px=max(least_rel * longer, _spread(_control_residuals(block, control))),
-        surface_m=max(least_m, _spread(offset)),
-    )
 
 
 def _spread(residuals: FloatArray) -> float:
@@ -280,35 +256,23 @@ def _spread(residuals: FloatArray) -> float:
     return 1.4826 * float(np.median(finite)) if len(finite) else 0.0
 
 
-def _track_residuals(block: Block) -> FloatArray:
-    return _residuals(block, block.xyz, block.point_of, block.photo_of, block.xy)
-
-
 def _control_residuals(block: Block, control: Marks) -> FloatArray:
-    return _residuals(block, control.xyz, np.arange(len(control.xyz)), control.photo_of, control.xy)
+    """(m, 2) of the correspondences that their photos can see, pixels."""
+    rows = np.arange(len(control.xyz))
+    return residuals_of(
+        replace(block, xyz=control.xyz, point_of=rows, photo_of=control.photo_of, xy=control.xy)
+    )[0]
 
 
-def _residuals(
-    block: Block,
-    points: FloatArray,
-    point_of: NDArray[np.int64],
-    photo_of: NDArray[np.int64],
-    xy: FloatArray,
-) -> FloatArray:
-    """Observed minus projected (m, 2), pixels."""
-    return linearise(
-        block.cameras, block.camera_of, block.cam_from_block, points, point_of, photo_of, xy
-    ).residual
-
-
-def _state(block: Block, control: Marks, distances: FloatArray) -> dict[str, Any]:
-    tracks = np.linalg.norm(_track_residuals(block), axis=1)
+def _state(block: Block, control: Marks, surface: Surface) -> dict[str, Any]:
+    tracks = np.linalg.norm(residuals_of(block)[0], axis=1)
     seen = np.linalg.norm(_control_residuals(block, control), axis=1)
+    distances = nearest_planes(surface, block.xyz, _REACH_M)[0]
     near = np.abs(distances[np.isfinite(distances)])
     return {
-        "reprojection_median_px": float(np.nanmedian(tracks)),
-        "reprojection_rms_px": float(np.sqrt(np.nanmean(tracks**2))),
-        "control_median_px": float(np.nanmedian(seen)),
+        "reprojection_median_px": float(np.median(tracks)),
+        "reprojection_rms_px": float(np.sqrt(np.mean(tracks**2))),
+        "control_median_px": float(np.median(seen)),
         "surface_points": len(near),
         "surface_median_m": float(np.median(near)) if len(near) else None,
         "surface_rms_m": float(np.sqrt((near**2).mean())) if len(near) else None,

@@ -1,12 +1,11 @@
 """The scan's surface as planes, and how a placed map lies on it."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from featuredb.errors import MissingExtraError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.render.cloud import PointCloud
 
@@ -27,15 +26,14 @@ class Surface:
         points: (k, 3) float64, less `middle`.
         normals: (k, 3) unit.
         spacing_m: typical distance of neighbours.
-        cloud, tree: small_gicp's, of `points`; normals and tree lie in the cloud's memory.
+        tree: of `points`.
     """
 
     middle: FloatArray
     points: FloatArray
     normals: FloatArray
     spacing_m: float
-    cloud: Any
-    tree: Any
+    tree: cKDTree
 
 
 def surface_near(cloud: PointCloud, points: FloatArray, most: int = _MAX_SURFACE_POINTS) -> Surface | None:
@@ -44,21 +42,17 @@ def surface_near(cloud: PointCloud, points: FloatArray, most: int = _MAX_SURFACE
     rows = _rows_inside(cloud, low, high, most)
     if len(rows) < _NEIGHBOURS:
         return None
-    gicp = _small_gicp()
     xyz = cloud.xyz[rows].astype(np.float64)
     middle = xyz.mean(axis=0)
     xyz -= middle
-    prepared = gicp.PointCloud(xyz)
-    # One thread: small_gicp's are OpenMP's, after which a process should not fork.
-    tree = gicp.KdTree(prepared, num_threads=1)
-    gicp.estimate_normals_covariances(prepared, tree, num_neighbors=_NEIGHBOURS, num_threads=1)
-    _, squared = tree.batch_knn_search(xyz[:: max(1, len(xyz) // 500)], 2)
+    tree = cKDTree(xyz)
+    distance, near = tree.query(xyz, _NEIGHBOURS)
+    patch = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
     return Surface(
         middle=middle,
         points=xyz,
-        normals=np.asarray(prepared.normals())[:, :3],
-        spacing_m=float(np.median(np.sqrt(np.asarray(squared)[:, 1]))),
-        cloud=prepared,
+        normals=np.linalg.eigh(np.swapaxes(patch, 1, 2) @ patch)[1][:, :, 0],
+        spacing_m=float(np.median(distance[:, 1])),
         tree=tree,
     )
 
@@ -86,26 +80,18 @@ def _rows_inside(cloud: PointCloud, low: FloatArray, high: FloatArray, limit: in
     return np.concatenate(taken) if taken else np.zeros(0, np.int64)
 
 
-def plane_distances(surface: Surface, points: FloatArray, reach_m: float) -> FloatArray:
-    """Signed distance (n,) of points (n, 3) to the plane of the nearest scan point; NaN beyond the reach."""
-    centred = np.ascontiguousarray(points - surface.middle)
-    found, squared = surface.tree.batch_nearest_neighbor_search(centred)
-    index = np.asarray(found).astype(np.int64)
-    offset = centred - surface.points[index]
-    distance = np.einsum("ij,ij->i", surface.normals[index], offset)
-    return np.where(np.asarray(squared) <= reach_m**2, distance, np.nan)
+def nearest_planes(surface: Surface, points: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:
+    """Planes of the scan points next to points (n, 3): signed distances (n,) from them, and normals (n, 3).
+
+    Distances are NaN where the scan point is further than the reach.
+    """
+    centred = points - surface.middle
+    away, index = surface.tree.query(centred)
+    normals = surface.normals[index]
+    distance = np.einsum("ij,ij->i", normals, centred - surface.points[index])
+    return np.where(away <= reach_m, distance, np.nan), normals
 
 
 def reach_of(surface: Surface) -> float:
     """How far from the scan a point may be to be compared with it, metres."""
     return max(MIN_REACH_M, _REACH_SPACINGS * surface.spacing_m)
-
-
-def _small_gicp() -> Any:
-    try:
-        import small_gicp
-    except ImportError as error:
-        raise MissingExtraError(
-            "aligning maps with a scan needs small_gicp: pip install 'featuredb[lidar]'"
-        ) from error
-    return small_gicp
