@@ -121,7 +121,8 @@ def test_blurred_and_empty_photos_fall_back(monkeypatch: pytest.MonkeyPatch) -> 
 def moved(feature_map: FeatureMap, move: Sim3) -> FeatureMap:
     utm = feature_map.frame.utm_from_enu(move.act(feature_map.points_local()), feature_map.epsg)
     images = tuple(replace(i, cam_from_local=move.act_on_pose(i.cam_from_local)) for i in feature_map.images)
-    return replace(feature_map, images=images, points=replace(feature_map.points, utm=utm))
+    placed = replace(feature_map.placement, local_from_sfm=move @ feature_map.placement.local_from_sfm)
+    return replace(feature_map, images=images, points=replace(feature_map.points, utm=utm), placement=placed)
 
 
 def test_a_move_is_told_in_words_that_people_know() -> None:

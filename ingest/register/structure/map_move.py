@@ -10,7 +10,6 @@ from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.structure.similarity import similarities
 
 _MAX_POINTS = 20_000  # of a map; more say nothing new of it
 _PLAN_REACH_M = 2.0  # a map point with no scan this near in plan lies over a hole or beyond the border
@@ -18,7 +17,7 @@ _PLAN_REACH_M = 2.0  # a map point with no scan this near in plan lies over a ho
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapMove:
-    """The similarity nearest to how a map's points moved, about their middle.
+    """The similarity between two placements of a map, about the middle of its points.
 
     Attributes:
         horizontal_m, up_m: of the middle.
@@ -74,15 +73,11 @@ class MapResidual:
 
 
 def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
-    """From the places of the same points in both; a bent map that is straightened has one that fits best."""
-    step = max(1, len(old.points) // _MAX_POINTS)
-    before = old.points_local()[::step]
-    after = new.points_local(old.frame)[::step]
-    scale, rotation, _, usable = similarities(before[None], after[None])
-    turn = so3_log(rotation[0]) if usable[0] else np.zeros(3)
-    ratio = float(scale[0]) if usable[0] else 1.0
-    middle = np.median(before, axis=0)
-    shift = np.median(after, axis=0) - middle
+    """From the placements of the same map in one local frame."""
+    move = new.placement.local_from_sfm @ old.placement.local_from_sfm.inverse()
+    turn = so3_log(move.rotation)
+    middle = np.median(old.points_local(), axis=0)
+    shift = move.act(middle) - middle
     covariance = old.placement.covariance
     jacobian = point_jacobian(middle)
     spread = jacobian @ covariance @ jacobian.T
@@ -92,11 +87,11 @@ def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
         up_m=float(shift[2]),
         heading_deg=float(np.degrees(turn[2])),
         tilt_deg=float(np.degrees(tilt)),
-        scale=ratio,
+        scale=move.scale,
         horizontal_sigmas=float(np.hypot(*shift[:2]) / np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])),
         heading_sigmas=heading / float(np.sqrt(covariance[3, 3])),
         tilt_sigmas=tilt / float(np.sqrt(max(covariance[1, 1], covariance[2, 2]))),
-        scale_sigmas=abs(float(np.log(ratio))) / float(np.sqrt(covariance[0, 0])),
+        scale_sigmas=abs(float(np.log(move.scale))) / float(np.sqrt(covariance[0, 0])),
     )
 
 
