@@ -14,7 +14,6 @@ from ingest.register.structure.similarity import (
     Pairs,
     ransac_similarity,
     refine_similarity,
-    similarities,
 )
 
 _TRUE = Sim3(scale=1.03, rotation=so3_exp([0.02, -0.03, 0.4]), translation=np.array([3.0, -8.0, 11.0]))
@@ -50,25 +49,6 @@ def _pairs(
 
 def _error(sim: Sim3) -> FloatArray:
     return (_TRUE @ sim.inverse()).log()
-
-
-def test_many_sets_at_once_give_what_each_gives_alone() -> None:
-    rng = np.random.default_rng(0)
-    source = rng.normal(0, 5, (20, 6, 3))
-    target = rng.normal(0, 5, (20, 6, 3)) + 2.0 * source
-    scale, rotation, translation, usable = similarities(source, target)
-    assert usable.all()
-    for k in range(20):
-        alone = similarity_closed_form(source[k], target[k])
-        assert alone is not None
-        assert scale[k] == pytest.approx(alone.scale, abs=1e-9)
-        assert np.abs(rotation[k] - alone.rotation).max() < 1e-9
-        assert np.abs(translation[k] - alone.translation).max() < 1e-8
-
-
-def test_points_on_a_line_determine_nothing() -> None:
-    line = np.linspace(0, 1, 5)[:, None] * np.array([1.0, 2.0, 3.0])
-    assert not similarities(line[None], 2.0 * line[None])[3][0]
 
 
 def test_ransac_finds_the_similarity_among_two_thirds_outliers() -> None:

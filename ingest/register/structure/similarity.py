@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.similarity import similarity_closed_form
 
 _CHI2_3_95 = 7.815  # 95 % of the squared Mahalanobis length of three normal coordinates
 _CHI2_3_MEDIAN = 2.366
@@ -59,7 +60,6 @@ class SimilarityFit:
         target_from_source: the similarity.
         covariance: (7, 7) of its left perturbation.
         inliers: (n,) bool.
-        weights: (n,) of the last round, 1 for pairs that fit perfectly.
         residuals_m: (n, 3) target, moved by its frame's correction, minus placed source.
         frame_corrections: (f, 6) left perturbations of the frames' poses that were estimated along.
         spread: how many times its claimed sigma the typical residual is.
@@ -69,7 +69,6 @@ class SimilarityFit:
     target_from_source: Sim3
     covariance: FloatArray
     inliers: NDArray[np.bool_]
-    weights: FloatArray
     residuals_m: FloatArray
     frame_corrections: FloatArray
     spread: float
@@ -87,46 +86,17 @@ def ransac_similarity(source: FloatArray, target: FloatArray, tolerance: FloatAr
         return None
     generator = np.random.default_rng(_SEED)
     samples = generator.integers(0, n, (_SAMPLES, 3))
-    samples = samples[(np.diff(np.sort(samples, axis=1), axis=1) > 0).all(axis=1)]
-    scale, rotation, translation, usable = similarities(source[samples], target[samples])
-    if not usable.any():
-        return None
-    scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
     rows = np.arange(n) if n <= _SCORE_PAIRS else generator.choice(n, _SCORE_PAIRS, replace=False)
-    off = (scale[:, None, None] * rotation).reshape(-1, 3) @ source[rows].T  # (3 k, n)
-    off += translation.reshape(-1, 1)
-    off = off.reshape(-1, 3, len(rows))
-    off -= target[rows].T
-    off *= off
-    cost = np.minimum(off.sum(axis=1) / tolerance[rows] ** 2, 1.0).sum(axis=1)
-    best = int(np.argmin(cost))
-    return Sim3(scale=float(scale[best]), rotation=rotation[best], translation=translation[best])
-
-
-def similarities(
-    source: FloatArray, target: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Umeyama's solution for k sets of m pairs at once.
-
-    Args:
-        source, target: (k, m, 3).
-
-    Returns:
-        scale (k,), rotation (k, 3, 3), translation (k, 3), and which sets determine them (k,).
-    """
-    source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
-    a, b = source - source_mean[:, None], target - target_mean[:, None]
-    u, values, vt = np.linalg.svd(np.swapaxes(b, 1, 2) @ a)
-    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    values[:, 2] *= sign
-    u[:, :, 2] *= sign[:, None]
-    rotation = u @ vt
-    variance = (a**2).sum(axis=(1, 2))
-    scale = values.sum(axis=1) / np.where(variance > 0, variance, 1.0)
-    # Collinear points leave the rotation about their line open.
-    usable = (variance > 1e-12) & (values[:, 1] > 1e-3 * values[:, 0]) & (scale > 0)
-    translation = target_mean - scale[:, None] * np.einsum("kij,kj->ki", rotation, source_mean)
-    return scale, rotation, translation, usable
+    best: tuple[float, Sim3] | None = None
+    for sample in samples:
+        sim = similarity_closed_form(source[sample], target[sample])
+        if sim is None:
+            continue
+        squared = ((sim.act(source[rows]) - target[rows]) ** 2).sum(axis=1)
+        cost = float(np.minimum(squared / tolerance[rows] ** 2, 1.0).sum())
+        if best is None or cost < best[0]:
+            best = (cost, sim)
+    return None if best is None else best[1]
 
 
 def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
@@ -136,14 +106,14 @@ def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
     more than its pose allows, and the inverse of the normal equations is an honest covariance. Pairs carry
     Geman-McClure weights at their robust spread; how far neighbours err alike dilutes them all.
     """
-    whitened = _whitened(pairs)
+    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(pairs.covariance)), 1, 2)
     sim, frames = start, np.zeros((len(pairs.frame_covariance), 6))
     dilution = 1.0
     for _ in range(2):  # the dilution is known after the first
         for _ in range(_ROUNDS):
-            residual = whitened.residuals(_residuals(sim, frames, pairs))
+            residual = _whiten(root, _residuals(sim, frames, pairs))
             weights, spread = _weights(residual)
-            normal, gradient = _equations(sim, frames, residual, pairs, whitened, weights / dilution)
+            normal, gradient = _equations(sim, frames, residual, pairs, root, weights / dilution)
             step = np.linalg.solve(normal, gradient)
             sim = Sim3.exp(step[:7]) @ sim
             frames = frames + step[7:].reshape(-1, 6)
@@ -151,15 +121,14 @@ def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
                 break
         factor = _neighbours_factor(residual, weights, pairs, spread)
         dilution = max(spread, 1.0) ** 2 * factor
-    normal, _ = _equations(sim, frames, residual, pairs, whitened, weights / dilution)
+    normal, _ = _equations(sim, frames, residual, pairs, root, weights / dilution)
     covariance = np.linalg.inv(normal)[:7, :7]
     residual = _residuals(sim, frames, pairs)
-    squared = (whitened.residuals(residual) ** 2).sum(axis=1)
+    squared = (_whiten(root, residual) ** 2).sum(axis=1)
     return SimilarityFit(
         target_from_source=sim,
         covariance=np.asarray((covariance + covariance.T) / 2),
         inliers=squared <= 2 * _CHI2_3_95 * spread**2,  # 99.9 % of honest pairs
-        weights=weights,
         residuals_m=residual,
         frame_corrections=frames,
         spread=spread,
@@ -180,70 +149,32 @@ def _weights(whitened: FloatArray) -> tuple[FloatArray, float]:
     return 1.0 / (1.0 + squared / (_CHI2_3_95 * spread**2)) ** 2, spread
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Whitened:
-    """What turns residuals into ones of unit covariance.
-
-    Attributes:
-        root: (n, 3, 3), its transpose times itself is the inverse of a pair's covariance.
-        design: of each frame (14, m, 3), root times the derivatives by the similarity (7) and by the frame
-            (6), and the residual; the first four and the last are filled in anew in each round.
-        rows: of each frame, those of its pairs.
-    """
-
-    root: FloatArray
-    design: list[FloatArray]
-    rows: list[NDArray[np.intp]]
-
-    def residuals(self, residual: FloatArray) -> FloatArray:
-        return np.asarray((self.root @ residual[:, :, None])[:, :, 0])
-
-
-def _whitened(pairs: Pairs) -> _Whitened:
-    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(pairs.covariance)), 1, 2)
-    rows = [np.flatnonzero(pairs.frame_of == frame) for frame in range(len(pairs.frame_covariance))]
-    design = [np.empty((14, len(own), 3)) for own in rows]
-    for own, columns in zip(rows, design, strict=True):
-        columns[4:7] = np.moveaxis(root[own], 2, 0)
-        columns[7:13] = np.moveaxis(-root[own] @ pairs.by_frame[own], 2, 0)
-    return _Whitened(root=root, design=design, rows=rows)
+def _whiten(root: FloatArray, residual: FloatArray) -> FloatArray:
+    return np.asarray((root @ residual[:, :, None])[:, :, 0])
 
 
 def _equations(
-    sim: Sim3,
-    frames: FloatArray,
-    residual: FloatArray,
-    pairs: Pairs,
-    whitened: _Whitened,
-    weights: FloatArray,
+    sim: Sim3, frames: FloatArray, residual: FloatArray, pairs: Pairs, root: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Normal matrix and gradient over (similarity, frame 0, frame 1, ...), (7 + 6 f).
 
     Args:
-        residual: (n, 3) whitened.
+        residual: (n, 3) whitened. root: (n, 3, 3) that whitens.
     """
     size = 7 + 6 * len(frames)
     normal, gradient = np.zeros((size, size)), np.zeros(size)
-    placed, weight = sim.act(pairs.source), np.sqrt(weights)
+    by_both = np.concatenate([point_jacobian(sim.act(pairs.source)), -pairs.by_frame], axis=2)
+    weight = np.sqrt(weights)[:, None]
+    design, wanted = root @ by_both * weight[:, :, None], residual * weight
     for frame, prior in enumerate(pairs.frame_covariance):
-        rows, design = whitened.rows[frame], whitened.design[frame]
-        x, y, z = (axis[:, None] for axis in placed[rows].T)
-        by_x, by_y, by_z = design[4:7]
-        # root @ point_jacobian(x, y, z), of which the last three columns stay as they are.
-        design[0] = by_x * x + by_y * y + by_z * z
-        design[1] = by_z * y - by_y * z
-        design[2] = by_x * z - by_z * x
-        design[3] = by_y * x - by_x * y
-        design[13] = residual[rows]
-        weighted = (design * weight[rows, None]).reshape(14, -1)
-        product = weighted @ weighted.T
+        own = pairs.frame_of == frame
+        rows = design[own].reshape(-1, 13)
         at = np.r_[0:7, 7 + 6 * frame : 13 + 6 * frame]
-        normal[np.ix_(at, at)] += product[:13, :13]
-        gradient[at] += product[:13, 13]
+        normal[np.ix_(at, at)] += rows.T @ rows
+        gradient[at] += rows.T @ wanted[own].ravel()
         knowledge = np.linalg.inv(prior)
-        own = at[7:]
-        normal[np.ix_(own, own)] += knowledge
-        gradient[own] -= knowledge @ frames[frame]
+        normal[np.ix_(at[7:], at[7:])] += knowledge
+        gradient[at[7:]] -= knowledge @ frames[frame]
     return normal, gradient
 
 
