@@ -130,9 +130,10 @@ def test_a_move_is_told_in_words_that_people_know() -> None:
     old = random_map(4, points=500, extent_m=80.0)
     old = replace(old, placement=replace(old.placement, covariance=covariance))
     turn = np.radians(2.0)
-    new = moved(old, Sim3.exp([0.01, 0.0, 0.0, turn, 0.0, 0.0, 0.0]))
+    true = Sim3.exp([0.01, 0.0, 0.0, turn, 0.0, 0.0, 0.0])
+    new = moved(old, true)
     middle = np.median(old.points_local(), axis=0)
-    shift = np.median(new.points_local(), axis=0) - middle
+    shift = true.act(middle) - middle
     move = map_move(old, new)
     assert move.heading_deg == pytest.approx(2.0, abs=1e-3)
     assert move.heading_sigmas == pytest.approx(turn / 0.02, rel=1e-3)
