@@ -1,7 +1,7 @@
 """3D/3D pairs: points of a map, projected through a registered frame onto the scan."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,14 +70,7 @@ def structure_pairs(
         _pairs_of_frame(feature_map, source, uncertainty, images[r.image_id], r, row, cloud)
         for row, r in enumerate(registered)
     ]
-    joined = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in (
-            *("frame_of", "source", "target"),
-            *("covariance", "by_frame", "cell_of", "frame_covariance"),
-        )
-    }
-    return Pairs(**joined)
+    return Pairs(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Pairs)})
 
 
 def _pairs_of_frame(

@@ -93,7 +93,7 @@ def project_structure(
     reason, message, figures = _gate_of_pairs(pairs, near, distances)
     if reason is not None:
         return StructurePlacement(reason=reason, message=message, figures=figures)
-    kept = _rows(pairs, near)
+    kept = pairs.of(near)
     fit = refine_similarity(start, kept)
     figures |= _figures_of_fit(fit, kept, feature_map, registered)
     reason, message = _gate_of_fit(fit, distances[near], figures)
@@ -112,18 +112,6 @@ def _distances(pairs: Pairs, registered: Sequence[RegisteredImage]) -> FloatArra
     """(n,) from the registered cameras, metres."""
     centers = np.array([r.registration.cam_from_local.center for r in registered])  # type: ignore[union-attr]
     return np.asarray(np.linalg.norm(pairs.target - centers[pairs.frame_of], axis=1))
-
-
-def _rows(pairs: Pairs, kept: NDArray[np.bool_]) -> Pairs:
-    return Pairs(
-        frame_of=pairs.frame_of[kept],
-        source=pairs.source[kept],
-        target=pairs.target[kept],
-        covariance=pairs.covariance[kept],
-        by_frame=pairs.by_frame[kept],
-        cell_of=pairs.cell_of[kept],
-        frame_covariance=pairs.frame_covariance,
-    )
 
 
 def _gate_of_pairs(

@@ -6,7 +6,7 @@ Umeyama, Least-squares estimation of transformation parameters between two point
 structure-projection paper, 2.4 and eq. 7-9.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,11 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.source)
+
+    def of(self, rows: NDArray[np.bool_]) -> "Pairs":
+        """Some of the pairs, of the same frames."""
+        per_pair = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "frame_covariance"}
+        return replace(self, **per_pair)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
