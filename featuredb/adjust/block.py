@@ -41,6 +41,12 @@ class Block:
         """Camera centres (k, 3)."""
         return np.array([pose.center for pose in self.cam_from_block]).reshape(-1, 3)
 
+    def distances(self) -> FloatArray:
+        """Median distance (k,) of the points that each photo sees from its camera; 1 where it sees none."""
+        away = np.linalg.norm(self.xyz[self.point_of] - self.centers()[self.photo_of], axis=1)
+        seen = [away[self.photo_of == k] for k in range(len(self.names))]
+        return np.array([float(np.median(distances)) if len(distances) else 1.0 for distances in seen])
+
     def moved(self, target_from_block: Sim3) -> "Block":
         """The same block in another frame."""
         return replace(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyceres
 import pycolmap
+from numpy.typing import NDArray
 from pycolmap import cost_functions
 from scipy import sparse
 
@@ -190,7 +191,7 @@ class Problem:
         """The same with the targets, and what their residuals may be."""
         assert self._terms.targets is not None
         poses, lenses = self._free()
-        targets = np.unique(self._terms.targets.point_of)
+        targets = _target_rows(self._terms.targets)
         rows = [*np.setdiff1d(list(self._points), targets).tolist(), *targets.tolist()]
         residual = self._ceres.evaluate_residuals(self._targets)
         return target_marginals(
@@ -290,7 +291,7 @@ class Problem:
             self._ceres.add_residual_block(cost, self._loss, [self._poses[photo]])
 
     def _add_targets(self, targets: Targets) -> None:
-        for row in targets.point_of.tolist():
+        for row in _target_rows(targets).tolist():
             self._points.setdefault(row, self._block.xyz[row].copy())
         unit = 1.0 / self._terms.keypoint_px**2
         for point, photo, xy in zip(
@@ -309,6 +310,11 @@ class Problem:
         ):
             cost = pyceres.factors.NormalPrior(xyz, covariance)
             self._targets.append(self._ceres.add_residual_block(cost, None, [self._points[point]]))
+
+
+def _target_rows(targets: Targets) -> NDArray[np.int64]:
+    """The block's points that are marked or surveyed, in order."""
+    return np.union1d(targets.point_of, targets.survey.point_of)
 
 
 def _pose(params: FloatArray) -> Rigid3:

@@ -108,7 +108,7 @@ class Targets:
     Attributes:
         point_of, photo_of: (c,) what each mark shows, and in which photo. xy: (c, 2) full-size pixels.
         sigma_px: of a pixel coordinate.
-        survey: of some or all of the marked points.
+        survey: of points, marked ones and others.
     """
 
     point_of: NDArray[np.int64]

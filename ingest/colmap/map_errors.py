@@ -59,7 +59,7 @@ def map_errors(block: Block, focal_px: Mapping[int, float], centers: CenterPrior
     noise -= moved @ (fit @ noise)
     noise -= (noise @ fit.T) @ moved.T
     poses = noise + factor[:size] @ factor[:size].T
-    shear, depths = picture_shear(block), _depths(block)
+    shear, depths = picture_shear(block), block.distances()
     # Photos agree on a wrong lens: parameters are off by more than poses made with them.
     lenses = [options.dilution * weighted.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
@@ -148,13 +148,6 @@ def _modes(block: Block, noise: FloatArray, factor: FloatArray, depths: FloatArr
         poses=(vectors[:, :kept] * root).reshape(count, 6, kept),
         lenses=lenses.reshape(-1, LENS_SIZE, kept),
     )
-
-
-def _depths(block: Block) -> FloatArray:
-    """(k,) median distance of the points that each photo sees from its camera; 1 where it sees none."""
-    away = np.linalg.norm(block.xyz[block.point_of] - block.centers()[block.photo_of], axis=1)
-    seen = [away[block.photo_of == k] for k in range(len(block.names))]
-    return np.array([float(np.median(distances)) if len(distances) else 1.0 for distances in seen])
 
 
 def _anywhere(block: Block) -> tuple[CenterPriors, Orientations]:

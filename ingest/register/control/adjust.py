@@ -73,8 +73,8 @@ class Adjusted:
     Attributes:
         block: as it is now. change: the similarity nearest to what became of it.
         covariance: (7, 7) of its left perturbation.
-        control_xyz: (n, 3) of the control points, spread: (n, 3, 3) their covariances; NaN where no mark
-            that took part shows them.
+        control_xyz: (n, 3) of the control points, NaN where no mark that took part shows them.
+        spread: (n, 3, 3) their covariances.
         marks: of the marks that took part, in their order.
         survey: (n, 3) of the control points, found minus surveyed over sigma; 0 where nothing was surveyed.
         weights: of this adjustment.
@@ -95,20 +95,19 @@ class Task:
     """What all adjustments of a block have in common.
 
     Attributes:
-        block: those points that take part; metres, in place but for small changes.
+        placed: the whole block; metres, in place but for small changes. Its ground holds points that one
+            photo shows.
+        block: those of its points that take part.
         control_xyz: (n, 3) where the control points lie in it.
-        ground: (m, 3) where the ray of each mark meets the block's ground, NaN where that is not known;
-            ground_m: (m,) how well. It holds points that one photo shows.
         vertical: what is known of it in that frame.
         keypoint_px: standard deviation of a keypoint's coordinate; weight_px: with which keypoints count.
         keep_lens: keep all lenses.
     """
 
+    placed: Block
     block: Block
     control: Control
     control_xyz: FloatArray
-    ground: FloatArray
-    ground_m: FloatArray
     vertical: Vertical | None
     keypoint_px: float
     weight_px: float
@@ -122,17 +121,11 @@ def task_of(
     chosen = _sample(placed, _POINTS_PER_PHOTO)
     variance_px2 = max(block_variance_px2(chosen), _LEAST_PX2)
     share = len(chosen.xy) / len(placed.xy)
-    ground = np.full((len(control.marks), 3), np.nan)
-    for row, (photo, xy) in enumerate(zip(control.photo_of.tolist(), control.xy, strict=True)):
-        met = on_ground(placed, photo, xy)
-        ground[row] = np.nan if met is None else met
-    centers = placed.centers()[control.photo_of]
     return Task(
+        placed=placed,
         block=chosen if keep_lens else whole_lens(chosen),
         control=control,
         control_xyz=control_xyz,
-        ground=ground,
-        ground_m=_GROUND_SHARE * np.linalg.norm(ground - centers, axis=1),
         vertical=vertical,
         keypoint_px=float(np.sqrt(variance_px2)),
         weight_px=float(np.sqrt(variance_px2 * max(1.0, _DILUTION * share))),
@@ -160,7 +153,6 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
         None if vertical is None else vertical.moved(move),
     )
     count = len(start.xyz)
-    located = np.unique(control.point_of[weights.marks])
     terms = Terms(
         keypoint_px=task.weight_px,
         lenses=tuple(None if task.keep_lens else lens_prior(camera, _LENS) for camera in task.block.cameras),
@@ -180,20 +172,22 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
     adjusted = replace(everything, xyz=everything.xyz[:count])
     by_poses = similarity_of_change(adjusted)
     poses = 6 * len(adjusted.names)
+    located = np.isin(np.arange(len(used)), control.point_of[weights.marks])
     return Adjusted(
         block=adjusted,
         change=_common_change(start, adjusted) @ move @ change,
         covariance=by_poses @ found.block.shared[:poses, :poses] @ by_poses.T,
-        control_xyz=_of_all(everything.xyz[count:][located], located, len(used), np.nan),
-        spread=_of_all(found.point, located, len(used), np.nan),
+        control_xyz=np.where(located[:, None], everything.xyz[count:], np.nan),
+        spread=found.point,
         marks=found.marks,
-        survey=_of_points(found.survey, located, len(used)),
+        survey=found.survey,
         weights=weights,
     )
 
 
-def with_all_points(placed: Block, adjusted: Adjusted, task: Task) -> Block:
+def with_all_points(adjusted: Adjusted, task: Task) -> Block:
     """All of the block: points that took no part follow the cameras."""
+    placed = task.placed
     start = replace(
         adjusted.block,
         xyz=adjusted.change.act(placed.xyz),
@@ -231,37 +225,24 @@ def _sample(block: Block, per_photo: int) -> Block:
     )
 
 
-def _of_all(values: FloatArray, rows: NDArray[np.int64], count: int, otherwise: float) -> FloatArray:
-    """Values (r, ...) of some rows among those of all."""
-    result = np.full((count, *values.shape[1:]), otherwise)
-    result[rows] = values
-    return result
-
-
-def _of_points(survey: Whitened, located: NDArray[np.int64], count: int) -> Whitened:
-    """The same among all points."""
-    rows = (3 * located[:, None] + np.arange(3)).ravel()
-    together = np.zeros((3 * count, 3 * count))
-    together[np.ix_(rows, rows)] = survey.together
-    return Whitened(residual=_of_all(survey.residual, located, count, 0.0), together=together)
-
-
 def _survey(task: Task, change: Sim3, xyz: FloatArray, weights: Weights) -> PointPriors:
-    """Surveyed coordinates of the located points (n, 3), else the ground's height, else next to nothing."""
+    """Surveyed coordinates of the points (n, 3), else the ground's height, else next to nothing."""
+    control = task.control
     expected, sigma = xyz.copy(), np.full(xyz.shape, _LOOSE_M)
     rows = np.flatnonzero(weights.marks)
-    point_of = task.control.point_of[rows]
-    alone = (np.bincount(point_of)[point_of] == 1) & np.isfinite(task.ground_m[rows])
-    expected[point_of[alone], 2] = change.act(task.ground[rows[alone]])[:, 2]
-    sigma[point_of[alone], 2] = task.ground_m[rows[alone]]
-    known = np.isfinite(task.control.surveyed) & weights.points[:, None]
-    expected = np.where(known, task.control.surveyed, expected)
-    sigma = np.where(known, weights.control_m, sigma)
-    located = np.unique(point_of)
+    point_of = control.point_of[rows]
+    for row in rows[np.bincount(point_of)[point_of] == 1].tolist():
+        photo, point = int(control.photo_of[row]), int(control.point_of[row])
+        ground = on_ground(task.placed, photo, control.xy[row])
+        if ground is not None:
+            expected[point, 2] = change.act(ground)[2]
+            distance_m = np.linalg.norm(ground - task.placed.cam_from_block[photo].center)
+            sigma[point, 2] = _GROUND_SHARE * distance_m
+    known = np.isfinite(control.surveyed) & weights.points[:, None]
     return PointPriors(
-        point_of=len(task.block.xyz) + located,
-        xyz=expected[located],
-        covariance=np.array([np.diag(s**2) for s in sigma[located]]),
+        point_of=len(task.block.xyz) + np.arange(len(xyz)),
+        xyz=np.where(known, control.surveyed, expected),
+        covariance=np.where(known, weights.control_m, sigma)[:, :, None] ** 2 * np.eye(3),
     )
 
 
@@ -313,29 +294,12 @@ def similarity_of_change(block: Block) -> FloatArray:
     """
     k = len(block.names)
     wanted, given = np.zeros((6 * k, 7)), np.zeros((6 * k, 6 * k))
-    for photo, (pose, depth) in enumerate(zip(block.cam_from_block, _depths(block), strict=True)):
+    for photo, (pose, distance) in enumerate(zip(block.cam_from_block, block.distances(), strict=True)):
         rows = slice(6 * photo, 6 * photo + 3)
         turns = slice(6 * photo + 3, 6 * photo + 6)
         # cam_from_local becomes exp(omega, nu) cam_from_local: centre and axes move by the inverse.
         wanted[rows] = point_jacobian(pose.center)
         given[rows, 6 * photo + 3 : 6 * photo + 6] = -pose.rotation.T
-        wanted[turns, 1:4] = depth * np.eye(3)
-        given[turns, 6 * photo : 6 * photo + 3] = -depth * pose.rotation.T
+        wanted[turns, 1:4] = distance * np.eye(3)
+        given[turns, 6 * photo : 6 * photo + 3] = -distance * pose.rotation.T
     return np.asarray(np.linalg.lstsq(wanted, given, rcond=None)[0])
-
-
-def _depths(block: Block) -> FloatArray:
-    """Median depth (k,) of the points that each photo sees."""
-    rotations = np.array([p.rotation for p in block.cam_from_block])
-    translations = np.array([p.translation for p in block.cam_from_block])
-    depth = (
-        np.einsum("mj,mj->m", rotations[block.photo_of, 2], block.xyz[block.point_of])
-        + translations[block.photo_of, 2]
-    )
-    overall = float(np.median(depth))
-    return np.array(
-        [
-            float(np.median(depth[rows])) if (rows := block.photo_of == k).any() else overall
-            for k in range(len(block.names))
-        ]
-    )

@@ -248,7 +248,7 @@ def _adjusted_placement(
 ) -> GcpPlacement:
     placed = block.moved(fit.local_from_block)
     local_vertical, free_height_m = _in_place(vertical, fit.local_from_block, control)
-    weights, xyz = initial_weights(placed, control, fit, options.sigma_m)
+    weights, xyz = initial_weights(control, fit, options.sigma_m)
     task = task_of(placed, control, xyz, local_vertical, options.keep_lens)
     outcome = improve(control, weights, lambda w, last: adjust(task, w, last), options.sigma_m is not None)
     adjusted = outcome.adjusted
@@ -259,7 +259,7 @@ def _adjusted_placement(
         message="placed by control points",
         local_from_block=adjusted.change @ fit.local_from_block,
         covariance=covariance,
-        block=with_all_points(placed, adjusted, task),
+        block=with_all_points(adjusted, task),
         points=points,
         marks=marks,
         notes=tuple(notes),

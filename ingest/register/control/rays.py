@@ -6,7 +6,6 @@ from scipy.spatial import cKDTree
 
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
-from ingest.colmap.precision import linearise
 from ingest.register.control.marks import Control
 
 _NEIGHBOURS = 12  # observations around a mark: enough for a plane, few enough to be near
@@ -23,10 +22,7 @@ def ray(block: Block, photo: int, xy: FloatArray) -> tuple[FloatArray, FloatArra
 def intersect(
     block: Block, photos: NDArray[np.int64], xy: FloatArray, min_angle_deg: float
 ) -> FloatArray | None:
-    """The place (3,) that pixels (m, 2) of m photos show, least squares in pixels.
-
-    None where the rays are too nearly parallel, or the place would lie behind a camera.
-    """
+    """The place (3,) nearest to the rays of pixels (m, 2) of m photos; None where these are nearly parallel."""
     rays = [ray(block, int(p), pixel) for p, pixel in zip(photos, xy, strict=True)]
     directions = np.array([d for _, d in rays])
     if not np.isfinite(directions).all():
@@ -35,26 +31,8 @@ def intersect(
     if cosine > np.cos(np.radians(min_angle_deg)):
         return None
     across = [np.eye(3) - np.outer(d, d) for _, d in rays]
-    xyz = np.linalg.solve(
-        np.sum(across, axis=0), np.sum([a @ c for a, (c, _) in zip(across, rays, strict=True)], axis=0)
-    )
-    for _ in range(5):
-        if not _in_front(block, photos, xyz):
-            return None
-        linear = linearise(
-            block.cameras,
-            block.camera_of,
-            block.cam_from_block,
-            xyz[None],
-            np.zeros(len(photos), dtype=np.int64),
-            photos,
-            xy,
-        )
-        if not np.isfinite(linear.residual).all():
-            return None
-        jacobian = linear.by_point.reshape(-1, 3)
-        xyz = xyz + np.linalg.lstsq(jacobian, linear.residual.ravel(), rcond=None)[0]
-    return xyz if _in_front(block, photos, xyz) else None
+    at_centers = np.sum([a @ center for a, (center, _) in zip(across, rays, strict=True)], axis=0)
+    return np.asarray(np.linalg.solve(np.sum(across, axis=0), at_centers))
 
 
 def shown(block: Block, photos: NDArray[np.int64], xyz: FloatArray) -> FloatArray:
@@ -100,7 +78,3 @@ def on_ground(block: Block, photo: int, xy: FloatArray) -> FloatArray | None:
     if abs(slope) < 0.2:  # the ray grazes the plane, or the plane is ill-defined: take the middle's depth
         return np.asarray(center + direction * float((middle - center) @ direction))
     return np.asarray(center + direction * (float(normal @ (points.mean(axis=0) - center)) / slope))
-
-
-def _in_front(block: Block, photos: NDArray[np.int64], xyz: FloatArray) -> bool:
-    return all(block.cam_from_block[int(p)].act(xyz)[2] > 0 for p in photos)

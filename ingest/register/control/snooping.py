@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
-from featuredb.adjust.block import Block
 from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.control.adjust import Adjusted, Weights
 from ingest.register.control.fit import ControlFit
 from ingest.register.control.marks import Control
-from ingest.register.control.rays import mark_errors, mark_residuals
+from ingest.register.control.rays import mark_residuals
 
 _LOG = logging.getLogger(__name__)
 _SETTLED = 0.01  # relative change of the sigma, whose own uncertainty is tens of per cent
@@ -31,7 +30,6 @@ _SIGNIFICANCE = 0.01  # chance of naming a good observation as wrong, over the w
 _READMISSION = 0.05
 _MIN_MARK_PX = 5.0  # marks nearer than that are not called wrong: people mark to one to three pixels
 _MIN_POINT_M = 0.05  # the same for points; better surveys are rare
-_MAX_MARK_PX = 12.0  # marks within that take part from the start
 _START_MARK_PX = 1.0  # standard deviation of marks before they have been compared
 # Below, agreement is luck.
 _MIN_MARK_SIGMA_PX = 0.3
@@ -54,7 +52,7 @@ class Outcome:
 
 
 def initial_weights(
-    placed: Block, control: Control, fit: ControlFit, sigma_m: tuple[float, float] | None
+    control: Control, fit: ControlFit, sigma_m: tuple[float, float] | None
 ) -> tuple[Weights, FloatArray]:
     """What takes part at first, and where the control points lie in the placed block."""
     count = len(control.names)
@@ -63,12 +61,9 @@ def initial_weights(
     xyz = np.zeros((count, 3))
     for hypothesis, inlier in zip(fit.chosen, fit.inliers, strict=True):
         point = control.point_of[hypothesis.marks[0]]
-        rows = control.marks_of(int(point))
         xyz[point] = fit.local_from_block.act(hypothesis.xyz)
-        near = mark_errors(placed, control.photo_of[rows], control.xy[rows], xyz[point]) <= _MAX_MARK_PX
-        near |= np.isin(rows, hypothesis.marks)
         points[point] = inlier
-        marks[rows] = near
+        marks[list(hypothesis.marks)] = True
     horizontal, vertical = sigma_m or (fit.sigma_m, fit.sigma_m)
     weights = Weights(
         mark_px=_START_MARK_PX,
