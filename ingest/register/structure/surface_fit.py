@@ -46,7 +46,7 @@ def surface_near(cloud: PointCloud, points: FloatArray, most: int = _MAX_SURFACE
     middle = xyz.mean(axis=0)
     xyz -= middle
     tree = cKDTree(xyz)
-    distance, near = tree.query(xyz, _NEIGHBOURS)
+    distance, near = (np.asarray(found) for found in tree.query(xyz, _NEIGHBOURS))
     patch = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
     return Surface(
         middle=middle,
