@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from ingest.colmap.bridge import Model
@@ -16,7 +17,9 @@ from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE, held_of
 from ingest.photos.photo import Photo, capture_seconds, gps_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions, Reconstructed
-from ingest.register.control.maps import ControlledPlacement, Survey, place_by_survey
+from ingest.register.block import block_of_model, model_of_block
+from ingest.register.control.maps import ControlledPlacement, Survey, place_by_survey, vertical_of
+from ingest.register.control.marks import control_frame
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.register.tagged_elsewhere import TaggedElsewhere, tagged_elsewhere
 from ingest.sfm.extract import PhotoFeatures
@@ -257,23 +260,31 @@ def _by_control(
     survey: Survey,
 ) -> Component:
     """The component placed by control points; GPS, where it was accepted, says what they leave open."""
-    control = place_by_survey(component.model, component.photos, features, frame, component.placement, survey)
+    block = block_of_model(component.model, component.photos, features)
+    by_gps, vertical = component.placement, None
+    if by_gps.reason is None and by_gps.local_from_sfm is not None and by_gps.covariance is not None:
+        vertical = vertical_of(by_gps.local_from_sfm, by_gps.covariance, block.xyz, "the photos' GPS")
+    positions = [photo.gps for photo in component.photos]
+    control = place_by_survey(block, positions, frame or control_frame(survey.file), vertical, survey)
     component = replace(component, control=control)
     placed = control.placement
-    if placed.reason is not None or control.map_placement is None:
-        component = replace(component, reason_code=placed.reason or "", reason=placed.message)
+    if placed.reason is not None:
+        component = replace(component, reason_code=placed.reason, reason=placed.message)
         return _without_place(component, features, identity, options)
-    datum = control.height_datum(options.maps.height_datum)
+    assert placed.block is not None
+    assert placed.local_from_block is not None  # accepted
+    model = model_of_block(component.model, placed.block.moved(placed.local_from_block.inverse()))
+    datum = control.height_datum(options.maps.height_datum, options.maps.height_datum)
     feature_map = build_map(
-        control.model,
-        control.map_placement,
+        model,
+        control.map_placement(Sim3.identity()),
         control.frame,
         component.photos,
         features,
         identity,
         replace(options.maps, height_datum=datum),
     )
-    return replace(component, model=control.model, feature_map=feature_map, reason_code="", reason="")
+    return replace(component, model=model, feature_map=feature_map, reason_code="", reason="")
 
 
 def placement_evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import CommitResult, Database
-from ingest.register.control.control_file import ControlFile, read_control_file
+from ingest.register.control.control_file import read_control_file
 from ingest.register.control.maps import (
     GcpRegistration,
-    gcp_evidence,
+    Survey,
     place_unplaced_by_gcp,
     register_by_gcp,
     residual_table,
@@ -22,20 +22,20 @@ class ControlledMap:
     """What control points did to a map.
 
     Attributes:
-        file: the control points. result: the placement, with its figures; refused where it has no map.
+        result: the placement, with its figures; refused where it has no map.
         committed: None where it was refused, or nothing was to be committed.
     """
 
     map_id: str
-    file: ControlFile
     result: GcpRegistration
     committed: CommitResult | None
 
     def as_text(self) -> str:
         """For the terminal."""
-        placement, committed = self.result.placement, self.committed
-        lines = [f"note: {note}" for note in self.file.notes]
-        lines.append(residual_table(placement, self.result.control).rstrip("\n"))
+        controlled, committed = self.result.controlled, self.committed
+        placement = controlled.placement
+        lines = [f"note: {note}" for note in controlled.file.notes]
+        lines.append(residual_table(placement, controlled.control).rstrip("\n"))
         if self.result.feature_map is None:
             return "\n".join([*lines, f"refused: {placement.reason}: {placement.message}"]) + "\n"
         lines.append(_moved_words(self.result))
@@ -71,23 +71,21 @@ def place_by_control(
     Raises:
         ControlFileError, MapNotFoundError, InvalidValueError, StoreError, ConflictError
     """
-    file = read_control_file(gcp, crs)
-    options = options or GcpOptions()
+    survey = Survey(file=read_control_file(gcp, crs), options=options or GcpOptions())
     snapshot = database.snapshot()
     before = snapshot.load_any(map_id)
     if isinstance(before, UnplacedMap):
-        result = place_unplaced_by_gcp(before, file, options, height_datum)
+        result = place_unplaced_by_gcp(before, survey, height_datum)
     else:
-        result = register_by_gcp(before, file, options, height_datum)
+        result = register_by_gcp(before, survey, height_datum)
     if report is not None:
-        evidence = gcp_evidence(result.placement, result.control)
-        title = f"Control points of {before.name}"
-        write_control_report(report, title, result.placement, result.control, evidence)
+        done, title = result.controlled, f"Control points of {before.name}"
+        write_control_report(report, title, done.placement, done.control, done.evidence)
     committed = None
     if result.feature_map is not None and not dry_run:
         based_on = snapshot.get_any(map_id).write_id
         committed = database.commit_map(result.feature_map, replaces=map_id, based_on=based_on)
-    return ControlledMap(map_id=map_id, file=file, result=result, committed=committed)
+    return ControlledMap(map_id=map_id, result=result, committed=committed)
 
 
 def _moved_words(result: GcpRegistration) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from featuredb.adjust.block import Block
 from featuredb.geo.datum import check_datum
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -15,18 +16,91 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
 from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import UnplacedMap
-from ingest.colmap.bridge import Model
-from ingest.photos.photo import Photo
-from ingest.register.block import block_of_map, block_of_model, map_of_block, model_of_block
+from ingest.register.block import block_of_map, map_of_block
 from ingest.register.control.control_file import ControlFile
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control, control_frame, meet
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
-from ingest.register.gps import GpsPlacement
-from ingest.sfm.extract import PhotoFeatures
 
 # A local frame is good for tens of kilometres; a new one further away keeps coordinates small.
 _MAX_FRAME_DISTANCE_M = 2_000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Survey:
+    """A control point file and how it is used."""
+
+    file: ControlFile
+    options: GcpOptions = field(default_factory=GcpOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlledPlacement:
+    """A reconstruction placed by control points, or why not.
+
+    Attributes:
+        placement: with residuals; its reason is None where it was accepted.
+        control: what met the photos, and what did not.
+        frame: local frame of the placement.
+        file: the control points.
+    """
+
+    placement: GcpPlacement
+    control: Control
+    frame: LocalFrame
+    file: ControlFile
+
+    @property
+    def evidence(self) -> dict[str, Any]:
+        """Figures, residuals of every point and mark, and notes; JSON-able."""
+        return _evidence(self.placement, self.control) | {"file_notes": list(self.file.notes)}
+
+    def map_placement(self, block_from_sfm: Sim3) -> Placement:
+        """For the map, of an accepted placement.
+
+        Args:
+            block_from_sfm: what had placed the block in its own frame.
+        """
+        assert self.placement.local_from_block is not None
+        assert self.placement.covariance is not None  # accepted
+        return Placement(
+            method="gcp",
+            local_from_sfm=self.placement.local_from_block @ block_from_sfm,
+            covariance=self.placement.covariance,
+            residual_rms_m=self.placement.residual_rms_m,
+            evidence=self.evidence,
+        )
+
+    def height_datum(self, before: str, said: str) -> str:
+        """Datum of the map's heights: the survey's where it gives heights, else what it was before.
+
+        Args:
+            said: of the surveyed heights, where the file's reference system does not say it.
+        """
+        if np.isfinite(self.control.surveyed[:, 2]).sum() < 3:
+            return before
+        return self.file.crs.height_datum if self.file.crs.height_datum != "unknown" else said
+
+
+def place_by_survey(
+    block: Block,
+    positions: Sequence[GeoPrior | None],
+    frame: LocalFrame,
+    vertical: Vertical | None,
+    survey: Survey,
+) -> ControlledPlacement:
+    """Place and adjust a block.
+
+    Args:
+        positions: of its photos by GPS. frame: of the placement.
+        vertical: what is known of tilt and height from elsewhere.
+    """
+    control = meet(survey.file, block, frame)
+    gps, sigma = _gps_in(frame, positions)
+    placement = place_by_gcp(
+        block, control, survey.options, vertical=vertical, gps_local=gps, gps_sigma_m=sigma
+    )
+    return ControlledPlacement(placement=placement, control=control, frame=frame, file=survey.file)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,26 +108,19 @@ class GcpRegistration:
     """A map placed anew by control points, or why not.
 
     Attributes:
-        placement: with residuals; its reason is None where it was accepted.
-        control: what met the map's photos, and what did not.
-        frame: local frame of the placement.
+        controlled: the placement.
         feature_map: to be committed in the old one's place, None where it was refused.
         moved_m: (3,) median of how far the map's points moved, east, north, up; None without a map, and where
             it had no place before.
     """
 
-    placement: GcpPlacement
-    control: Control
-    frame: LocalFrame
-    feature_map: FeatureMap | None
-    moved_m: FloatArray | None
+    controlled: ControlledPlacement
+    feature_map: FeatureMap | None = None
+    moved_m: FloatArray | None = None
 
 
 def register_by_gcp(
-    feature_map: FeatureMap,
-    file: ControlFile,
-    options: GcpOptions,
-    height_datum: str = "unknown",
+    feature_map: FeatureMap, survey: Survey, height_datum: str = "unknown"
 ) -> GcpRegistration:
     """Place a map by control points; nothing is written.
 
@@ -61,48 +128,26 @@ def register_by_gcp(
         height_datum: of the surveyed heights, where the file's reference system does not say it.
     """
     check_datum(height_datum)
-    frame = _frame(feature_map, file)
+    frame = _frame(feature_map, survey.file)
     block = block_of_map(feature_map)
-    control = meet(file, block, frame)
     frame_from_map = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
-    gps, sigma = gps_in(frame, [image.gps for image in feature_map.images])
-    placement = place_by_gcp(
-        block,
-        control,
-        options,
-        vertical=_vertical_of_map(feature_map, block.xyz, frame_from_map),
-        gps_local=gps,
-        gps_sigma_m=sigma,
-    )
-    if placement.reason is not None or placement.block is None or placement.covariance is None:
-        return GcpRegistration(
-            placement=placement, control=control, frame=frame, feature_map=None, moved_m=None
-        )
-    assert placement.local_from_block is not None
-    placed = map_of_block(
-        feature_map,
-        placement.block,
-        frame,
-        Placement(
-            method="gcp",
-            local_from_sfm=placement.local_from_block @ feature_map.placement.local_from_sfm,
-            covariance=placement.covariance,
-            residual_rms_m=placement.residual_rms_m,
-            evidence=gcp_evidence(placement, control),
-        ),
-        datum_of(file, control, feature_map.height_datum, height_datum),
-    )
-    moved = np.median(placement.block.xyz - frame_from_map.act(block.xyz), axis=0)
+    vertical = _vertical_of_map(feature_map, block.xyz, frame_from_map)
+    positions = [image.gps for image in feature_map.images]
+    found = place_by_survey(block, positions, frame, vertical, survey)
+    if not found.placement.accepted:
+        return GcpRegistration(controlled=found)
+    assert found.placement.block is not None
+    placement = found.map_placement(feature_map.placement.local_from_sfm)
+    datum = found.height_datum(feature_map.height_datum, height_datum)
     return GcpRegistration(
-        placement=placement, control=control, frame=frame, feature_map=placed, moved_m=moved
+        controlled=found,
+        feature_map=map_of_block(feature_map, found.placement.block, frame, placement, datum),
+        moved_m=np.median(found.placement.block.xyz - frame_from_map.act(block.xyz), axis=0),
     )
 
 
 def place_unplaced_by_gcp(
-    unplaced: UnplacedMap,
-    file: ControlFile,
-    options: GcpOptions,
-    height_datum: str = "unknown",
+    unplaced: UnplacedMap, survey: Survey, height_datum: str = "unknown"
 ) -> GcpRegistration:
     """Place a map that has no place by control points; arguments as in `register_by_gcp`.
 
@@ -114,15 +159,8 @@ def place_unplaced_by_gcp(
         covariance=np.zeros((7, 7)),
         residual_rms_m=0.0,
     )
-    start = placed_map(unplaced, at_the_points, control_frame(file), "unknown")
-    return replace(register_by_gcp(start, file, options, height_datum), moved_m=None)
-
-
-def datum_of(file: ControlFile, control: Control, before: str, said: str) -> str:
-    """Datum of the placed map's heights: the survey's where it gives heights, else what it was."""
-    if np.isfinite(control.surveyed[:, 2]).sum() < 3:
-        return before
-    return file.crs.height_datum if file.crs.height_datum != "unknown" else said
+    start = placed_map(unplaced, at_the_points, control_frame(survey.file), "unknown")
+    return replace(register_by_gcp(start, survey, height_datum), moved_m=None)
 
 
 def vertical_of(
@@ -142,7 +180,7 @@ def vertical_of(
     )
 
 
-def gps_in(frame: LocalFrame, priors: Sequence[GeoPrior | None]) -> tuple[FloatArray, tuple[float, float]]:
+def _gps_in(frame: LocalFrame, priors: Sequence[GeoPrior | None]) -> tuple[FloatArray, tuple[float, float]]:
     """The photos' own positions (k, 3) in a frame, NaN where not known, and the medians of their sigmas."""
     gps = np.full((len(priors), 3), np.nan)
     for row, prior in enumerate(priors):
@@ -173,98 +211,7 @@ def _vertical_of_map(feature_map: FeatureMap, points: FloatArray, frame_from_map
     return vertical_of(frame_from_map, covariance, points, f"the map's placement by {method}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Survey:
-    """A control point file and how it is used."""
-
-    file: ControlFile
-    options: GcpOptions = field(default_factory=GcpOptions)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControlledPlacement:
-    """A reconstruction placed by control points, or why not.
-
-    Attributes:
-        placement: with residuals.
-        control: what met the photos, and what did not.
-        model: adjusted where the placement was accepted, in the reconstruction's own frame.
-        frame: local frame of the placement.
-        map_placement: for the map, None where it was refused.
-        file: the control points.
-        evidence: figures and residuals, JSON-able.
-    """
-
-    placement: GcpPlacement
-    control: Control
-    model: Model
-    frame: LocalFrame
-    map_placement: Placement | None
-    file: ControlFile
-    evidence: dict[str, Any]
-
-    def height_datum(self, said: str) -> str:
-        """Datum of the map's heights; `said` is that of the heights that the caller knows of."""
-        return datum_of(self.file, self.control, said, said)
-
-
-def place_by_survey(
-    model: Model,
-    photos: Sequence[Photo],
-    features: Sequence[PhotoFeatures],
-    frame: LocalFrame | None,
-    by_gps: GpsPlacement,
-    survey: Survey,
-) -> ControlledPlacement:
-    """Place and adjust a reconstruction.
-
-    Args:
-        photos, features: of its registered photos, in the order of `model.rows`.
-        frame: at the photos' GPS, None where they have none.
-        by_gps: what GPS says, accepted or not.
-    """
-    where = frame or control_frame(survey.file)
-    block = block_of_model(model, photos, features)
-    control = meet(survey.file, block, where)
-    vertical = None
-    if by_gps.reason is None and by_gps.local_from_sfm is not None and by_gps.covariance is not None:
-        vertical = vertical_of(by_gps.local_from_sfm, by_gps.covariance, block.xyz, "the photos' GPS")
-    gps, sigma = gps_in(where, [photo.gps for photo in photos])
-    placement = place_by_gcp(
-        block, control, survey.options, vertical=vertical, gps_local=gps, gps_sigma_m=sigma
-    )
-    evidence = gcp_evidence(placement, control) | {"file_notes": list(survey.file.notes)}
-    return ControlledPlacement(
-        placement=placement,
-        control=control,
-        model=_adjusted_model(model, placement),
-        frame=where,
-        map_placement=_map_placement(placement, evidence),
-        file=survey.file,
-        evidence=evidence,
-    )
-
-
-def _adjusted_model(model: Model, placement: GcpPlacement) -> Model:
-    if placement.reason is not None or placement.block is None or placement.local_from_block is None:
-        return model
-    return model_of_block(model, placement.block.moved(placement.local_from_block.inverse()))
-
-
-def _map_placement(placement: GcpPlacement, evidence: dict[str, Any]) -> Placement | None:
-    if placement.reason is not None or placement.local_from_block is None or placement.covariance is None:
-        return None
-    return Placement(
-        method="gcp",
-        local_from_sfm=placement.local_from_block,
-        covariance=placement.covariance,
-        residual_rms_m=placement.residual_rms_m,
-        evidence=evidence,
-    )
-
-
-def gcp_evidence(placement: GcpPlacement, control: Control) -> dict[str, Any]:
-    """Figures, residuals of every point and mark, and notes; JSON-able."""
+def _evidence(placement: GcpPlacement, control: Control) -> dict[str, Any]:
     return {
         **placement.figures,
         "notes": list(placement.notes),

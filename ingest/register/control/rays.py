@@ -22,7 +22,7 @@ def ray(block: Block, photo: int, xy: FloatArray) -> tuple[FloatArray, FloatArra
 def intersect(
     block: Block, photos: NDArray[np.int64], xy: FloatArray, min_angle_deg: float
 ) -> FloatArray | None:
-    """The place (3,) nearest to the rays of pixels (m, 2) of m photos; None where these are nearly parallel."""
+    """The place (3,) next to the rays of pixels (m, 2) of m photos; None where they are nearly parallel."""
     rays = [ray(block, int(p), pixel) for p, pixel in zip(photos, xy, strict=True)]
     directions = np.array([d for _, d in rays])
     if not np.isfinite(directions).all():
