@@ -83,7 +83,6 @@ class Hypothesis:
     point: int
     xyz: FloatArray
     marks: tuple[int, ...]
-    by_rays: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,14 +91,13 @@ class ControlFit:
 
     Attributes:
         local_from_block: the similarity.
-        inliers: (n,) points that take part.
-        chosen: of each point.
+        chosen: of each point that has hypotheses. inliers: whether it takes part.
         sigma_m: robust standard deviation of a coordinate.
     """
 
     local_from_block: Sim3
-    inliers: NDArray[np.bool_]
     chosen: tuple[Hypothesis, ...]
+    inliers: NDArray[np.bool_]
     sigma_m: float
 
 
@@ -109,7 +107,7 @@ _MAX_MARK_ERROR_PX = 12.0
 _MIN_RAY_ANGLE_DEG = 1.0  # rays closer to parallel than that give no place
 _OUTLIER_SIGMAS = 3.5  # points further out are left out; 3.5 keeps 99.8 % of honest ones in the plane
 _MIN_SIGMA_M = 0.02  # survey and marks are not better than that, so smaller residuals never make outliers
-_MAX_SAMPLES = 1500  # of hypotheses
+_SAMPLES = 1500  # of hypotheses
 _SEED = 0  # of the samples
 
 
@@ -123,11 +121,11 @@ def hypotheses(block: Block, control: Control) -> list[Hypothesis]:
             consensus = _consensus(block, control, rows, pair)
             if consensus is not None and consensus[1] not in seen:
                 seen.add(consensus[1])
-                found.append(Hypothesis(point=point, xyz=consensus[0], marks=consensus[1], by_rays=True))
+                found.append(Hypothesis(point=point, xyz=consensus[0], marks=consensus[1]))
         for row in rows:
             ground = on_ground(block, int(control.photo_of[row]), control.xy[row])
             if ground is not None:
-                found.append(Hypothesis(point=point, xyz=ground, marks=(int(row),), by_rays=False))
+                found.append(Hypothesis(point=point, xyz=ground, marks=(int(row),)))
     return found
 
 
@@ -136,19 +134,15 @@ def _consensus(
 ) -> tuple[FloatArray, tuple[int, ...]] | None:
     """The intersection of all marks that agree with a pair; None where the pair does not agree itself."""
     chosen = np.array(pair)
-    xyz = None
-    for _ in range(3):
-        xyz = intersect(block, control.photo_of[chosen], control.xy[chosen], _MIN_RAY_ANGLE_DEG)
-        if xyz is None:
-            return None
-        errors = mark_errors(block, control.photo_of[rows], control.xy[rows], xyz)
-        again = rows[errors <= _MAX_MARK_ERROR_PX]
-        if not set(pair) <= set(again.tolist()):
-            return None
-        if np.array_equal(again, chosen):
-            break
-        chosen = again
-    return None if xyz is None else (xyz, tuple(int(r) for r in chosen))
+    xyz = intersect(block, control.photo_of[chosen], control.xy[chosen], _MIN_RAY_ANGLE_DEG)
+    if xyz is None:
+        return None
+    errors = mark_errors(block, control.photo_of[rows], control.xy[rows], xyz)
+    agreeing = rows[errors <= _MAX_MARK_ERROR_PX]
+    if not set(pair) <= set(agreeing.tolist()):
+        return None
+    of_all = intersect(block, control.photo_of[agreeing], control.xy[agreeing], _MIN_RAY_ANGLE_DEG)
+    return None if of_all is None else (of_all, tuple(agreeing.tolist()))
 
 
 def fit_similarity(
@@ -161,7 +155,8 @@ def fit_similarity(
         vertical: None where the surveyed heights say which way is up.
     """
     xyz = np.array([h.xyz for h in found])
-    point = np.array([h.point for h in found])
+    usable, point = np.unique([h.point for h in found], return_inverse=True)
+    surveyed = surveyed[usable]
     start = _least_trimmed(xyz, point, surveyed, vertical)
     if start is None:
         return None
@@ -170,7 +165,7 @@ def fit_similarity(
         residuals = _residuals(sim, xyz, surveyed[point])
         lengths = np.linalg.norm(residuals, axis=1)
         sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical)
-        chosen = _choose(found, lengths, len(surveyed), _OUTLIER_SIGMAS * sigma)
+        chosen = _choose(found, point, lengths, _OUTLIER_SIGMAS * sigma)
         inliers = lengths[chosen] <= _OUTLIER_SIGMAS * sigma
         refined = refined_similarity(sim, xyz[chosen][inliers], surveyed[inliers], sigma, vertical)
         moved = float(np.abs(refined.act(xyz[chosen]) - sim.act(xyz[chosen])).max())
@@ -223,19 +218,13 @@ def _least_trimmed(
 
 
 def _samples(usable: NDArray[np.int64], point: NDArray[np.int64], size: int) -> list[NDArray[np.int64]]:
-    """Sets of hypotheses of different points: all of them, or random ones where there are too many."""
+    """Random sets of hypotheses of different points."""
     generator = np.random.default_rng(_SEED)
-    total = 1
-    for k in range(size):
-        total = total * (len(usable) - k) // (k + 1)
-    if total <= _MAX_SAMPLES:
-        every = (np.array(c) for c in itertools.combinations(usable, size))
-        return [rows for rows in every if len(set(point[rows])) == size]
     names = np.unique(point[usable])
     if len(names) < size:
         return []
     samples = []
-    for _ in range(_MAX_SAMPLES):
+    for _ in range(_SAMPLES):
         chosen = generator.choice(names, size, replace=False)
         samples.append(np.array([generator.choice(usable[point[usable] == p]) for p in chosen]))
     return samples
@@ -268,17 +257,15 @@ def _sigma(lengths: FloatArray, surveyed: FloatArray, vertical: Vertical | None)
 
 
 def _choose(
-    found: Sequence[Hypothesis], lengths: FloatArray, count: int, limit_m: float
+    found: Sequence[Hypothesis], point: NDArray[np.int64], lengths: FloatArray, limit_m: float
 ) -> NDArray[np.int64]:
     """For each point the hypothesis of most marks within the limit, the nearest if none is."""
-    chosen = np.zeros(count, dtype=np.int64)
-    for point in range(count):
-        rows = [i for i, h in enumerate(found) if h.point == point]
+    chosen = np.zeros(int(point.max()) + 1, dtype=np.int64)
+    for row in range(len(chosen)):
+        rows = np.flatnonzero(point == row).tolist()
         near = [i for i in rows if lengths[i] <= limit_m]
-        chosen[point] = min(
+        chosen[row] = min(
             near or rows,
-            key=lambda i: (
-                (-len(found[i].marks), not found[i].by_rays, lengths[i]) if near else (0, 0, lengths[i])
-            ),
+            key=lambda i: (-len(found[i].marks), lengths[i]) if near else (0, lengths[i]),
         )
     return chosen

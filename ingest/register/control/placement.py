@@ -21,7 +21,6 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.register.control.adjust import (
     Adjusted,
     Task,
-    adjust,
     task_of,
     with_all_points,
 )
@@ -147,22 +146,27 @@ def place_by_gcp(
             "needed; mark each point in two photos or more",
             figures={"points": len(control.names), "usable_points": len(usable), "marks": len(control.marks)},
         )
-    notes: list[str] = []
-    needed = _vertical_is_needed(control, usable)
-    if needed and vertical is None:
+    notes: tuple[str, ...] = ()
+    if not _vertical_is_needed(control, usable):
+        vertical = None
+    elif vertical is None:
         vertical = level_ground(block, np.median([h.xyz for h in found], axis=0), options.ground_m)
-        notes.append(vertical.source)
-    elif needed and vertical is not None:
-        notes.append(f"tilt and height are kept from {vertical.source}")
-    row = {point: k for k, point in enumerate(usable)}  # of the fit
-    renumbered = [replace(h, point=row[h.point]) for h in found]
-    fit = fit_similarity(renumbered, control.surveyed[usable], vertical if needed else None)
-    refused = _gate_fit(fit, control, usable)
-    if refused is not None or fit is None:
-        return refused or GcpPlacement(reason="DEGENERATE_LINE", message="the control points coincide")
-    return _adjusted_placement(
-        block, control, fit, vertical if needed else None, options, notes, gps_local, gps_sigma_m
-    )
+        notes = (vertical.source,)
+    else:
+        notes = (f"tilt and height are kept from {vertical.source}",)
+    fit = fit_similarity(found, control.surveyed, vertical)
+    extent = float(np.linalg.norm(np.ptp(control.surveyed[usable, :2], axis=0)))
+    if fit is None or extent <= 0:
+        return GcpPlacement(
+            reason="DEGENERATE_LINE",
+            message="the control points, or their places in the photos, coincide or lie along a line",
+            figures={"usable_points": len(usable), "extent_m": extent},
+        )
+    refused = _gate_fit(fit, extent)
+    if refused is not None:
+        return refused
+    placement = _adjusted_placement(block, control, fit, vertical, options)
+    return _gate(replace(placement, notes=notes), gps_local, gps_sigma_m)
 
 
 def level_ground(block: Block, anchor_block: FloatArray, ground_m: tuple[float, float] | None) -> Vertical:
@@ -212,28 +216,22 @@ def _vertical_is_needed(control: Control, usable: list[int]) -> bool:
     return bool(spread[1] < _MIN_LINE_RATIO * spread[0])
 
 
-def _gate_fit(fit: ControlFit | None, control: Control, usable: list[int]) -> GcpPlacement | None:
-    surveyed = control.surveyed[usable, :2]
-    extent = float(np.linalg.norm(np.ptp(surveyed, axis=0)))
-    figures: dict[str, Any] = {"usable_points": len(usable), "extent_m": extent}
-    if fit is None or extent <= 0:
-        return GcpPlacement(
-            reason="DEGENERATE_LINE",
-            message="the control points, or their places in the photos, coincide or lie along a line",
-            figures=figures,
-        )
-    share = float(fit.inliers.mean())
-    figures |= {"agreeing_share": share, "fit_sigma_m": fit.sigma_m}
-    if share < _MIN_SHARE or fit.inliers.sum() < _MIN_POINTS or fit.sigma_m > _MAX_SIGMA_OVER_EXTENT * extent:
-        return GcpPlacement(
-            reason="RESIDUALS",
-            message="the control points do not fit the photos: "
-            f"{int(fit.inliers.sum())} of {len(usable)} agree, to {fit.sigma_m:.2f} m over {extent:.0f} m; "
-            "check the reference system, the order of x and y, the units, and that the marks are of these "
-            "photos",
-            figures=figures,
-        )
-    return None
+def _gate_fit(fit: ControlFit, extent: float) -> GcpPlacement | None:
+    agree, usable = int(fit.inliers.sum()), len(fit.inliers)
+    if agree >= max(_MIN_POINTS, _MIN_SHARE * usable) and fit.sigma_m <= _MAX_SIGMA_OVER_EXTENT * extent:
+        return None
+    return GcpPlacement(
+        reason="RESIDUALS",
+        message=f"the control points do not fit the photos: {agree} of {usable} agree, to "
+        f"{fit.sigma_m:.2f} m over {extent:.0f} m; check the reference system, the order of x and y, the "
+        "units, and that the marks are of these photos",
+        figures={
+            "usable_points": usable,
+            "extent_m": extent,
+            "agreeing_share": agree / usable,
+            "fit_sigma_m": fit.sigma_m,
+        },
+    )
 
 
 def _adjusted_placement(
@@ -242,19 +240,16 @@ def _adjusted_placement(
     fit: ControlFit,
     vertical: Vertical | None,
     options: GcpOptions,
-    notes: list[str],
-    gps_local: FloatArray | None,
-    gps_sigma_m: tuple[float, float],
 ) -> GcpPlacement:
     placed = block.moved(fit.local_from_block)
     local_vertical, free_height_m = _in_place(vertical, fit.local_from_block, control)
     weights, xyz = initial_weights(control, fit, options.sigma_m)
     task = task_of(placed, control, xyz, local_vertical, options.keep_lens)
-    outcome = improve(control, weights, lambda w, last: adjust(task, w, last), options.sigma_m is not None)
+    outcome = improve(task, weights, options.sigma_m is not None)
     adjusted = outcome.adjusted
     points, marks = residuals_of(adjusted, control)
     covariance = _covariance(adjusted, free_height_m, outcome.freedom)
-    placement = GcpPlacement(
+    return GcpPlacement(
         reason=None,
         message="placed by control points",
         local_from_block=adjusted.change @ fit.local_from_block,
@@ -262,10 +257,8 @@ def _adjusted_placement(
         block=with_all_points(adjusted, task),
         points=points,
         marks=marks,
-        notes=tuple(notes),
         figures=_figures(fit, outcome, covariance, task, options),
     )
-    return _gate(placement, gps_local, gps_sigma_m)
 
 
 def _in_place(
@@ -314,8 +307,7 @@ def _figures(
         "heights": "surveyed" if task.vertical is None else "unknown or too few",
     }
     if task.vertical is not None:
-        residual = task.vertical.residual(Sim3.identity())
-        figures["vertical"] = {"source": task.vertical.source, "tilt_at_fit_sigmas": residual[:2].tolist()}
+        figures["vertical"] = {"source": task.vertical.source}
     return figures
 
 

@@ -6,7 +6,6 @@ covariance of all residuals, and one is left out at a time.
 """
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.stats import f as f_distribution
 
 from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.control.adjust import Adjusted, Weights
+from ingest.register.control.adjust import Adjusted, Task, Weights, adjust
 from ingest.register.control.fit import ControlFit
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import mark_residuals
@@ -60,9 +59,8 @@ def initial_weights(
     marks = np.zeros(len(control.marks), dtype=bool)
     xyz = np.zeros((count, 3))
     for hypothesis, inlier in zip(fit.chosen, fit.inliers, strict=True):
-        point = control.point_of[hypothesis.marks[0]]
-        xyz[point] = fit.local_from_block.act(hypothesis.xyz)
-        points[point] = inlier
+        xyz[hypothesis.point] = fit.local_from_block.act(hypothesis.xyz)
+        points[hypothesis.point] = inlier
         marks[list(hypothesis.marks)] = True
     horizontal, vertical = sigma_m or (fit.sigma_m, fit.sigma_m)
     weights = Weights(
@@ -74,16 +72,11 @@ def initial_weights(
     return weights, xyz
 
 
-def improve(
-    control: Control,
-    weights: Weights,
-    solve: Callable[[Weights, Adjusted | None], Adjusted],
-    sigma_is_given: bool,
-) -> Outcome:
+def improve(task: Task, weights: Weights, sigma_is_given: bool) -> Outcome:
     """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none."""
-    rounds, adjusted = 0, None
+    control, rounds, adjusted = task.control, 0, None
     while True:
-        adjusted = solve(weights, adjusted)
+        adjusted = adjust(task, weights, adjusted)
         rounds += 1
         control_m, freedom = _control_sigma(adjusted, control)
         tested = replace(
