@@ -16,8 +16,9 @@ from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.files import load_proposals, save_proposals
 from ingest.register.anchor.pictures import FramePicture, edges_of, flick_page, overlay_rgb, scan_view
 from ingest.register.anchor.proposals import propose_frames, small_camera
+from ingest.register.block import block_of_map
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from ingest.register.structure.map_move import map_move, map_residuals, viewing_distance_m
+from ingest.register.structure.map_move import map_move, map_residuals
 from tests.support.maps import random_map
 from tools.worlds.clouds import build_cloud
 
@@ -154,7 +155,7 @@ def test_residuals_compare_the_same_points_and_leave_out_holes() -> None:
     assert before.median_m == pytest.approx(7.0, abs=0.05)
     far = moved(feature_map, Sim3.exp([0, 0, 0, 0, 500.0, 0, 0]))
     assert map_residuals(feature_map, far, cloud)[1].as_figures()["compared"] == 0
-    assert viewing_distance_m(feature_map) == pytest.approx(54.0, abs=3.0)
+    assert np.median(block_of_map(feature_map).distances()) == pytest.approx(54.0, abs=3.0)
 
 
 def test_edges_lie_where_depth_and_colour_change_and_not_at_the_scans_border() -> None:

@@ -24,12 +24,12 @@ from ingest.register.anchor.frames import (
 )
 from ingest.register.anchor.placing import PlaceRound, place_in_rounds, registered_image
 from ingest.register.anchor.proposals import PhotoReader
+from ingest.register.block import block_of_map
 from ingest.register.structure.map_move import (
     MapMove,
     MapResidual,
     map_move,
     map_residuals,
-    viewing_distance_m,
 )
 from ingest.register.structure.projection import (
     project_structure,
@@ -240,7 +240,7 @@ def _judged(
     """The gates on the placed map as a whole."""
     before, after = map_residuals(old, new, cloud)
     move = map_move(old, new)
-    distance = viewing_distance_m(new)
+    distance = float(np.median(block_of_map(new).distances()))
     apart = found.agreement.apart_m if found.agreement else {}
     allowed = found.agreement.allowed_m if found.agreement else {}
     checks: dict[str, Any] = {

@@ -169,13 +169,10 @@ def _principal_axes(
     cloud: PointCloud, index: NDArray[np.int32], weight: NDArray[np.bool_]
 ) -> tuple[FloatArray, NDArray[np.int64], FloatArray, FloatArray]:
     """Mean (n, 3), number (n,), variances (n, 3) and axes (n, 3, 3) of the points chosen in each row."""
-    # A window shows fewer points than it has samples: those are moved to the front, and the rest left out.
     count = weight.sum(axis=1)
-    front = np.argsort(~weight, axis=1, kind="stable")[:, : int(count.max())]
-    chosen = np.arange(front.shape[1]) < count[:, None]
-    points = cloud.xyz[np.where(chosen, np.take_along_axis(index, front, axis=1), 0)].astype(np.float64)
-    mean = (chosen[:, None, :] @ points)[:, 0] / count[:, None]
+    points = cloud.xyz[np.where(weight, index, 0)].astype(np.float64)
+    mean = (weight[:, None, :] @ points)[:, 0] / count[:, None]
     points -= mean[:, None]
-    points *= chosen[:, :, None]
+    points *= weight[:, :, None]
     values, vectors = np.linalg.eigh(np.swapaxes(points, 1, 2) @ points / count[:, None, None])
     return mean, count, values, vectors

@@ -108,8 +108,6 @@ def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[
     high = np.maximum(before.max(axis=0), after.max(axis=0))[:2] + _PLAN_REACH_M
     near = ((cloud.xyz[:, :2] >= low) & (cloud.xyz[:, :2] <= high)).all(axis=1)
     scan = cloud.xyz[near].astype(np.float64)
-    if not len(scan):
-        return tuple(MapResidual(distance_m=np.zeros(0), points=len(old.points)) for _ in range(2))  # type: ignore[return-value]
     in_plan, _ = cKDTree(scan[:, :2]).query(after[:, :2], distance_upper_bound=_PLAN_REACH_M)
     compared = np.isfinite(in_plan)
     tree = cKDTree(scan)
@@ -118,14 +116,3 @@ def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[
         for points in (before, after)
     )
     return first, second
-
-
-def viewing_distance_m(feature_map: FeatureMap) -> float:
-    """Median distance from which the map's images see its points."""
-    rows = {image.image_id: row for row, image in enumerate(feature_map.images)}
-    centers = np.array([image.cam_from_local.center for image in feature_map.images])
-    observations = feature_map.observations
-    step = max(1, len(observations) // _MAX_POINTS)
-    points = feature_map.points_local()[observations.point_index[::step]]
-    seen_from = centers[[rows[int(i)] for i in observations.image_id[::step]]]
-    return float(np.median(np.linalg.norm(points - seen_from, axis=1)))

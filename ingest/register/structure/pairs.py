@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
@@ -100,7 +99,8 @@ def _pairs_of_frame(
     hits = surface_at(rendering, cloud, pixels)
     distance = np.linalg.norm(hits.points - pose.center, axis=1)
     kept = np.flatnonzero(hits.valid)
-    kept = kept[_no_larger(uncertainty[points[kept]], _MAX_POINT_SIGMA_REL * distance[kept])]
+    largest = np.linalg.eigvalsh(uncertainty[points[kept]])[:, -1]
+    kept = kept[largest <= (_MAX_POINT_SIGMA_REL * distance[kept]) ** 2]
     own, by_frame = _errors(hits.rows(kept), pose, camera)
     grid = np.minimum((pixels / (small.width, small.height) * _CELLS).astype(np.int64), _CELLS - 1)
     cell = row * _CELLS**2 + grid[:, 1] * _CELLS + grid[:, 0]
@@ -113,15 +113,6 @@ def _pairs_of_frame(
         cell_of=cell[kept],
         frame_covariance=covariance[None],
     )
-
-
-def _no_larger(covariance: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
-    """(n,) bool: whether the largest standard deviation of covariances (n, 3, 3) is at most sigma (n,)."""
-    trace, limit = np.trace(covariance, axis1=1, axis2=2), sigma**2
-    small = trace <= limit  # the largest eigenvalue is between a third of the trace and the trace
-    open_ = np.flatnonzero(~small & (trace <= 3.0 * limit))
-    small[open_] = np.linalg.eigvalsh(covariance[open_])[:, -1] <= limit[open_]
-    return np.asarray(small)
 
 
 def _errors(hits: SurfaceHits, pose: Rigid3, camera: Camera) -> tuple[FloatArray, FloatArray]:
