@@ -12,7 +12,7 @@ pixel, whose centre is (0.5, 0.5). See https://docs.opendronemap.org/gcp/.
 import math
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -75,14 +75,10 @@ class ControlFile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Line:
-    number: int
-    x: float
-    y: float
-    z: float
-    px: float
-    py: float
-    photo: str
-    name: str
+    """A mark, whose point is "" where the line names none, and where the point lies."""
+
+    mark: Mark
+    place: tuple[float, float, float]
 
 
 def read_control_file(path: Path, crs: str | None = None) -> ControlFile:
@@ -124,7 +120,7 @@ def parse_control_file(text: str, where: str, crs: str | None = None) -> Control
     lines = _collect(body, where)
     points, notes = _points(lines, where)
     marks, more_notes = _marks(points, where)
-    xyz = np.array([[group[0].x, group[0].y, group[0].z] for group in points.values()])
+    xyz = np.array([lines[0].place for lines in points.values()])
     xyz, height_notes = _heights(xyz, list(points), system)
     return ControlFile(
         crs=system,
@@ -179,16 +175,9 @@ def _parse_line(number: int, line: str) -> _Line:
         raise ControlFileError(
             f"line {number}: expected pixels >= 0, found {px:g} {py:g}; the columns are {_COLUMNS}"
         )
-    return _Line(
-        number=number,
-        x=x,
-        y=y,
-        z=z,
-        px=px,
-        py=py,
-        photo=fields[5].replace("\\", "/"),
-        name=fields[6] if len(fields) > 6 else "",
-    )
+    name = fields[6] if len(fields) > 6 else ""
+    mark = Mark(point=name, photo=fields[5].replace("\\", "/"), x=px, y=py, line=number)
+    return _Line(mark=mark, place=(x, y, z))
 
 
 def _fields(line: str) -> list[str]:
@@ -229,22 +218,21 @@ def _points(lines: list[_Line], where: str) -> tuple[dict[str, list[_Line]], lis
     points: dict[str, list[_Line]] = defaultdict(list)
     faults, notes = [], []
     for line in lines:
-        if line.name:
-            other = name_at.setdefault((line.x, line.y), line.name)
-            if other != line.name and line.name not in points:
-                notes.append(f"line {line.number}: {line.name} has the coordinates of {other}")
+        if name := line.mark.point:
+            other = name_at.setdefault(line.place[:2], name)
+            if other != name and name not in points:
+                notes.append(f"line {line.mark.line}: {name} has the coordinates of {other}")
     for line in lines:
-        name = line.name or name_at.setdefault((line.x, line.y), f"point {len(name_at) + 1}")
+        name = line.mark.point or name_at.setdefault(line.place[:2], f"point {len(name_at) + 1}")
         first = points[name][0] if points[name] else line
-        same_height = first.z == line.z or (math.isnan(first.z) and math.isnan(line.z))
-        if (first.x, first.y) != (line.x, line.y) or not same_height:
+        if not np.array_equal(first.place, line.place, equal_nan=True):
+            here, there = (" ".join(f"{v:.10g}" for v in found.place) for found in (line, first))
             faults.append(
-                f"line {line.number}: {name} is at {line.x:.10g} {line.y:.10g} {line.z:.10g}, line "
-                f"{first.number} says {first.x:.10g} {first.y:.10g} {first.z:.10g}; give it one position, or "
-                "different names to different points"
+                f"line {line.mark.line}: {name} is at {here}, line {first.mark.line} says {there}; give it "
+                "one position, or different names to different points"
             )
             continue
-        points[name].append(line)
+        points[name].append(replace(line, mark=replace(line.mark, point=name)))
     _raise(faults, where)
     return dict(points), notes
 
@@ -254,17 +242,16 @@ def _marks(points: dict[str, list[_Line]], where: str) -> tuple[tuple[Mark, ...]
     marks: dict[tuple[str, str], Mark] = {}
     faults, notes = [], []
     for name, lines in points.items():
-        for line in lines:
-            mark = Mark(point=name, photo=line.photo, x=line.px, y=line.py, line=line.number)
-            first = marks.setdefault((name, line.photo), mark)
+        for mark in (line.mark for line in lines):
+            first = marks.setdefault((name, mark.photo), mark)
             if first is mark:
                 continue
             if (first.x, first.y) == (mark.x, mark.y):
-                notes.append(f"line {line.number} repeats line {first.line}")
+                notes.append(f"line {mark.line} repeats line {first.line}")
             else:
                 faults.append(
-                    f"line {line.number}: {name} is marked in {line.photo} a second time, at {line.px:g} "
-                    f"{line.py:g}; line {first.line} has it at {first.x:g} {first.y:g}; remove one of them"
+                    f"line {mark.line}: {name} is marked in {mark.photo} a second time, at {mark.x:g} "
+                    f"{mark.y:g}; line {first.line} has it at {first.x:g} {first.y:g}; remove one of them"
                 )
     _raise(faults, where)
     return tuple(sorted(marks.values(), key=lambda m: m.line)), notes
@@ -293,10 +280,11 @@ def _geodetic(crs: SurveyCrs, xyz: FloatArray, points: dict[str, list[_Line]], w
     faults = []
     if crs.geographic:
         for lines in points.values():
-            if abs(lines[0].x) > 180 or abs(lines[0].y) > 90:
+            x, y, _ = lines[0].place
+            if abs(x) > 180 or abs(y) > 90:
                 faults.append(
-                    f"line {lines[0].number}: expected longitude and latitude in degrees ({crs.name}), found "
-                    f"{lines[0].x:g} {lines[0].y:g}; name the projected system in the first line"
+                    f"line {lines[0].mark.line}: expected longitude and latitude in degrees ({crs.name}), "
+                    f"found {x:g} {y:g}; name the projected system in the first line"
                 )
     _raise(faults, where)
     try:
