@@ -14,8 +14,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.precision import linearise
 from ingest.register.block import block_of_map, map_of_block
+from ingest.register.frame_registration import FrameRegistration
 from ingest.register.structure.adjustment import LidarAdjustment, adjust_to_scan, placed_map
-from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement, project_structure
 from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map
 
@@ -63,10 +63,10 @@ def replace_map(world: ScannedMap, feature_map: FeatureMap) -> ScannedMap:
     return replace(world, feature_map=feature_map)
 
 
-def _registered_by_its_lens(world: ScannedMap, image: int, seed: int) -> RegisteredImage:
+def _registered_by_its_lens(world: ScannedMap, image: int, seed: int) -> FrameRegistration:
     """A frame registered through the map's wrong lens: its pose is the one that fits its correspondences."""
-    frame = world.registered(image, correspondences=150, seed=seed)
-    lens, found = world.feature_map.cameras[0], frame.registration
+    found = world.registered(image, correspondences=150, seed=seed)
+    lens = world.feature_map.cameras[0]
     pose, none = found.cam_from_local, np.zeros(len(found.pixels), np.int64)
     assert pose is not None
     for _ in range(20):
@@ -75,7 +75,7 @@ def _registered_by_its_lens(world: ScannedMap, image: int, seed: int) -> Registe
         )
         jacobian = linear.by_pose.reshape(-1, 6)
         pose = Rigid3.exp(np.linalg.lstsq(jacobian, linear.residual.ravel(), rcond=None)[0]) @ pose
-    return replace(frame, registration=replace(found, cam_from_local=pose, camera=lens))
+    return replace(found, cam_from_local=pose, camera=lens)
 
 
 def _heights_off(feature_map: FeatureMap, world: ScannedMap) -> FloatArray:
@@ -88,7 +88,7 @@ def _heights_off(feature_map: FeatureMap, world: ScannedMap) -> FloatArray:
 
 
 def _adjusted(world: ScannedMap, frames: tuple[int, ...]) -> tuple[StructurePlacement, LidarAdjustment]:
-    registered = [_registered_by_its_lens(world, k, seed) for seed, k in enumerate(frames)]
+    registered = {k: _registered_by_its_lens(world, k, seed) for seed, k in enumerate(frames)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     assert structure.accepted, structure.message
     return structure, adjust_to_scan(world.feature_map, structure, registered, world.cloud)
@@ -149,13 +149,13 @@ def test_a_right_lens_stays(world: ScannedMap) -> None:
 
 
 def test_too_little_control_is_refused(world: ScannedMap) -> None:
-    registered = [world.registered(4, correspondences=20)]
+    registered = {4: world.registered(4, correspondences=20)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     assert adjust_to_scan(world.feature_map, structure, registered, world.cloud).reason == "NO_CONTROL"
 
 
 def test_no_scan_under_the_map_is_refused(world: ScannedMap) -> None:
-    registered = [world.registered(4, correspondences=150)]
+    registered = {4: world.registered(4, correspondences=150)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     away = plain_cloud(world.cloud.xyz + np.array([900.0, 0.0, 0.0]))
     assert adjust_to_scan(world.feature_map, structure, registered, away).reason == "NO_SCAN"
@@ -165,13 +165,10 @@ def test_a_scan_that_contradicts_the_photos_is_refused(
     world: ScannedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A scan twice as rugged as the ground, and a lens that may not change to make up for it."""
-    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    registered = {k: world.registered(k, correspondences=150) for k in (0, 4, 8)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     rugged = np.array([1.0, 1.0, 2.0])
-    high = [
-        replace(r, registration=replace(r.registration, points_local=r.registration.points_local * rugged))
-        for r in registered
-    ]
+    high = {k: replace(r, points_local=r.points_local * rugged) for k, r in registered.items()}
     monkeypatch.setattr(f"{_ADJUSTMENT}._REACH_M", 5.0)
     monkeypatch.setattr(f"{_ADJUSTMENT}._LENS", replace(_STIFF, tangential=0.003))
     scan = plain_cloud(world.cloud.xyz.astype(np.float64) * rugged)
@@ -184,7 +181,7 @@ def test_bending_the_photos_to_the_scan_is_refused(
     world: ScannedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Waves that are not there, and tracks that are hardly trusted: the map bends, and its photos tell."""
-    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    registered = {k: world.registered(k, correspondences=150) for k in (0, 4, 8)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     xyz = world.cloud.xyz.astype(np.float64)
     xyz[:, 2] += 0.4 * np.sin(xyz[:, 0] / 2.0) * np.sin(xyz[:, 1] / 2.0)
@@ -197,17 +194,10 @@ def test_an_adjustment_that_does_not_gain_is_refused(
     world: ScannedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Control that pulls the map off the scan: correspondences all 2 m too high."""
-    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    registered = {k: world.registered(k, correspondences=150) for k in (0, 4, 8)}
     structure = project_structure(world.feature_map, registered, world.cloud)
-    high = [
-        replace(
-            r,
-            registration=replace(
-                r.registration, points_local=r.registration.points_local + np.array([0.0, 0.0, 2.0])
-            ),
-        )
-        for r in registered
-    ]
+    up = np.array([0.0, 0.0, 2.0])
+    high = {k: replace(r, points_local=r.points_local + up) for k, r in registered.items()}
     monkeypatch.setattr(f"{_ADJUSTMENT}._REACH_M", 5.0)
     monkeypatch.setattr(f"{_ADJUSTMENT}._MIN_SURFACE_M", 5.0)
     monkeypatch.setattr(f"{_ADJUSTMENT}._MAX_CONTROL_REL", 1.0)
@@ -219,7 +209,7 @@ def test_a_lens_that_folds_is_refused(world: ScannedMap, monkeypatch: pytest.Mon
     folding = Camera(model="RADIAL", width=1200, height=900, params=(1000.0, 600.0, 450.0, -0.9, 0.0))
     assert folding.tan_of_fold < 0.75  # the corner is at 0.75
     bad = replace(world.feature_map, cameras=(folding,))
-    registered = [world.registered(4, correspondences=150)]
+    registered = {4: world.registered(4, correspondences=150)}
     structure = project_structure(world.feature_map, registered, world.cloud)
     monkeypatch.setattr(f"{_ADJUSTMENT}._LENS", _STIFF)
     monkeypatch.setattr(f"{_ADJUSTMENT}._ROUNDS", 1)

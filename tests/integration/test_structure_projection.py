@@ -13,7 +13,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from ingest.register.frame_registration import FrameRegistration
 from ingest.register.structure.adjustment import placed_map
-from ingest.register.structure.pairs import RegisteredImage, structure_pairs
+from ingest.register.structure.pairs import structure_pairs
 from ingest.register.structure.projection import project_structure
 from tests.support.scanned_map import FRAME, ScannedMap, plain_cloud, scanned_map
 
@@ -37,7 +37,7 @@ def _errors(placed: FeatureMap, world: ScannedMap) -> FloatArray:
 
 
 def test_one_exact_frame_puts_the_map_back(world: ScannedMap) -> None:
-    structure = project_structure(world.feature_map, [world.registered(4)], world.cloud)
+    structure = project_structure(world.feature_map, {4: world.registered(4)}, world.cloud)
     assert structure.accepted, structure.message
     placed = placed_map(world.feature_map, structure, world.cloud)
     assert _errors(world.feature_map, world).mean() > 8.0
@@ -48,7 +48,7 @@ def test_one_exact_frame_puts_the_map_back(world: ScannedMap) -> None:
 
 
 def test_the_placed_map_says_how_it_got_there(world: ScannedMap) -> None:
-    structure = project_structure(world.feature_map, [world.registered(4)], world.cloud)
+    structure = project_structure(world.feature_map, {4: world.registered(4)}, world.cloud)
     placed = placed_map(world.feature_map, structure, world.cloud)
     assert placed.placement.method == "lidar"
     assert placed.generation == 0
@@ -68,15 +68,15 @@ def test_three_frames_are_better_than_one(world: ScannedMap) -> None:
         rows = []
         for seed in range(5):
             rng = np.random.default_rng(seed)
-            registered = [
-                world.registered(
+            registered = {
+                k: world.registered(
                     k,
                     error=np.concatenate([rng.normal(0, 5e-4, 3), rng.normal(0, 0.03, 3)]),
                     sigma_deg=0.0286,
                     sigma_m=0.03,
                 )
                 for k in frames
-            ]
+            }
             structure = project_structure(world.feature_map, registered, world.cloud)
             rows.append(_errors(placed_map(world.feature_map, structure, world.cloud), world).mean())
         means.append(np.mean(rows))
@@ -90,7 +90,7 @@ def test_covariance_covers_what_frames_are_off_by(world: ScannedMap) -> None:
         rng = np.random.default_rng(seed)
         error = np.concatenate([rng.normal(0, 5e-4, 3), rng.normal(0, 0.03, 3)])
         frame = world.registered(4, error=error, sigma_deg=0.0286, sigma_m=0.03)
-        structure = project_structure(world.feature_map, [frame], world.cloud)
+        structure = project_structure(world.feature_map, {4: frame}, world.cloud)
         assert structure.new_from_old is not None
         assert structure.covariance is not None
         off = (world.back @ structure.new_from_old.inverse()).log()
@@ -105,7 +105,7 @@ def test_pairs_move_with_their_frame_as_the_jacobian_says(world: ScannedMap) -> 
     both = []
     for error in (-0.5 * step, 0.5 * step):
         frame = world.registered(4, error=error)
-        both.append(structure_pairs(world.feature_map, source, [frame], world.cloud))
+        both.append(structure_pairs(world.feature_map, source, {4: frame}, world.cloud))
     east = [pairs.source[:, 0] for pairs in both]  # no two points share it
     common, first, second = np.intersect1d(*east, return_indices=True)
     assert len(common) > 100
@@ -125,10 +125,10 @@ def test_the_cloud_s_frame_need_not_be_the_map_s(world: ScannedMap) -> None:
     moved = plain_cloud(there.act(world.cloud.xyz.astype(np.float64)))
     cloud = replace(moved, frame=other)
     frame = world.registered(4)
-    pose = frame.registration.cam_from_local
+    pose = frame.cam_from_local
     assert pose is not None
-    registration = replace(frame.registration, cam_from_local=pose @ there.inverse())
-    structure = project_structure(world.feature_map, [replace(frame, registration=registration)], cloud)
+    moved_frame = replace(frame, cam_from_local=pose @ there.inverse())
+    structure = project_structure(world.feature_map, {4: moved_frame}, cloud)
     placed = placed_map(world.feature_map, structure, cloud)
     assert _errors(placed, world).mean() < 0.05
     assert placed.frame == FRAME
@@ -139,12 +139,12 @@ def test_the_cloud_s_frame_need_not_be_the_map_s(world: ScannedMap) -> None:
 
 
 def test_no_frames_is_a_refusal(world: ScannedMap) -> None:
-    assert project_structure(world.feature_map, [], world.cloud).reason == "NO_FRAMES"
+    assert project_structure(world.feature_map, {}, world.cloud).reason == "NO_FRAMES"
 
 
 def test_too_few_points_on_the_scan_are_refused(world: ScannedMap) -> None:
     corner = world.cloud.xyz[(world.cloud.xyz[:, 0] > 12) & (world.cloud.xyz[:, 1] > 12)]
-    structure = project_structure(world.feature_map, [world.registered(4)], plain_cloud(corner))
+    structure = project_structure(world.feature_map, {4: world.registered(4)}, plain_cloud(corner))
     assert structure.reason == "TOO_FEW_PAIRS"
     assert structure.new_from_old is None
 
@@ -158,20 +158,20 @@ def test_pairs_on_a_strip_are_refused(world: ScannedMap, monkeypatch: pytest.Mon
         observations=replace(seen, **{name: getattr(seen, name)[kept] for name in seen.__dataclass_fields__}),
     )
     monkeypatch.setattr("ingest.register.structure.projection._MIN_PAIRS", 6)
-    structure = project_structure(strip, [world.registered(4)], world.cloud)
+    structure = project_structure(strip, {4: world.registered(4)}, world.cloud)
     assert structure.reason == "NO_SPREAD"
 
 
 def test_a_frame_elsewhere_is_refused(world: ScannedMap) -> None:
     """Registered 15 m away from where it is: the ground there has another shape."""
     error = np.array([0.0, 0.0, 0.0, 15.0, 9.0, 0.0])
-    structure = project_structure(world.feature_map, [world.registered(4, error=error)], world.cloud)
+    structure = project_structure(world.feature_map, {4: world.registered(4, error=error)}, world.cloud)
     assert structure.reason in ("RESIDUALS", "TOO_FEW_PAIRS")
 
 
 def test_a_map_of_another_size_is_refused() -> None:
     shrunk = scanned_map(placed_by=Sim3(scale=0.8, rotation=np.eye(3), translation=np.zeros(3)))
-    structure = project_structure(shrunk.feature_map, [shrunk.registered(4)], shrunk.cloud)
+    structure = project_structure(shrunk.feature_map, {4: shrunk.registered(4)}, shrunk.cloud)
     assert structure.reason == "SCALE"
     assert "22.3%" in structure.message  # log(1 / 0.8)
 
@@ -183,17 +183,16 @@ def test_a_bent_map_is_refused(world: ScannedMap) -> None:
         world.feature_map,
         points=replace(world.feature_map.points, utm=FRAME.utm_from_enu(points, world.feature_map.epsg)),
     )
-    structure = project_structure(bent, [world.registered(4)], world.cloud)
+    structure = project_structure(bent, {4: world.registered(4)}, world.cloud)
     assert structure.reason in ("RESIDUALS", "TOO_FEW_PAIRS")
 
 
 def test_an_image_that_the_map_does_not_have_is_an_error(world: ScannedMap) -> None:
-    stranger = replace(world.registered(4), image_id=77)
     with pytest.raises(InvalidValueError, match="77"):
-        project_structure(world.feature_map, [stranger], world.cloud)
+        project_structure(world.feature_map, {77: world.registered(4)}, world.cloud)
 
 
-def test_a_refused_registration_cannot_place() -> None:
+def test_a_refused_registration_cannot_place(world: ScannedMap) -> None:
     refused = FrameRegistration(
         cam_from_local=None,
         covariance=None,
@@ -203,12 +202,12 @@ def test_a_refused_registration_cannot_place() -> None:
         points_local=np.zeros((0, 3)),
         pixels=np.zeros((0, 2)),
     )
-    with pytest.raises(InvalidValueError, match="NOT_CONFIRMED"):
-        RegisteredImage(image_id=0, registration=refused)
+    with pytest.raises(InvalidValueError, match="accepted"):
+        project_structure(world.feature_map, {0: refused}, world.cloud)
 
 
 def test_the_projection_is_repeatable(world: ScannedMap) -> None:
-    frames = [world.registered(4), world.registered(0)]
+    frames = {k: world.registered(k) for k in (4, 0)}
     first, second = (project_structure(world.feature_map, frames, world.cloud) for _ in range(2))
     assert first.new_from_old is not None
     assert second.new_from_old is not None
@@ -217,7 +216,7 @@ def test_the_projection_is_repeatable(world: ScannedMap) -> None:
 
 def test_identity_is_not_an_answer(world: ScannedMap) -> None:
     """What comes out is the known move, and not merely something that fits."""
-    structure = project_structure(world.feature_map, [world.registered(4)], world.cloud)
+    structure = project_structure(world.feature_map, {4: world.registered(4)}, world.cloud)
     assert structure.new_from_old is not None
     off = (structure.new_from_old @ world.back.inverse()).log()
     assert np.abs(off[:4]).max() < 4e-3

@@ -18,7 +18,6 @@ from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, Ma
 from featuredb.render.cloud import CloudNodes, PointCloud
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.frame_registration import FrameRegistration
-from ingest.register.structure.pairs import RegisteredImage
 
 EPSG = 32632
 FRAME = LocalFrame(latitude_deg=48.1, longitude_deg=11.5, height_m=520.0)
@@ -51,7 +50,7 @@ class ScannedMap:
         correspondences: int = 0,
         lens: Camera = CAMERA,
         seed: int = 0,
-    ) -> RegisteredImage:
+    ) -> FrameRegistration:
         """The frame at its true pose, perturbed on the left by `error` (6,)."""
         pose = self.true_poses[image]
         rng = np.random.default_rng(seed)
@@ -60,18 +59,15 @@ class ScannedMap:
         inside = (pixels > 0).all(axis=1) & (pixels < (CAMERA.width, CAMERA.height)).all(axis=1)
         points, pixels = points[inside][:correspondences], pixels[inside][:correspondences]
         covariance = np.diag([np.radians(sigma_deg) ** 2] * 3 + [sigma_m**2] * 3)
-        return RegisteredImage(
-            image_id=image,
-            registration=FrameRegistration(
-                cam_from_local=pose if error is None else Rigid3.exp(error) @ pose,
-                covariance=covariance,
-                reason=None,
-                message="",
-                source="rgb",
-                camera=lens,
-                points_local=points,
-                pixels=pixels + rng.normal(0, 0.5, pixels.shape),
-            ),
+        return FrameRegistration(
+            cam_from_local=pose if error is None else Rigid3.exp(error) @ pose,
+            covariance=covariance,
+            reason=None,
+            message="",
+            source="rgb",
+            camera=lens,
+            points_local=points,
+            pixels=pixels + rng.normal(0, 0.5, pixels.shape),
         )
 
 

@@ -22,7 +22,7 @@ from ingest.register.anchor.frames import (
     TriedFrames,
     frames_that_agree,
 )
-from ingest.register.anchor.placing import PlaceRound, place_in_rounds, registered_image
+from ingest.register.anchor.placing import PlaceRound, place_in_rounds
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.block import block_of_map
 from ingest.register.structure.map_move import (
@@ -178,7 +178,7 @@ def _alone(
     refused: dict[str, str] = {}
     for frame in frames:
         image = frame.image
-        structure = project_structure(feature_map, [registered_image(frame)], cloud)
+        structure = project_structure(feature_map, {image.image_id: frame.registration}, cloud)
         if not structure.accepted or structure.new_from_old is None:
             refused[image.name] = f"{structure.reason}: {structure.message}"
             continue

@@ -12,7 +12,6 @@ from ingest.executor import Progress
 from ingest.register.anchor.frames import TriedFrame, register_again
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.structure.adjustment import adjust_to_scan, placed_map
-from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import project_structure
 
 _LOG = logging.getLogger(__name__)
@@ -63,7 +62,7 @@ def place_in_rounds(
     rounds: list[PlaceRound] = []
     for number in range(_LENS_ROUNDS):
         lens = (placed or feature_map).cameras
-        registered = [registered_image(frame) for frame in frames]
+        registered = {frame.image.image_id: frame.registration for frame in frames}
         start, cpu = time.perf_counter(), time.process_time()
         structure = project_structure(feature_map, registered, cloud)
         structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
@@ -114,8 +113,3 @@ def place_in_rounds(
             break
         frames = kept
     return placed, rounds, ""
-
-
-def registered_image(frame: TriedFrame) -> RegisteredImage:
-    """A frame that was accepted, for structure projection."""
-    return RegisteredImage(image_id=frame.image.image_id, registration=frame.registration)

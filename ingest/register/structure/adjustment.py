@@ -7,7 +7,6 @@ correspondences) and the scan's surface under all points of the map determine po
 """
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -25,7 +24,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.colmap.adjust import AdjustOptions, longest_side, residuals_of
 from ingest.colmap.precision import design_effect
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.pairs import RegisteredImage
+from ingest.register.structure.pairs import Registered
 from ingest.register.structure.projection import StructurePlacement
 from ingest.register.structure.surface_fit import Surface, nearest_planes, surface_near
 
@@ -74,9 +73,9 @@ class LidarAdjustment:
 
     reason: AdjustReason | None
     message: str
-    block: Block | None
-    poses: tuple[FloatArray, ...]
-    lenses: LensUncertainty | None
+    block: Block | None = None
+    poses: tuple[FloatArray, ...] = ()
+    lenses: LensUncertainty | None = None
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -87,7 +86,7 @@ class LidarAdjustment:
 def adjust_to_scan(
     feature_map: FeatureMap,
     structure: StructurePlacement,
-    registered: Sequence[RegisteredImage],
+    registered: Registered,
     cloud: PointCloud,
     begin: FeatureMap | None = None,
 ) -> LidarAdjustment:
@@ -104,11 +103,11 @@ def adjust_to_scan(
     control = _control_of(feature_map, registered)
     if len(control.xyz) < _MIN_CONTROL:
         words = f"{len(control.xyz)} correspondences with the scan, at least {_MIN_CONTROL} are needed"
-        return _refused("NO_CONTROL", words, {})
+        return LidarAdjustment(reason="NO_CONTROL", message=words)
     low, high = np.percentile(start.xyz, [1, 99], axis=0)
     surface = surface_near(cloud, np.clip(start.xyz, low, high), _MAX_SURFACE_POINTS)
     if surface is None:
-        return _refused("NO_SCAN", "the scan has no points under the map", {})
+        return LidarAdjustment(reason="NO_SCAN", message="the scan has no points under the map")
     first = start
     if begin is not None:
         first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
@@ -121,7 +120,7 @@ def adjust_to_scan(
     }
     reason, message = _gate(block, figures)
     if reason is not None:
-        return _refused(reason, message, figures)
+        return LidarAdjustment(reason=reason, message=message, figures=figures)
     poses, lenses = _left_open(block, control, surface, structure, start)
     return LidarAdjustment(
         reason=None,
@@ -179,14 +178,14 @@ def placed_map(
     )
 
 
-def _control_of(feature_map: FeatureMap, registered: Sequence[RegisteredImage]) -> Marks:
+def _control_of(feature_map: FeatureMap, registered: Registered) -> Marks:
     """Scan points that the registered frames see, by their correspondences."""
     row_of_image = {image.image_id: row for row, image in enumerate(feature_map.images)}
-    found = [item.registration for item in registered]
+    counts = [len(found.pixels) for found in registered.values()]
     return Marks(
-        xyz=np.concatenate([r.points_local for r in found]),
-        photo_of=np.repeat([row_of_image[i.image_id] for i in registered], [len(r.pixels) for r in found]),
-        xy=np.concatenate([r.pixels for r in found]),
+        xyz=np.concatenate([found.points_local for found in registered.values()]),
+        photo_of=np.repeat([row_of_image[image_id] for image_id in registered], counts),
+        xy=np.concatenate([found.pixels for found in registered.values()]),
     )
 
 
@@ -319,7 +318,3 @@ def _further(before: dict[str, Any], after: dict[str, Any]) -> bool:
         return False
     errors = [1.858 * s["surface_median_m"] / np.sqrt(s["surface_points"]) for s in (before, after)]
     return bool(after["surface_median_m"] - before["surface_median_m"] > 3.0 * np.hypot(*errors))
-
-
-def _refused(reason: AdjustReason, message: str, figures: dict[str, Any]) -> LidarAdjustment:
-    return LidarAdjustment(reason=reason, message=message, block=None, poses=(), lenses=None, figures=figures)

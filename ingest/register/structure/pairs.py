@@ -1,7 +1,7 @@
 """3D/3D pairs: points of a map, projected through a registered frame onto the scan."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import fields
 
 import numpy as np
 
@@ -28,29 +28,11 @@ _SCAN_SIGMA_M = 0.03  # of the scan's points across their surface, beyond what t
 _MAX_POINT_SIGMA_REL = 0.05  # map points less certain than this share of their distance are left out
 _CELLS = 6  # per side of the grid of neighbourhoods in a frame
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RegisteredImage:
-    """A frame of a map that was registered to the scan.
-
-    Attributes:
-        image_id: of the map's image.
-        registration: accepted, in the local frame of the cloud.
-    """
-
-    image_id: int
-    registration: FrameRegistration
-
-    def __post_init__(self) -> None:
-        if not self.registration.accepted:
-            raise InvalidValueError(
-                f"RegisteredImage {self.image_id}: expected an accepted registration, "
-                f"found {self.registration.reason}"
-            )
+Registered = Mapping[int, FrameRegistration]  # accepted, in the local frame of the cloud, by image id
 
 
 def structure_pairs(
-    feature_map: FeatureMap, source: FloatArray, registered: Sequence[RegisteredImage], cloud: PointCloud
+    feature_map: FeatureMap, source: FloatArray, registered: Registered, cloud: PointCloud
 ) -> Pairs:
     """Pairs of all frames.
 
@@ -58,16 +40,19 @@ def structure_pairs(
         source: (n, 3) the map's points in the cloud's local frame, at their present place.
 
     Raises:
-        InvalidValueError: a registered image that the map does not have.
+        InvalidValueError: a registration that was refused, or of an image that the map does not have.
     """
     images = {image.image_id: image for image in feature_map.images}
-    missing = [r.image_id for r in registered if r.image_id not in images]
-    if missing:
-        raise InvalidValueError(f"structure_pairs: the map {feature_map.map_id} has no images {missing}")
+    wrong = [i for i, found in registered.items() if i not in images or not found.accepted]
+    if wrong:
+        raise InvalidValueError(
+            f"structure_pairs: expected accepted registrations of images of map {feature_map.map_id}, found "
+            f"others of {wrong}"
+        )
     uncertainty = full_covariances(feature_map.points.covariance)
     parts = [
-        _pairs_of_frame(feature_map, source, uncertainty, images[r.image_id], r, row, cloud)
-        for row, r in enumerate(registered)
+        _pairs_of_frame(feature_map, source, uncertainty, images[image_id], registration, row, cloud)
+        for row, (image_id, registration) in enumerate(registered.items())
     ]
     return Pairs(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Pairs)})
 
@@ -77,11 +62,10 @@ def _pairs_of_frame(
     source: FloatArray,
     uncertainty: FloatArray,
     image: MapImage,
-    registered: RegisteredImage,
+    registration: FrameRegistration,
     row: int,
     cloud: PointCloud,
 ) -> Pairs:
-    registration = registered.registration
     pose, covariance, camera = registration.cam_from_local, registration.covariance, registration.camera
     assert pose is not None
     assert covariance is not None

@@ -6,7 +6,6 @@ pairs by their own covariance and knows that all pairs of a frame share its pose
 which slides over flat ground, comes the adjustment by the scan's surface (`adjustment.py`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -17,7 +16,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.structure.pairs import RegisteredImage, structure_pairs
+from ingest.register.structure.pairs import Registered, structure_pairs
 from ingest.register.structure.similarity import (
     Pairs,
     SimilarityFit,
@@ -69,7 +68,7 @@ class StructurePlacement:
 
 
 def project_structure(
-    feature_map: FeatureMap, registered: Sequence[RegisteredImage], cloud: PointCloud
+    feature_map: FeatureMap, registered: Registered, cloud: PointCloud
 ) -> StructurePlacement:
     """Place a map on a scan by frames of the map that were registered to it.
 
@@ -108,9 +107,9 @@ def project_structure(
     )
 
 
-def _distances(pairs: Pairs, registered: Sequence[RegisteredImage]) -> FloatArray:
+def _distances(pairs: Pairs, registered: Registered) -> FloatArray:
     """(n,) from the registered cameras, metres."""
-    centers = np.array([r.registration.cam_from_local.center for r in registered])  # type: ignore[union-attr]
+    centers = np.array([r.cam_from_local.center for r in registered.values()])  # type: ignore[union-attr]
     return np.asarray(np.linalg.norm(pairs.target - centers[pairs.frame_of], axis=1))
 
 
@@ -149,7 +148,7 @@ def _gate_of_pairs(
 
 
 def _figures_of_fit(
-    fit: SimilarityFit, pairs: Pairs, feature_map: FeatureMap, registered: Sequence[RegisteredImage]
+    fit: SimilarityFit, pairs: Pairs, feature_map: FeatureMap, registered: Registered
 ) -> dict[str, Any]:
     """What is written into the evidence."""
     residuals = np.linalg.norm(fit.residuals_m[fit.inliers], axis=1)
@@ -159,7 +158,7 @@ def _figures_of_fit(
     return {
         "inliers": int(fit.inliers.sum()),
         "inliers_by_frame": np.bincount(pairs.frame_of[fit.inliers], minlength=len(registered)).tolist(),
-        "frame_images": [r.image_id for r in registered],
+        "frame_images": list(registered),
         "residual_rms_m": float(np.sqrt((residuals**2).mean())),
         "residual_median_m": float(np.median(residuals)),
         "sigma_factor": fit.spread,
