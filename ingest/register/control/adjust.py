@@ -14,7 +14,6 @@ from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.marginals import Whitened
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import (
-    LensWidths,
     Orientations,
     PointPriors,
     Targets,
@@ -25,7 +24,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.similarity import refined_similarity
-from ingest.colmap.adjust import block_variance_px2
+from ingest.colmap.adjust import AdjustOptions, block_variance_px2
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import on_ground
@@ -38,11 +37,10 @@ _TOLERANCE = 1e-7  # of the cost, relative: a hundredth of what a tenth of a sig
 _FOLLOW = (10, 1e-4)  # steps and relative cost: single points settle in three or four
 # A block hangs on a few coordinates, a billionth of what holds its photos together.
 _RADIUS = 1e9
-# Around the lenses as the block has them.
-_LENS = LensWidths(focal_rel=0.02, aspect_rel=0.001, center_rel=0.01, radial=0.1, tangential=0.003)
-# So many observations of the size that residuals have with what neighbours share count as one: what lens
-# models leave over is common to whole photos.
-_DILUTION = 50.0
+# Around the lenses as the block has them, and so many observations count as one against them: as in the
+# adjustment of photos whose EXIF tells the focal length.
+_LENS = replace(AdjustOptions().lens, focal_rel=AdjustOptions().exif_focal_rel)
+_DILUTION = AdjustOptions().dilution
 _GROUND_SHARE = 0.01  # standard deviation of the ground's height under a single mark, over its distance
 # Of the block's own points that take part, long tracks first, with the weight of all; the others follow the
 # cameras afterwards.
@@ -100,7 +98,7 @@ class Task:
         block: those of its points that take part.
         control_xyz: (n, 3) where the control points lie in it.
         vertical: what is known of it in that frame.
-        keypoint_px: standard deviation of a keypoint's coordinate; weight_px: with which keypoints count.
+        weight_px: standard deviation of a keypoint's coordinate with which keypoints count.
         keep_lens: keep all lenses.
     """
 
@@ -109,7 +107,6 @@ class Task:
     control: Control
     control_xyz: FloatArray
     vertical: Vertical | None
-    keypoint_px: float
     weight_px: float
     keep_lens: bool
 
@@ -127,7 +124,6 @@ def task_of(
         control=control,
         control_xyz=control_xyz,
         vertical=vertical,
-        keypoint_px=float(np.sqrt(variance_px2)),
         weight_px=float(np.sqrt(variance_px2 * max(1.0, _DILUTION * share))),
         keep_lens=keep_lens,
     )
@@ -187,13 +183,11 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
 
 def with_all_points(adjusted: Adjusted, task: Task) -> Block:
     """All of the block: points that took no part follow the cameras."""
-    placed = task.placed
     start = replace(
-        adjusted.block,
-        xyz=adjusted.change.act(placed.xyz),
-        point_of=placed.point_of,
-        photo_of=placed.photo_of,
-        xy=placed.xy,
+        task.placed,
+        cameras=adjusted.block.cameras,
+        cam_from_block=adjusted.block.cam_from_block,
+        xyz=adjusted.change.act(task.placed.xyz),
     )
     held = Terms(
         keypoint_px=task.weight_px,

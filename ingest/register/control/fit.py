@@ -21,7 +21,7 @@ from featuredb.geometry.rotation import rotation_to_up
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.similarity import refined_similarity, similarity_closed_form
 from ingest.register.control.marks import Control
-from ingest.register.control.rays import intersect, mark_errors, on_ground
+from ingest.register.control.rays import intersect, on_ground, shown
 
 _MOST_PAIRS = 45  # of one point's marks: all of ten
 _SIGMA_OF_MEDIAN = {
@@ -137,8 +137,8 @@ def _consensus(
     xyz = intersect(block, control.photo_of[chosen], control.xy[chosen], _MIN_RAY_ANGLE_DEG)
     if xyz is None:
         return None
-    errors = mark_errors(block, control.photo_of[rows], control.xy[rows], xyz)
-    agreeing = rows[errors <= _MAX_MARK_ERROR_PX]
+    errors = np.linalg.norm(shown(block, control.photo_of[rows], xyz) - control.xy[rows], axis=1)
+    agreeing = rows[errors <= _MAX_MARK_ERROR_PX]  # not behind a camera, where it is NaN
     if not set(pair) <= set(agreeing.tolist()):
         return None
     of_all = intersect(block, control.photo_of[agreeing], control.xy[agreeing], _MIN_RAY_ANGLE_DEG)

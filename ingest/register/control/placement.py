@@ -300,7 +300,6 @@ def _figures(
         "control_sigma_m": weights.control_m.tolist(),
         "control_sigma_from": "options" if options.sigma_m is not None else "residuals",
         "mark_sigma_px": weights.mark_px,
-        "keypoint_sigma_px": task.keypoint_px,
         "fit_sigma_m": fit.sigma_m,
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
         "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),

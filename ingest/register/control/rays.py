@@ -46,11 +46,6 @@ def shown(block: Block, photos: NDArray[np.int64], xyz: FloatArray) -> FloatArra
     ).reshape(-1, 2)
 
 
-def mark_errors(block: Block, photos: NDArray[np.int64], xy: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Pixels (m,) from marks (m, 2) to where their photos show a place (3,); infinity behind a camera."""
-    return np.asarray(np.nan_to_num(np.linalg.norm(shown(block, photos, xyz) - xy, axis=1), nan=np.inf))
-
-
 def mark_residuals(block: Block, control: Control, xyz: FloatArray) -> FloatArray:
     """(m, 2) marks minus where the block shows their points (n, 3); NaN where it does not."""
     return control.xy - shown(block, control.photo_of, xyz[control.point_of])
