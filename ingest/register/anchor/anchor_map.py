@@ -6,7 +6,7 @@ is a new map, or a reason. Gates ask of the map as a whole whether it lies on th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -246,7 +246,7 @@ def _judged(
     checks: dict[str, Any] = {
         "before": before.as_figures(),
         "after": after.as_figures(),
-        "move": move.as_figures(),
+        "move": asdict(move),
         "viewing_distance_m": distance,
         "frames_apart_m": [
             {"frames": list(pair), "apart_m": metres, "allowed_m": allowed[pair]}

@@ -20,7 +20,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.register.control.adjust import (
     Adjusted,
-    Task,
+    Weights,
     task_of,
     with_all_points,
 )
@@ -32,7 +32,7 @@ from ingest.register.control.fit import (
 )
 from ingest.register.control.marks import Control
 from ingest.register.control.residuals import MarkResidual, PointResidual, gps_offset, residuals_of
-from ingest.register.control.snooping import Outcome, improve, initial_weights
+from ingest.register.control.snooping import improve, initial_weights
 
 GcpReason = Literal[
     "TOO_FEW",
@@ -245,10 +245,9 @@ def _adjusted_placement(
     local_vertical, free_height_m = _in_place(vertical, fit.local_from_block, control)
     weights, xyz = initial_weights(control, fit, options.sigma_m)
     task = task_of(placed, control, xyz, local_vertical, options.keep_lens)
-    outcome = improve(task, weights, options.sigma_m is not None)
-    adjusted = outcome.adjusted
+    adjusted, freedom, rounds = improve(task, weights, options.sigma_m is not None)
     points, marks = residuals_of(adjusted, control)
-    covariance = _covariance(adjusted, free_height_m, outcome.freedom)
+    covariance = _covariance(adjusted, free_height_m, freedom)
     return GcpPlacement(
         reason=None,
         message="placed by control points",
@@ -257,7 +256,15 @@ def _adjusted_placement(
         block=with_all_points(adjusted, task),
         points=points,
         marks=marks,
-        figures=_figures(fit, outcome, covariance, task, options),
+        figures={
+            "rounds": rounds,
+            "degrees_of_freedom": freedom,
+            "control_sigma_from": "options" if options.sigma_m is not None else "residuals",
+            "fit_sigma_m": fit.sigma_m,
+            "heights": "surveyed" if vertical is None else "unknown or too few",
+            **_figures(adjusted.weights, covariance),
+            **({} if vertical is None else {"vertical": {"source": vertical.source}}),
+        },
     )
 
 
@@ -284,30 +291,15 @@ def _covariance(adjusted: Adjusted, free_height_m: float, freedom: float) -> Flo
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _figures(
-    fit: ControlFit,
-    outcome: Outcome,
-    covariance: FloatArray,
-    task: Task,
-    options: GcpOptions,
-) -> dict[str, Any]:
-    weights = outcome.adjusted.weights
-    figures: dict[str, Any] = {
+def _figures(weights: Weights, covariance: FloatArray) -> dict[str, Any]:
+    return {
         "points_used": int(weights.points.sum()),
         "marks_used": int(weights.marks.sum()),
-        "rounds": outcome.rounds,
-        "degrees_of_freedom": outcome.freedom,
         "control_sigma_m": weights.control_m.tolist(),
-        "control_sigma_from": "options" if options.sigma_m is not None else "residuals",
         "mark_sigma_px": weights.mark_px,
-        "fit_sigma_m": fit.sigma_m,
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
         "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),
-        "heights": "surveyed" if task.vertical is None else "unknown or too few",
     }
-    if task.vertical is not None:
-        figures["vertical"] = {"source": task.vertical.source}
-    return figures
 
 
 def _gate(

@@ -6,7 +6,7 @@ covariance of all residuals, and one is left out at a time.
 """
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,20 +36,6 @@ _MIN_CONTROL_SIGMA_M = 0.005
 _MAX_ROUNDS = 12  # of adjusting and testing
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Outcome:
-    """The last adjustment.
-
-    Attributes:
-        freedom: degrees of freedom of the surveyed coordinates.
-        rounds: adjustments done.
-    """
-
-    adjusted: Adjusted
-    freedom: float
-    rounds: int
-
-
 def initial_weights(
     control: Control, fit: ControlFit, sigma_m: tuple[float, float] | None
 ) -> tuple[Weights, FloatArray]:
@@ -72,8 +58,12 @@ def initial_weights(
     return weights, xyz
 
 
-def improve(task: Task, weights: Weights, sigma_is_given: bool) -> Outcome:
-    """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none."""
+def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjusted, float, int]:
+    """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none.
+
+    Returns:
+        The last adjustment, degrees of freedom of the surveyed coordinates, and the number of adjustments.
+    """
     control, rounds, adjusted = task.control, 0, None
     while True:
         adjusted = adjust(task, weights, adjusted)
@@ -87,7 +77,7 @@ def improve(task: Task, weights: Weights, sigma_is_given: bool) -> Outcome:
         settled = np.allclose(tested.control_m, weights.control_m, rtol=_SETTLED)
         unchanged = (tested.marks == weights.marks).all() and (tested.points == weights.points).all()
         if (settled and unchanged) or rounds >= _MAX_ROUNDS:
-            return Outcome(adjusted=adjusted, freedom=freedom, rounds=rounds)
+            return adjusted, freedom, rounds
         weights = tested
         _LOG.info("round %d: control sigma %s m", rounds, weights.control_m)
 

@@ -135,9 +135,6 @@ def _intersect(
     valid = np.zeros(total, dtype=bool)
     points, normals = np.full((total, 3), np.nan), np.full((total, 3), np.nan)
     sigma, depths = np.full(total, np.nan), np.full(total, np.nan)
-    hits = SurfaceHits(valid=valid, points=points, normals=normals, sigma_ray_m=sigma, depths=depths)
-    if len(rows) == 0:
-        return hits
     pose = rendering.cam_from_local
     mean, count, values, vectors = _principal_axes(cloud, index, weight)
     normal = vectors[:, :, 0]
@@ -162,7 +159,7 @@ def _intersect(
     normals[rows] = -normal[ok] * np.sign(facing[ok])[:, None]
     sigma[rows] = rough[ok] / cosine[ok]
     depths[rows] = depth
-    return hits
+    return SurfaceHits(valid=valid, points=points, normals=normals, sigma_ray_m=sigma, depths=depths)
 
 
 def _principal_axes(

@@ -1,6 +1,6 @@
 """How a map moves when it is placed anew, and how it lies on a scan."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -36,10 +36,6 @@ class MapMove:
     heading_sigmas: float
     tilt_sigmas: float
     scale_sigmas: float
-
-    def as_figures(self) -> dict[str, float]:
-        """JSON-able."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
