@@ -1,4 +1,4 @@
-"""Similarity between paired points: vectorised RANSAC, robust refinement on SIM(3), honest covariance.
+"""Similarity between paired points: RANSAC, robust refinement on SIM(3), honest covariance.
 
 Equation: scan_i = S map_i + e_i + J_i xi_f. The e_i belong to the pair (pixel, roughness of the surface, the
 map point's own error); xi_f is the pose error of the frame that made the pair and is shared by all its pairs.
