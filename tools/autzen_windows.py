@@ -50,7 +50,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store.database import Database
 from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
-from ingest.register.frame.verdict import MIN_CONFIRMATION_LOG_NFA
+from ingest.register.frame.verdict import SURE_CONFIRMATION_LOG_NFA
 from ingest.register.frame_registration import FramePrior
 from tools.figures import study_parser, write_figures
 from tools.ortho_place import WINDOW_PX, Floats, OrthoOverScan, has_structure, measured_offset, place_of
@@ -241,7 +241,7 @@ def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
         )
         if len(some):
             axes.plot(some[:, 0], some[:, 1], marker, color=colour, ms=5, label=kind)
-    for limit in (MIN_CONFIRMATION_LOG_NFA, MIN_LOG_NFA):
+    for limit in (SURE_CONFIRMATION_LOG_NFA, MIN_LOG_NFA):
         axes.axhline(limit, color="#1b2733", lw=0.8, ls="--")
     axes.set(xscale="log", xlabel="error on the ground, m", ylabel="evidence, -log10(NFA)", ylim=(0, None))
     axes.legend(fontsize=8)
