@@ -147,7 +147,7 @@ def anchor(
     notes += _about_photos(job, tried)
     result: AnchorResult | None = None
     if request.auto or request.confirm:
-        supervised = bool(request.confirm or request.start)
+        supervised = bool(request.confirm or request.start.pose or request.start.picks)
         result = place_map(
             job.feature_map, job.cloud, tried, job.gray, job.options,
             confirmed=bool(request.confirm), supervised=supervised, progress=progress,
@@ -330,8 +330,10 @@ def _confirmed(job: _Job) -> TriedFrames:
 
 
 def _state(job: _Job) -> tuple[str, str, str]:
-    """What proposals belong to: a map, its state, a scan."""
-    return job.summary.map_id, job.summary.write_id, " ".join(job.scan_ids)
+    """What proposals belong to: a map, its state, a scan, and the frame of their poses."""
+    frame = job.cloud.frame
+    place = f"{frame.latitude_deg!r},{frame.longitude_deg!r},{frame.height_m!r}"
+    return job.summary.map_id, job.summary.write_id, f"{' '.join(job.scan_ids)} from {place}"
 
 
 def _about_photos(job: _Job, tried: TriedFrames) -> list[str]:

@@ -17,7 +17,7 @@ from ingest.positions.position_noise import Held
 
 # What gives a map without a place its place; for people.
 WAYS_TO_A_PLACE = (
-    "a scan: featuredb lidar add DB SCAN, then featuredb anchor DB MAP --photos FOLDER --near LAT,LON, or "
+    "a scan: featuredb lidar add DB SCAN, then featuredb anchor DB MAP --photos FOLDER --near=LAT,LON, or "
     "--page to point at it by hand",
     "ground control points, three or more, each marked in two photos: featuredb register DB MAP --gcp FILE",
     "maps with a place that show the same: featuredb grow DB",

@@ -117,8 +117,10 @@ class Problem:
         summary = pyceres.SolverSummary()
         told = pyceres.logging.minloglevel
         pyceres.logging.minloglevel = pyceres.logging.Level.ERROR.value  # steps taken back are no news
-        pyceres.solve(options, self._ceres, summary)
-        pyceres.logging.minloglevel = told
+        try:
+            pyceres.solve(options, self._ceres, summary)
+        finally:
+            pyceres.logging.minloglevel = told
         if not summary.IsSolutionUsable():
             _LOG.warning("the adjustment failed, everything stays as it was: %s", summary.BriefReport())
         return summary

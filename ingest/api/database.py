@@ -160,7 +160,7 @@ class FeatureDatabase:
                 pose=_path(pose),
                 picks=_path(picks),
                 image=image,
-                near=None if near is None else Circle(*near),
+                near=None if near is None else Circle.parse(",".join(map(str, near))),
             ),
         )
         with progress_bars(quiet) as progress:

@@ -56,7 +56,8 @@ def register(subparsers: Any) -> None:
     helping.add_argument(
         "--near",
         metavar="LAT,LON[,RADIUS_M]",
-        help="look for a map without a place there, its heading and size unknown; default radius: 250 m",
+        help="look for a map without a place there, its heading and size unknown; with an equals "
+        "sign where the latitude is negative: --near=-33.86,151.21; default radius: 250 m",
     )
     helping.add_argument("--image", metavar="NAME", help="photo of --pose or --picks")
     page = anchor.add_argument_group("picking in a page")
@@ -111,8 +112,6 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
     from ingest.anchoring import AnchorRequest
     from ingest.register.anchor.start.first_place import Circle, StartFiles
 
-    if args.near and (args.pose or args.picks):
-        raise InvalidValueError("expected --near, or --pose and --picks, found both")
     if args.page and (args.auto or args.confirm or args.pose or args.picks or args.near):
         raise InvalidValueError("--page asks a person for everything; expected it alone")
     if args.auto and args.confirm:

@@ -87,6 +87,18 @@ def test_what_is_no_circle_is_told(near: str, capsys: pytest.CaptureFixture[str]
     assert "expected LAT,LON or LAT,LON,RADIUS_M" in capsys.readouterr().err
 
 
+def test_poses_proposed_from_another_point_are_not_confirmed(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They are in the frame of the point that was named."""
+    *proposing, near = [word for word in words(made, tmp_path, texture=1) if word != "--auto"]
+    assert main([*proposing, near]) == 0
+    name = hill_photos()[4].name
+    lat, lon, radius = near.removeprefix("--near=").split(",")
+    assert main([*proposing, f"--near={float(lat) + 1e-4:.6f},{lon},{radius}", "--confirm", name]) == 2
+    assert "by the very words that were printed" in capsys.readouterr().err
+
+
 def test_a_map_that_has_a_place_is_not_looked_for(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

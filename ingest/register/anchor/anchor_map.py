@@ -218,7 +218,7 @@ def _too_little(
         )
         return AnchorResult(
             reason="FRAMES_DISAGREE",
-            message=f"the frames send the map to different places ({apart}); look at their overlays and "
+            message=f"the frames send the map to different places ({apart}); look at them in anchor.html and "
             "confirm the right one (--confirm)",
             feature_map=None,
         )
@@ -227,7 +227,7 @@ def _too_little(
         return AnchorResult(
             reason="TOO_FEW_FRAMES",
             message=f"{len(agreement.agreeing)} frame places the map, {names[agreement.agreeing[0]]}{others}"
-            f"; {needed} that agree are needed without a person; look at its overlay and confirm it "
+            f"; {needed} that agree are needed without a person; look at it in anchor.html and confirm it "
             "(--confirm), or accept one frame (--frames 1)",
             feature_map=None,
         )

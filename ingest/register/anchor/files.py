@@ -22,7 +22,7 @@ _VERSION = 2
 
 
 State = tuple[str, str, str]
-"""Ids of a map, of its state (another one has other poses), and of the scan."""
+"""Ids of a map, of its state (another one has other poses), and of the scan with where its frame begins."""
 
 
 def save_proposals(folder: Path, state: State, registrations: Mapping[int, FrameRegistration]) -> None:
@@ -57,7 +57,8 @@ def load_proposals(folder: Path, state: State) -> Mapping[int, FrameRegistration
     if found != state:
         raise RegistrationError(
             f"{path}: proposed for map {found[0]}, state {found[1]}, scan {found[2]}; the map is now in "
-            f"state {state[1]} with scan {state[2]}; run the command without --confirm again"
+            f"state {state[1]} with scan {state[2]}; run the command without --confirm again, or confirm by "
+            "the very words that were printed"
         )
     return frames
 

@@ -66,7 +66,7 @@ class Circle:
             raise InvalidValueError(f"--near: expected {_CIRCLE}, found {text!r}") from error
 
     def __str__(self) -> str:
-        return f"{self.lat:.7f},{self.lon:.7f},{self.radius_m:g}"
+        return f"{self.lat!r},{self.lon!r},{self.radius_m!r}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,12 +75,19 @@ class StartFiles:
 
     Attributes:
         near: instead of files: where the map is looked for.
+
+    Raises:
+        InvalidValueError: near, and files besides.
     """
 
     pose: Path | None = None
     picks: Path | None = None
     image: str | None = None
     near: Circle | None = None
+
+    def __post_init__(self) -> None:
+        if self.near is not None and (self.pose or self.picks):
+            raise InvalidValueError("expected near, or pose and picks, found both")
 
     def __bool__(self) -> bool:
         """Whether a person says where the map is."""
@@ -177,7 +184,7 @@ def first_place(
     if not files:
         raise RegistrationError(
             f"map {unplaced.map_id} has no place ({unplaced.no_place.reason}); say where it is: "
-            "--near LAT,LON (looks for it within 250 m), --page (click the same spots in photo and scan), "
+            "--near=LAT,LON (looks for it within 250 m), --page (click the same spots in photo and scan), "
             "--picks FILE or --pose FILE"
         )
     scans = chosen_scans(database, scan_ids)
@@ -214,6 +221,11 @@ def _found_near(
             f"no scan of {database.url} lies within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}; "
             "`featuredb lidar list` tells where scans lie"
         )
+    if cloud.rgb is None and cloud.intensity is None:
+        raise RegistrationError(
+            f"scan {', '.join(scan_ids)} has neither colours nor intensities, and nothing is looked for by "
+            "heights alone; say where one photo is: --page, --picks FILE, --pose FILE"
+        )
     found = found_from_above(unplaced, cloud)
     if found is None or not found.sure:
         said = (
@@ -221,7 +233,7 @@ def _found_near(
         )
         raise RegistrationError(
             f"map {unplaced.map_id} is not found within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}: "
-            f"{said}. A smaller radius shows the scan finer (--near LAT,LON,RADIUS_M), colours show more "
+            f"{said}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show more "
             "than intensities; or say where one photo is: --page, --picks FILE, --pose FILE"
         )
     placement = Placement(

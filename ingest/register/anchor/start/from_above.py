@@ -90,6 +90,8 @@ def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundFromAbove
 
 def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> FoundFromAbove | None:
     wide_m = _wide_m(cloud)
+    if wide_m <= 0.0:  # a single point
+        return None
     pools = [pool_features(view, source, upright=False) for view in _views(cloud, wide_m)]
     if not pools:
         return None
