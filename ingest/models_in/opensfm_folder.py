@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +26,13 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
 from ingest.models_in.opensfm_parts import (
+    UNKNOWN_DOP,
     OpensfmReconstruction,
     OpensfmReference,
     OpensfmShot,
     OpensfmTracks,
     camera_from_opensfm,
+    checked,
     read_json,
     read_tracks,
 )
@@ -64,7 +67,8 @@ def read_opensfm(place: Path, chosen: int | None = None) -> ModelSource:
             a lens that maps do not have.
     """
     path = next(place / name for name in _RECONSTRUCTIONS if (place / name).is_file())
-    found = _chosen(read_json(path, TypeAdapter(list[OpensfmReconstruction])), chosen, path)
+    listed = read_json(path, TypeAdapter(list[dict[str, Any]]))
+    found = checked(_chosen(listed, chosen, path), TypeAdapter(OpensfmReconstruction), path)
     shots, points = list(found.shots.items()), list(found.points.values())
     unknown = sorted({shot.camera for _, shot in shots} - found.cameras.keys())
     if unknown:
@@ -122,13 +126,14 @@ class _Parts:
     tracks: OpensfmTracks
 
 
-def _chosen(found: Sequence[OpensfmReconstruction], chosen: int | None, path: Path) -> OpensfmReconstruction:
+def _chosen(found: Sequence[dict[str, Any]], chosen: int | None, path: Path) -> dict[str, Any]:
     if not found:
         raise IngestError(f"{path}: expected a list of reconstructions, found none; is this OpenSfM's file?")
     if chosen is None and len(found) > 1:
+        shots = [len(one.get("shots", ())) for one in found]
         raise IngestError(
-            f"{path}: expected one reconstruction, found {len(found)} of {[len(r.shots) for r in found]} "
-            f"shots; choose one by --reconstruction 0 to {len(found) - 1}"
+            f"{path}: expected one reconstruction, found {len(found)} of {shots} shots; choose one by "
+            f"--reconstruction 0 to {len(found) - 1}"
         )
     if chosen is not None and not 0 <= chosen < len(found):
         raise IngestError(
@@ -279,10 +284,11 @@ def _gps(shot: OpensfmShot, reference: LocalFrame | None, where: str) -> GeoPrio
     """What the shot's photo said of its position, on Earth."""
     if reference is None or shot.gps_position is None:
         return None
-    if isinstance(shot.gps_dop, tuple):
-        horizontal, vertical = max(shot.gps_dop[:2]), shot.gps_dop[2]
+    dop = UNKNOWN_DOP if shot.gps_dop is None else shot.gps_dop
+    if isinstance(dop, tuple):
+        horizontal, vertical = max(dop[:2]), dop[2]
     else:
-        horizontal = shot.gps_dop
+        horizontal = dop
         vertical = horizontal * DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
     try:
         latitude, longitude, height = (float(v) for v in reference.geodetic_from_enu(shot.gps_position))

@@ -4,6 +4,7 @@ Reference: OpenSfM, doc/source/geometry.rst. Lengths are over the longer side of
 point counts from its middle; `featuredb.export.formats.opensfm_camera` is the way back.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Vector = tuple[_Number, _Number, _Number]
 _Kind = TypeVar("_Kind")
 
-_UNKNOWN_DOP = 15.0  # what OpenSfM writes where a photo does not say
+UNKNOWN_DOP = 15.0  # what OpenSfM writes where a photo does not say
 
 
 class OpensfmReference(BaseModel):
@@ -44,7 +45,7 @@ class OpensfmShot(BaseModel):
     rotation: _Vector
     translation: _Vector
     gps_position: _Vector | None = None
-    gps_dop: _Number | _Vector = _UNKNOWN_DOP
+    gps_dop: _Number | _Vector | None = None
 
 
 class OpensfmPoint(BaseModel):
@@ -73,6 +74,18 @@ def read_json(path: Path, kind: TypeAdapter[_Kind]) -> _Kind:
         return kind.validate_json(path.read_bytes())
     except OSError as error:
         raise IngestError(f"{path}: expected OpenSfM's JSON, cannot be read: {error}") from error
+    except ValidationError as error:
+        raise IngestError(f"{path}: {_wrong(error)}") from error
+
+
+def checked(found: object, kind: TypeAdapter[_Kind], path: Path) -> _Kind:
+    """A part of a file's document.
+
+    Raises:
+        IngestError: it is something else.
+    """
+    try:
+        return kind.validate_json(json.dumps(found))
     except ValidationError as error:
         raise IngestError(f"{path}: {_wrong(error)}") from error
 

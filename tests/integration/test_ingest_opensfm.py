@@ -203,3 +203,13 @@ def test_one_of_several_is_chosen(tmp_path: Path) -> None:
     assert read_opensfm(tmp_path, 1).stored.model.xyz[0, 2] == 10.001
     with pytest.raises(IngestError, match="expected one of the 2"):
         read_opensfm(tmp_path, 2)
+
+
+def test_one_that_is_not_chosen_may_be_broken(tmp_path: Path) -> None:
+    broken = TINY | {"points": {}}
+    (write_tiny(tmp_path) / "reconstruction.json").write_text(json.dumps([TINY, broken]))
+    assert len(read_opensfm(tmp_path, 0).stored.model.xyz) == len(TINY["points"])
+    with pytest.raises(IngestError, match=r"found 2 of \[3, 3\] shots"):
+        read_opensfm(tmp_path)
+    with pytest.raises(IngestError, match="points"):
+        read_opensfm(tmp_path, 1)

@@ -62,6 +62,9 @@ def events(text: str) -> list[dict[str, Any]]:
         ("contributed refused:BLUR", "m1", "refused"),
         ("contributed refused:BLUR contributed:Bob", "", "refused"),
         ("contributed refused:BLUR used:m1", "", "waiting"),
+        ("contributed refused:BLUR reopened", "", "waiting"),  # as earlier versions wrote
+        ("contributed refused:BLUR reopened used:m1", "m1", "used"),
+        ("contributed used:m1 reopened", "m1", "waiting"),
         ("contributed used:m1 refused:ALTERED", "m1", "refused"),
         ("contributed withdrawn:OWNER", "", "withdrawn"),
         ("contributed withdrawn:OWNER used:m1", "m1", "withdrawn"),  # a map that was under way

@@ -22,7 +22,8 @@ CANDIDATE_STATES: tuple[CandidateState, ...] = get_args(CandidateState)
 
 CONTRIBUTED, USED, REFUSED, WITHDRAWN = "contributed", "used", "refused", "withdrawn"
 CONFIRMED = "confirmed"
-EVENTS = (CONTRIBUTED, USED, CONFIRMED, REFUSED, WITHDRAWN)
+REOPENED = "reopened"  # nothing writes it any more; what it opened waits
+EVENTS = (CONTRIBUTED, USED, CONFIRMED, REFUSED, REOPENED, WITHDRAWN)
 
 # Owners that no certificate names: whoever was not authenticated, all of them one; who keeps the database.
 ANONYMOUS = "anonymous"
@@ -175,14 +176,14 @@ def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidat
         if kind == USED:
             if latest is None or latest["event"] != WITHDRAWN:  # noted too late, the bytes are gone
                 used.append(event["map_id"])
-        elif kind in (REFUSED, WITHDRAWN) or (latest is not None and latest["event"] == WITHDRAWN):
+        elif kind in (REFUSED, REOPENED, WITHDRAWN) or (latest is not None and latest["event"] == WITHDRAWN):
             latest, used = event, []
     if used:
         living = tuple(m for m in dict.fromkeys(used) if m in live_maps)
         return (
             CandidateStanding(state="used", used_by=living) if living else CandidateStanding(state="waiting")
         )
-    if latest is None or latest["event"] == CONTRIBUTED:
+    if latest is None or latest["event"] in (REOPENED, CONTRIBUTED):
         return CandidateStanding(state="waiting")
     return CandidateStanding(
         state="refused" if latest["event"] == REFUSED else "withdrawn",

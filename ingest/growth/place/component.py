@@ -68,7 +68,8 @@ def grow_component(
         model: a connected reconstruction; its rows are rows of `photos`.
         localised: new photos that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
-        identity: of the map; None: it is named by its photos, so that the same ones give the same map.
+        identity: of the map; None: it is named by the photos that were tried, so that the same ones give the
+            same map.
         max_bound_m: photos that may be further off (95 %) are left out.
     """
     rows = tuple(int(r) for r in model.rows)
@@ -89,7 +90,8 @@ def grow_component(
     refined = refine_placed(model, placement, correspondences, mine, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
-    return _assembled(refined, photos, features_of, near, identity)
+    named = identity or _named([photos[r] for r in rows])
+    return _assembled(refined, photos, features_of, near, named)
 
 
 def _meeting_place(
@@ -110,7 +112,7 @@ def _assembled(
     photos: Sequence[Photo],
     features_of: FeaturesOf,
     areas: Sequence[Area],
-    identity: MapIdentity | None,
+    identity: MapIdentity,
 ) -> GrownMap | Refused:
     """The map of a refined model, with what growth knows of it as evidence."""
     model, placement = refined.model, refined.placement
@@ -129,7 +131,7 @@ def _assembled(
         placement.frame,
         [photos[r] for r in rows],
         [features_of(r) for r in rows],
-        identity or _named([photos[r] for r in rows]),
+        identity,
         replace(_MAPS, height_datum=parents[0][0].height_datum),
     )
     if feature_map is None:

@@ -270,6 +270,13 @@ def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) ->
     return run_canaries(database, before, after, maps)
 
 
+def _still_active(database: Database, active: Sequence[str]) -> None:
+    """Raises ConflictError where other maps are active than those that were asked."""
+    now = [m.write_id for m in database.snapshot().maps() if m.status == "active"]
+    if sorted(now) != sorted(active):
+        raise ConflictError("other maps are active since the known photos were asked; they are asked again")
+
+
 def _decide(
     database: Database, before: Localiser, ready: Sequence[ExaminedMap], run: CanaryRun
 ) -> list[Promotion]:
@@ -282,6 +289,7 @@ def _decide(
     for found in ready:
         mark_confirmed(database, found.earned, found.feature_map.map_id)
     try:
+        _still_active(database, active)  # before a map loses what nobody confirms
         based_on = {found.feature_map.map_id: _committed(database, found) for found in ready}
         database.set_status(list(asked), "active", reason, based_on=based_on, active=active)
     except ConflictError as error:
