@@ -17,7 +17,10 @@ from tools.proxy_process import proxied
 _CONNECTIONS = 120  # Zenoh's listener is behind for 12 s
 _CLIENT = "alice"
 
-pytestmark = pytest.mark.skipif(shutil.which("haproxy") is None, reason="haproxy is not installed")
+pytestmark = pytest.mark.skipif(
+    shutil.which("haproxy") is None or not Path("/etc/resolv.conf").exists(),
+    reason="haproxy is not installed, or there is no /etc/resolv.conf",
+)
 
 
 @pytest.fixture
