@@ -44,7 +44,7 @@ from reloc.wire.track import TrackPose
 from tools.figures import study_parser, write_figures
 from tools.serve_process import ServeProcess
 
-_WIDTH, _FRAMES, _RATE_HZ = 1280, 400, 10.0
+_WIDTH, _FRAMES, _RATE_HZ = 1280, 1200, 10.0
 _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
