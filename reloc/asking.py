@@ -2,7 +2,6 @@
 
 import base64
 import threading
-import uuid
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
@@ -13,10 +12,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from featuredb.errors import ImageError, InvalidValueError
-from featuredb.features.decode import DecodeLimits
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.answered_view import AnsweredView, geopose_of
 from reloc.localiser import Localiser
@@ -148,14 +145,7 @@ class PhotoAsker:
         photo, called = _image_bytes(image)
         request = _request(prior, camera, exif_prior, maps, inliers)
         localiser = self.localiser()
-        reply = answer_query(
-            photo,
-            request,
-            localiser,
-            limits=DecodeLimits(),
-            request_id=uuid.uuid4().hex,
-            clock=StageClock(),
-        )
+        reply = answer_query(request, photo, localiser)
         on_earth = reply.status == "localised"
         return PhotoAnswer(
             name=name or called,

@@ -148,7 +148,7 @@ class Follower:
         """The process, a new one where it has ended, over the area in service."""
         if self._process is None or not self._process.is_alive():
             self._close()
-            self._process = WorkerProcess(self._limits, self._answerer)
+            self._process = WorkerProcess(self._limits, self._answerer.answer)
             if self._stopped:  # while it was started
                 self._process.kill()
         self._process.open(self._files())
@@ -192,8 +192,4 @@ class Follower:
                 ErrorCode.TOO_LARGE,
                 f"payload: expected at most {self._max_bytes} bytes, found {arrival.size}; send smaller or "
                 "more compressed frames",
-            )
-        if not arrival.payload:
-            raise RequestError(
-                ErrorCode.BAD_IMAGE, "payload: expected the bytes of an image file, found none"
             )

@@ -6,18 +6,20 @@ import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
+from functools import partial
 
 from featuredb.stage_clock import StageClock
 from featuredb.store.candidates.states import ANONYMOUS, candidate_id_of
 from reloc.service.contributions.database_inbox import contribution_of
 from reloc.service.contributions.inbox import Inbox, InboxRefusal
+from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
-from reloc.service.workers.answering import Ask, QueryAnswerer, WorkerLimits
+from reloc.service.workers.answering import WorkerLimits
 from reloc.service.workers.area_files import AreaFiles, LocaliserFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
 from reloc.wire.query import (
@@ -52,7 +54,7 @@ class WorkerPool:
         self._options = options
         self._inbox = inbox
         self._limits = options.worker_limits
-        self._answerer = QueryAnswerer(decode=options.limits)
+        self._answerer = partial(answer_query, limits=options.limits)
         self._files = AreaFiles()
         # A photo is named while it is localised: the query does not wait for a hash of its megabytes.
         self._namer = ThreadPoolExecutor(1, thread_name_prefix="name-photo")
@@ -215,7 +217,8 @@ class WorkerPool:
             return
         name = self._namer.submit(candidate_id_of, data) if request.contribute else None
         process.open(self._published)
-        reply = process.ask(Ask(request=request, request_id=item.request_id), data, LocaliseReply)
+        asked = request.model_copy(update={"request_id": item.request_id})
+        reply = process.ask(asked, data, LocaliseReply)
         clock.lap("worker", reply.timings_ms)
         reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
         _check_deadline(item)
