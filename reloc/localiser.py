@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from featuredb.errors import (
     FeatureDbError,
-    IncompatibleExtractorError,
     MapNotFoundError,
     StoreError,
     UnplacedBesideOthersError,
@@ -207,15 +206,7 @@ class Localiser:
         if unplaced is not None:
             return self._in_own_frame(gray, request, unplaced)
         areas = self.areas_of(request.map_ids)
-        fingerprint = self.options.extractor.fingerprint
-        matching = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
-        if areas and not matching:
-            found = ", ".join(sorted({a.area.extractor_fingerprint for a in areas}))
-            raise IncompatibleExtractorError(
-                f"the maps were made by extractor {found}, queries here use {fingerprint}: descriptors "
-                "cannot be compared; start the server with the extractor options of the ingest"
-            )
-        return self._with_lineage(localise(gray, request, matching, self.options, self.snapshot))
+        return self._with_lineage(localise(gray, request, areas, self.options, self.snapshot))
 
     def _named_unplaced(self, map_ids: tuple[str, ...] | None) -> str | None:
         """The map without a place that the request names, if it does.

@@ -17,10 +17,11 @@ from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, list_scans
 from ingest.register.anchor.start.files import RoughPose, read_pose
 from ingest.track.scan_ground import ScanFinder, ScanGround
-from reloc.localise.result import LocaliseRequest
+from reloc.localise.candidates import usable_areas
+from reloc.localise.result import LocaliseRequest, OwnPose
 from reloc.localiser import Localiser
-from reloc.tracking.ground import Finder, Ground, Keyframe, Standing, StandingInMap, Unmatched
-from reloc.tracking.map_ground import MapFinder, usable_areas
+from reloc.tracking.ground import EarthPose, Finder, Ground, Keyframe, Unmatched
+from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
 
 FilmBy = Literal["map", "scan", "both"]
@@ -176,14 +177,12 @@ class MapOverScan:
             return replace(by_scan, ground=self)
         return _both(by_map, by_scan)
 
-    def standing(
-        self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray
-    ) -> Standing | StandingInMap:
-        """On that of which more landmarks are."""
+    def posed(self, rows: NDArray[np.int64], pose: Rigid3, measured: FloatArray) -> EarthPose | OwnPose:
+        """By that of which more landmarks are."""
         of_map = rows >= 0
         if 2 * int(of_map.sum()) >= len(rows):
-            return self.maps.standing(rows[of_map], center, measured)
-        return self.scan.standing(rows[~of_map], center, measured)
+            return self.maps.posed(rows[of_map], pose, measured)
+        return self.scan.posed(rows[~of_map], pose, measured)
 
     def visible(self, camera: Camera, pose: Rigid3) -> FloatArray:
         """Of both."""

@@ -9,7 +9,8 @@ from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from reloc.answered_view import geopose_of
 from reloc.reply import place_fields
-from reloc.tracking.trajectory.values import EarthPose, TrajectoryPoint
+from reloc.tracking.ground import EarthPose
+from reloc.tracking.trajectory.values import TrajectoryPoint
 from reloc.wire.query import Intrinsics
 from reloc.wire.track import TrackPose
 

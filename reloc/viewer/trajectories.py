@@ -6,7 +6,8 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rotation import matrix_from_quaternion
-from reloc.tracking.trajectory.values import EarthPose, Trajectory
+from reloc.tracking.ground import EarthPose
+from reloc.tracking.trajectory.values import Trajectory
 from reloc.viewer.places import Spot
 from reloc.viewer.poses import drawn_pose, worded_place, worded_sigmas
 

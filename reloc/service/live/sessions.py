@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from zenoh.handlers import Callback
 
 from featuredb.errors import IncompatibleExtractorError
+from reloc.localise.candidates import usable_areas
 from reloc.service.live.follower import Follower
 from reloc.service.live.frames import FrameAnswerer
 from reloc.service.live.latest import Arrival
@@ -23,7 +24,6 @@ from reloc.service.logs import fields
 from reloc.service.pending import session_of
 from reloc.service.source import ServedArea
 from reloc.service.tally import Tally
-from reloc.tracking.map_ground import usable_areas
 from reloc.wire.keys import NAME_PATTERN, Keys
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,

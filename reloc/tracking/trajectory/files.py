@@ -18,8 +18,9 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose_documents import irregular_series
+from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS
-from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPoint
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 
 _POSE = (
     *("easting", "northing", "height", "qx", "qy", "qz", "qw", "latitude", "longitude"),
