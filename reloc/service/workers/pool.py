@@ -11,7 +11,7 @@ from functools import partial
 from featuredb.stage_clock import StageClock
 from featuredb.store.candidates.states import ANONYMOUS, candidate_id_of
 from reloc.service.contributions.database_inbox import contribution_of
-from reloc.service.contributions.inbox import Inbox, InboxRefusal
+from reloc.service.contributions.inbox import Inbox
 from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
@@ -255,9 +255,8 @@ def _answer_and_keep(
     received_at = datetime.now(UTC)
     owner = item.identity or ANONYMOUS  # never what the request claims
     place = inbox.reserve(owner, len(data))
-    if isinstance(place, InboxRefusal):
-        said = ContributionReply(accepted=False, candidate_id=None, reason=place.reason, detail=place.detail)
-        item.answer(_with_contribution(reply, said, clock))
+    if isinstance(place, ContributionReply):
+        item.answer(_with_contribution(reply, place, clock))
         return
     answered = False
     try:
@@ -267,9 +266,9 @@ def _answer_and_keep(
         answered = item.answer(_with_contribution(reply, said, clock))
     finally:
         if not answered:
-            place.cancel()
+            inbox.cancel(place)
     if answered:
-        place.submit(lambda: contribution_of(data, request, reply, received_at, owner))
+        inbox.submit(place, lambda: contribution_of(data, request, reply, received_at, owner))
 
 
 def _with_contribution(reply: LocaliseReply, said: ContributionReply, clock: StageClock) -> LocaliseReply:
