@@ -108,8 +108,12 @@ class Follower:
             self._close()
             self._check_not_stopped(error)
             logger.exception("a frame failed", extra=fields("frame_failed"))
-            code, why = self._failure(error)
-            raise FrameError(code, why, header.sequence) from error
+            how = error if isinstance(error, WorkerEndedError) else "a defect"
+            raise FrameError(
+                ErrorCode.INTERNAL,
+                f"{how} on this frame; the server's log has it. The track begins anew",
+                header.sequence,
+            ) from error
         self._last_time_s = header.time_s
         clock.lap("worker", pose.timings_ms)
         return pose.model_copy(update={"timings_ms": clock.milliseconds()})
@@ -134,15 +138,6 @@ class Follower:
             raise
         finally:
             watch.cancel()
-
-    def _failure(self, error: WorkerEndedError | WorkerDefectError) -> tuple[ErrorCode, str]:
-        if isinstance(error, WorkerEndedError) and error.out_of_memory:
-            return ErrorCode.TOO_LARGE, (
-                f"the frame needs more than the {self._limits.memory_bytes >> 20} MiB of memory that it may; "
-                "send smaller ones"
-            )
-        how = error if isinstance(error, WorkerEndedError) else "a defect"
-        return ErrorCode.INTERNAL, f"{how} on this frame; the server's log has it. The track begins anew"
 
     def _ready(self) -> WorkerProcess:
         """The process, a new one where it has ended, over the area in service."""

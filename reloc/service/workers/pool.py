@@ -19,7 +19,6 @@ from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
-from reloc.service.workers.answering import WorkerLimits
 from reloc.service.workers.area_files import AreaFiles, LocaliserFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
 from reloc.wire.query import (
@@ -181,7 +180,13 @@ class WorkerPool:
         except WorkerEndedError as error:
             with self._changed:
                 self._up.discard(process)
-            item.refuse(_ended_error(error, self._limits, item))
+            item.refuse(
+                RequestError(
+                    ErrorCode.INTERNAL,
+                    f"{error} on this query, which concerns no other; the server's log has it under request "
+                    f"id {item.request_id}",
+                )
+            )
         except Exception as error:
             trace = {"trace": str(error)} if isinstance(error, WorkerDefectError) else {}
             told = fields("internal", request_id=item.request_id, **trace)
@@ -226,20 +231,6 @@ class WorkerPool:
             _answer_and_keep(item, data, request, reply, clock, self._inbox, name)
         else:
             item.answer(reply)
-
-
-def _ended_error(ended: WorkerEndedError, limits: WorkerLimits, item: PendingQuery) -> RequestError:
-    if ended.out_of_memory:
-        return RequestError(
-            ErrorCode.TOO_LARGE,
-            f"the query needs more than the {limits.memory_bytes >> 20} MiB of memory that it may; "
-            "send a smaller picture",
-        )
-    return RequestError(
-        ErrorCode.INTERNAL,
-        f"{ended} on this query, which concerns no other; the server's log has it under request id "
-        f"{item.request_id}",
-    )
 
 
 def _answer_and_keep(
