@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
@@ -42,12 +42,11 @@ class AnsweredView:
     map_ids: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        covariance = frozen_array("AnsweredView.covariance", self.covariance, (None, None))
-        if covariance.shape not in ((6, 6), (6 + len(self.camera.params),) * 2):
+        freeze(self, covariance=(None, None))
+        if self.covariance.shape not in ((6, 6), (6 + len(self.camera.params),) * 2):
             raise InvalidValueError(
-                f"AnsweredView.covariance: expected a pose's, or with its lens, found {covariance.shape}"
+                f"AnsweredView.covariance: expected a pose's, or with its lens, found {self.covariance.shape}"
             )
-        object.__setattr__(self, "covariance", covariance)
 
     @classmethod
     def of_reply(cls, reply: LocaliseReply) -> Self:

@@ -6,6 +6,7 @@ cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,19 +163,13 @@ def _decide(
     options: LocaliseOptions,
     snapshot: int,
 ) -> Localised:
+    evidence = found.candidates[0].evidence if found.candidates else None
+    answered = partial(
+        LocaliseResult, features=len(features), matches=found.matches, snapshot=snapshot, evidence=evidence
+    )
+
     def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None) -> Localised:
-        result = LocaliseResult(
-            reason=reason,
-            detail=detail,
-            pose=None,
-            confidence=0.0,
-            features=len(features),
-            matches=found.matches,
-            inliers=inliers,
-            runner_up=rival,
-            snapshot=snapshot,
-            evidence=found.candidates[0].evidence if found.candidates else None,
-        )
+        result = answered(reason=reason, detail=detail, inliers=inliers, runner_up=rival)
         return Localised(result=result)
 
     if found.reason is not None:
@@ -209,16 +204,12 @@ def _decide(
     against = contradicts_prior(answer, request.prior)
     if against is not None:
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
-    result = LocaliseResult(
+    result = answered(
         reason=None,
         detail=f"{best.evidence.inliers} inliers of {found.matches} matches",
         pose=answer,
         confidence=confidence(best.evidence, rival.inliers if rival else 0),
-        features=len(features),
-        matches=found.matches,
         inliers=best.evidence.inliers,
         runner_up=rival,
-        snapshot=snapshot,
-        evidence=best.evidence,
     )
     return Localised(result=result, best=best, uncertainty=uncertainty)

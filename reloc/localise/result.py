@@ -270,13 +270,13 @@ class LocaliseResult:
 
     reason: Reason | None
     detail: str
-    pose: LocalisedPose | None
-    confidence: float
     features: int
     matches: int
     inliers: int
-    runner_up: RunnerUp | None
     snapshot: int
+    pose: LocalisedPose | None = None
+    confidence: float = 0.0
+    runner_up: RunnerUp | None = None
     evidence: Evidence | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
     in_map: PoseInMap | None = None

@@ -205,7 +205,6 @@ class Tracker:
             ground=track.ground,
             inliers=len(track.landmarks),
             pixels=track.landmarks.pixels,
-            points=track.landmarks.points,
             rows=track.landmarks.rows,
         )
 
