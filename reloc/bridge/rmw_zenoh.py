@@ -38,16 +38,14 @@ class RmwZenohNode:
     Args:
         connect: Zenoh endpoint of ROS 2's router, tcp/HOST:7447.
         domain: ROS_DOMAIN_ID.
-        origin: of the frame `map`; None: where the first pose is.
 
     Raises:
         InvalidValueError: nobody is at the endpoint, or it is none; raised when the block begins.
     """
 
-    def __init__(self, connect: str, *, domain: int = 0, origin: LocalFrame | None = None) -> None:
+    def __init__(self, connect: str, *, domain: int = 0) -> None:
         self._connect = connect
         self._domain = domain
-        self._origin = origin
         self._sent = 0
 
     def __enter__(self) -> Self:
@@ -72,12 +70,10 @@ class RmwZenohNode:
     def __exit__(self, *failed: object) -> None:
         self._open.close()
 
-    def write(self, pose: RobotPose) -> None:
-        """Publish the three messages of a pose."""
-        if self._origin is None:
-            self._origin = pose.frame_here()
+    def write(self, pose: RobotPose, origin: LocalFrame) -> None:
+        """Publish the three messages of a pose, in the frame `map` at this origin."""
         self._sent += 1
-        for topic, data in messages(pose, self._origin).items():
+        for topic, data in messages(pose, origin).items():
             publisher, gid = self._publishers[topic]
             publisher.put(data, attachment=z_serialize((Int64(self._sent), Int64(time.time_ns()), gid)))
 
