@@ -15,9 +15,8 @@ from zenoh.handlers import Callback
 
 from featuredb.errors import IncompatibleExtractorError
 from reloc.localise.candidates import usable_areas
-from reloc.service.live.follower import Follower
+from reloc.service.live.follower import Arrival, Follower
 from reloc.service.live.frames import FrameAnswerer
-from reloc.service.live.latest import Arrival
 from reloc.service.live.options import LiveOptions
 from reloc.service.live.session import LiveSession
 from reloc.service.logs import fields

@@ -11,7 +11,6 @@ import pickle
 import tempfile
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import IO, Any
 
 from featuredb.errors import StoreError
@@ -35,11 +34,8 @@ class AreaFile:
         weakref.finalize(self, self.file.close)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LocaliserFiles:
-    """A localiser as files: those of its areas, then the one that refers to them."""
-
-    files: tuple[AreaFile, ...]
+# A localiser as files: those of its areas, then the one that refers to them.
+LocaliserFiles = tuple[AreaFile, ...]
 
 
 class AreaFiles:
@@ -73,7 +69,7 @@ class AreaFiles:
             return parts[-1].key
 
         whole = self._file(localiser, key_of)
-        return LocaliserFiles(files=(*parts, whole))
+        return (*parts, whole)
 
     def _file(self, value: object, key_of: Callable[[object], int] | None) -> AreaFile:
         made = AreaFile(next(self._keys))

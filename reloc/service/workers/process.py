@@ -118,8 +118,8 @@ class WorkerProcess:
         if files is self._open:
             return
         try:
-            self._connection.send(OpenFiles(keys=tuple(file.key for file in files.files)))
-            for file in files.files:
+            self._connection.send(OpenFiles(keys=tuple(file.key for file in files)))
+            for file in files:
                 send_handle(self._connection, file.file.fileno(), self._process.pid)
             self._connection.recv_bytes()
         except (EOFError, OSError) as error:
