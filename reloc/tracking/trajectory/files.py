@@ -4,8 +4,6 @@ The suffix chooses. Frames whose track is lost are rows without a pose in CSV, a
 appears whole or not at all.
 """
 
-import csv
-import io
 import json
 import os
 import secrets
@@ -19,21 +17,16 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose_documents import irregular_series
 from reloc.tracking.ground import EarthPose
-from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS
+from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS, UPPER, columns_of, csv_table
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 
+_AXES = ("re", "rn", "ru", "e", "n", "u")
 _POSE = (
     *("easting", "northing", "height", "qx", "qy", "qz", "qw", "latitude", "longitude"),
     *("heading_deg", "pitch_deg", "roll_deg", "epsg", "height_datum", "map_id"),
+    *(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in UPPER),
 )
-_AXES = ("re", "rn", "ru", "e", "n", "u")
-_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
-CSV_COLUMNS = (
-    *("frame", "time_s", "state", "inliers"),
-    *_POSE,
-    *(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in _UPPER),
-    "detail",
-)
+CSV_COLUMNS = columns_of(_POSE)
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
@@ -71,35 +64,23 @@ def csv_text(trajectory: Trajectory) -> str:
     into camera axes (x right, y down, z forward); cov_* is the covariance, rad and m, axes true east, north,
     up: rotation (re, rn, ru) before displacement (e, n, u).
     """
-    out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(CSV_COLUMNS)
-    for point in trajectory.points:
-        head = (point.index, f"{point.time_s:.6f}", point.state, point.inliers)
-        if point.pose is None:
-            rows.writerow((*head, *([""] * (len(_POSE) + len(_UPPER))), point.detail))
-            continue
-        pose = point.pose
-        angles = (f"{a:.5f}" for a in pose.geopose.heading_pitch_roll_deg)
-        rows.writerow(
-            (
-                *head,
-                *(f"{v:.4f}" for v in pose.utm),
-                *(f"{q:.9f}" for q in pose.cam_from_utm_xyzw),
-                *(f"{pose.geopose.latitude_deg:.10f}", f"{pose.geopose.longitude_deg:.10f}"),
-                *angles,
-                *(pose.epsg, pose.height_datum, pose.map_id),
-                *(f"{pose.covariance[i, j]:.6e}" for i, j in _UPPER),
-                point.detail,
-            )
-        )
-    return out.getvalue()
+    return csv_table(_POSE, trajectory, lambda point: None if point.pose is None else _cells(point.pose))
+
+
+def _cells(pose: EarthPose) -> list[object]:
+    return [
+        *(f"{v:.4f}" for v in pose.utm),
+        *(f"{q:.9f}" for q in pose.cam_from_utm_xyzw),
+        *(f"{pose.geopose.latitude_deg:.10f}", f"{pose.geopose.longitude_deg:.10f}"),
+        *(f"{a:.5f}" for a in pose.geopose.heading_pitch_roll_deg),
+        *(pose.epsg, pose.height_datum, pose.map_id),
+        *(f"{pose.covariance[i, j]:.6e}" for i, j in UPPER),
+    ]
 
 
 def tum_text(trajectory: Trajectory) -> str:
     """TUM's format for evo and its like: time x y z qx qy qz qw, world from camera, world is the UTM grid."""
     found = _known(trajectory, "TUM")
-    _one_datum(trajectory, found)
     zones = {pose.epsg for _, pose in found}
     if len(zones) > 1:
         raise InvalidValueError(
@@ -119,7 +100,7 @@ def geojson_text(trajectory: Trajectory) -> str:
 
     Heights are those of the maps, in their datum, which is among the properties.
     """
-    _known(trajectory, "GeoJSON")
+    _known(trajectory, "GeoJSON", datums=True)
     features = []
     for number, stretch in enumerate(trajectory.stretches()):
         if len(stretch) > 1:
@@ -162,7 +143,6 @@ def geojson_text(trajectory: Trajectory) -> str:
 def kml_text(trajectory: Trajectory) -> str:
     """A line for each stretch without loss, for Google Earth and the like; heights as the maps have them."""
     found = _known(trajectory, "KML")
-    _one_datum(trajectory, found)
     marks = []
     for number, stretch in enumerate(trajectory.stretches()):
         places = " ".join(",".join(f"{v:.10g}" for v in _place(pose)) for _, pose in stretch)
@@ -185,7 +165,6 @@ def geopose_text(trajectory: Trajectory) -> str:
     are Unix milliseconds, or since the film's start where that is not known.
     """
     found = _known(trajectory, "GeoPose")
-    _one_datum(trajectory, found)
     start_ms = 0.0 if trajectory.start is None else 1000.0 * trajectory.start.timestamp()
     poses = [(round(start_ms + 1000.0 * point.time_s), pose.geopose) for point, pose in found]
     return json.dumps(irregular_series(poses), indent=1) + "\n"
@@ -197,7 +176,6 @@ def srt_text(trajectory: Trajectory) -> str:
     abs_alt is the height as the maps have it; angles are those of the camera.
     """
     found = _known(trajectory, "SRT")
-    _one_datum(trajectory, found)
     times = [point.time_s for point in trajectory.points]
     usual_s = float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
     ends_s = [*times[1:], times[-1] + usual_s]
@@ -251,7 +229,10 @@ def _format(path: Path, is_in_map: bool = False) -> Callable[[Trajectory], str |
     return formats[path.suffix.lower()]
 
 
-def _known(trajectory: Trajectory, what: str) -> Sequence[tuple[TrajectoryPoint, EarthPose]]:
+def _known(
+    trajectory: Trajectory, what: str, *, datums: bool = False
+) -> Sequence[tuple[TrajectoryPoint, EarthPose]]:
+    """The frames with poses; `datums`: whether the format can have heights of several."""
     found = [(p, p.pose) for p in trajectory.points if p.pose is not None]
     if not found:
         reasons = {p.detail for p in trajectory.points if p.detail}
@@ -259,16 +240,13 @@ def _known(trajectory: Trajectory, what: str) -> Sequence[tuple[TrajectoryPoint,
             f"{trajectory.source}: no frame has a pose, a {what} file would be empty"
             + (f" ({sorted(reasons)[0]})" if reasons else "")
         )
-    return found
-
-
-def _one_datum(trajectory: Trajectory, found: Sequence[tuple[TrajectoryPoint, EarthPose]]) -> None:
-    datums = sorted({pose.height_datum for _, pose in found})
-    if len(datums) > 1:
+    several = sorted({pose.height_datum for _, pose in found})
+    if len(several) > 1 and not datums:
         raise InvalidValueError(
-            f"{trajectory.source}: the track crosses from maps with heights {datums[0]} to {datums[1]}, "
+            f"{trajectory.source}: the track crosses from maps with heights {several[0]} to {several[1]}, "
             "which this format cannot say; write CSV or GeoJSON, or name maps of one datum"
         )
+    return found
 
 
 def _place(pose: EarthPose) -> list[float]:
