@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from featuredb.errors import ImageError, InvalidValueError
+from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.store import Database
@@ -89,9 +90,7 @@ class PhotoAnswer:
         text = f"<pre>{escape(str(self))}</pre>"
         if self.reply.inlier_points is None or self.utm is None:
             return text
-        picture = self.overlay()[:, :, ::-1]
-        scale = min(1.0, _SHOWN_PX / max(picture.shape[:2]))
-        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = shrunk(draw_overlay(self.photo, self.reply, self.other_points_utm), _SHOWN_PX)
         data = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode("ascii")
         return f'{text}<img alt="inliers" src="data:image/jpeg;base64,{data}">{_plan_svg(self)}'
 

@@ -1,13 +1,14 @@
 """A film tracked by a database: the poses, files of them, and a summary."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import GeoPrior
+from featuredb.plain_json import plain
 from featuredb.store import Database
 from ingest.track.finders import FilmGround, finder_for
 from reloc.localise.result import LocaliseRequest
@@ -39,19 +40,9 @@ class TrackedFilm:
             "stretches": [list(times) for times in found.trajectory.times_found()],
             "frame": "own" if found.trajectory.is_in_map else "earth",
             "last_reason": lost[-1].detail if lost else "",
-            "frames_per_s": round(len(points) / max(found.seconds.total, 1e-9), 1),
-            "seconds": {
-                name: round(getattr(found.seconds, name), 3)
-                for name in ("total", "decoding", "tracking", "drawing", "longest_gap")
-            },
-            "camera": None
-            if found.camera is None
-            else {
-                "model": found.camera.model,
-                "width": found.camera.width,
-                "height": found.camera.height,
-                "params": list(found.camera.params),
-            },
+            "frames_per_s": round(len(points) / max(found.seconds["total"], 1e-9), 1),
+            "seconds": {name: round(seconds, 3) for name, seconds in found.seconds.items()},
+            "camera": None if found.camera is None else plain(asdict(found.camera)),
             "complaints": list(found.complaints),
             "written": [*self.outputs.written, *([] if self.overlay is None else [str(self.overlay)])],
         }

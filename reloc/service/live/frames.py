@@ -6,16 +6,15 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
 from featuredb.features.decode import decode_gray, probe
 from featuredb.features.image_header import ImageHeader
+from featuredb.features.shrink import fitted_size, shrunk
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
-from featuredb.video.film import fitted_size
 from reloc.answered_view import geo_prior
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
@@ -82,7 +81,7 @@ class FrameAnswerer:
         clock.lap("decode")
         tracker = self._tracker_for(gray, localiser)
         height, width = gray.shape
-        tracked = tracker.track(_smaller(gray, self._options.max_side_px), ask.time_s)
+        tracked = tracker.track(shrunk(gray, self._options.max_side_px), ask.time_s)
         clock.lap("track")
         point = point_of(tracked)
         camera = None if tracked.camera is None else tracked.camera.scaled_to(width, height)
@@ -161,11 +160,3 @@ def _yield_to_queries() -> None:
     for task in [int(one.name) for one in tasks.iterdir()] if tasks.exists() else [0]:
         with suppress(OSError):  # it has ended meanwhile
             os.setpriority(os.PRIO_PROCESS, task, _YIELDING)
-
-
-def _smaller(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
-    height, width = gray.shape
-    size = fitted_size(width, height, max_side_px)
-    if size == (width, height):
-        return gray
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from reloc.localiser import Localiser
 from reloc.service.workers.area_files import MappedAreas
-from reloc.wire.query import ErrorCode, ErrorReply, RequestError, encode
+from reloc.wire.query import ErrorReply, RequestError, encode
 
 # What the first byte of an answer says of the rest.
 REPLY, REFUSAL, DEFECT = b"R", b"E", b"D"
@@ -140,9 +140,7 @@ def _answer(answerer: Answerer, ask: object, data: bytes, localiser: Localiser) 
     try:
         return REPLY + encode(answerer(ask, data, localiser))
     except RequestError as error:
-        return REFUSAL + encode(
-            ErrorReply(code=ErrorCode(error.code), message=error.message, request_id=None)
-        )
+        return REFUSAL + encode(ErrorReply(code=error.code, message=error.message, request_id=None))
     except Exception as error:  # the server logs it
         if _is_out_of_memory(error):
             raise
