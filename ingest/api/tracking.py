@@ -1,7 +1,7 @@
 """A film tracked by a database: the poses, files of them, and a summary."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,7 @@ def track_film(
     """
     check_outputs(out)
     options = options or TrackVideoOptions()
-    finder, version = finder_for(database, ground or FilmGround(), camera, options.track)
+    finder = finder_for(database, ground or FilmGround(), camera, options.track)
     if isinstance(finder, MapFinder) and finder.own_map is not None:
         check_outputs_in_map(out, finder.own_map)
         if prior is not None:
@@ -107,9 +107,4 @@ def track_film(
         overlay=overlay,
         options=options,
     )
-    trajectory = replace(found.trajectory, database=database.url, version=version)
-    return TrackedFilm(
-        video=replace(found, trajectory=trajectory),
-        outputs=write_outputs(out, trajectory),
-        overlay=overlay,
-    )
+    return TrackedFilm(video=found, outputs=write_outputs(out, found.trajectory), overlay=overlay)

@@ -32,6 +32,7 @@ class PendingQuery:
         identity: name of the client, where the server authenticates its clients.
         asker: who shares the server with others: the identity, else the session that the query came from as
             it says itself.
+        answered: whether it was, or refused.
     """
 
     def __init__(
@@ -49,27 +50,23 @@ class PendingQuery:
         self._key = key
         self._tally = tally
         self._lock = threading.Lock()
-        self._answered = False
+        self.answered = False
         self.received = time.perf_counter()
         self.deadline = self.received + deadline_s
         self.request_id = uuid.uuid4().hex
         self.size = 0 if query.payload is None else len(query.payload)
 
-    @property
-    def answered(self) -> bool:
-        return self._answered
-
     def attachment(self) -> bytes | None:
         """The request's attachment; None where there is none or it was answered meanwhile."""
         with self._lock:
-            if self._answered or self._query.attachment is None:
+            if self.answered or self._query.attachment is None:
                 return None
             return self._query.attachment.to_bytes()
 
     def payload(self) -> bytes:
         """The request's payload; empty where there is none or it was answered meanwhile."""
         with self._lock:
-            if self._answered or self._query.payload is None:
+            if self.answered or self._query.payload is None:
                 return b""
             return self._query.payload.to_bytes()
 
@@ -103,9 +100,9 @@ class PendingQuery:
     def _settled(self, payload: bytes, kind: str, code: str, latency_ms: float | None = None) -> bool:
         """Count and send an answer; False if somebody was faster."""
         with self._lock:
-            if self._answered:
+            if self.answered:
                 return False
-            self._answered = True
+            self.answered = True
             self._tally.add(kind, code, latency_ms)
             try:
                 with self._query as query:

@@ -30,8 +30,7 @@ from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import build_scene
-from reloc.viewer.serve import serve
-from reloc.viewer.server import ViewerStartError, listen
+from reloc.viewer.server import ViewerStartError, listen, serve
 from reloc.wire.query import LocaliseWireRequest
 from tests.support.maps import random_map
 from tests.support.viewer import MISSING, ViewerWorld, get, make_world, running_viewer

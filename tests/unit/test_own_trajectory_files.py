@@ -88,7 +88,7 @@ def test_formats_of_places_on_earth_refuse(suffix: str, tmp_path: Path) -> None:
 
 def test_a_frame_on_a_map_without_a_place_has_a_pose_in_it(database: Database) -> None:
     unplaced = random_unplaced_map()
-    finder, _ = finder_for(database, FilmGround(maps=(unplaced.map_id,)), None, TrackOptions())
+    finder = finder_for(database, FilmGround(maps=(unplaced.map_id,)), None, TrackOptions())
     assert isinstance(finder, MapFinder)
     (ground,) = finder.grounds
     frame = TrackedFrame(

@@ -19,7 +19,7 @@ from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
-from reloc.service.workers.area_files import AreaFiles, LocaliserFiles
+from reloc.service.workers.area_files import AreaFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
 from reloc.wire.query import (
     ContributionReply,
@@ -39,6 +39,9 @@ class WorkerPool:
     """Takes queries from the queue and answers each from the area in service at that moment.
 
     A process that is still at a query when its time is over, or that ends before its answer, is replaced.
+
+    Attributes:
+        published: the area that is answered from.
     """
 
     def __init__(
@@ -76,14 +79,9 @@ class WorkerPool:
         """Workers whose process is up, and not beyond its query's deadline."""
         return len(self._up)
 
-    @property
-    def published(self) -> LocaliserFiles:
-        """The area that is answered from."""
-        return self._published
-
     def publish(self, area: ServedArea) -> None:
         """Answer from this area, beginning with the next query of each worker."""
-        self._published = self._files.of(area.localiser)
+        self.published = self._files.of(area.localiser)
 
     def start(self) -> None:
         """Start the workers; returns when one of them is ready.
@@ -148,7 +146,7 @@ class WorkerPool:
                 process = None
             try:
                 process = WorkerProcess(self._limits, self._answerer)
-                process.open(self._published)
+                process.open(self.published)
             except Exception as error:
                 if process is not None:
                     self._gone(process)
@@ -221,7 +219,7 @@ class WorkerPool:
         if item.answered:
             return
         name = self._namer.submit(candidate_id_of, data) if request.contribute else None
-        process.open(self._published)
+        process.open(self.published)
         asked = request.model_copy(update={"request_id": item.request_id})
         reply = process.ask(asked, data, LocaliseReply)
         clock.lap("worker", reply.timings_ms)

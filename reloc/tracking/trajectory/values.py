@@ -49,14 +49,12 @@ class Trajectory:
     """The frames of one video, in order.
 
     Attributes:
-        source: name of the video. database, version: that was asked.
+        source: name of the video.
         start: when the film's clock showed 0, timezone-aware; None: not known.
     """
 
     source: str
     points: tuple[TrajectoryPoint, ...]
-    database: str = ""
-    version: int = -1
     start: datetime | None = None
 
     @property
