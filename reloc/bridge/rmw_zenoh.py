@@ -6,7 +6,6 @@ show them in ROS 2's graph.
 """
 
 import hashlib
-import json
 import time
 from contextlib import ExitStack
 from typing import Any, Self
@@ -18,6 +17,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from reloc.bridge.robot_pose import RobotPose
 from reloc.bridge.ros2 import TOPICS, messages
+from reloc.client.client import client_config
 
 _NODE, _NODE_ID = "featuredb", 0
 # Of each topic's type, by its description (REP 2016), from Iron on; what has another hash is another type.
@@ -49,13 +49,8 @@ class RmwZenohNode:
         self._sent = 0
 
     def __enter__(self) -> Self:
-        config = zenoh.Config()
         try:
-            config.insert_json5("mode", '"client"')
-            config.insert_json5("connect/endpoints", json.dumps([self._connect]))
-            config.insert_json5("connect/timeout_ms", json.dumps(int(_CONNECT_TIMEOUT_S * 1e3)))
-            config.insert_json5("scouting/multicast/enabled", "false")
-            session = zenoh.open(config)
+            session = zenoh.open(client_config(self._connect, _CONNECT_TIMEOUT_S))
         except zenoh.ZError as error:
             raise InvalidValueError(
                 f"--connect: expected the endpoint of ROS 2's Zenoh router (ros2 run rmw_zenoh_cpp "

@@ -62,10 +62,7 @@ def parse(body: bytes) -> GeoPoseReq:
     try:
         return GeoPoseReq.model_validate_json(body)
     except ValidationError as error:
-        # Without the values found: a missing id would print the whole request with its picture.
-        items = error.errors(include_url=False, include_input=False, include_context=False)[:3]
-        said = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'body'}: {item['msg']}" for item in items)
-        raise GatewayError(ErrorCode.BAD_REQUEST, said) from error
+        raise GatewayError(ErrorCode.BAD_REQUEST, _explained(error, "body")) from error
 
 
 def check_version(accept: str) -> bool:
@@ -206,10 +203,13 @@ def _camera(picture: CameraReading, size: tuple[int, int] | None) -> CameraReque
     try:
         return CameraRequest(model=model, width=size[0], height=size[1], params=params.modelParams)
     except ValidationError as error:
-        said = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        raise GatewayError(
-            ErrorCode.BAD_REQUEST, f"params.{'.'.join(map(str, said['loc']))}: {said['msg']}"
-        ) from error
+        raise GatewayError(ErrorCode.BAD_REQUEST, f"params.{_explained(error, '')}") from error
+
+
+def _explained(error: ValidationError, whole: str) -> str:
+    """Without the values found: a missing id would print the whole request with its picture."""
+    items = error.errors(include_url=False, include_input=False, include_context=False)[:3]
+    return "; ".join(f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}" for item in items)
 
 
 def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions) -> PriorRequest | None:

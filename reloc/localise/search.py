@@ -182,9 +182,7 @@ def _poses(
     best = _refined(features, cluster, matches, pose, options)
     clock.lap("guided")
     taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
-    left = Matches(
-        feature=matches.feature[~taken], point=matches.point[~taken], distance=matches.distance[~taken]
-    )
+    left = Matches(feature=matches.feature[~taken], point=matches.point[~taken])
     # A photo has one lens, which the first pose has estimated.
     rival = _best_pose(features, cluster.area, left, [(best.pose.camera, "request")], options)
     clock.lap("pose")

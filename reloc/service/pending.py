@@ -87,15 +87,14 @@ class PendingQuery:
         logger.info("query answered", extra=told)
         return True
 
-    def refuse(self, error: RequestError) -> bool:
-        """Send `reply_err`; False if somebody was faster."""
+    def refuse(self, error: RequestError) -> None:
+        """Send `reply_err`, unless somebody was faster."""
         reply = ErrorReply(code=error.code, message=error.message, request_id=self.request_id)
         if not self._settled(encode(reply), "error", error.code):
-            return False
+            return
         level = logging.ERROR if error.code == ErrorCode.INTERNAL else logging.INFO
         told = self._fields("refused", code=error.code, refusal=error.message)
         logger.log(level, "query refused", extra=told)
-        return True
 
     def _settled(self, payload: bytes, kind: str, code: str, latency_ms: float | None = None) -> bool:
         """Count and send an answer; False if somebody was faster."""
