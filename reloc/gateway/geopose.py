@@ -24,8 +24,6 @@ from reloc.gateway.protocol import (
     GeolocationReading,
     GeoPoseAccuracy,
     GeoPoseBasicQuaternion,
-    GeoPosePosition,
-    GeoPoseQuaternion,
     GeoPoseReq,
     GeoPoseResp,
 )
@@ -120,13 +118,12 @@ def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp,
     """
     if reply.position is None or reply.quaternion is None or reply.covariance is None:
         raise NotLocalisedError(reply, request.id)
-    position, turn = reply.position, reply.quaternion
-    height, datum = position.h, reply.height_datum or "unknown"
+    position, datum = reply.position, reply.height_datum or "unknown"
     if datum in HEIGHT_DATUMS:
         # Without the geoid's grid the height stays what it is, and the answer says so.
-        converted = ellipsoidal_height(position.lat, position.lon, height, datum).height_m
+        converted = ellipsoidal_height(position.lat, position.lon, position.h, datum).height_m
         if converted is not None:
-            height, datum = converted, "ellipsoidal"
+            position, datum = position.model_copy(update={"h": converted}), "ellipsoidal"
     sigmas = np.sqrt(np.diag(np.array(reply.covariance)))
     response = GeoPoseResp(
         id=request.id,
@@ -134,10 +131,7 @@ def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp,
         accuracy=GeoPoseAccuracy(
             position=float(np.mean(sigmas[3:])), orientation=float(np.degrees(np.mean(sigmas[:3])))
         ),
-        geopose=GeoPoseBasicQuaternion(
-            position=GeoPosePosition(lon=position.lon, lat=position.lat, h=height),
-            quaternion=GeoPoseQuaternion(x=turn.x, y=turn.y, z=turn.z, w=turn.w),
-        ),
+        geopose=GeoPoseBasicQuaternion(position=position, quaternion=reply.quaternion),
     )
     return response, datum
 

@@ -249,9 +249,9 @@ def camera_hypotheses(
             )
         return [(request.camera, "request")]
     if request.camera_key:
-        camera = area.camera_for_key(request.camera_key)
-        if camera is not None and (camera.width, camera.height) != (features.width, features.height):
-            camera = _resampled(camera, features.width, features.height)  # frames of films are made smaller
+        of_map = area.camera_for_key(request.camera_key)
+        # Frames of films are made smaller.
+        camera = None if of_map is None else _resampled(of_map, features.width, features.height)
         if camera is not None:
             return [(camera, "map")]
     if request.film:

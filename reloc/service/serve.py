@@ -3,10 +3,11 @@
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 
 from featuredb.stop_signals import on_stop_signals
 from featuredb.store import Database
-from reloc.service.contributions.database_inbox import DatabaseInbox
+from featuredb.store.candidates.photos import contribute, count_candidates
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.metrics import metrics_page
 from reloc.service.options import ServeOptions, wire_name_of
@@ -26,7 +27,9 @@ def start_server(database: Database, options: ServeOptions | None = None) -> Ser
     """
     options = options or ServeOptions()
     name = options.name or wire_name_of(database.url)
-    inbox = Inbox(DatabaseInbox(database), options.inbox) if options.contributions else None
+    inbox = None
+    if options.contributions:
+        inbox = Inbox(partial(contribute, database), partial(count_candidates, database), options.inbox)
     return Server.start(DatabaseSource(database), options, name, inbox)
 
 

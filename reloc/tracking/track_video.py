@@ -107,7 +107,7 @@ def track_video(
         with ExitStack() as stack:
             video = stack.enter_context(open_video(source, settings))
             info = video.info
-            lens = None if camera is None else _resized(camera, info.frame_width, info.frame_height)
+            lens = None if camera is None else camera.scaled_to(info.frame_width, info.frame_height)
             request = _with_film(request or LocaliseRequest(), info, source)
             tracker = stack.enter_context(Tracker(finder, lens, options.track, request))
             writer = None
@@ -190,8 +190,3 @@ def _with_film(request: LocaliseRequest, info: VideoInfo, source: Source) -> Loc
 def _digest(film: Path) -> str | None:
     """By which maps of a film know it; None for what is no file."""
     return unnamed_model(file_sha256(film)) if film.is_file() else None
-
-
-def _resized(camera: Camera, width: int, height: int) -> Camera:
-    """The lens of the full frames, for frames of another size."""
-    return camera if (camera.width, camera.height) == (width, height) else camera.scaled_to(width, height)

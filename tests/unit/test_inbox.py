@@ -46,7 +46,7 @@ def opened(store):
     made = []
 
     def make(options: InboxOptions = QUICK) -> Inbox:
-        inbox = Inbox(store, options)
+        inbox = Inbox(lambda given: store.write(given), lambda: store.counts(), options)
         inbox.start()
         made.append(inbox)
         return inbox

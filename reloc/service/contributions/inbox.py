@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 from featuredb.store.candidates.photos import InboxCounts
 from featuredb.store.candidates.states import Contribution
-from reloc.service.contributions.database_inbox import DatabaseInbox
 from reloc.service.logs import fields
 from reloc.wire.query import ContributionReason, ContributionReply
 from reloc.wire.server import ContributionStatus
@@ -60,8 +59,18 @@ class Ticket:
 class Inbox:
     """Takes photos from the workers; they share it."""
 
-    def __init__(self, store: DatabaseInbox, options: InboxOptions | None = None) -> None:
-        self._store = store
+    def __init__(
+        self,
+        write: Callable[[list[Contribution]], object],
+        count: Callable[[], InboxCounts],
+        options: InboxOptions | None = None,
+    ) -> None:
+        """
+        Args:
+            write: stores contributions in one append, may take seconds, and fail.
+            count: how much is stored; likewise.
+        """
+        self._store, self._count = write, count
         self._options = options or InboxOptions()
         self._changed = threading.Condition()
         self._queue: deque[tuple[Ticket, Callable[[], Contribution]]] = deque()
@@ -202,7 +211,7 @@ class Inbox:
     def _write_with_retries(self, contributions: list[Contribution]) -> bool:
         for pause_s in (*self._options.retry_s, None):
             try:
-                self._store.write(contributions)
+                self._store(contributions)
             except Exception as error:
                 # A store may break in many ways; the thread must live on, or photos would be lost for ever.
                 logger.warning("inbox: a write failed", exc_info=True, extra=fields("inbox_failed"))
@@ -228,7 +237,7 @@ class Inbox:
     def _refresh(self) -> None:
         """Take new counts; a store that answers again is trusted again."""
         try:
-            counts, error = self._store.counts(), None
+            counts, error = self._count(), None
         except Exception as failure:  # as for a write
             counts, error = None, f"{type(failure).__name__}: {failure}"
             logger.warning("inbox: cannot be counted", exc_info=True, extra=fields("inbox_failed"))
