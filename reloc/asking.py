@@ -125,7 +125,6 @@ class PhotoAsker:
         exif_prior: bool = True,
         maps: tuple[str, ...] | None = None,
         inliers: bool = True,
-        name: str | None = None,
     ) -> PhotoAnswer:
         """Where was this photo taken?
 
@@ -147,7 +146,7 @@ class PhotoAsker:
         reply = answer_query(request, photo, localiser)
         on_earth = reply.status == "localised"
         return PhotoAnswer(
-            name=name or called,
+            name=called,
             database=self.name,
             reply=reply,
             photo=photo,
