@@ -14,7 +14,8 @@ from ingest.track.finders import FilmGround, finder_for
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, TrackVideoOptions, track_video
-from reloc.tracking.trajectory.outputs import Outputs, check_outputs, check_outputs_in_map, write_outputs
+from reloc.tracking.trajectory.files import check_format
+from reloc.tracking.trajectory.outputs import Outputs, check_outputs, write_outputs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,7 +95,8 @@ def track_film(
     options = options or TrackVideoOptions()
     finder = finder_for(database, ground or FilmGround(), camera, options.track)
     if isinstance(finder, MapFinder) and finder.own_map is not None:
-        check_outputs_in_map(out, finder.own_map)
+        for file in out:
+            check_format(file, finder.own_map)
         if prior is not None:
             raise InvalidValueError(
                 f"--prior is a place on Earth, and map {finder.own_map} has none; leave it out"

@@ -37,7 +37,8 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     Raises:
         InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
     """
-    made = _format(path, trajectory.is_in_map)(trajectory)
+    own = next((point.in_map.map_id for point in trajectory.points if point.in_map is not None), None)
+    made = _format(path, own)(trajectory)
     content = made if isinstance(made, bytes) else made.encode()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
@@ -48,13 +49,16 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def check_format(path: Path) -> None:
+def check_format(path: Path, own_map: str | None = None) -> None:
     """Whether the suffix is one of those above.
+
+    Args:
+        own_map: id of the map without a place in whose frame the poses are.
 
     Raises:
         InvalidValueError: it is not.
     """
-    _format(path)
+    _format(path, own_map)
 
 
 def csv_text(trajectory: Trajectory) -> str:
@@ -218,15 +222,18 @@ _FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {
 }
 
 
-def _format(path: Path, is_in_map: bool = False) -> Callable[[Trajectory], str | bytes]:
-    formats, why = _FORMATS, ""
-    if is_in_map:
-        formats, why = OWN_FORMATS, "the track is in the frame of a map without a place: "
-    if path.suffix.lower() not in formats:
+def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str | bytes]:
+    suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else OWN_FORMATS
+    if suffix in formats:
+        return formats[suffix]
+    if own_map is None:
         raise InvalidValueError(
-            f"{path.name}: {why}expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
+            f"{path.name}: expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
         )
-    return formats[path.suffix.lower()]
+    raise InvalidValueError(
+        f"{path.name}: needs places on Earth, and map {own_map} has none: expected {' or '.join(formats)}, "
+        "with poses in the map's own frame; or place the map first: `featuredb maps` says how"
+    )
 
 
 def _known(
