@@ -9,12 +9,14 @@ from numpy.typing import ArrayLike
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.maps.feature_map import GeoPrior
 from reloc.localise.jacobians import pixel_jacobians
+from reloc.localise.lens_prior import lens_of, opencv_by_lens
+from reloc.localise.self_calibration import joint_jacobians
 from reloc.wire.query import CameraRequest, Intrinsics, LocaliseReply, PriorRequest
 from reloc.wire.track import TrackPose
 
@@ -42,12 +44,11 @@ class AnsweredView:
     map_ids: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        covariance = frozen_array("AnsweredView.covariance", self.covariance, (None, None))
-        if covariance.shape not in ((6, 6), (6 + len(self.camera.params),) * 2):
+        freeze(self, covariance=(None, None))
+        if self.covariance.shape not in ((6, 6), (6 + len(self.camera.params),) * 2):
             raise InvalidValueError(
-                f"AnsweredView.covariance: expected a pose's, or with its lens, found {covariance.shape}"
+                f"AnsweredView.covariance: expected a pose's, or with its lens, found {self.covariance.shape}"
             )
-        object.__setattr__(self, "covariance", covariance)
 
     @classmethod
     def of_reply(cls, reply: LocaliseReply) -> Self:
@@ -113,23 +114,19 @@ class AnsweredView:
         return np.asarray(np.column_stack([xy, np.ones(len(xy))]) @ self.cam_from_local.rotation)
 
     def pixel_derivatives(self, point: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of the pixel of a point (3,): by the point (2, 3), and by what `covariance` is of (2, 6 + n)."""
-        by_point, by_pose = pixel_jacobians(self.camera, self.cam_from_local, point[None])
-        if len(self.covariance) == 6:
-            return by_point[0], by_pose[0]
-        in_camera = self.cam_from_local.act(point[None])
-        by_lens = [self._by_parameter(k, in_camera) for k in range(len(self.camera.params))]
-        return by_point[0], np.column_stack([by_pose[0], *by_lens])
+        """Of the pixel of a point (3,): by the point (2, 3), and by what `covariance` is of (2, 6 + n).
 
-    def _by_parameter(self, k: int, in_camera: FloatArray) -> FloatArray:
-        params = np.array(self.camera.params)
-        step = 1e-6 * max(abs(params[k]), 1.0)
-        ends = []
-        for sign in (-1.0, 1.0):
-            moved = params.copy()
-            moved[k] += sign * step
-            ends.append(replace(self.camera, params=tuple(moved)).project(in_camera)[0])
-        return np.asarray((ends[1] - ends[0]) / (2.0 * step))
+        Raises:
+            InvalidValueError: with a lens that is neither OPENCV nor SIMPLE_RADIAL, and not exact.
+        """
+        if len(self.covariance) == 6:
+            by_point, by_view = pixel_jacobians(self.camera, self.cam_from_local, point[None])
+            return by_point[0], by_view[0]
+        by_point, by_view = joint_jacobians(self.camera, self.cam_from_local, point[None])
+        by_params = np.eye(len(self.covariance))
+        if self.camera.model == "OPENCV":
+            by_params[6:, 6:] = np.linalg.inv(opencv_by_lens(lens_of(self.camera)))
+        return by_point[0], by_view[0] @ by_params
 
 
 def geopose_of(message: LocaliseReply | TrackPose) -> GeoPose:

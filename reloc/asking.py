@@ -2,7 +2,6 @@
 
 import base64
 import threading
-import uuid
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
@@ -13,10 +12,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from featuredb.errors import ImageError, InvalidValueError
-from featuredb.features.decode import DecodeLimits
+from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.answered_view import AnsweredView, geopose_of
 from reloc.localiser import Localiser
@@ -92,9 +90,7 @@ class PhotoAnswer:
         text = f"<pre>{escape(str(self))}</pre>"
         if self.reply.inlier_points is None or self.utm is None:
             return text
-        picture = self.overlay()[:, :, ::-1]
-        scale = min(1.0, _SHOWN_PX / max(picture.shape[:2]))
-        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = shrunk(draw_overlay(self.photo, self.reply, self.other_points_utm), _SHOWN_PX)
         data = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode("ascii")
         return f'{text}<img alt="inliers" src="data:image/jpeg;base64,{data}">{_plan_svg(self)}'
 
@@ -129,7 +125,6 @@ class PhotoAsker:
         exif_prior: bool = True,
         maps: tuple[str, ...] | None = None,
         inliers: bool = True,
-        name: str | None = None,
     ) -> PhotoAnswer:
         """Where was this photo taken?
 
@@ -148,17 +143,10 @@ class PhotoAsker:
         photo, called = _image_bytes(image)
         request = _request(prior, camera, exif_prior, maps, inliers)
         localiser = self.localiser()
-        reply = answer_query(
-            photo,
-            request,
-            localiser,
-            limits=DecodeLimits(),
-            request_id=uuid.uuid4().hex,
-            clock=StageClock(),
-        )
+        reply = answer_query(request, photo, localiser)
         on_earth = reply.status == "localised"
         return PhotoAnswer(
-            name=name or called,
+            name=called,
             database=self.name,
             reply=reply,
             photo=photo,

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from typing import Any, Generic, TypeVar
@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from featuredb.errors import (
     FeatureDbError,
-    IncompatibleExtractorError,
     MapNotFoundError,
     StoreError,
     UnplacedBesideOthersError,
@@ -37,15 +36,6 @@ _LOG = logging.getLogger(__name__)
 _AREA_GAP_M = 300.0
 
 _Value = TypeVar("_Value")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Loaded:
-    """One indexed area and what it was made of: the write ids of its maps, sorted."""
-
-    key: tuple[str, ...]
-    map_ids: frozenset[str]
-    indexed: IndexedArea
 
 
 class OnDemand(Generic[_Value]):
@@ -88,26 +78,33 @@ class Localiser:
     """Answers queries from one snapshot, which never changes; threads may share it.
 
     Attributes:
-        areas: all, of whatever extractor; those whose maps did not change stay the same over reloads.
         options: settings by which it answers. snapshot: version of the database that it answers from.
     """
 
     def __init__(
         self,
-        loaded: Sequence[_Loaded],
+        loaded: Mapping[tuple[str, ...], IndexedArea],
         options: LocaliseOptions,
         snapshot: int,
         lineages: Mapping[str, MapLineage],
-        unplaced: Mapping[str, OnDemand[_OwnArea]] | None = None,
-        provisional: Mapping[str, OnDemand[IndexedArea]] | None = None,
+        unplaced: Mapping[str, OnDemand[_OwnArea]],
+        provisional: Mapping[str, OnDemand[IndexedArea]],
     ) -> None:
-        self._loaded = tuple(loaded)
-        self.areas = tuple(one.indexed for one in loaded)
+        """
+        Args:
+            loaded: areas by what they are made of, the sorted write ids of their maps.
+            lineages, unplaced, provisional: by map id.
+        """
+        self._loaded = loaded
         self.options, self.snapshot = options, snapshot
         # Of the snapshot, not of an area: an area that is taken over may hang on maps that have changed.
-        self._lineages = dict(lineages)
-        self._unplaced = dict(unplaced or {})
-        self._provisional = dict(provisional or {})
+        self._lineages = lineages
+        self._unplaced, self._provisional = unplaced, provisional
+
+    @property
+    def areas(self) -> tuple[IndexedArea, ...]:
+        """All, of whatever extractor; those whose maps did not change stay the same over reloads."""
+        return tuple(self._loaded.values())
 
     @classmethod
     def open(
@@ -138,13 +135,13 @@ class Localiser:
         snapshot = database.snapshot(as_of)
         taken = [m for m in snapshot.maps() if m.status == "active" or m.map_id in also]
         active = [m for m in taken if m.descriptors and m.box]
-        known = {loaded.key: loaded for loaded in previous._loaded} if previous else {}
-        loaded = []
+        known = previous._loaded if previous else {}
+        loaded = {}
         trial = instead or {}
         for group in _group(active):
             key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
             tried = any(m.map_id in trial for m in group)
-            loaded.append(known[key] if key in known and not tried else _load(snapshot, group, key, trial))
+            loaded[key] = known[key] if key in known and not tried else _load(snapshot, group, trial)
         had = {d.write_id: d for d in previous._unplaced.values()} if previous else {}
         unplaced = {
             m.map_id: had.get(m.write_id) or OnDemand(m.write_id, partial(_own_area, snapshot, m.map_id))
@@ -153,7 +150,7 @@ class Localiser:
         }
         held = {d.write_id: d for d in previous._provisional.values()} if previous else {}
         provisional = {
-            m.map_id: held.get(m.write_id) or OnDemand(m.write_id, partial(_area_of_one, snapshot, m.map_id))
+            m.map_id: held.get(m.write_id) or OnDemand(m.write_id, partial(_load, snapshot, [m], {}))
             for m in snapshot.maps()
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
@@ -168,22 +165,23 @@ class Localiser:
         if map_ids is None:
             return list(self.areas)
         wanted = set(map_ids)
-        unknown = wanted - self._provisional.keys() - {m for loaded in self._loaded for m in loaded.map_ids}
+        ids_of = [{m.map_id for m in indexed.area.maps} for indexed in self.areas]
+        unknown = wanted - self._provisional.keys() - set().union(*ids_of)
         if unknown:
             raise MapNotFoundError(
                 f"snapshot {self.snapshot} serves no map {', '.join(sorted(unknown))}; "
                 "`featuredb maps` lists what there is"
             )
         chosen = [
-            loaded.indexed if loaded.map_ids <= wanted else loaded.indexed.only(wanted)
-            for loaded in self._loaded
-            if loaded.map_ids & wanted
+            indexed if ids <= wanted else indexed.only(wanted)
+            for indexed, ids in zip(self.areas, ids_of, strict=True)
+            if ids & wanted
         ]
         return chosen + [
             self._provisional[map_id].get() for map_id in sorted(wanted & self._provisional.keys())
         ]
 
-    def own_area_of(self, map_ids: tuple[str, ...] | None) -> tuple[UnplacedMap, IndexedArea] | None:
+    def own_area_of(self, map_ids: tuple[str, ...] | None) -> _OwnArea | None:
         """The map without a place that is named alone, and its area, whose local frame is the map's own.
 
         Whoever asks for it has to word every pose in the map's frame: the area's place means nothing.
@@ -191,8 +189,15 @@ class Localiser:
         Raises:
             UnplacedBesideOthersError: it is named beside others.
         """
-        map_id = self._named_unplaced(map_ids)
-        return None if map_id is None else self._unplaced[map_id].get()
+        named = [m for m in map_ids or () if m in self._unplaced]
+        if not named:
+            return None
+        if len(set(map_ids or ())) > 1:
+            raise UnplacedBesideOthersError(
+                f"map {named[0]} has no place: expected it to be named alone, since its answers are in a "
+                f"frame of its own, found {', '.join(map_ids or ())}"
+            )
+        return self._unplaced[named[0]].get()
 
     def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
         """Pose of the image (h, w) uint8, or the reason why there is none.
@@ -203,41 +208,13 @@ class Localiser:
             IncompatibleExtractorError: all maps are of another extractor.
             ImageError: not a usable image.
         """
-        unplaced = self._named_unplaced(request.map_ids)
-        if unplaced is not None:
-            return self._in_own_frame(gray, request, unplaced)
+        own = self.own_area_of(request.map_ids)
+        if own is not None:
+            unplaced, area = own
+            told = replace(request, prior=None, own_position=None, beyond=None, map_ids=None)
+            return in_own_frame(localise(gray, told, [area], self.options, self.snapshot), unplaced)
         areas = self.areas_of(request.map_ids)
-        fingerprint = self.options.extractor.fingerprint
-        matching = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
-        if areas and not matching:
-            found = ", ".join(sorted({a.area.extractor_fingerprint for a in areas}))
-            raise IncompatibleExtractorError(
-                f"the maps were made by extractor {found}, queries here use {fingerprint}: descriptors "
-                "cannot be compared; start the server with the extractor options of the ingest"
-            )
-        return self._with_lineage(localise(gray, request, matching, self.options, self.snapshot))
-
-    def _named_unplaced(self, map_ids: tuple[str, ...] | None) -> str | None:
-        """The map without a place that the request names, if it does.
-
-        Raises:
-            UnplacedBesideOthersError: it names others beside it.
-        """
-        named = [m for m in map_ids or () if m in self._unplaced]
-        if not named:
-            return None
-        if len(set(map_ids or ())) > 1:
-            raise UnplacedBesideOthersError(
-                f"map {named[0]} has no place: expected it to be named alone, since its answers are in a "
-                f"frame of its own, found {', '.join(map_ids or ())}"
-            )
-        return named[0]
-
-    def _in_own_frame(self, gray: NDArray[np.uint8], request: LocaliseRequest, map_id: str) -> LocaliseResult:
-        """The pose in the own frame of a map without a place, or the reason why there is none."""
-        unplaced, indexed = self._unplaced[map_id].get()
-        told = replace(request, prior=None, own_position=None, beyond=None, map_ids=None)
-        return in_own_frame(localise(gray, told, [indexed], self.options, self.snapshot), unplaced)
+        return self._with_lineage(localise(gray, request, areas, self.options, self.snapshot))
 
     def _with_lineage(self, result: LocaliseResult) -> LocaliseResult:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""
@@ -251,10 +228,6 @@ class Localiser:
         return replace(result, pose=replace(result.pose, lineage=tuple(told)))
 
 
-def _area_of_one(snapshot: Snapshot, map_id: str) -> IndexedArea:
-    return IndexedArea.of([snapshot.load_map(map_id)])
-
-
 def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
     """A map without a place, and its area at the stand-in."""
     unplaced = snapshot.load_unplaced(map_id)
@@ -262,16 +235,11 @@ def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
     return replace(unplaced, observations=unplaced.observations.none()), indexed
 
 
-def _load(
-    snapshot: Snapshot,
-    group: list[MapSummary],
-    key: tuple[str, ...],
-    instead: Mapping[str, FeatureMap],
-) -> _Loaded:
+def _load(snapshot: Snapshot, group: Sequence[MapSummary], instead: Mapping[str, FeatureMap]) -> IndexedArea:
     indexed = IndexedArea.of([instead.get(m.map_id) or snapshot.load_map(m.map_id) for m in group])
     points, images = len(indexed.area.points), len(indexed.area.image_map)
     _LOG.info("area of %d maps: %d points, %d images", len(group), points, images)
-    return _Loaded(key=key, map_ids=frozenset(m.map_id for m in group), indexed=indexed)
+    return indexed
 
 
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import decode_rgb
+from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from reloc.answered_view import AnsweredView
@@ -49,12 +50,9 @@ def draw_overlay(
             f"overlay: expected a localised reply with inlier points, found {reply.status} "
             f"({reply.detail}); ask with options.inliers"
         )
-    image = np.ascontiguousarray(decode_rgb(photo)[:, :, ::-1])
-    shrink = min(1.0, _MAX_SIDE_PX / max(image.shape[:2]))
-    if shrink < 1.0:
-        image = np.asarray(
-            cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), dtype=np.uint8
-        )
+    whole = decode_rgb(photo)
+    image = np.ascontiguousarray(shrunk(whole, _MAX_SIDE_PX)[:, :, ::-1])
+    shrink = max(image.shape) / max(whole.shape)
     view, inliers_utm = AnsweredView.of_reply(reply), np.array(reply.inlier_points.utm).reshape(-1, 3)
     if other_points_utm is not None and len(other_points_utm):
         others = _thinned(_without(other_points_utm, inliers_utm))

@@ -59,17 +59,10 @@ def reply_from_result(
 
 
 _NO_POSE: dict[str, Any] = {
-    "position": None,
-    "quaternion": None,
-    "height_datum": None,
-    "utm": None,
-    "covariance": None,
-    "accuracy": None,
-    "camera": None,
-    "residual_rms_px": None,
+    **dict.fromkeys(("position", "quaternion", "height_datum", "utm", "covariance", "accuracy", "camera")),
+    **dict.fromkeys(("residual_rms_px", "inlier_points")),
     "maps": (),
     "lineage": (),
-    "inlier_points": None,
 }
 
 

@@ -124,7 +124,7 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
     # Where a photo's own lens lies among the priors does not matter: all of them outweigh these by far.
     focal_px = float(np.median([v.camera.focal_px for v in views]))
     prior = priors.around(first, focal_px, priors.unknown_focal_rel)
-    noise_px = 0.25 * PoseOptions().tolerance_rel * max(first.width, first.height)
+    noise_px = 0.25 * PoseOptions().tolerance_px(first)
     noise = [measured_noise_px(v.pixels, v.points, v.cam_from_local, v.camera, noise_px) for v in views]
     problems = [_problem(view, prior, noise_px, own) for view, own in zip(views, noise, strict=True)]
     alone = np.array([_alone(p, v) for p, v in zip(problems, views, strict=True)])

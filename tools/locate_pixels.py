@@ -18,7 +18,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from featuredb.adjust.block import whole_camera
-from featuredb.features.decode import DecodeLimits
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
@@ -27,7 +26,6 @@ from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.town.scene import Scene, texture_index
 from featuredb.simworld.truth import TrueImage, Truth
 from featuredb.simworld.world import WorldOptions, town_of
-from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.answered_view import AnsweredView
 from reloc.localiser import Localiser
@@ -156,14 +154,7 @@ def miss_figures(name: str, missed: Sequence[Miss]) -> dict[str, float]:
 
 def view_of(localiser: Localiser, data: bytes) -> AnsweredView | None:
     """The camera of the answer to a photo, asked with nothing but its file; None where there is no answer."""
-    reply = answer_query(
-        data,
-        LocaliseWireRequest(),
-        localiser,
-        limits=DecodeLimits(),
-        request_id="locate",
-        clock=StageClock(),
-    )
+    reply = answer_query(LocaliseWireRequest(), data, localiser)
     return AnsweredView.of_reply(reply) if reply.status == "localised" else None
 
 

@@ -65,7 +65,7 @@ def film(args: argparse.Namespace) -> dict[str, Any]:
     metres = np.linalg.norm(off[:, 3:], axis=1)
     figures = track_figures(metres) | {"placed": 1, "keyframes": made["keyframes"], "made_s": made["made_s"]}
     figures["adjusted_m"] = from_keyframes(tracked, feature_map)
-    figures["rate_hz"] = len(metres) / tracked.seconds.total
+    figures["rate_hz"] = len(metres) / tracked.seconds["total"]
     times = json.loads((work / "anchor" / "anchor.json").read_text(encoding="utf-8"))["times_s"]
     figures["frame_s"] = times.get("(B) one frame, median", float("nan"))
     figures["projection_s"] = times.get("(C) structure projection, all frames", float("nan"))

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from featuredb.features.decode import DEFAULT_LIMITS
-from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.client import Client, LocaliseReply
 from reloc.localiser import Localiser
@@ -54,14 +52,7 @@ def run_direct(localiser: Localiser, images: Sequence[Path]) -> list[Timed]:
     """Each image five times in this process, after one round that is not counted."""
 
     def ask(data: bytes) -> LocaliseReply:
-        return answer_query(
-            data,
-            _WITH_PRIOR,
-            localiser,
-            limits=DEFAULT_LIMITS,
-            request_id="",
-            clock=StageClock(),
-        )
+        return answer_query(_WITH_PRIOR, data, localiser)
 
     return _rounds(ask, images)
 

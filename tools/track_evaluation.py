@@ -207,8 +207,8 @@ def judge_film(tracked: TrackedVideo, truth: FilmTruth, load: float) -> Tracked:
         first_m=float(m[:end].mean()),
         last_m=float(m[-end:].mean()),
         found_s=_found_s(truth, known),
-        rate_hz=len(metres) / tracked.seconds.total,
-        gap_s=tracked.seconds.longest_gap,
+        rate_hz=len(metres) / tracked.seconds["total"],
+        gap_s=tracked.seconds["longest_gap"],
         load=load,
         **_inside(tracked.trajectory, off),
     )

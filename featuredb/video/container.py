@@ -14,8 +14,9 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from featuredb.errors import VideoError
+from featuredb.features.shrink import fitted_size
 from featuredb.video.decoding import Decoder, FilmClock
-from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
+from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
 from featuredb.video.opening import Opening, Source, coded_pixels, open_input, opening_of
 from featuredb.video.pixels import PixelReader
 from featuredb.video.rotation import clockwise_from_display_matrix

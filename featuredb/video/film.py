@@ -193,14 +193,6 @@ class VideoReport:
         return tuple(text for found, text in said if found)
 
 
-def fitted_size(width: int, height: int, max_side_px: int | None) -> tuple[int, int]:
-    """Width and height of the largest picture of the same shape whose sides are at most `max_side_px`."""
-    longer = max(width, height)
-    if max_side_px is None or longer <= max_side_px:
-        return width, height
-    return max(1, round(width * max_side_px / longer)), max(1, round(height * max_side_px / longer))
-
-
 def chosen(timed: Iterable[tuple[float, _T]], options: VideoOptions) -> Iterator[tuple[int, float, _T]]:
     """Those of (time in seconds, something), in order of time, that the options ask for, with their index."""
     index = 0

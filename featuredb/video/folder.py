@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError, VideoError
 from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb, probe
 from featuredb.features.exif.read import ExifInfo, read_exif
-from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
+from featuredb.features.shrink import fitted_size
+from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".heic", ".heif", ".avif", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 _CSV_NAME, _TXT_NAME = "timestamps.csv", "times.txt"

@@ -1,19 +1,21 @@
 """A film tracked by a database: the poses, files of them, and a summary."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import GeoPrior
+from featuredb.plain_json import plain
 from featuredb.store import Database
 from ingest.track.finders import FilmGround, finder_for
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, TrackVideoOptions, track_video
-from reloc.tracking.trajectory.outputs import Outputs, check_outputs, check_outputs_in_map, write_outputs
+from reloc.tracking.trajectory.files import check_format
+from reloc.tracking.trajectory.outputs import Outputs, check_outputs, write_outputs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,19 +41,9 @@ class TrackedFilm:
             "stretches": [list(times) for times in found.trajectory.times_found()],
             "frame": "own" if found.trajectory.is_in_map else "earth",
             "last_reason": lost[-1].detail if lost else "",
-            "frames_per_s": round(len(points) / max(found.seconds.total, 1e-9), 1),
-            "seconds": {
-                name: round(getattr(found.seconds, name), 3)
-                for name in ("total", "decoding", "tracking", "drawing", "longest_gap")
-            },
-            "camera": None
-            if found.camera is None
-            else {
-                "model": found.camera.model,
-                "width": found.camera.width,
-                "height": found.camera.height,
-                "params": list(found.camera.params),
-            },
+            "frames_per_s": round(len(points) / max(found.seconds["total"], 1e-9), 1),
+            "seconds": {name: round(seconds, 3) for name, seconds in found.seconds.items()},
+            "camera": None if found.camera is None else plain(asdict(found.camera)),
             "complaints": list(found.complaints),
             "written": [*self.outputs.written, *([] if self.overlay is None else [str(self.overlay)])],
         }
@@ -101,9 +93,10 @@ def track_film(
     """
     check_outputs(out)
     options = options or TrackVideoOptions()
-    finder, version = finder_for(database, ground or FilmGround(), camera, options.track)
+    finder = finder_for(database, ground or FilmGround(), camera, options.track)
     if isinstance(finder, MapFinder) and finder.own_map is not None:
-        check_outputs_in_map(out, finder.own_map)
+        for file in out:
+            check_format(file, finder.own_map)
         if prior is not None:
             raise InvalidValueError(
                 f"--prior is a place on Earth, and map {finder.own_map} has none; leave it out"
@@ -116,9 +109,4 @@ def track_film(
         overlay=overlay,
         options=options,
     )
-    trajectory = replace(found.trajectory, database=database.url, version=version)
-    return TrackedFilm(
-        video=replace(found, trajectory=trajectory),
-        outputs=write_outputs(out, trajectory),
-        overlay=overlay,
-    )
+    return TrackedFilm(video=found, outputs=write_outputs(out, found.trajectory), overlay=overlay)

@@ -92,7 +92,7 @@ def _page(database: "Database", request: "AnchorRequest", args: argparse.Namespa
     from featuredb.extras import require
     from ingest.register.picks_page.server import create_app, new_token
     from ingest.register.picks_page.session import PickSession
-    from reloc.viewer.serve import serve
+    from reloc.viewer.server import serve
 
     require("http", "The page of picks", "fastapi", "uvicorn")
     snapshot = database.snapshot()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.cli.common import add_command, open_database
+from reloc.cli.live import add_film_arguments
 
 
 def register(subparsers: Any) -> None:
@@ -32,14 +33,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument(
         "--overlay", type=Path, metavar="MP4", help="write the film with the track drawn over it"
     )
-    parser.add_argument(
-        "--camera",
-        metavar="MODEL,WIDTH,HEIGHT,PARAMS...",
-        help="intrinsics of the upright frames by COLMAP's model; default: estimated with the first pose",
-    )
-    parser.add_argument(
-        "--prior", metavar="LAT,LON,SIGMA_M", help="where the film begins, WGS84 degrees and metres"
-    )
+    add_film_arguments(parser)
     parser.add_argument(
         "--map",
         action="append",
@@ -63,11 +57,6 @@ def register(subparsers: Any) -> None:
         metavar="FILE",
         help="coarse pose of the first frame, JSON as for `featuredb anchor --pose`; a scan alone needs it",
     )
-    parser.add_argument(
-        "--fps", type=float, metavar="N", help="frames per second of a folder without a file of times"
-    )
-    parser.add_argument("--start", type=float, metavar="S", help="of the film; default: its beginning")
-    parser.add_argument("--end", type=float, metavar="S", help="of the film; default: its end")
     parser.add_argument(
         "--max-side", type=int, default=1280, metavar="PX", help="frames are tracked at; default 1280"
     )

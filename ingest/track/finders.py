@@ -17,10 +17,11 @@ from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, list_scans
 from ingest.register.anchor.start.files import RoughPose, read_pose
 from ingest.track.scan_ground import ScanFinder, ScanGround
-from reloc.localise.result import LocaliseRequest
+from reloc.localise.candidates import usable_areas
+from reloc.localise.result import LocaliseRequest, OwnPose
 from reloc.localiser import Localiser
-from reloc.tracking.ground import Finder, Ground, Keyframe, Standing, StandingInMap, Unmatched
-from reloc.tracking.map_ground import MapFinder, usable_areas
+from reloc.tracking.ground import EarthPose, Finder, Ground, Keyframe, Unmatched
+from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
 
 FilmBy = Literal["map", "scan", "both"]
@@ -43,10 +44,8 @@ class FilmGround:
     pose_file: Path | None = None
 
 
-def finder_for(
-    database: Database, asked: FilmGround, camera: Camera | None, options: TrackOptions
-) -> tuple[Finder, int]:
-    """What finds the film's frames, and the version of the database that it was made of.
+def finder_for(database: Database, asked: FilmGround, camera: Camera | None, options: TrackOptions) -> Finder:
+    """What finds the film's frames.
 
     Args:
         camera: intrinsics of the film's frames, if they are known.
@@ -70,8 +69,8 @@ def finder_for(
                 "a scan alone tells neither the lens nor where to look: give --camera and --pose, or let a "
                 "map find the film by --by both"
             )
-        return _on_scan(database, asked, rough), database.snapshot().version
-    maps, version = _maps(database, asked, options)
+        return _on_scan(database, asked, rough)
+    maps = _maps(database, asked, options)
     if maps.own_map is not None:
         raise InvalidValueError(
             f"--by both follows maps on a scan, and map {maps.own_map} has no place on any; leave out --by, "
@@ -85,18 +84,17 @@ def finder_for(
     scan = _over(
         area.frame, area.image_center[area.searched_images()], _scan(database, asked.scans), database, rough
     )
-    return MapOverScanFinder(maps, scan), version
+    return MapOverScanFinder(maps, scan)
 
 
-def _maps(database: Database, asked: FilmGround, options: TrackOptions) -> tuple[MapFinder, int]:
+def _maps(database: Database, asked: FilmGround, options: TrackOptions) -> MapFinder:
     localiser = Localiser.open(database)
     fingerprint = options.localise.extractor.fingerprint
     own = localiser.own_area_of(asked.maps)
     if own is not None:
         unplaced, area = own
-        return MapFinder(usable_areas([area], fingerprint), unplaced.frame), localiser.snapshot
-    areas = usable_areas(localiser.areas_of(asked.maps), fingerprint)
-    return MapFinder(areas), localiser.snapshot
+        return MapFinder(usable_areas([area], fingerprint), unplaced.frame)
+    return MapFinder(usable_areas(localiser.areas_of(asked.maps), fingerprint))
 
 
 def _scan(database: Database, ids: tuple[str, ...] | None) -> list[ScanSummary]:
@@ -176,14 +174,12 @@ class MapOverScan:
             return replace(by_scan, ground=self)
         return _both(by_map, by_scan)
 
-    def standing(
-        self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray
-    ) -> Standing | StandingInMap:
-        """On that of which more landmarks are."""
+    def posed(self, rows: NDArray[np.int64], pose: Rigid3, measured: FloatArray) -> EarthPose | OwnPose:
+        """By that of which more landmarks are."""
         of_map = rows >= 0
         if 2 * int(of_map.sum()) >= len(rows):
-            return self.maps.standing(rows[of_map], center, measured)
-        return self.scan.standing(rows[~of_map], center, measured)
+            return self.maps.posed(rows[of_map], pose, measured)
+        return self.scan.posed(rows[~of_map], pose, measured)
 
     def visible(self, camera: Camera, pose: Rigid3) -> FloatArray:
         """Of both."""

@@ -24,8 +24,8 @@ from ingest.register.frame.register import fit_near, register_frame
 from ingest.register.frame.sources import available_sources
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.structure.depth_filter import surface_at
-from reloc.localise.result import LocaliseRequest
-from reloc.tracking.ground import Ground, Keyframe, Standing, Unmatched
+from reloc.localise.result import LocaliseRequest, place_on_earth
+from reloc.tracking.ground import EarthPose, Ground, Keyframe, Unmatched
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import of_camera
 
@@ -71,7 +71,7 @@ _MAX_CHI2 = 20.1
 
 
 class ScanGround:
-    """A scan's surface; used from the tracker's thread, except `standing` and `visible`.
+    """A scan's surface; used from the tracker's thread, except `posed` and `visible`.
 
     Attributes:
         last: pose of the last keyframe, on the scan or on maps over it; None before the first. A lost camera
@@ -163,13 +163,13 @@ class ScanGround:
             rows=-1 - (number * _PER_KEYFRAME + np.arange(len(points), dtype=np.int64)),
         )
 
-    def standing(self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray) -> Standing:
+    def posed(self, rows: NDArray[np.int64], pose: Rigid3, measured: FloatArray) -> EarthPose:
         """With the error that the landmarks of a keyframe share: that of the keyframe with most of them."""
         number = int(np.bincount((-1 - rows) // _PER_KEYFRAME).argmax())
-        to_true = np.kron(np.eye(2), self.frame.true_enu_from_enu(center))
+        to_true = np.kron(np.eye(2), self.frame.true_enu_from_enu(pose.center))
         covariance = to_true @ (measured + self._covariances[number]) @ to_true.T
-        return Standing(
-            epsg=self._epsg,
+        return EarthPose(
+            **place_on_earth(self.frame, pose, self._epsg),
             height_datum=self._cloud.height_datum,
             map_id=self._scan_id,
             covariance=0.5 * (covariance + covariance.T),

@@ -15,7 +15,8 @@ from featuredb.features.exif.angles import DJI_GIMBAL
 from featuredb.features.exif.write import gps_directory
 from featuredb.features.exif.xmp_write import with_properties
 from featuredb.features.film_lens import UNNAMED_MAKE, shot_model
-from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions, fitted_size
+from featuredb.features.shrink import shrunk
+from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
 from featuredb.video.frames import open_video
 from ingest.executor import Progress
 from ingest.video.burnt_in import BurntIn, find_burnt_in, painted_over
@@ -140,5 +141,4 @@ def _paint_over(file: Path, mask: NDArray[np.bool_]) -> None:
 def _shrunk(file: Path, side_px: int) -> NDArray[np.uint8]:
     with Image.open(file) as picture:
         gray = np.asarray(picture.convert("L"))
-    width, height = fitted_size(gray.shape[1], gray.shape[0], side_px)
-    return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return shrunk(gray, side_px)

@@ -21,7 +21,7 @@ from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import DecodeLimits
 from reloc.authority.access_rules import access_control
 from reloc.authority.certificates import Identity
-from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, NAME_PATTERN
+from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, NAME_EXPECTED, is_name
 from reloc.wire.query import MESSAGE_HEADROOM
 
 DEFAULT_PORT = 7447  # Zenoh's own
@@ -105,10 +105,9 @@ class Authority:
             InvalidValueError: no name for a client.
             AuthorityError: the name was given before, or the server's configuration cannot be read.
         """
-        if not re.fullmatch(NAME_PATTERN, name) or name in (_SERVER, ANONYMOUS):
+        if not is_name(name) or name in (_SERVER, ANONYMOUS):
             raise InvalidValueError(
-                "client: expected 1..64 letters, digits, '_', '.', '-', beginning with a letter or digit, "
-                f"not {_SERVER!r} nor {ANONYMOUS!r}, found {name!r}"
+                f"client: {NAME_EXPECTED}, not {_SERVER!r} nor {ANONYMOUS!r}, found {name!r}"
             )
         path = self.folder / "clients" / f"{name}.json5"
         with self._alone():
@@ -139,7 +138,7 @@ class Authority:
             if name in self.clients():
                 (self.folder / "revoked").mkdir(mode=0o700, exist_ok=True)
                 self._issued(name).rename(self._revoked(name))  # first: no later rules name the client
-            elif not re.fullmatch(NAME_PATTERN, name) or not self._revoked(name).exists():
+            elif not is_name(name) or not self._revoked(name).exists():
                 known = ", ".join(self.clients()) or "none is"
                 raise AuthorityError(f"client: expected one that is known ({known}), found {name!r}")
             self._write_rules(config, self.clients())

@@ -33,10 +33,8 @@ class MavlinkSender:
     """Packs poses as MAVLink 2 messages.
 
     Args:
-        origin: of the local frame; None: where the first pose is.
         geoid_m: height of the geoid over the ellipsoid, by which ellipsoidal heights become altitudes;
             without it, and without a datum of sea level, GPS_INPUT says to ignore its altitude.
-        system, component: ids of the sender; by default the vehicle's own, as companion computers have it.
 
     Raises:
         MissingExtraError: pymavlink is not installed.
@@ -46,33 +44,31 @@ class MavlinkSender:
         self,
         messages: Sequence[MavMessage] = ("odometry",),
         *,
-        origin: LocalFrame | None = None,
         geoid_m: float | None = None,
-        system: int = 1,
-        component: int = 197,  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
     ) -> None:
         require("robots", "The MAVLink bridge", "pymavlink.dialects.v20.common")
         from pymavlink.dialects.v20 import common
 
         self._dialect: Any = common
-        self._link: Any = common.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._link: Any = common.MAVLink(
+            None,
+            srcSystem=1,  # the vehicle's own, as companion computers have it
+            srcComponent=common.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY,
+        )
         self._messages = tuple(messages)
-        self._origin = origin
         self._geoid_m = geoid_m
 
-    def pack(self, pose: RobotPose) -> list[bytes]:
-        """The messages of one pose, each a packet."""
-        if self._origin is None:
-            self._origin = pose.frame_here()
+    def pack(self, pose: RobotPose, origin: LocalFrame) -> list[bytes]:
+        """The messages of one pose in a local frame, each a packet."""
         made = {"odometry": self._odometry, "vision": self._vision, "gps": self._gps}
         packets = []
         for name in self._messages:
-            packets.append(bytes(made[name](pose).pack(self._link)))
+            packets.append(bytes(made[name](pose, origin).pack(self._link)))
             self._link.seq = (self._link.seq + 1) % 256
         return packets
 
-    def _odometry(self, pose: RobotPose) -> Any:
-        place, turn, covariance = self._local(pose)
+    def _odometry(self, pose: RobotPose, origin: LocalFrame) -> Any:
+        place, turn, covariance = _local(pose, origin)
         x, y, z, w = (float(q) for q in quaternion_from_matrix(turn))
         unknown = [float("nan")] * 21
         return self._dialect.MAVLink_odometry_message(
@@ -89,8 +85,8 @@ class MavlinkSender:
             quality=0,
         )
 
-    def _vision(self, pose: RobotPose) -> Any:
-        place, turn, covariance = self._local(pose)
+    def _vision(self, pose: RobotPose, origin: LocalFrame) -> Any:
+        place, turn, covariance = _local(pose, origin)
         yaw, pitch, roll = yaw_pitch_roll(turn)
         return self._dialect.MAVLink_vision_position_estimate_message(
             usec=round(pose.time_s * 1e6),
@@ -102,7 +98,7 @@ class MavlinkSender:
             reset_counter=0,
         )
 
-    def _gps(self, pose: RobotPose) -> Any:
+    def _gps(self, pose: RobotPose, origin: LocalFrame) -> Any:
         flags = self._dialect
         ignored = (
             flags.GPS_INPUT_IGNORE_FLAG_HDOP
@@ -132,17 +128,6 @@ class MavlinkSender:
             satellites_visible=0,  # none are behind it; GPS_INPUT has no value for unknown
             yaw=round(np.degrees(yaw) * 100.0) % 36_000 or 36_000,  # 0 would be "not known"
         )
-
-    def _local(self, pose: RobotPose) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Position, FRD body to NED, and covariance of x, y, z, roll, pitch, yaw."""
-        assert self._origin is not None
-        place, turn, covariance = pose.in_frame(self._origin)
-        ned_from_frd = NED_FROM_ENU @ turn @ FLU_FROM_FRD
-        to_angles = np.eye(6)
-        to_angles[3:, 3:] = _angles_by_rotation(ned_from_frd)
-        by_enu = to_angles @ np.kron(np.eye(2), NED_FROM_ENU)
-        told = by_enu @ covariance @ by_enu.T
-        return NED_FROM_ENU @ place, ned_from_frd, told
 
 
 class UdpLink:
@@ -183,6 +168,16 @@ class UdpLink:
 
     def __exit__(self, *failed: object) -> None:
         self._socket.close()
+
+
+def _local(pose: RobotPose, origin: LocalFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, FRD body to NED, and covariance of x, y, z, roll, pitch, yaw."""
+    place, turn, covariance = pose.in_frame(origin)
+    ned_from_frd = NED_FROM_ENU @ turn @ FLU_FROM_FRD
+    to_angles = np.eye(6)
+    to_angles[3:, 3:] = _angles_by_rotation(ned_from_frd)
+    by_enu = to_angles @ np.kron(np.eye(2), NED_FROM_ENU)
+    return NED_FROM_ENU @ place, ned_from_frd, by_enu @ covariance @ by_enu.T
 
 
 def altitude_m(pose: RobotPose, geoid_m: float | None) -> float | None:

@@ -6,7 +6,6 @@ show them in ROS 2's graph.
 """
 
 import hashlib
-import json
 import time
 from contextlib import ExitStack
 from typing import Any, Self
@@ -18,6 +17,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from reloc.bridge.robot_pose import RobotPose
 from reloc.bridge.ros2 import TOPICS, messages
+from reloc.client.client import client_config
 
 _NODE, _NODE_ID = "featuredb", 0
 # Of each topic's type, by its description (REP 2016), from Iron on; what has another hash is another type.
@@ -38,26 +38,19 @@ class RmwZenohNode:
     Args:
         connect: Zenoh endpoint of ROS 2's router, tcp/HOST:7447.
         domain: ROS_DOMAIN_ID.
-        origin: of the frame `map`; None: where the first pose is.
 
     Raises:
         InvalidValueError: nobody is at the endpoint, or it is none; raised when the block begins.
     """
 
-    def __init__(self, connect: str, *, domain: int = 0, origin: LocalFrame | None = None) -> None:
+    def __init__(self, connect: str, *, domain: int = 0) -> None:
         self._connect = connect
         self._domain = domain
-        self._origin = origin
         self._sent = 0
 
     def __enter__(self) -> Self:
-        config = zenoh.Config()
         try:
-            config.insert_json5("mode", '"client"')
-            config.insert_json5("connect/endpoints", json.dumps([self._connect]))
-            config.insert_json5("connect/timeout_ms", json.dumps(int(_CONNECT_TIMEOUT_S * 1e3)))
-            config.insert_json5("scouting/multicast/enabled", "false")
-            session = zenoh.open(config)
+            session = zenoh.open(client_config(self._connect, _CONNECT_TIMEOUT_S))
         except zenoh.ZError as error:
             raise InvalidValueError(
                 f"--connect: expected the endpoint of ROS 2's Zenoh router (ros2 run rmw_zenoh_cpp "
@@ -72,12 +65,10 @@ class RmwZenohNode:
     def __exit__(self, *failed: object) -> None:
         self._open.close()
 
-    def write(self, pose: RobotPose) -> None:
-        """Publish the three messages of a pose."""
-        if self._origin is None:
-            self._origin = pose.frame_here()
+    def write(self, pose: RobotPose, origin: LocalFrame) -> None:
+        """Publish the three messages of a pose, in the frame `map` at this origin."""
         self._sent += 1
-        for topic, data in messages(pose, self._origin).items():
+        for topic, data in messages(pose, origin).items():
             publisher, gid = self._publishers[topic]
             publisher.put(data, attachment=z_serialize((Int64(self._sent), Int64(time.time_ns()), gid)))
 

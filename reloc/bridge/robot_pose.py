@@ -98,11 +98,14 @@ def warm_up() -> None:
     frame.true_enu_from_enu(frame.enu_from_geodetic((0.0, 0.0, 1.0)))
 
 
-def read_answers(lines: Iterable[str], mount: Mount, clock: Any) -> Iterator[RobotPose]:
-    """Poses of answers, one JSON object a line; answers without a pose are passed over.
+def read_answers(
+    lines: Iterable[str], mount: Mount, clock: Any, origin: LocalFrame | None = None
+) -> Iterator[tuple[RobotPose, LocalFrame]]:
+    """Poses of answers and their local frame; one JSON object a line, those without a pose are passed over.
 
     Args:
         clock: gives Unix time in seconds, as time.time.
+        origin: of the local frame; None: where the first pose is.
 
     Raises:
         InvalidValueError: a line is no answer.
@@ -116,4 +119,5 @@ def read_answers(lines: Iterable[str], mount: Mount, clock: Any) -> Iterator[Rob
             raise InvalidValueError(f"bridge: expected a JSON object a line, found {line!r:.80}") from error
         pose = RobotPose.of_answer(answer, mount, clock())
         if pose is not None:
-            yield pose
+            origin = origin or pose.frame_here()
+            yield pose, origin

@@ -53,18 +53,14 @@ TOPICS = {
 class McapLog:
     """Writes the messages of poses into a file of ROS 2's profile; a context manager.
 
-    Args:
-        origin: of the frame `map`; None: where the first pose is.
-
     Raises:
         MissingExtraError: mcap is not installed.
         InvalidValueError: the file is there already, or cannot be written; raised when the block begins.
     """
 
-    def __init__(self, path: Path, *, origin: LocalFrame | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         require("robots", "The ROS 2 bridge", "mcap.writer")
         self._path = path
-        self._origin = origin
 
     def __enter__(self) -> Self:
         from mcap.writer import Writer
@@ -93,12 +89,10 @@ class McapLog:
         self._writer.finish()
         self._file.close()
 
-    def write(self, pose: RobotPose) -> None:
-        """Add the three messages of a pose."""
-        if self._origin is None:
-            self._origin = pose.frame_here()
+    def write(self, pose: RobotPose, origin: LocalFrame) -> None:
+        """Add the three messages of a pose, in the frame `map` at this origin."""
         stamp_ns = _nanoseconds(pose.time_s)
-        for topic, data in messages(pose, self._origin).items():
+        for topic, data in messages(pose, origin).items():
             self._writer.add_message(
                 channel_id=self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=data
             )

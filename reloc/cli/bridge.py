@@ -68,23 +68,25 @@ def register(subparsers: Any) -> None:
         kind.set_defaults(run=run)
 
 
-def _poses(args: argparse.Namespace) -> "Iterator[RobotPose]":
+def _poses(
+    args: argparse.Namespace, origin: "LocalFrame | None" = None
+) -> "Iterator[tuple[RobotPose, LocalFrame]]":
     import time
 
     from reloc.bridge.robot_pose import read_answers, warm_up
 
     warm_up()
-    return read_answers(sys.stdin, args.mount, time.time)
+    return read_answers(sys.stdin, args.mount, time.time, origin)
 
 
 def _mavlink(args: argparse.Namespace) -> int:
     from reloc.bridge.mavlink import MavlinkSender, UdpLink
 
-    sender = MavlinkSender(args.message or ("odometry",), origin=_origin(args.origin), geoid_m=args.geoid)
-    count = 0
+    sender = MavlinkSender(args.message or ("odometry",), geoid_m=args.geoid)
+    origin, count = _origin(args.origin), 0
     with UdpLink(args.to) as link:
-        for pose in _poses(args):
-            for packet in sender.pack(pose):
+        for placed in _poses(args, origin):
+            for packet in sender.pack(*placed):
                 link.send(packet)
             count += 1
     lost = f"; {link.lost} packets were not sent" if link.lost else ""
@@ -102,17 +104,17 @@ def _ros2(args: argparse.Namespace) -> int:
         raise InvalidValueError(f"--domain: expected 0 to {_MOST_DOMAIN}, found {args.domain}")
     origin, count = _origin(args.origin), 0
     with ExitStack() as opened:
-        sinks: list[Callable[[RobotPose], None]] = []
+        sinks: list[Callable[[RobotPose, LocalFrame], None]] = []
         if args.connect is not None:
             from reloc.bridge.rmw_zenoh import RmwZenohNode
 
-            node = RmwZenohNode(args.connect, domain=args.domain, origin=origin)
+            node = RmwZenohNode(args.connect, domain=args.domain)
             sinks.append(opened.enter_context(node).write)
         if args.out is not None:  # begun once the router is there: nothing is overwritten for nothing
-            sinks.append(opened.enter_context(McapLog(args.out, origin=origin)).write)
-        for pose in _poses(args):
+            sinks.append(opened.enter_context(McapLog(args.out)).write)
+        for placed in _poses(args, origin):
             for sink in sinks:
-                sink(pose)
+                sink(*placed)
             count += 1
     where = " and ".join(str(what) for what in (args.out, args.connect) if what is not None)
     return _said(f"{count} poses written to {where}", count)
@@ -122,7 +124,7 @@ def _nmea(args: argparse.Namespace) -> int:
     from reloc.bridge.nmea import sentences
 
     count = 0
-    for pose in _poses(args):
+    for pose, _ in _poses(args):
         sys.stdout.write("".join(sentences(pose, args.geoid)))
         sys.stdout.flush()
         count += 1

@@ -38,6 +38,14 @@ def register(subparsers: Any) -> None:
         help="trajectory of the answered frames: .csv, .tum, .geojson, .kml, .json, .srt or .png; "
         "may be repeated",
     )
+    add_film_arguments(parser)
+    parser.add_argument("--max-side", type=int, default=1280, metavar="PX", help="frames are sent at; 1280")
+    parser.add_argument("--json", action="store_true", help="print each pose as a line of JSON")
+    parser.set_defaults(run=run_live)
+
+
+def add_film_arguments(parser: argparse.ArgumentParser) -> None:
+    """What is known of a film, and how it is read."""
     parser.add_argument(
         "--camera",
         metavar="MODEL,WIDTH,HEIGHT,PARAMS...",
@@ -51,9 +59,6 @@ def register(subparsers: Any) -> None:
     )
     parser.add_argument("--start", type=float, metavar="S", help="of the film; default: its beginning")
     parser.add_argument("--end", type=float, metavar="S", help="of the film; default: its end")
-    parser.add_argument("--max-side", type=int, default=1280, metavar="PX", help="frames are sent at; 1280")
-    parser.add_argument("--json", action="store_true", help="print each pose as a line of JSON")
-    parser.set_defaults(run=run_live)
 
 
 def run_live(args: argparse.Namespace) -> int:

@@ -83,8 +83,7 @@ def _run(args: argparse.Namespace) -> int:
         sys.stdout.write(f"{args.static}: {size / 1e6:.1f} MB, of version {scene.document['snapshot']}\n")
         return 0
     from reloc.viewer.query import Queries
-    from reloc.viewer.serve import serve
-    from reloc.viewer.server import create_app
+    from reloc.viewer.server import create_app, serve
 
     pages = _placing_pages(scene, database.url, args)
     try:

@@ -241,12 +241,7 @@ class Client:
                 config = zenoh.Config.from_file(str(self._config_path))
                 self.name = _name_in(config)
             else:
-                config = zenoh.Config()
-                config.insert_json5("mode", '"client"')
-                config.insert_json5("connect/endpoints", json.dumps([self._connect]))
-                config.insert_json5("connect/timeout_ms", json.dumps(int(self._connect_timeout_s * 1e3)))
-                config.insert_json5("scouting/multicast/enabled", "false")
-                config.insert_json5("transport/shared_memory/enabled", "false")
+                config = client_config(self._connect, self._connect_timeout_s)
             return zenoh.open(config)
         except zenoh.ZError as error:
             raise ServiceError(
@@ -283,6 +278,17 @@ class Client:
         raise ServiceError(
             NO_SERVER, f"no server of database {self._database!r} answers any more at {self._where}"
         )
+
+
+def client_config(endpoint: str, timeout_s: float) -> zenoh.Config:
+    """The Zenoh configuration of a client of this endpoint alone; raises ZError where it is none."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("connect/timeout_ms", json.dumps(int(timeout_s * 1e3)))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("transport/shared_memory/enabled", "false")
+    return config
 
 
 def _deadline_ms(left_s: float) -> float:

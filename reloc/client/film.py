@@ -41,7 +41,6 @@ class StreamedFilm:
         trajectory: the frames that were answered.
         frames: of the film. sent: of them.
         latency_ms: (n,) from sending a frame to its pose, of the answered ones.
-        timings_ms: stage of the server -> (n,) of the same frames.
         refusals: why frames could not be used, the latest. complaints: what was wrong with the film, and
             why the session ended before it.
     """
@@ -50,7 +49,6 @@ class StreamedFilm:
     frames: int
     sent: int
     latency_ms: FloatArray
-    timings_ms: dict[str, FloatArray]
     refusals: tuple[str, ...]
     complaints: tuple[str, ...]
 
@@ -67,7 +65,6 @@ class _Answers:
     on_pose: OnPose | None
     points: list[TrajectoryPoint] = field(default_factory=list)
     latency_ms: list[float] = field(default_factory=list)
-    timings_ms: dict[str, list[float]] = field(default_factory=dict)
     taking: "Future[None]" = field(default_factory=Future)
     _changed: threading.Condition = field(default_factory=threading.Condition)
 
@@ -104,8 +101,6 @@ class _Answers:
             self.on_pose(pose, latency_ms)
         if latency_ms is not None:
             self.latency_ms.append(latency_ms)
-        for stage, ms in pose.timings_ms.items():
-            self.timings_ms.setdefault(stage, []).append(ms)
         self.points.append(point_of_message(pose))
         self._tell(pose)
 
@@ -173,14 +168,11 @@ def stream_film(
         trajectory=Trajectory(
             source=info.name,
             points=tuple(answers.points),
-            database=client.database,
-            version=live.opened.snapshot,
             start=info.creation_time,
         ),
         frames=last + 1,
         sent=sent,
         latency_ms=np.array(answers.latency_ms),
-        timings_ms={stage: np.array(values) for stage, values in answers.timings_ms.items()},
         refusals=refusals,
         complaints=complaints,
     )

@@ -113,7 +113,7 @@ class LiveTrack:
             ServiceError: NO_SERVER, it is not open.
         """
         if self._opened is None:
-            raise ServiceError(NO_SERVER, "the session is not open; use it in a `with` block or call open()")
+            raise _not_open()
         return self._opened
 
     def send(self, image: bytes, time_s: float, sequence: int | None = None) -> int:
@@ -131,7 +131,7 @@ class LiveTrack:
         if self._end is not None:
             raise self._end
         if frames is None:
-            raise ServiceError(NO_SERVER, "the session is not open; use it in a `with` block or call open()")
+            raise _not_open()
         sequence = self._next if sequence is None else sequence
         self._next = sequence + 1
         header = encode(TrackFrame(sequence=sequence, time_s=time_s))
@@ -231,6 +231,10 @@ class LiveTrack:
             self._over(ServiceError(event.code, event.message))
         else:
             self.refusals.append(event)
+
+
+def _not_open() -> ServiceError:
+    return ServiceError(NO_SERVER, "the session is not open; use it in a `with` block or call open()")
 
 
 def _remember(times: OrderedDict[int, float], sequence: int, value: float) -> None:

@@ -24,8 +24,6 @@ from reloc.gateway.protocol import (
     GeolocationReading,
     GeoPoseAccuracy,
     GeoPoseBasicQuaternion,
-    GeoPosePosition,
-    GeoPoseQuaternion,
     GeoPoseReq,
     GeoPoseResp,
 )
@@ -62,10 +60,7 @@ def parse(body: bytes) -> GeoPoseReq:
     try:
         return GeoPoseReq.model_validate_json(body)
     except ValidationError as error:
-        # Without the values found: a missing id would print the whole request with its picture.
-        items = error.errors(include_url=False, include_input=False, include_context=False)[:3]
-        said = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'body'}: {item['msg']}" for item in items)
-        raise GatewayError(ErrorCode.BAD_REQUEST, said) from error
+        raise GatewayError(ErrorCode.BAD_REQUEST, _explained(error, "body")) from error
 
 
 def check_version(accept: str) -> bool:
@@ -123,13 +118,12 @@ def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp,
     """
     if reply.position is None or reply.quaternion is None or reply.covariance is None:
         raise NotLocalisedError(reply, request.id)
-    position, turn = reply.position, reply.quaternion
-    height, datum = position.h, reply.height_datum or "unknown"
+    position, datum = reply.position, reply.height_datum or "unknown"
     if datum in HEIGHT_DATUMS:
         # Without the geoid's grid the height stays what it is, and the answer says so.
-        converted = ellipsoidal_height(position.lat, position.lon, height, datum).height_m
+        converted = ellipsoidal_height(position.lat, position.lon, position.h, datum).height_m
         if converted is not None:
-            height, datum = converted, "ellipsoidal"
+            position, datum = position.model_copy(update={"h": converted}), "ellipsoidal"
     sigmas = np.sqrt(np.diag(np.array(reply.covariance)))
     response = GeoPoseResp(
         id=request.id,
@@ -137,10 +131,7 @@ def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp,
         accuracy=GeoPoseAccuracy(
             position=float(np.mean(sigmas[3:])), orientation=float(np.degrees(np.mean(sigmas[:3])))
         ),
-        geopose=GeoPoseBasicQuaternion(
-            position=GeoPosePosition(lon=position.lon, lat=position.lat, h=height),
-            quaternion=GeoPoseQuaternion(x=turn.x, y=turn.y, z=turn.z, w=turn.w),
-        ),
+        geopose=GeoPoseBasicQuaternion(position=position, quaternion=reply.quaternion),
     )
     return response, datum
 
@@ -206,10 +197,13 @@ def _camera(picture: CameraReading, size: tuple[int, int] | None) -> CameraReque
     try:
         return CameraRequest(model=model, width=size[0], height=size[1], params=params.modelParams)
     except ValidationError as error:
-        said = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        raise GatewayError(
-            ErrorCode.BAD_REQUEST, f"params.{'.'.join(map(str, said['loc']))}: {said['msg']}"
-        ) from error
+        raise GatewayError(ErrorCode.BAD_REQUEST, f"params.{_explained(error, '')}") from error
+
+
+def _explained(error: ValidationError, whole: str) -> str:
+    """Without the values found: a missing id would print the whole request with its picture."""
+    items = error.errors(include_url=False, include_input=False, include_context=False)[:3]
+    return "; ".join(f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}" for item in items)
 
 
 def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions) -> PriorRequest | None:

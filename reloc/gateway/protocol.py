@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from reloc.wire.query import Position, Quaternion
+
 MEDIA_TYPE = "application/vnd.oscp+json"
 VERSION = "2.0"
 
@@ -69,24 +71,11 @@ class Sensor(Message):
     type: Text
 
 
-class GeoPosePosition(Message):
-    lon: Degrees180
-    lat: Degrees90
-    h: float
-
-
-class GeoPoseQuaternion(Message):
-    x: float
-    y: float
-    z: float
-    w: float
-
-
 class GeoPoseBasicQuaternion(Message):
     """OGC GeoPose Basic-Quaternion: x forward, y left, z up of the camera to true east, north, up."""
 
-    position: GeoPosePosition
-    quaternion: GeoPoseQuaternion
+    position: Position
+    quaternion: Quaternion
 
 
 class GeoPoseAccuracy(Message):

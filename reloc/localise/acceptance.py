@@ -84,7 +84,7 @@ def agreement(
     Args:
         inliers: (k, 2) pixels. expected: (v, 2) pixels of all map points that the pose makes visible.
     """
-    cells = _expected_cells(expected, width, height)
+    cells = expected_cells(expected, width, height)
     if len(cells) == 0:
         return 0.0
     return float(np.isin(cells, _cells(inliers, width, height)).mean())
@@ -100,7 +100,7 @@ def spread(inliers: NDArray[np.floating], expected: NDArray[np.floating], width:
     Args:
         inliers: (k, 2) pixels. expected: (v, 2) pixels of all map points that the pose makes visible.
     """
-    cells = _expected_cells(expected, width, height)
+    cells = expected_cells(expected, width, height)
     inside = np.isin(_cells(inliers, width, height), cells)
     if not inside.any():
         return 0.0
@@ -110,12 +110,8 @@ def spread(inliers: NDArray[np.floating], expected: NDArray[np.floating], width:
     return float(reached / (1.0 - (1.0 - share) ** inside.sum()).sum())
 
 
-def expected_cells(expected: NDArray[np.floating], width: int, height: int) -> int:
-    """How many cells `agreement` asks."""
-    return len(_expected_cells(expected, width, height))
-
-
-def _expected_cells(expected: NDArray[np.floating], width: int, height: int) -> NDArray[np.int64]:
+def expected_cells(expected: NDArray[np.floating], width: int, height: int) -> NDArray[np.int64]:
+    """Numbers of the cells that `agreement` asks."""
     cells, counts = np.unique(_cells(expected, width, height), return_counts=True)
     return np.asarray(cells[counts >= 3], dtype=np.int64)
 

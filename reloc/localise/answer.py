@@ -5,17 +5,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rotation import quaternion_from_matrix, skew
+from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
 from reloc.localise.lens_prior import lens_of, opencv_by_lens
 from reloc.localise.map_shape import shape_covariance
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
-from reloc.localise.result import Inliers, LocalisedPose
+from reloc.localise.result import Inliers, LocalisedPose, place_on_earth
 
 
 def make_answer(
@@ -51,7 +50,6 @@ def make_answer(
         if shape is not None
         else on_earth(area, main, center, (lent or uncertainty).joint, point_rows, np.zeros((6, 6)))
     )
-    grid_from_local = area.frame.grid_from_enu(center, main.epsg)
     return LocalisedPose(
         frame=area.frame,
         cam_from_local=pose.cam_from_local,
@@ -59,10 +57,7 @@ def make_answer(
         view_covariance=None if told else _of_params(pose.camera, seen),
         camera=told or pose.camera,
         camera_source=pose.camera_source,
-        epsg=main.epsg,
-        utm=area.frame.utm_from_enu(center, main.epsg),
-        cam_from_utm_xyzw=quaternion_from_matrix(pose.cam_from_local.rotation @ grid_from_local.T),
-        geopose=geopose_from_camera(pose.cam_from_local, area.frame),
+        **place_on_earth(area.frame, pose.cam_from_local, main.epsg),
         height_datum=main.height_datum,
         map_ids=tuple(area.maps[i].map_id for i in order),
         lineage=tuple(_lineage(area.maps[i]) for i in order),

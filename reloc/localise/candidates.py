@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from featuredb.errors import IncompatibleExtractorError
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.area import Area, build_area
@@ -33,6 +34,22 @@ class IndexedArea:
     def only(self, map_ids: Collection[str]) -> "IndexedArea":
         """The same area and index, of which only these maps are searched."""
         return IndexedArea(area=self.area.only(map_ids), index=self.index)
+
+
+def usable_areas(areas: Sequence[IndexedArea], fingerprint: str) -> list[IndexedArea]:
+    """Those whose descriptors can be compared with those of this extractor.
+
+    Raises:
+        IncompatibleExtractorError: there are areas, and none of them is.
+    """
+    usable = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
+    if areas and not usable:
+        raise IncompatibleExtractorError(
+            f"the maps were made by extractor {areas[0].area.extractor_fingerprint}, photos and frames here "
+            f"use {fingerprint}: their descriptors cannot be compared; use the same extractor options "
+            "(upright or not) as the ingest"
+        )
+    return usable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,7 +7,7 @@ from scipy.stats import norm
 
 from featuredb.adjust.block import whole_camera
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
 from featuredb.maps.lens_uncertainty import LensUncertainty
 
@@ -31,10 +31,7 @@ class QueryLensPrior:
     dilution: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("mean", "sigma"):
-            object.__setattr__(
-                self, name, frozen_array(f"QueryLensPrior.{name}", getattr(self, name), (None,))
-            )
+        freeze(self, mean=(None,), sigma=(None,))
         if self.mean.shape not in ((4,), (8,)) or self.sigma.shape != self.mean.shape:
             raise InvalidValueError(
                 f"QueryLensPrior: expected 4 or 8 means and as many sigmas, found {self.mean.shape} and "

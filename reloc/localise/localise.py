@@ -6,18 +6,18 @@ cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import IncompatibleExtractorError
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.stage_clock import StageClock
 from reloc.localise.acceptance import confidence, prior_tells, verdict
 from reloc.localise.answer import make_answer
-from reloc.localise.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea, usable_areas
 from reloc.localise.lens_prior import seen_by_a_map
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.pose import PoseUncertainty, pose_uncertainty
@@ -59,16 +59,16 @@ def localise(
 
     Args:
         gray: (h, w) uint8, pixels as stored in the file.
-        areas: the indexed maps to search.
+        areas: the indexed maps to search; those of another extractor than the options' are left out.
         snapshot: version of the database that the areas come from, passed through.
 
     Raises:
-        IncompatibleExtractorError: an area's descriptors are of another extractor than the options'.
+        IncompatibleExtractorError: there are areas, and all of them are of another extractor.
         ImageError: the image is not (h, w) uint8 or tiny.
         InvalidValueError: the request's camera is of another image size.
     """
     options = options or LocaliseOptions()
-    check_extractor(areas, options)
+    areas = usable_areas(areas, options.extractor.fingerprint)
     clock = StageClock()
     features = extract(gray, options.extractor)
     clock.lap("features")
@@ -84,11 +84,11 @@ def localise_features(
     """`localise` of a photo whose features are there already, strongest and best spread first.
 
     Raises:
-        IncompatibleExtractorError: an area's descriptors are of another extractor than the options'.
+        IncompatibleExtractorError: there are areas, and all of them are of another extractor.
         InvalidValueError: the request's camera is of another image size.
     """
     options = options or LocaliseOptions()
-    check_extractor(areas, options)
+    areas = usable_areas(areas, options.extractor.fingerprint)
     return _localised(features, request, areas, options, 0, StageClock())
 
 
@@ -156,17 +156,6 @@ def _with_own_position(
     return said(Localised(result=refused), "contradicted")
 
 
-def check_extractor(areas: Sequence[IndexedArea], options: LocaliseOptions) -> None:
-    """Raise IncompatibleExtractorError where descriptors could not be compared."""
-    for indexed in areas:
-        if indexed.area.extractor_fingerprint != options.extractor.fingerprint:
-            raise IncompatibleExtractorError(
-                f"the maps were made by extractor {indexed.area.extractor_fingerprint}, this query uses "
-                f"{options.extractor.fingerprint}: their descriptors cannot be compared; use the same "
-                "extractor options (upright or not) as the ingest"
-            )
-
-
 def _decide(
     found: Search,
     features: Features,
@@ -174,19 +163,13 @@ def _decide(
     options: LocaliseOptions,
     snapshot: int,
 ) -> Localised:
+    evidence = found.candidates[0].evidence if found.candidates else None
+    answered = partial(
+        LocaliseResult, features=len(features), matches=found.matches, snapshot=snapshot, evidence=evidence
+    )
+
     def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None) -> Localised:
-        result = LocaliseResult(
-            reason=reason,
-            detail=detail,
-            pose=None,
-            confidence=0.0,
-            features=len(features),
-            matches=found.matches,
-            inliers=inliers,
-            runner_up=rival,
-            snapshot=snapshot,
-            evidence=found.candidates[0].evidence if found.candidates else None,
-        )
+        result = answered(reason=reason, detail=detail, inliers=inliers, runner_up=rival)
         return Localised(result=result)
 
     if found.reason is not None:
@@ -221,16 +204,12 @@ def _decide(
     against = contradicts_prior(answer, request.prior)
     if against is not None:
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
-    result = LocaliseResult(
+    result = answered(
         reason=None,
         detail=f"{best.evidence.inliers} inliers of {found.matches} matches",
         pose=answer,
         confidence=confidence(best.evidence, rival.inliers if rival else 0),
-        features=len(features),
-        matches=found.matches,
         inliers=best.evidence.inliers,
         runner_up=rival,
-        snapshot=snapshot,
-        evidence=best.evidence,
     )
     return Localised(result=result, best=best, uncertainty=uncertainty)

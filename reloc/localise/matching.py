@@ -28,12 +28,10 @@ class Matches:
     Attributes:
         feature: (m,) rows of the query's features.
         point: (m,) rows of the area's points.
-        distance: (m,) descriptor distances (descriptors have length 512).
     """
 
     feature: NDArray[np.int64]
     point: NDArray[np.int64]
-    distance: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.feature)
@@ -145,23 +143,20 @@ def _one_to_one(
     SIFT gives a place several keypoints when its orientation is not clear; they are one measurement.
     """
     order = np.argsort(distance, kind="stable")
-    feature, point, distance = feature[order], point[order], distance[order]
+    feature, point = feature[order], point[order]
     _, first = np.unique(point, return_index=True)
     first.sort()
-    feature, point, distance = feature[first], point[first], distance[first]
+    feature, point = feature[first], point[first]
     place = np.round(xy[feature] * 2.0).astype(np.int64)
     _, first = np.unique(place, axis=0, return_index=True)
     first.sort()
-    return Matches(feature=feature[first], point=point[first], distance=distance[first])
+    return Matches(feature=feature[first], point=point[first])
 
 
 def _concatenate(parts: list[Matches]) -> Matches:
     if not parts:
-        return Matches(
-            feature=np.zeros(0, np.int64), point=np.zeros(0, np.int64), distance=np.zeros(0, np.float32)
-        )
+        return Matches(feature=np.zeros(0, np.int64), point=np.zeros(0, np.int64))
     return Matches(
         feature=np.concatenate([p.feature for p in parts]),
         point=np.concatenate([p.point for p in parts]),
-        distance=np.concatenate([p.distance for p in parts]),
     )

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from featuredb.features.extractor import ExtractorOptions
+from featuredb.geometry.camera import Camera
 from reloc.localise.acceptance import AcceptanceOptions
 from reloc.localise.lens_prior import LensPriors
 
@@ -78,6 +79,10 @@ class PoseOptions:
     confidence: float = 0.9999
     seed: int = 0
     lens: LensPriors = field(default_factory=LensPriors)
+
+    def tolerance_px(self, camera: Camera) -> float:
+        """The inlier tolerance in pictures of this camera's size."""
+        return self.tolerance_rel * max(camera.width, camera.height)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -59,7 +59,7 @@ def estimate_pose(
     """
     if len(pixels) < options.min_matches:
         return None
-    tolerance_px = options.tolerance_rel * max(camera.width, camera.height)
+    tolerance_px = options.tolerance_px(camera)
     tries = [
         _ransac(pixels, points, guess, tolerance_px, options)
         for guess in _guesses(camera, source, options.lens)
@@ -145,7 +145,7 @@ def refine_pose(
     Args:
         rounds: how often the matches within reach are chosen anew.
     """
-    tolerance_px = options.tolerance_rel * max(start.camera.width, start.camera.height)
+    tolerance_px = options.tolerance_px(start.camera)
     pose = start
     for _ in range(rounds):
         residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
@@ -243,7 +243,8 @@ def pose_uncertainty(
     chi_square = float(np.einsum("ni,nij,nj->", residual, weight, residual))
     # Chi-square per degree of freedom, times what the robust loss costs.
     factor = chi_square / max(2 * len(points) - jacobian.shape[2], 1)
-    factor *= _price_of_robustness(residual, _loss_scale_px(pose.camera, options), jacobian.shape[2])
+    # The scale of the Cauchy loss is a quarter of the inlier tolerance.
+    factor *= _price_of_robustness(residual, 0.25 * options.tolerance_px(pose.camera), jacobian.shape[2])
     # Residuals of zero are test data; the floor is a hundredth of a pixel.
     information = np.einsum("nij,nik,nkl->jl", jacobian, weight, jacobian) / max(factor, 1e-4)
     if lens is not None:
@@ -278,11 +279,6 @@ def _price_of_robustness(residual: FloatArray, scale_px: float, parameters: int)
     few = 1.0 + parameters / residual.size * variation
     # A dozen residuals may be small by luck; the lower bound keeps that from being taken for precision.
     return float(np.clip(few**2 * np.mean(weight**2 * squared) / spread / slope**2, 0.1, 10.0))
-
-
-def _loss_scale_px(camera: Camera, options: PoseOptions) -> float:
-    """Scale of the Cauchy loss: a quarter of the inlier tolerance."""
-    return 0.25 * options.tolerance_rel * max(camera.width, camera.height)
 
 
 def _poselib_camera(camera: Camera) -> dict[str, Any]:

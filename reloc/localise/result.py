@@ -1,18 +1,19 @@
 """What goes into a localisation and what comes out of it."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.geo.geopose import GeoPose
+from featuredb.geo.geopose import GeoPose, geopose_from_camera
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.unplaced_map import OwnFrame
 from reloc.localise.lens_prior import QueryLensPrior
@@ -25,7 +26,6 @@ Reason = Literal[
     "AMBIGUOUS",
     "CONTRADICTS_PRIOR",
 ]
-REASONS: tuple[Reason, ...] = get_args(Reason)
 CameraSource = Literal["request", "map", "exif", "estimated"]
 PositionRole = Literal["agrees", "decided", "contradicted", "no_help"]
 
@@ -105,8 +105,7 @@ class OnEarth:
     covariance: FloatArray
 
     def __post_init__(self) -> None:
-        for name, shape in (("covariance", (6, 6)), ("utm", (3,)), ("cam_from_utm_xyzw", (4,))):
-            object.__setattr__(self, name, frozen_array(f"OnEarth.{name}", getattr(self, name), shape))
+        freeze(self, covariance=(6, 6), utm=(3,), cam_from_utm_xyzw=(4,))
 
     @property
     def horizontal_68_m(self) -> float:
@@ -119,6 +118,19 @@ class OnEarth:
     @property
     def orientation_68_deg(self) -> float:
         return float(np.degrees(error_radius(self.covariance[:3, :3])))
+
+
+def place_on_earth(frame: LocalFrame, cam_from_local: Rigid3, epsg: int) -> dict[str, Any]:
+    """The fields of `OnEarth` that say where a camera is whose pose is known in a local frame."""
+    center = cam_from_local.center
+    return {
+        "epsg": epsg,
+        "utm": frame.utm_from_enu(center, epsg),
+        "cam_from_utm_xyzw": quaternion_from_matrix(
+            cam_from_local.rotation @ frame.grid_from_enu(center, epsg).T
+        ),
+        "geopose": geopose_from_camera(cam_from_local, frame),
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,8 +164,7 @@ class LocalisedPose(OnEarth):
         OnEarth.__post_init__(self)
         if self.view_covariance is not None:
             size = 6 + len(self.camera.params)
-            joint = frozen_array("LocalisedPose.view_covariance", self.view_covariance, (size, size))
-            object.__setattr__(self, "view_covariance", joint)
+            freeze(self, view_covariance=(size, size))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -173,8 +184,7 @@ class OwnPose:
     covariance: FloatArray
 
     def __post_init__(self) -> None:
-        covariance = frozen_array("OwnPose.covariance", self.covariance, (6, 6))
-        object.__setattr__(self, "covariance", covariance)
+        freeze(self, covariance=(6, 6))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -259,13 +269,13 @@ class LocaliseResult:
 
     reason: Reason | None
     detail: str
-    pose: LocalisedPose | None
-    confidence: float
     features: int
     matches: int
     inliers: int
-    runner_up: RunnerUp | None
     snapshot: int
+    pose: LocalisedPose | None = None
+    confidence: float = 0.0
+    runner_up: RunnerUp | None = None
     evidence: Evidence | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
     in_map: PoseInMap | None = None
@@ -276,10 +286,6 @@ class LocaliseResult:
         if sum(said) != 1:
             raise InvalidValueError(
                 "LocaliseResult: expected a reason, a pose on Earth or one in a map, found none or several"
-            )
-        if self.reason is not None and self.reason not in REASONS:
-            raise InvalidValueError(
-                f"LocaliseResult.reason: expected one of {REASONS}, found {self.reason!r}"
             )
         if not 0.0 <= self.confidence <= 1.0:
             raise InvalidValueError(f"LocaliseResult.confidence: expected 0..1, found {self.confidence}")

@@ -182,9 +182,7 @@ def _poses(
     best = _refined(features, cluster, matches, pose, options)
     clock.lap("guided")
     taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
-    left = Matches(
-        feature=matches.feature[~taken], point=matches.point[~taken], distance=matches.distance[~taken]
-    )
+    left = Matches(feature=matches.feature[~taken], point=matches.point[~taken])
     # A photo has one lens, which the first pose has estimated.
     rival = _best_pose(features, cluster.area, left, [(best.pose.camera, "request")], options)
     clock.lap("pose")
@@ -226,11 +224,13 @@ def _is_hopeless(matches: int, pose: PoseHypothesis, options: LocaliseOptions) -
     What is refused costs most, since RANSAC ends early only where there is something to be found. Refining
     adds a few to RANSAC's inliers; twice is out of reach.
     """
-    width, height = pose.camera.width, pose.camera.height
-    tolerance_px = options.pose.tolerance_rel * max(width, height)
     twice = min(_MORE_BY_REFINING * pose.count, matches)
-    sample = 4 if pose.focal_is_free else 3
-    return log_nfa(matches, twice, tolerance_px, width, height, sample) < options.acceptance.min_log_nfa
+    return _log_nfa(matches, twice, pose, options) < options.acceptance.min_log_nfa
+
+
+def _log_nfa(matches: int, inliers: int, pose: PoseHypothesis, options: LocaliseOptions) -> float:
+    camera, sample = pose.camera, 4 if pose.focal_is_free else 3
+    return log_nfa(matches, inliers, options.pose.tolerance_px(camera), camera.width, camera.height, sample)
 
 
 def camera_hypotheses(
@@ -249,9 +249,9 @@ def camera_hypotheses(
             )
         return [(request.camera, "request")]
     if request.camera_key:
-        camera = area.camera_for_key(request.camera_key)
-        if camera is not None and (camera.width, camera.height) != (features.width, features.height):
-            camera = _resampled(camera, features.width, features.height)  # frames of films are made smaller
+        of_map = area.camera_for_key(request.camera_key)
+        # Frames of films are made smaller.
+        camera = None if of_map is None else _resampled(of_map, features.width, features.height)
         if camera is not None:
             return [(camera, "map")]
     if request.film:
@@ -318,22 +318,14 @@ def _with_evidence(
     Of those, only independent ones count, or a few places that match several times over would be believed.
     """
     area, width, height = cluster.area, pose.camera.width, pose.camera.height
-    tolerance_px = options.pose.tolerance_rel * max(width, height)
     own = _independent(features, area, pose, matches, pose.inliers)
     error = reprojection_errors(*pairs(features, area, unguided), pose.camera, pose.cam_from_local)
-    blind = _independent(features, area, pose, unguided, error < tolerance_px)
+    blind = _independent(features, area, pose, unguided, error < options.pose.tolerance_px(pose.camera))
     inlier_pixels = features.xy[matches.feature[own]]
     expected_pixels = _expected(area, cluster.points.astype(np.int64), pose)
     evidence = Evidence(
         inliers=len(own),
-        log_nfa=log_nfa(
-            len(unguided),
-            len(blind),
-            tolerance_px,
-            width,
-            height,
-            sample=4 if pose.focal_is_free else 3,
-        ),
+        log_nfa=_log_nfa(len(unguided), len(blind), pose, options),
         coverage=coverage(inlier_pixels, width, height),
         agreement=agreement(inlier_pixels, expected_pixels, width, height),
         spread=spread(inlier_pixels, expected_pixels, width, height),
@@ -351,7 +343,7 @@ def _expected(area: Area, points: NDArray[np.int64], pose: PoseHypothesis) -> Fl
     for beyond_deg in (EXPECTED_DEG, POSSIBLE_DEG):
         visible = visible_points(area, points, pose.camera, pose.cam_from_local, beyond_deg)
         pixels = pose.camera.project(pose.cam_from_local.act(area.points[visible]))
-        if expected_cells(pixels, pose.camera.width, pose.camera.height) >= _FEWEST_CELLS:
+        if len(expected_cells(pixels, pose.camera.width, pose.camera.height)) >= _FEWEST_CELLS:
             break
     return pixels
 

@@ -119,14 +119,13 @@ def _minimise(problem: "LensProblem", pose: Rigid3, camera: Camera) -> tuple[Rig
     damping = 1e-4
     cost = problem.cost(pose, camera)
     for _ in range(20):
-        system = problem.linearise(pose, camera)
+        information, gradient = problem.linearise(pose, camera)
         before = cost
         while damping < 1e6:
             # The floor keeps the matrix regular where no point says anything of a parameter.
-            diagonal = np.maximum(np.diag(system.information), 1e-9)
-            step: FloatArray = np.linalg.solve(
-                system.information + damping * np.diag(diagonal), system.gradient
-            ).astype(np.float64)
+            diagonal = np.maximum(np.diag(information), 1e-9)
+            damped = information + damping * np.diag(diagonal)
+            step = np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
             length, moved = problem.best_length(pose, camera, step)
             if moved < cost:
                 pose, camera = _step(pose, camera, length * step)
@@ -136,14 +135,6 @@ def _minimise(problem: "LensProblem", pose: Rigid3, camera: Camera) -> tuple[Rig
         if before - cost < 1e-7 * before:
             break
     return pose, camera
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NormalEquations:
-    """Normal equations of one Levenberg-Marquardt step: (6 + n, 6 + n) and (6 + n,)."""
-
-    information: FloatArray
-    gradient: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -158,7 +149,8 @@ class LensProblem:
 
     def cost(self, pose: Rigid3, camera: Camera) -> float:
         """Half the Cauchy loss in units of the noise plus half the priors' chi-square."""
-        return self.cost_of_pixels(pose, camera) + prior_cost(self.prior, camera)
+        off = lens_of(camera) - self.prior.mean
+        return self.cost_of_pixels(pose, camera) + 0.5 * float(np.sum(off**2 * self.prior.information))
 
     def cost_of_pixels(self, pose: Rigid3, camera: Camera) -> float:
         """Half the Cauchy loss in units of the noise."""
@@ -177,8 +169,8 @@ class LensProblem:
             length, cost = longer, longer_cost
         return length, cost
 
-    def linearise(self, pose: Rigid3, camera: Camera) -> NormalEquations:
-        """Gauss-Newton with the Cauchy weights 1 / (1 + r^2 / s^2), and the prior."""
+    def linearise(self, pose: Rigid3, camera: Camera) -> tuple[FloatArray, FloatArray]:
+        """Normal equations (6 + n, 6 + n) and (6 + n,) with the Cauchy weights 1 / (1 + r^2 / s^2)."""
         in_camera = pose.act(self.points)
         # The derivatives reach a little beyond the point: on the fold of the distortion there are none.
         front = (in_camera[:, 2] > 0.1) & np.isfinite(camera.project(in_camera * [1.001, 1.001, 1.0])).all(1)
@@ -189,12 +181,7 @@ class LensProblem:
         gradient = np.einsum("nij,n,ni->j", jacobian, weight, residual)
         information[6:, 6:] += np.diag(self.prior.information)
         gradient[6:] += (self.prior.mean - lens_of(camera)) * self.prior.information
-        return NormalEquations(information=information, gradient=gradient)
-
-
-def prior_cost(prior: QueryLensPrior, camera: Camera) -> float:
-    """Half the chi-square of a lens under what was known of it."""
-    return 0.5 * float(np.sum((lens_of(camera) - prior.mean) ** 2 * prior.information))
+        return information, gradient
 
 
 def _step(pose: Rigid3, camera: Camera, delta: FloatArray) -> tuple[Rigid3, Camera]:

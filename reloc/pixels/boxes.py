@@ -6,10 +6,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from featuredb.errors import InvalidValueError
+from featuredb.plain_json import plain
 from reloc.pixels.locate import PixelPlace
 
 Foot = Literal["bottom", "centre"]
+_TOLD = (
+    *("pixel", "reason", "detail", "surface", "epsg", "utm", "height_datum", "covariance"),
+    *("horizontal_68_m", "vertical_68_m", "at_edge", "grazing"),
+    *("distance_m", "incidence_deg", "roughness_m"),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,24 +78,9 @@ def geojson(places: Sequence[PixelPlace], marks: Sequence[MarkedPixel], photo: s
 
 def as_json(place: PixelPlace) -> dict[str, Any]:
     """All of a place but its geodetic coordinates, as JSON has it."""
-    utm, covariance = place.utm, place.covariance
-    return {
-        "pixel": list(place.pixel),
-        "reason": place.reason,
-        "detail": place.detail,
-        "surface": place.surface,
-        "epsg": place.epsg,
-        "utm": None if utm is None else [round(float(v), 4) for v in utm],
-        "height_datum": place.height_datum,
-        "covariance": None if covariance is None else covariance.tolist(),
-        "horizontal_68_m": place.horizontal_68_m,
-        "vertical_68_m": place.vertical_68_m,
-        "at_edge": place.at_edge,
-        "grazing": place.grazing,
-        "distance_m": place.distance_m,
-        "incidence_deg": place.incidence_deg,
-        "roughness_m": place.roughness_m,
-    }
+    told = {name: getattr(place, name) for name in _TOLD}
+    utm = None if place.utm is None else np.round(place.utm, 4)
+    return {name: plain(value) for name, value in (told | {"utm": utm}).items()}
 
 
 def _feature(place: PixelPlace, mark: MarkedPixel) -> dict[str, Any]:

@@ -1,5 +1,9 @@
 """One query from bytes to reply: parse, decode, localise, word the answer. No network here."""
 
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +14,7 @@ from featuredb.errors import (
     MapNotFoundError,
     UnplacedBesideOthersError,
 )
-from featuredb.features.decode import DecodeLimits, decode_gray
+from featuredb.features.decode import DEFAULT_LIMITS, DecodeLimits, decode_gray
 from featuredb.features.exif.read import read_exif
 from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
@@ -30,40 +34,38 @@ from reloc.wire.query import (
 
 
 def answer_query(
-    data: bytes,
     wire_request: LocaliseWireRequest,
+    data: bytes,
     localiser: Localiser,
     *,
-    limits: DecodeLimits,
-    request_id: str,
-    clock: StageClock,
+    limits: DecodeLimits = DEFAULT_LIMITS,
 ) -> LocaliseReply:
     """Localise the image file in `data`.
 
     Args:
+        wire_request: what the client says about it; without a request id it gets one.
         data: bytes of the image file.
-        wire_request: what the client says about it.
         localiser: answers from one snapshot.
         limits: bytes and pixels allowed.
-        request_id: goes into the reply.
-        clock: its stages so far become part of the reply's timings.
 
     Raises:
-        RequestError: bad image, bad request, too large, or maps of another extractor.
+        RequestError: why the query has no answer.
     """
-    gray = _decode(data, limits)
-    clock.lap("decode")
-    request = localise_request(wire_request, data, gray)
-    clock.lap("exif")
+    clock = StageClock()
     try:
+        gray = decode_gray(data, limits)
+        clock.lap("decode")
+        request = localise_request(wire_request, data, gray)
+        clock.lap("exif")
         result = localiser.localise(gray, request)
+    except ImageError as error:
+        raise image_refused(error) from error
     except IncompatibleExtractorError as error:
         raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
     except (MapNotFoundError, UnplacedBesideOthersError) as error:
         raise RequestError(ErrorCode.BAD_REQUEST, f"options.maps: {error}") from error
-    except ImageError as error:
-        raise RequestError(ErrorCode.BAD_IMAGE, f"image: {error}") from error
     clock.lap("localise_rest", result.timings_ms)
+    request_id = wire_request.request_id or uuid.uuid4().hex
     reply = reply_from_result(result, request_id=request_id, timings_ms={})
     clock.lap("reply")
     return reply.model_copy(update={"timings_ms": clock.milliseconds()})
@@ -79,39 +81,35 @@ def localise_request(
     """
     height, width = gray.shape
     exif = read_exif(data)
-    prior = None if wire_request.prior is None else geo_prior(wire_request.prior)
     lens = wire_request.camera
-    camera = None if lens is None else _camera(lens, width, height)
+    camera = None if lens is None else query_camera(lens, width, height)
     return LocaliseRequest(
         camera=camera,
         camera_prior=None if lens is None or camera is None else _camera_prior(lens, camera),
         camera_is_exact=lens is not None and lens.sigmas is None,
         camera_key=exif.camera_key or None,
         exif_focal_px=exif.focal_px,
-        prior=prior,
+        prior=None if wire_request.prior is None else geo_prior(wire_request.prior),
         own_position=prior_from_exif(exif) if wire_request.options.exif_prior else None,
         map_ids=wire_request.options.maps,
         want_inliers=wire_request.options.inliers,
     )
 
 
-def _decode(data: bytes, limits: DecodeLimits) -> NDArray[np.uint8]:
-    if not data:
-        raise RequestError(ErrorCode.BAD_IMAGE, "payload: expected the bytes of an image file, found none")
-    try:
-        return decode_gray(data, limits)
-    except ImageError as error:
-        code = ErrorCode.TOO_LARGE if error.code == "too_large" else ErrorCode.BAD_IMAGE
-        raise RequestError(code, f"image: {error}") from error
+def image_refused(error: ImageError) -> RequestError:
+    """What the client hears of a picture that cannot be used."""
+    code = ErrorCode.TOO_LARGE if error.code == "too_large" else ErrorCode.BAD_IMAGE
+    return RequestError(code, f"image: {error}")
 
 
-def _camera(camera: CameraRequest, width: int, height: int) -> Camera:
-    try:
+def query_camera(camera: CameraRequest, width: int, height: int) -> Camera:
+    """The camera that a message speaks of, for pictures of this size.
+
+    Raises:
+        RequestError: BAD_REQUEST, it is none, or of another shape.
+    """
+    with _as_bad_request("camera"):
         return camera_of(camera).scaled_to(width, height)
-    except InvalidValueError as error:
-        raise RequestError(
-            ErrorCode.BAD_REQUEST, f"camera: {error} (the image has {width}x{height})"
-        ) from error
 
 
 def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | None:
@@ -119,9 +117,15 @@ def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | No
     if request.sigmas is None:
         return None
     lengths = {"OPENCV": 4, "SIMPLE_RADIAL": 3}.get(camera.model, 0)  # in pixels, which grow with the image
-    try:
-        sigmas = np.array(request.sigmas)
-        sigmas[:lengths] *= camera.width / request.width
+    sigmas = np.array(request.sigmas)
+    sigmas[:lengths] *= camera.width / request.width
+    with _as_bad_request("camera.sigmas"):
         return known_within(camera, sigmas)
+
+
+@contextmanager
+def _as_bad_request(field: str) -> Iterator[None]:
+    try:
+        yield
     except InvalidValueError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, f"camera.sigmas: {error}") from error
+        raise RequestError(ErrorCode.BAD_REQUEST, f"{field}: {error}") from error

@@ -11,7 +11,7 @@ from reloc.service.contributions.inbox import InboxOptions
 from reloc.service.live.options import LiveOptions
 from reloc.service.workers.answering import WorkerLimits
 from reloc.wire.endpoints import DEFAULT_ENDPOINT
-from reloc.wire.keys import NAME_PATTERN
+from reloc.wire.keys import NAME_EXPECTED, is_name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,10 +109,9 @@ def check_wire_name(name: str) -> str:
     Raises:
         InvalidValueError: it cannot.
     """
-    if not re.fullmatch(NAME_PATTERN, name):
+    if not is_name(name):
         raise InvalidValueError(
-            "database name on the wire: expected 1..64 letters, digits, '_', '.', '-', beginning with a "
-            f"letter or digit, found {name!r}; choose one with --name"
+            f"database name on the wire: {NAME_EXPECTED}, found {name!r}; choose one with --name"
         )
     return name
 

@@ -13,6 +13,8 @@ from reloc.wire.query import ErrorCode, ErrorReply, LocaliseReply, RequestError,
 
 logger = logging.getLogger(__name__)
 
+_JSON = zenoh.Encoding.APPLICATION_JSON
+
 
 def session_of(query: zenoh.Query) -> str:
     """The session that asks, which nobody has verified; "" where it does not say."""
@@ -30,21 +32,8 @@ class PendingQuery:
         identity: name of the client, where the server authenticates its clients.
         asker: who shares the server with others: the identity, else the session that the query came from as
             it says itself.
+        answered: whether it was, or refused.
     """
-
-    __slots__ = (
-        "_answered",
-        "_key",
-        "_lock",
-        "_query",
-        "_tally",
-        "asker",
-        "deadline",
-        "identity",
-        "received",
-        "request_id",
-        "size",
-    )
 
     def __init__(
         self,
@@ -61,84 +50,69 @@ class PendingQuery:
         self._key = key
         self._tally = tally
         self._lock = threading.Lock()
-        self._answered = False
+        self.answered = False
         self.received = time.perf_counter()
         self.deadline = self.received + deadline_s
         self.request_id = uuid.uuid4().hex
         self.size = 0 if query.payload is None else len(query.payload)
 
-    @property
-    def answered(self) -> bool:
-        return self._answered
-
     def attachment(self) -> bytes | None:
         """The request's attachment; None where there is none or it was answered meanwhile."""
         with self._lock:
-            if self._answered or self._query.attachment is None:
+            if self.answered or self._query.attachment is None:
                 return None
             return self._query.attachment.to_bytes()
 
     def payload(self) -> bytes:
         """The request's payload; empty where there is none or it was answered meanwhile."""
         with self._lock:
-            if self._answered or self._query.payload is None:
+            if self.answered or self._query.payload is None:
                 return b""
             return self._query.payload.to_bytes()
 
     def answer(self, reply: LocaliseReply) -> bool:
         """Send the reply; False if somebody was faster."""
-        payload = encode(reply)
-        with self._lock:
-            if self._answered:
-                return False
-            self._answered = True
-            latency_ms = (time.perf_counter() - self.received) * 1e3
-            kind = "localised" if reply.reason is None else "not_localised"
-            self._tally.add(kind, reply.reason or "", latency_ms)
-            self._send(payload, error=False)
-        told = fields(
+        latency_ms = (time.perf_counter() - self.received) * 1e3
+        kind = "localised" if reply.reason is None else "not_localised"
+        if not self._settled(encode(reply), kind, reply.reason or "", latency_ms):
+            return False
+        told = self._fields(
             "answered",
-            request_id=self.request_id,
-            client=self.identity,
             status=reply.status,
             reason=reply.reason,
             inliers=reply.inliers,
             snapshot=reply.snapshot,
-            bytes=self.size,
             latency_ms=round(latency_ms, 3),
         )
         logger.info("query answered", extra=told)
         return True
 
-    def refuse(self, error: RequestError) -> bool:
-        """Send `reply_err`; False if somebody was faster."""
+    def refuse(self, error: RequestError) -> None:
+        """Send `reply_err`, unless somebody was faster."""
         reply = ErrorReply(code=error.code, message=error.message, request_id=self.request_id)
-        payload = encode(reply)
-        with self._lock:
-            if self._answered:
-                return False
-            self._answered = True
-            self._tally.add("error", error.code)
-            self._send(payload, error=True)
+        if not self._settled(encode(reply), "error", error.code):
+            return
         level = logging.ERROR if error.code == ErrorCode.INTERNAL else logging.INFO
-        told = fields(
-            "refused",
-            request_id=self.request_id,
-            client=self.identity,
-            code=error.code,
-            refusal=error.message,
-            bytes=self.size,
-        )
+        told = self._fields("refused", code=error.code, refusal=error.message)
         logger.log(level, "query refused", extra=told)
-        return True
 
-    def _send(self, payload: bytes, *, error: bool) -> None:
-        try:
-            with self._query as query:
-                if error:
-                    query.reply_err(payload, encoding=zenoh.Encoding.APPLICATION_JSON)
-                else:
-                    query.reply(self._key, payload, encoding=zenoh.Encoding.APPLICATION_JSON, express=True)
-        except zenoh.ZError:  # the client went away, or asked with a selector that takes no such key
-            told = fields("reply_failed", request_id=self.request_id)
-            logger.warning("reply could not be sent", exc_info=True, extra=told)
+    def _settled(self, payload: bytes, kind: str, code: str, latency_ms: float | None = None) -> bool:
+        """Count and send an answer; False if somebody was faster."""
+        with self._lock:
+            if self.answered:
+                return False
+            self.answered = True
+            self._tally.add(kind, code, latency_ms)
+            try:
+                with self._query as query:
+                    if kind == "error":
+                        query.reply_err(payload, encoding=_JSON)
+                    else:
+                        query.reply(self._key, payload, encoding=_JSON, express=True)
+            except zenoh.ZError:  # the client went away, or asked with a selector that takes no such key
+                told = fields("reply_failed", request_id=self.request_id)
+                logger.warning("reply could not be sent", exc_info=True, extra=told)
+            return True
+
+    def _fields(self, event: str, **values: object) -> dict[str, object]:
+        return fields(event, request_id=self.request_id, client=self.identity, bytes=self.size, **values)

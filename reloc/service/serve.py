@@ -3,11 +3,11 @@
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 
 from featuredb.stop_signals import on_stop_signals
 from featuredb.store import Database
-from reloc.localise.options import LocaliseOptions
-from reloc.service.contributions.database_inbox import DatabaseInbox
+from featuredb.store.candidates.photos import contribute, count_candidates
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.metrics import metrics_page
 from reloc.service.options import ServeOptions, wire_name_of
@@ -18,9 +18,7 @@ from reloc.wire.server import StatusReply
 _TURN_S = 1.0  # of waiting for a signal
 
 
-def start_server(
-    database: Database, options: ServeOptions | None = None, localise_options: LocaliseOptions | None = None
-) -> Server:
+def start_server(database: Database, options: ServeOptions | None = None) -> Server:
     """Load the database's maps and listen; the server runs until `close`.
 
     Raises:
@@ -29,14 +27,15 @@ def start_server(
     """
     options = options or ServeOptions()
     name = options.name or wire_name_of(database.url)
-    inbox = Inbox(DatabaseInbox(database), options.inbox) if options.contributions else None
-    return Server.start(DatabaseSource(database, localise_options), options, name, inbox)
+    inbox = None
+    if options.contributions:
+        inbox = Inbox(partial(contribute, database), partial(count_candidates, database), options.inbox)
+    return Server.start(DatabaseSource(database), options, name, inbox)
 
 
 def serve(
     database: Database,
     options: ServeOptions | None = None,
-    localise_options: LocaliseOptions | None = None,
     *,
     on_ready: Callable[[Server], None] = lambda server: None,
 ) -> None:
@@ -55,7 +54,7 @@ def serve(
         if options is not None and options.metrics_port is not None:
             # Before the maps are loaded: that takes long, and the port may be taken.
             stack.enter_context(metrics_page(options.metrics_port, status))
-        started.append(stack.enter_context(start_server(database, options, localise_options)))
+        started.append(stack.enter_context(start_server(database, options)))
         on_ready(started[0])
         # A signal that a library's thread receives does not end a wait: its handler runs at the next.
         while not stop.wait(_TURN_S):

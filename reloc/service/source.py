@@ -6,7 +6,6 @@ import numpy as np
 
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.store import Database, MapSummary
-from reloc.localise.options import LocaliseOptions
 from reloc.localiser import Localiser
 from reloc.wire.server import BoundingBox, MapInfo
 
@@ -36,9 +35,8 @@ class ServedArea:
 class DatabaseSource:
     """Loads areas of a database; the server polls `version` and loads when it has changed."""
 
-    def __init__(self, database: Database, options: LocaliseOptions | None = None) -> None:
+    def __init__(self, database: Database) -> None:
         self._database = database
-        self._options = options or LocaliseOptions()
         self._previous: Localiser | None = None
 
     def version(self) -> int:
@@ -51,7 +49,7 @@ class DatabaseSource:
         Raises:
             FeatureDbError: the store cannot be read, or maps do not fit together.
         """
-        localiser = Localiser.open(self._database, self._options, previous=self._previous)
+        localiser = Localiser.open(self._database, previous=self._previous)
         self._previous = localiser
         snapshot = self._database.snapshot(localiser.snapshot)
         active = [summary for summary in snapshot.maps() if summary.status == "active"]

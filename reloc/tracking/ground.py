@@ -10,40 +10,15 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.maps.unplaced_map import OwnFrame
-from reloc.localise.result import CameraSource, LocaliseRequest
+from reloc.localise.result import CameraSource, LocaliseRequest, OnEarth, OwnPose
 from reloc.tracking.options import TrackOptions
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Standing:
-    """What a pose stands on, and how surely.
-
-    Attributes:
-        epsg, height_datum: of UTM coordinates of the pose. map_id: of the map, or the scan.
-        covariance: (6, 6) of the pose, true east-north-up at the camera: rotation (rad) before displacement
-            (m), with what the ground's own place is uncertain.
-    """
-
-    epsg: int
-    height_datum: str
-    map_id: str
-    covariance: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StandingInMap:
-    """What a pose stands on whose map has no place: nothing of it is on Earth.
-
-    Attributes:
-        map_id: of the map. frame: whether its unit is a metre, and whether its z is up.
-        covariance: (6, 6) of the pose, axes of the map's own frame: rotation (rad) before displacement (units
-            of the frame).
-    """
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EarthPose(OnEarth):
+    """Where the camera was; `map_id`: of the map, or the scan, whose points most landmarks are."""
 
     map_id: str
-    frame: OwnFrame
-    covariance: FloatArray
 
 
 class Ground(Protocol):
@@ -63,13 +38,11 @@ class Ground(Protocol):
         """What is seen of the ground in a frame (h, w) that `pose` is about right for."""
         ...
 
-    def standing(
-        self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray
-    ) -> Standing | StandingInMap:
-        """What a pose stands on whose landmarks are these.
+    def posed(self, rows: NDArray[np.int64], pose: Rigid3, measured: FloatArray) -> EarthPose | OwnPose:
+        """A pose in `frame` on Earth, or in its map where that has no place, with the ground's own errors.
 
         Args:
-            rows: (k,) of the landmarks. center: (3,) of the camera.
+            rows: (k,) of its landmarks.
             measured: (6, 6) covariance by the landmarks' pixels alone, local axes: rotation before centre.
         """
         ...

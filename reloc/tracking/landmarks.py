@@ -24,12 +24,6 @@ class Landmarks:
     pixels: FloatArray
     born: NDArray[np.int64]
 
-    @classmethod
-    def none(cls) -> "Landmarks":
-        """No landmarks."""
-        rows = np.zeros(0, dtype=np.int64)
-        return cls(rows=rows, points=np.zeros((0, 3)), pixels=np.zeros((0, 2)), born=rows)
-
     def __len__(self) -> int:
         return len(self.rows)
 

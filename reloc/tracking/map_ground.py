@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import IncompatibleExtractorError
 from featuredb.features.extractor import extract
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -19,9 +18,9 @@ from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise_features
 from reloc.localise.matching import guided_matches, visible_points
 from reloc.localise.pose import PoseHypothesis, refine_pose
-from reloc.localise.result import LocaliseRequest
+from reloc.localise.result import LocaliseRequest, OwnPose, place_on_earth
 from reloc.localise.search import pairs
-from reloc.tracking.ground import Ground, Keyframe, Standing, StandingInMap, Unmatched
+from reloc.tracking.ground import EarthPose, Ground, Keyframe, Unmatched
 from reloc.tracking.options import TrackOptions
 
 _MOST_SHOWN = 1500  # more dots hide the picture
@@ -83,19 +82,17 @@ class MapGround:
             rows=rows,
         )
 
-    def standing(
-        self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray
-    ) -> Standing | StandingInMap:
+    def posed(self, rows: NDArray[np.int64], pose: Rigid3, measured: FloatArray) -> EarthPose | OwnPose:
         """By the map whose points most landmarks are."""
         area = self.area
         if self.own is not None:
-            return StandingInMap(map_id=area.maps[0].map_id, frame=self.own, covariance=measured)
+            return OwnPose(map_id=area.maps[0].map_id, frame=self.own, cam_from_map=pose, covariance=measured)
         main = area.maps[int(np.argmax(np.bincount(area.point_map[rows], minlength=len(area.maps))))]
-        return Standing(
-            epsg=main.epsg,
+        return EarthPose(
+            **place_on_earth(area.frame, pose, main.epsg),
             height_datum=main.height_datum,
             map_id=main.map_id,
-            covariance=on_earth(area, main, center, measured, rows),
+            covariance=on_earth(area, main, pose.center, measured, rows),
         )
 
     def visible(self, camera: Camera, pose: Rigid3) -> FloatArray:
@@ -151,17 +148,3 @@ class MapFinder:
     def has(self, ground: Ground) -> bool:
         """Whether these very maps are among its own: one that was moved or taken back is another."""
         return isinstance(ground, MapGround) and any(a.area is ground.area for a in self._areas)
-
-
-def usable_areas(areas: Sequence[IndexedArea], fingerprint: str) -> list[IndexedArea]:
-    """Those whose descriptors can be compared with the film's.
-
-    Raises:
-        IncompatibleExtractorError: there are areas, and none of them is.
-    """
-    usable = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
-    if areas and not usable:
-        raise IncompatibleExtractorError(
-            f"the maps have descriptors of {areas[0].area.extractor_fingerprint}, a film's are {fingerprint}"
-        )
-    return usable

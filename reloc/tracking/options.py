@@ -71,14 +71,6 @@ class LensWalkOptions:
             raise InvalidValueError(f"LensWalkOptions: expected 0 < floor_rel <= estimated_rel, found {self}")
 
 
-def _keyframe_features() -> ExtractorOptions:
-    return ExtractorOptions(max_side_px=720, max_features=1500, oversample=1.0)
-
-
-def _fine_features() -> ExtractorOptions:
-    return ExtractorOptions(max_side_px=1280, max_features=6000, oversample=1.0)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackOptions:
     """From frames to poses.
@@ -142,8 +134,12 @@ class TrackOptions:
     live_steps: int = 3
     min_matches: int = 30
     max_unconfirmed: int = 3
-    keyframes: ExtractorOptions = field(default_factory=_keyframe_features)
-    fine_keyframes: ExtractorOptions = field(default_factory=_fine_features)
+    keyframes: ExtractorOptions = field(
+        default_factory=lambda: ExtractorOptions(max_side_px=720, max_features=1500, oversample=1.0)
+    )
+    fine_keyframes: ExtractorOptions = field(
+        default_factory=lambda: ExtractorOptions(max_side_px=1280, max_features=6000, oversample=1.0)
+    )
     localise: LocaliseOptions = field(default_factory=LocaliseOptions)
 
     def __post_init__(self) -> None:

@@ -9,7 +9,8 @@ from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from reloc.answered_view import geopose_of
 from reloc.reply import place_fields
-from reloc.tracking.trajectory.values import EarthPose, TrajectoryPoint
+from reloc.tracking.ground import EarthPose
+from reloc.tracking.trajectory.values import TrajectoryPoint
 from reloc.wire.query import Intrinsics
 from reloc.wire.track import TrackPose
 
@@ -29,7 +30,8 @@ def pose_message(point: TrajectoryPoint, camera: Camera | None, **about: Any) ->
     pose: dict[str, Any] = dict.fromkeys(_POSE_FIELDS)
     if point.pose is not None:
         assert camera is not None
-        pose = _pose_fields(point.pose, camera)
+        lens = Intrinsics(**asdict(camera))
+        pose = {**place_fields(point.pose), "camera": lens, "map_id": point.pose.map_id}
     return TrackPose(
         time_s=point.time_s,
         state=point.state,
@@ -51,14 +53,6 @@ def point_of_message(message: TrackPose) -> TrajectoryPoint:
         inliers=message.inliers,
         detail=message.detail,
     )
-
-
-def _pose_fields(pose: EarthPose, camera: Camera) -> dict[str, Any]:
-    return {
-        **place_fields(pose),
-        "camera": Intrinsics(**asdict(camera)),
-        "map_id": pose.map_id,
-    }
 
 
 def _earth_pose(message: TrackPose) -> EarthPose | None:

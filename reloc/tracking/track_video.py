@@ -49,35 +49,21 @@ class TrackVideoOptions:
     track: TrackOptions = field(default_factory=TrackOptions)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrackSeconds:
-    """Where the time went, seconds: the whole run is waiting, tracking and drawing.
-
-    Attributes:
-        waiting: for the next frame. decoding: also of frames that were decoded beside the tracking.
-        longest_gap: between the poses of two frames.
-    """
-
-    total: float
-    waiting: float
-    decoding: float
-    tracking: float
-    drawing: float
-    longest_gap: float
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedVideo:
     """What came of a video.
 
     Attributes:
         camera: intrinsics of the frames as they were tracked; None where nothing was localised.
+        seconds: where the time went: `total`; of it `tracking` and `drawing`, the rest is waiting for frames;
+            `decoding`, also of frames that were decoded beside the tracking; `longest_gap` between the poses
+            of two frames.
         complaints: what was wrong with the film, for people.
     """
 
     trajectory: Trajectory
     camera: Camera | None
-    seconds: TrackSeconds
+    seconds: dict[str, float]
     complaints: tuple[str, ...]
 
 
@@ -121,7 +107,7 @@ def track_video(
         with ExitStack() as stack:
             video = stack.enter_context(open_video(source, settings))
             info = video.info
-            lens = None if camera is None else _resized(camera, info.frame_width, info.frame_height)
+            lens = None if camera is None else camera.scaled_to(info.frame_width, info.frame_height)
             request = _with_film(request or LocaliseRequest(), info, source)
             tracker = stack.enter_context(Tracker(finder, lens, options.track, request))
             writer = None
@@ -167,14 +153,13 @@ def track_video(
     return TrackedVideo(
         trajectory=Trajectory(source=info.name, points=tuple(points), start=info.creation_time),
         camera=lens,
-        seconds=TrackSeconds(
-            total=sum(seconds.values()),
-            waiting=seconds["waiting"],
-            decoding=ahead.seconds,
-            tracking=seconds["tracking"],
-            drawing=seconds.get("drawing", 0.0),
-            longest_gap=gap,
-        ),
+        seconds={
+            "total": sum(seconds.values()),
+            "decoding": ahead.seconds,
+            "tracking": seconds["tracking"],
+            "drawing": seconds.get("drawing", 0.0),
+            "longest_gap": gap,
+        },
         complaints=complaints,
     )
 
@@ -205,8 +190,3 @@ def _with_film(request: LocaliseRequest, info: VideoInfo, source: Source) -> Loc
 def _digest(film: Path) -> str | None:
     """By which maps of a film know it; None for what is no file."""
     return unnamed_model(file_sha256(film)) if film.is_file() else None
-
-
-def _resized(camera: Camera, width: int, height: int) -> Camera:
-    """The lens of the full frames, for frames of another size."""
-    return camera if (camera.width, camera.height) == (width, height) else camera.scaled_to(width, height)

@@ -24,8 +24,8 @@ class TrackedFrame:
         cam_from_local: pose in the ground's frame, None where the track is lost.
         covariance: (6, 6), see `FittedPose`; None with the pose.
         camera: intrinsics in use; None with the pose. ground: in whose frame the pose is.
-        inliers: landmarks that agree with it. pixels, points: (k, 2), (k, 3) of them; rows: (k,) of the
-            ground's points.
+        inliers: landmarks that agree with it. pixels: (k, 2) of them; rows: (k,) of the ground's
+            points.
         detail: why there is no pose.
     """
 
@@ -38,6 +38,5 @@ class TrackedFrame:
     ground: Ground | None = None
     inliers: int = 0
     pixels: FloatArray | None = None
-    points: FloatArray | None = None
     rows: NDArray[np.int64] | None = None
     detail: str = ""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.camera import Camera
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.flow_track import FlowTrack, carried
-from reloc.tracking.ground import Finder, Ground, Keyframe, Unmatched
+from reloc.tracking.ground import Finder, Keyframe, Unmatched
 from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose
@@ -78,7 +78,6 @@ class Tracker:
         self._given = self._camera = camera
         self._found = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
-        self._ground: Ground | None = None
         self._track: FlowTrack | None = None
         self._frames = RecentFrames(_frames_kept(self._options))
         self._late: list[TrackedFrame] = []
@@ -100,11 +99,6 @@ class Tracker:
     def camera(self) -> Camera | None:
         """Intrinsics in use, or of the last frame with a pose; None until something was localised."""
         return self._camera if self._track is None else self._track.camera
-
-    @property
-    def ground(self) -> Ground | None:
-        """The ground in whose frame the poses are; None until something was localised."""
-        return self._ground
 
     def track(self, gray: NDArray[np.uint8], time_s: float) -> TrackedFrame:
         """The pose of the next frame (h, w) uint8, taken at `time_s`, later than the last one."""
@@ -205,7 +199,6 @@ class Tracker:
             ground=track.ground,
             inliers=len(track.landmarks),
             pixels=track.landmarks.pixels,
-            points=track.landmarks.points,
             rows=track.landmarks.rows,
         )
 
@@ -253,7 +246,7 @@ class Tracker:
             return track.refresh(found, since[0], now)
         if isinstance(found, FlowTrack):
             return self._caught_up(found, since)
-        self._ground, self._found, self._unconfirmed = found.ground, True, 0
+        self._found, self._unconfirmed = True, 0
         begun = self._begun(found, since[0])
         fitted = begun.settle()
         if fitted is None:

@@ -13,7 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.lineage import MapLineage, describe_lineage
 from featuredb.maps.unplaced_map import AnyMap
-from featuredb.store import MapSummary
+from featuredb.store import MapSummary, UnplacedSummary
 from reloc.viewer.places import Spot
 from reloc.viewer.points import DrawnPoints
 from reloc.viewer.poses import drawn_pose, worded_place, worded_sigmas
@@ -29,10 +29,7 @@ def describe_map(summary: MapSummary, lineage: MapLineage, drawn_under: str | No
         drawn_under: the map under which it stands in the tree, or None.
     """
     return {
-        "id": summary.map_id,
-        "name": summary.name,
-        "status": summary.status,
-        "status_reason": summary.status_reason,
+        **as_stored(summary),
         "method": summary.method,
         "generation": summary.generation,
         "parents": list(summary.parents),
@@ -45,6 +42,16 @@ def describe_map(summary: MapSummary, lineage: MapLineage, drawn_under: str | No
         "points": summary.points,
         "epsg": summary.epsg,
         "height_datum": summary.height_datum,
+    }
+
+
+def as_stored(summary: MapSummary | UnplacedSummary) -> dict[str, Any]:
+    """What the store knows of every map, with a place or without."""
+    return {
+        "id": summary.map_id,
+        "name": summary.name,
+        "status": summary.status,
+        "status_reason": summary.status_reason,
         "created_at": summary.created_at.isoformat(timespec="seconds"),
         "source": summary.source,
         "licence": summary.licence,

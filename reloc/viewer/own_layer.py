@@ -8,7 +8,7 @@ import numpy as np
 
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import UnplacedSummary
-from reloc.viewer.map_layer import coverage, described_photo
+from reloc.viewer.map_layer import as_stored, coverage, described_photo
 from reloc.viewer.points import DrawnPoints, drawn_points, sampled
 from reloc.viewer.poses import drawn_pose
 
@@ -33,24 +33,14 @@ def describe_own_place(
     """
     frame, why = unplaced.frame, unplaced.no_place
     told = {
-        "id": summary.map_id,
-        "name": summary.name,
-        "status": summary.status,
-        "status_reason": summary.status_reason,
-        "no_place": {
-            "reason": why.reason,
-            "ways": list(why.ways),
-            "command": command,
-        },
+        **as_stored(summary),
+        "no_place": {"reason": why.reason, "ways": list(why.ways), "command": command},
         **dict.fromkeys(("method", "drift_m", "budget_m", "residual_rms_m", "epsg", "height_datum", "under")),
         "generation": 0,
         "parents": [],
         "chain": [summary.map_id],
         "lineage": "",
         "points": len(unplaced.points),
-        "created_at": summary.created_at.isoformat(timespec="seconds"),
-        "source": summary.source,
-        "licence": summary.licence,
         "photos": _photos(unplaced),
         "coverage": coverage(drawn),
         "buffer": buffer,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.decode import INGEST_LIMITS, decode_rgb
+from featuredb.features.shrink import shrunk
 from featuredb.maps.feature_map import MapImage
 from featuredb.maps.photo_files import PhotoFolder
 
@@ -49,10 +50,7 @@ class Pictures:
 
 def jpeg_of(bgr: NDArray[np.uint8], longer_side_px: int) -> bytes:
     """Pixels (h, w, 3) uint8 BGR as JPEG without metadata, shrunk to the given longer side."""
-    shrink = min(1.0, longer_side_px / max(bgr.shape[:2]))
-    if shrink < 1.0:
-        height, width = (max(1, round(side * shrink)) for side in bgr.shape[:2])
-        bgr = np.asarray(cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    encoded, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    small = shrunk(bgr, longer_side_px)
+    encoded, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     assert encoded
     return data.tobytes()

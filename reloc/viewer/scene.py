@@ -108,7 +108,7 @@ class _Builder:
     def build(self) -> ViewerScene:
         maps, scans, tracks = self._maps, self._scans(), self._trajectories
         spots = [self._spot(m) for m in maps] + [spot_of(s.box, s.epsg) for s in scans]
-        spots += [_known_spot(t) for t in tracks]
+        spots += [spot_of_trajectory(t) for t in tracks]
         places: list[dict[str, Any]] = []
         points: list[bytes] = []
         frames: list[LocalFrame] = []
@@ -283,12 +283,3 @@ def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]
         "licence": scan.licence,
         "buffer": buffer,
     }
-
-
-def _known_spot(trajectory: Trajectory) -> Spot:
-    spot = spot_of_trajectory(trajectory)
-    if spot is None:
-        raise InvalidValueError(
-            f"{trajectory.source}: all {len(trajectory.points)} frames are lost, there is nothing to show"
-        )
-    return spot

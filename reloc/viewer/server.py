@@ -8,6 +8,8 @@ opened on which a map is placed, only with a media type that a browser does not 
 import asyncio
 import logging
 import socket
+import sys
+import webbrowser
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -22,6 +24,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 
 from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
+from featuredb.stop_signals import on_stop_signals
 from reloc.viewer.page import Asset, assets, content_policy, page
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
@@ -164,6 +167,27 @@ def uvicorn_server(app: FastAPI) -> uvicorn.Server:
             timeout_graceful_shutdown=2,
         )
     )
+
+
+def serve(app: FastAPI, port: int, *, browser: bool, path: str = "") -> None:
+    """Serve until SIGINT or SIGTERM, after printing the address; call from the main thread.
+
+    Args:
+        browser: also open the page. path: of the page, below the address.
+
+    Raises:
+        ViewerStartError: cannot listen.
+    """
+    server = uvicorn_server(app)
+    # uvicorn handles these while it runs, and then raises them again; one that comes before counts as well.
+    with on_stop_signals(partial(setattr, server, "should_exit", True)), listen(port) as bound:
+        url = f"http://{HOST}:{bound.getsockname()[1]}/{path}"
+        sys.stdout.write(f"{url}; stop with Ctrl-C\n")
+        sys.stdout.flush()
+        # Connections wait in the socket until the server runs.
+        if browser and not webbrowser.open(url):
+            sys.stderr.write("no browser was found; open the address by hand\n")
+        server.run(sockets=[bound])
 
 
 async def _photo(request: Request) -> bytes:

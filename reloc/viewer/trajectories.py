@@ -4,18 +4,26 @@ from typing import Any
 
 import numpy as np
 
+from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rotation import matrix_from_quaternion
-from reloc.tracking.trajectory.values import EarthPose, Trajectory
+from reloc.tracking.ground import EarthPose
+from reloc.tracking.trajectory.values import Trajectory
 from reloc.viewer.places import Spot
 from reloc.viewer.poses import drawn_pose, worded_place, worded_sigmas
 
 
-def spot_of_trajectory(trajectory: Trajectory) -> Spot | None:
-    """Where the first known pose lies; None where all frames are lost."""
+def spot_of_trajectory(trajectory: Trajectory) -> Spot:
+    """Where the first known pose lies.
+
+    Raises:
+        InvalidValueError: all frames are lost.
+    """
     pose = next((point.pose for point in trajectory.points if point.pose is not None), None)
     if pose is None:
-        return None
+        raise InvalidValueError(
+            f"{trajectory.source}: all {len(trajectory.points)} frames are lost, there is nothing to show"
+        )
     easting, northing, height = pose.utm.tolist()
     return Spot(easting=easting, northing=northing, height=height, epsg=pose.epsg)
 

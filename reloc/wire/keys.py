@@ -8,7 +8,9 @@ import re
 from dataclasses import dataclass
 
 KEY_ROOT = "featuredb"
-NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"  # of databases, clients and live sessions: one chunk
+# Of databases, clients and live sessions: one chunk of a key.
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+NAME_EXPECTED = "expected 1..64 letters, digits, '_', '.', '-', beginning with a letter or digit"
 ANONYMOUS = "anonymous"  # a client that has no name
 CLIENT_SETTING = "featuredb_client"  # in `metadata` of a Zenoh configuration: the client's name
 
@@ -43,4 +45,9 @@ class Keys:
 def client_of(key: str) -> str:
     """The client that a query to `Keys.localise` names; ANONYMOUS where that is a wildcard."""
     last = key.rpartition("/")[2]
-    return last if re.fullmatch(NAME_PATTERN, last) else ANONYMOUS
+    return last if is_name(last) else ANONYMOUS
+
+
+def is_name(text: str) -> bool:
+    """Whether a database, a client or a live session may be called so."""
+    return _NAME.fullmatch(text) is not None

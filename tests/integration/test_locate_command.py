@@ -21,8 +21,9 @@ from featuredb.store import Database
 from featuredb.video.frames import open_video
 from featuredb.video.writer import VideoWriter
 from reloc.answered_view import AnsweredView
+from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import write_trajectory
-from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPoint
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from reloc.wire.query import LocaliseReply
 from tests.support.command_line import only_command
 from tests.support.las_files import SOUTH, WEST, grid_points, write_scan

@@ -4,6 +4,7 @@ import json
 import random
 import struct
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,9 @@ from PIL import Image
 from featuredb.errors import InvalidValueError, ServiceError, StoreError
 from featuredb.features.decode import DecodeLimits
 from featuredb.store import Database
-from featuredb.store.candidates.photos import InboxCounts, list_candidates
+from featuredb.store.candidates.photos import InboxCounts, contribute, count_candidates, list_candidates
 from featuredb.store.candidates.states import candidate_id_of
 from reloc.client import PriorRequest
-from reloc.service.contributions.database_inbox import DatabaseInbox
 from reloc.service.contributions.inbox import Inbox, InboxOptions
 from reloc.service.options import ServeOptions
 from reloc.wire.query import LocaliseReply
@@ -32,6 +32,10 @@ from tests.support.service import (
 
 GIFT = {"contribute": True, "credit": "A. Person", "licence": "CC-BY-4.0"}
 WAIT_S = 20.0
+
+
+def inbox_of(database: Database) -> Inbox:
+    return Inbox(partial(contribute, database), partial(count_candidates, database))
 
 
 def exif() -> Image.Exif:
@@ -67,7 +71,7 @@ def test_a_contributed_query_lands_in_the_database(database):
     data = photo(exif=exif())
     localiser = ScriptedLocaliser(7)
     with (
-        running_server(localiser, inbox=Inbox(DatabaseInbox(database))) as server,
+        running_server(localiser, inbox=inbox_of(database)) as server,
         client_of(server) as client,
     ):
         assert list_candidates(database) == [], "the tables are made by the first photo"
@@ -105,9 +109,7 @@ def test_a_contributed_query_lands_in_the_database(database):
 def test_photos_that_are_not_localised_are_welcome(database):
     """They may be the ones from which the maps grow."""
     with (
-        running_server(
-            ScriptedLocaliser(1, lambda *_: not_localised(1)), inbox=Inbox(DatabaseInbox(database))
-        ) as server,
+        running_server(ScriptedLocaliser(1, lambda *_: not_localised(1)), inbox=inbox_of(database)) as server,
         client_of(server) as client,
     ):
         reply = client.localise(photo(), **GIFT)
@@ -118,7 +120,7 @@ def test_photos_that_are_not_localised_are_welcome(database):
 
 def test_who_is_not_authenticated_is_one_owner_whatever_names_are_given(database):
     with (
-        running_server(ScriptedLocaliser(1), inbox=Inbox(DatabaseInbox(database))) as server,
+        running_server(ScriptedLocaliser(1), inbox=inbox_of(database)) as server,
         client_of(server) as client,
     ):
         client.name = "Cleo"
@@ -133,7 +135,7 @@ def test_who_is_not_authenticated_is_one_owner_whatever_names_are_given(database
 
 def test_a_server_that_stops_writes_what_it_has_taken(database):
     with (
-        running_server(ScriptedLocaliser(1), inbox=Inbox(DatabaseInbox(database))) as server,
+        running_server(ScriptedLocaliser(1), inbox=inbox_of(database)) as server,
         client_of(server) as client,
     ):
         for seed in range(6):
@@ -146,7 +148,10 @@ def test_a_query_never_waits_for_the_store():
     store.gate = Gate()
     options = InboxOptions(max_queue=2)
     with (
-        running_server(ScriptedLocaliser(1), inbox=Inbox(store, options)) as server,
+        running_server(
+            ScriptedLocaliser(1),
+            inbox=Inbox(lambda given: store.write(given), lambda: store.counts(), options),
+        ) as server,
         client_of(server) as client,
     ):
         replies = [client.localise(photo(seed=i), timeout_s=10.0, **GIFT) for i in range(5)]
@@ -183,7 +188,10 @@ def test_what_is_not_taken_is_answered_all_the_same(options, stored, failure, re
 
         store.counts = fail
     with (
-        running_server(ScriptedLocaliser(1), inbox=Inbox(store, options)) as server,
+        running_server(
+            ScriptedLocaliser(1),
+            inbox=Inbox(lambda given: store.write(given), lambda: store.counts(), options),
+        ) as server,
         client_of(server) as client,
     ):
         reply = client.localise(photo(), **GIFT)
@@ -208,7 +216,7 @@ def test_a_query_that_comes_too_late_contributes_nothing():
         running_server(
             ScriptedLocaliser(1, slow),
             ServeOptions(deadline_s=0.2),
-            inbox=Inbox(store, InboxOptions(max_queue=1)),
+            inbox=Inbox(store.write, store.counts, InboxOptions(max_queue=1)),
         ) as server,
         client_of(server) as client,
     ):
@@ -228,7 +236,9 @@ def test_what_fails_as_a_query_contributes_nothing():
     store = MemoryInbox()
     with (
         running_server(
-            ScriptedLocaliser(1), ServeOptions(limits=DecodeLimits(max_bytes=50_000)), inbox=Inbox(store)
+            ScriptedLocaliser(1),
+            ServeOptions(limits=DecodeLimits(max_bytes=50_000)),
+            inbox=Inbox(store.write, store.counts),
         ) as server,
         client_of(server) as client,
     ):
@@ -288,7 +298,10 @@ def test_random_gifts_are_answered_one_by_one():
         "'; --",
     ]
     told = {"taken": 0, "refused": 0}
-    with running_server(ScriptedLocaliser(1), inbox=Inbox(store)) as server, client_of(server) as client:
+    with (
+        running_server(ScriptedLocaliser(1), inbox=Inbox(store.write, store.counts)) as server,
+        client_of(server) as client,
+    ):
         for _ in range(150):
             request = {name: rng.choice(values) for name in ("credit", "licence") if rng.random() < 0.9}
             request["contribute"] = rng.choice([True, True, True, False, None])

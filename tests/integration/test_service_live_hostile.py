@@ -84,7 +84,7 @@ def test_hostile_frames_get_a_reason_each_and_the_session_goes_on() -> None:
         (good, header(1, 9.0), "BAD_REQUEST", "expected more than 1"),
         (good, header(0, 9.0), "BAD_REQUEST", "expected more than 1"),
         (good, header(2, 0.0), "BAD_REQUEST", "time_s"),
-        (b"", header(3, 1.0), "BAD_IMAGE", "found none"),
+        (b"", header(3, 1.0), "BAD_IMAGE", "empty"),
         (b"no image", header(4, 1.0), "BAD_IMAGE", "image"),
         (good[: len(good) // 2], header(5, 1.0), "BAD_IMAGE", "image"),
         (bytes(bomb), header(6, 1.0), "TOO_LARGE", "image"),

@@ -65,7 +65,8 @@ def messages():
     source = MemorySource(area_of(Mixed(1)))
     options = ServeOptions(poll_interval_s=0.05, limits=DecodeLimits(max_bytes=100_000))
     found: dict[str, list[bytes]] = {name: [] for name in NAMES}
-    inbox = Inbox(MemoryInbox(), InboxOptions(max_owner_photos=1))
+    given = MemoryInbox()
+    inbox = Inbox(given.write, given.counts, InboxOptions(max_owner_photos=1))
     with running_server(source, options, inbox=inbox) as server, client_of(server) as client:
         session = client._session()
         with session.declare_subscriber(

@@ -24,16 +24,13 @@ from fastapi import FastAPI
 from PIL import ExifTags, Image
 from scipy.spatial import cKDTree
 
-from featuredb.features.decode import DecodeLimits
-from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.localiser import Localiser
 from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import build_scene
-from reloc.viewer.serve import serve
-from reloc.viewer.server import ViewerStartError, listen
+from reloc.viewer.server import ViewerStartError, listen, serve
 from reloc.wire.query import LocaliseWireRequest
 from tests.support.maps import random_map
 from tests.support.viewer import MISSING, ViewerWorld, get, make_world, running_viewer
@@ -187,14 +184,7 @@ def test_a_query_is_answered_as_by_the_server(url: str, world: ViewerWorld) -> N
     data = world.query.read_bytes()
     answer = post(url, data).json()
     reply = answer["reply"]
-    wanted = answer_query(
-        data,
-        LocaliseWireRequest(),
-        Localiser.open(world.database),
-        limits=DecodeLimits(),
-        request_id="q",
-        clock=StageClock(start=0.0),
-    )
+    wanted = answer_query(LocaliseWireRequest(), data, Localiser.open(world.database))
     assert wanted.utm is not None
     assert reply["utm"]["easting"] == pytest.approx(wanted.utm.easting, abs=1e-6)
     assert reply["inliers"] == wanted.inliers

@@ -102,5 +102,5 @@ def free_port() -> int:
 def _serving(options: ServeOptions, folder: Path | None, database: str = DATABASE) -> Iterator[Wire]:
     given = MemoryInbox()
     source = MemorySource(area_of(localiser()))
-    with Server.start(source, options, database, Inbox(given)) as server:
+    with Server.start(source, options, database, Inbox(given.write, given.counts)) as server:
         yield Wire(server=server, keys=folder, contributions=given)

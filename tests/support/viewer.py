@@ -16,8 +16,9 @@ from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
+from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import write_trajectory
-from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPoint
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from reloc.viewer.photos import Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import Queries

@@ -4,6 +4,7 @@ import io
 import json
 import re
 import socket
+import time
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,7 @@ def answer(turn: Rotation, datum: str = "ellipsoidal") -> dict[str, object]:
 
 def pose(datum: str = "ellipsoidal", turn: Rotation | None = None, mount: str = "forward") -> RobotPose:
     line = json.dumps(answer(turn or body_from_angles(), datum))
-    (found,) = read_answers([line, "\n"], mount, lambda: 0.0)  # type: ignore[arg-type]
+    ((found, _),) = read_answers([line, "\n"], mount, lambda: 0.0)  # type: ignore[arg-type]
     return found
 
 
@@ -65,7 +66,7 @@ def decoded(packet: bytes) -> object:
 
 
 def test_odometry_is_north_east_down_with_its_covariance() -> None:
-    (packet,) = MavlinkSender(("odometry",), origin=ORIGIN).pack(pose())
+    (packet,) = MavlinkSender(("odometry",)).pack(pose(), ORIGIN)
     found = decoded(packet)
     assert found.get_type() == "ODOMETRY"
     assert (found.frame_id, found.child_frame_id) == (common.MAV_FRAME_LOCAL_NED, common.MAV_FRAME_BODY_FRD)
@@ -99,7 +100,7 @@ def upper() -> FloatArray:
 
 
 def test_the_vision_estimate_has_the_covariance_of_its_angles() -> None:
-    (packet,) = MavlinkSender(("vision",), origin=ORIGIN).pack(pose())
+    (packet,) = MavlinkSender(("vision",)).pack(pose(), ORIGIN)
     found = decoded(packet)
     assert found.get_type() == "VISION_POSITION_ESTIMATE"
     angles = np.degrees([found.roll, found.pitch, found.yaw])
@@ -118,7 +119,7 @@ def test_places_are_those_that_proj_gives() -> None:
     )
     place = [position[name] for name in ("lon", "lat", "h")]  # type: ignore[index]
     east, north, up = pyproj.Transformer.from_pipeline(pipeline).transform(*place)
-    found = decoded(MavlinkSender(("odometry",), origin=ORIGIN).pack(pose())[0])
+    found = decoded(MavlinkSender(("odometry",)).pack(pose(), ORIGIN)[0])
     np.testing.assert_allclose([found.x, found.y, found.z], [north, east, -up], atol=1e-4)
     made = messages(pose(), ORIGIN)["/featuredb/pose"]
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -131,7 +132,7 @@ def test_places_are_those_that_proj_gives() -> None:
 )
 def test_gps_input_has_altitudes_of_sea_level(datum: str, geoid_m: float | None, altitude: float) -> None:
     sender = MavlinkSender(("gps",), geoid_m=geoid_m)
-    found = decoded(sender.pack(pose(datum))[0])
+    found = decoded(sender.pack(pose(datum), ORIGIN)[0])
     assert found.get_type() == "GPS_INPUT"
     lat, lon, _ = ORIGIN.geodetic_from_enu(PLACE)
     np.testing.assert_allclose([found.lat, found.lon], [lat * 1e7, lon * 1e7], atol=0.6)
@@ -145,7 +146,7 @@ def test_gps_input_has_altitudes_of_sea_level(datum: str, geoid_m: float | None,
 
 def test_gps_input_has_no_altitude_where_the_datum_does_not_tell_it() -> None:
     for datum, geoid_m in (("ellipsoidal", None), ("unknown", 22.5)):
-        found = decoded(MavlinkSender(("gps",), geoid_m=geoid_m).pack(pose(datum))[0])
+        found = decoded(MavlinkSender(("gps",), geoid_m=geoid_m).pack(pose(datum), ORIGIN)[0])
         assert found.ignore_flags & common.GPS_INPUT_IGNORE_FLAG_ALT
         assert ",,M" not in sentences(pose(datum), None)[0]
 
@@ -157,8 +158,9 @@ def test_packets_arrive_at_an_autopilot_s_port() -> None:
     autopilot = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", dialect="common")
     sender = MavlinkSender(("odometry", "gps"))
     with UdpLink(f"udpout:127.0.0.1:{port}") as link:
-        for packet in sender.pack(pose()) + sender.pack(pose()):
-            link.send(packet)
+        for placed in read_answers([json.dumps(answer(body_from_angles()))] * 2, "forward", time.time):
+            for packet in sender.pack(*placed):
+                link.send(packet)
     found = [autopilot.recv_match(blocking=True, timeout=5.0) for _ in range(4)]
     autopilot.close()
     assert [m.get_type() for m in found] == ["ODOMETRY", "GPS_INPUT"] * 2
@@ -219,7 +221,8 @@ def test_a_camera_that_looks_down_is_on_a_level_vehicle() -> None:
     heading = np.radians(HEADING_DEG)
     ahead, up = np.array([np.sin(heading), np.cos(heading), 0.0]), np.array([0.0, 0.0, 1.0])
     looks_down = Rotation.from_matrix(np.column_stack([-up, np.cross(up, ahead), ahead]))
-    found = decoded(MavlinkSender(("vision",)).pack(pose(turn=looks_down, mount="down"))[0])
+    down = pose(turn=looks_down, mount="down")
+    found = decoded(MavlinkSender(("vision",)).pack(down, down.frame_here())[0])
     np.testing.assert_allclose([found.roll, found.pitch, found.yaw], [0.0, 0.0, heading], atol=1e-5)
 
 
@@ -252,9 +255,9 @@ def test_ros_messages_are_read_by_two_libraries(tmp_path: Path) -> None:
     )
 
     path = tmp_path / "run.mcap"
-    with McapLog(path, origin=ORIGIN) as log:
-        log.write(pose())
-        log.write(pose("unknown"))
+    with McapLog(path) as log:
+        log.write(pose(), ORIGIN)
+        log.write(pose("unknown"), ORIGIN)
     read = {}
     with path.open("rb") as file:
         for _, channel, _, told in make_reader(

@@ -8,7 +8,8 @@ import pytest
 from featuredb.errors import StoreError
 from featuredb.store.candidates.photos import InboxCounts
 from featuredb.store.candidates.states import Contribution
-from reloc.service.contributions.inbox import Inbox, InboxOptions, InboxRefusal, Ticket
+from reloc.service.contributions.inbox import Inbox, InboxOptions, Ticket
+from reloc.wire.query import ContributionReply
 from tests.support.contributions import contribution
 from tests.support.service import Gate, MemoryInbox
 
@@ -23,15 +24,15 @@ def until(condition, what: str) -> None:
         time.sleep(0.002)
 
 
-def give(inbox: Inbox, one: Contribution) -> Ticket | InboxRefusal:
+def give(inbox: Inbox, one: Contribution) -> Ticket | ContributionReply:
     place = inbox.reserve(one.owner, len(one.image))
     if isinstance(place, Ticket):
-        place.submit(lambda: one)
+        inbox.submit(place, lambda: one)
     return place
 
 
-def reason(place: Ticket | InboxRefusal) -> str:
-    return place.reason if isinstance(place, InboxRefusal) else "taken"
+def reason(place: Ticket | ContributionReply) -> str:
+    return place.reason if isinstance(place, ContributionReply) else "taken"
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def opened(store):
     made = []
 
     def make(options: InboxOptions = QUICK) -> Inbox:
-        inbox = Inbox(store, options)
+        inbox = Inbox(lambda given: store.write(given), lambda: store.counts(), options)
         inbox.start()
         made.append(inbox)
         return inbox
@@ -71,7 +72,7 @@ def test_a_place_that_is_given_back(store, opened):
     inbox = opened(InboxOptions(max_queue=1))
     place = inbox.reserve("Ada", 10)
     assert reason(inbox.reserve("Ada", 10)) == "QUEUE_FULL"
-    place.cancel()
+    inbox.cancel(place)
     assert reason(give(inbox, contribution(1))) == "taken"
     inbox.close(WAIT_S)
     assert len(store.written) == 1
@@ -182,7 +183,7 @@ def test_a_photo_that_cannot_be_described_does_not_take_others_with_it(store, op
     assert store.gate.entered.acquire(timeout=WAIT_S)
     for i in (1, 2, 3):  # wait for the held write, and come in one batch
         place = inbox.reserve("Ada", 10)
-        place.submit((lambda: 1 / 0) if i == 2 else (lambda i=i: contribution(i)))
+        inbox.submit(place, (lambda: 1 / 0) if i == 2 else (lambda i=i: contribution(i)))
     store.gate.open()
     until(lambda: inbox.status().waiting == 0, "all are done")
     assert [c.image for c in store.written] == [contribution(i).image for i in (0, 1, 3)]

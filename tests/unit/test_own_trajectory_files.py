@@ -20,8 +20,8 @@ from reloc.tracking.film_overlay import _words
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracked_frame import TrackedFrame
-from reloc.tracking.trajectory.files import CSV_COLUMNS, write_trajectory
-from reloc.tracking.trajectory.outputs import check_outputs_in_map, exit_code, write_outputs
+from reloc.tracking.trajectory.files import CSV_COLUMNS, check_format, write_trajectory
+from reloc.tracking.trajectory.outputs import exit_code, write_outputs
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 from tests.support.maps import random_unplaced_map
@@ -81,14 +81,14 @@ def test_the_json_says_that_it_is_not_on_earth(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".tum", ".geojson", ".kml", ".srt", ".png"])
 def test_formats_of_places_on_earth_refuse(suffix: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidValueError, match="needs places on Earth, and map film-0 has none"):
-        check_outputs_in_map([tmp_path / f"t{suffix}"], "film-0")
-    with pytest.raises(InvalidValueError, match="map without a place"):
+        check_format(tmp_path / f"t{suffix}", "film-0")
+    with pytest.raises(InvalidValueError, match="needs places on Earth"):
         write_trajectory(tmp_path / f"t{suffix}", _TRACK)
 
 
 def test_a_frame_on_a_map_without_a_place_has_a_pose_in_it(database: Database) -> None:
     unplaced = random_unplaced_map()
-    finder, _ = finder_for(database, FilmGround(maps=(unplaced.map_id,)), None, TrackOptions())
+    finder = finder_for(database, FilmGround(maps=(unplaced.map_id,)), None, TrackOptions())
     assert isinstance(finder, MapFinder)
     (ground,) = finder.grounds
     frame = TrackedFrame(

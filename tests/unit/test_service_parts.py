@@ -2,6 +2,7 @@
 
 import threading
 import time
+from typing import get_args
 
 import cv2
 import pytest
@@ -11,7 +12,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
-from reloc.localise.result import REASONS
+from reloc.localise.result import Reason
 from reloc.reply import reply_from_result
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
 from reloc.service.queueing import QueryQueue
@@ -124,7 +125,7 @@ def test_threads_are_capped_within_the_block_and_restored_after_it():
 
 
 def test_every_reason_has_advice():
-    assert set(ADVICE) == set(REASONS)
+    assert set(ADVICE) == set(get_args(Reason))
 
 
 def test_people_read_the_reason_and_what_to_try():

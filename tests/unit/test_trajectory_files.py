@@ -19,9 +19,10 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
 from featuredb.video.telemetry.read import read_telemetry
+from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import CSV_COLUMNS, check_format, write_trajectory
 from reloc.tracking.trajectory.plot import plot_png
-from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPoint
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from schemas import load_schema
 from tests.support.planar_map import view
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from featuredb.errors import VideoError
-from featuredb.video.film import VideoOptions, fitted_size
+from featuredb.features.shrink import fitted_size
+from featuredb.video.film import VideoOptions
 from featuredb.video.frames import open_video
 from featuredb.video.pixels import PixelReader
 from featuredb.video.rotation import clockwise_from_display_matrix

@@ -14,13 +14,14 @@ from featuredb.errors import ImageError, StoreError
 from featuredb.features import decode
 from featuredb.features.decode import DecodeLimits
 from reloc.localiser import OnDemand
+from reloc.service.handler import answer_query
 from reloc.service.workers import answering, process
-from reloc.service.workers.answering import QueryAnswerer, WorkerLimits
+from reloc.service.workers.answering import WorkerLimits
 from reloc.service.workers.area_files import AreaFiles
 from reloc.service.workers.process import WorkerEndedError, WorkerProcess
 
 LIMITS = WorkerLimits(threads=1, memory_bytes=1 << 30, processor_s=5.0)
-ANSWERER = QueryAnswerer(decode=DecodeLimits())
+ANSWERER = answer_query
 
 
 def test_a_process_that_was_told_to_end_is_not_alive():

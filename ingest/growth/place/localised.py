@@ -196,14 +196,10 @@ def _match_each_map(
         matches = guided_matches(features, area, points, pose.camera, pose.cam_from_local, QUERY.matching)
         pixels, places = pairs(features, area, matches)
         errors = reprojection_errors(pixels, places, pose.camera, pose.cam_from_local)
-        near = errors < 2.0 * _tolerance_px(pose.camera)
+        near = errors < 2.0 * QUERY.pose.tolerance_px(pose.camera)
         if near.sum() >= QUERY.acceptance.min_inliers:
             found = np.concatenate([found, np.stack([matches.feature[near], matches.point[near]])], axis=1)
     return found[0], found[1]
-
-
-def _tolerance_px(camera: Camera) -> float:
-    return QUERY.pose.tolerance_rel * max(camera.width, camera.height)
 
 
 def with_lens(photo: LocalisedPhoto, camera: Camera) -> LocalisedPhoto:
@@ -273,4 +269,4 @@ def _fitting(photo: LocalisedPhoto, lens: Camera) -> int:
     if photo.camera != lens:
         return 0
     errors = reprojection_errors(photo.pixels, photo.points, lens, photo.cam_from_local)
-    return int((errors < _tolerance_px(lens)).sum())
+    return int((errors < QUERY.pose.tolerance_px(lens)).sum())

@@ -87,7 +87,7 @@ def fitted_under_prior(
     """
     if len(matches) < _MIN_MATCHES:
         return pose
-    tolerance_px = options.tolerance_rel * max(pose.camera.width, pose.camera.height)
+    tolerance_px = options.tolerance_px(pose.camera)
     here = pose.cam_from_local
     for _ in range(_ROUNDS):
         found = _information(matches, pose.camera, here, tolerance_px)

@@ -6,12 +6,12 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import INGEST_LIMITS, decode_rgb
+from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.lidar.picture import ground_of
@@ -98,12 +98,7 @@ class PickSession:
 
     def photo_jpeg(self, image_id: int) -> bytes:
         rgb = decode_rgb(self.files.path(self.image(image_id)), INGEST_LIMITS)
-        shrink = _PHOTO_PX / max(rgb.shape)
-        if shrink < 1:
-            rgb = np.asarray(
-                cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8
-            )
-        return jpeg(rgb)
+        return jpeg(shrunk(rgb, _PHOTO_PX))
 
     def ground_png(self) -> bytes:
         return png(self.ground.rgb)

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 
 from featuredb.store.candidates.photos import InboxCounts
 from featuredb.store.candidates.states import Contribution
-from reloc.service.contributions.database_inbox import DatabaseInbox
 from reloc.service.logs import fields
-from reloc.wire.query import ContributionReason
+from reloc.wire.query import ContributionReason, ContributionReply
 from reloc.wire.server import ContributionStatus
 
 logger = logging.getLogger(__name__)
@@ -50,37 +49,28 @@ class InboxOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InboxRefusal:
-    """Why a photo is not taken."""
-
-    reason: ContributionReason
-    detail: str
-
-
 class Ticket:
-    """A place in the queue; either `submit` or `cancel` must be called, once."""
+    """A place in the queue for a photo of `size` bytes; `submit` or `cancel` must be called with it, once."""
 
-    __slots__ = ("_inbox", "owner", "size")
-
-    def __init__(self, inbox: "Inbox", owner: str, size: int) -> None:
-        self._inbox = inbox
-        self.owner = owner
-        self.size = size
-
-    def submit(self, make: Callable[[], Contribution]) -> None:
-        """Give the photo; `make` is called by the writing thread."""
-        self._inbox._take(self, make)
-
-    def cancel(self) -> None:
-        """Give the place back."""
-        self._inbox._release(self)
+    owner: str
+    size: int
 
 
 class Inbox:
     """Takes photos from the workers; they share it."""
 
-    def __init__(self, store: DatabaseInbox, options: InboxOptions | None = None) -> None:
-        self._store = store
+    def __init__(
+        self,
+        write: Callable[[list[Contribution]], object],
+        count: Callable[[], InboxCounts],
+        options: InboxOptions | None = None,
+    ) -> None:
+        """
+        Args:
+            write: stores contributions in one append, may take seconds, and fail.
+            count: how much is stored; likewise.
+        """
+        self._store, self._count = write, count
         self._options = options or InboxOptions()
         self._changed = threading.Condition()
         self._queue: deque[tuple[Ticket, Callable[[], Contribution]]] = deque()
@@ -112,17 +102,34 @@ class Inbox:
             if self._thread.is_alive():  # with a batch in hand that the store may still take
                 _lost(self._reserved, "the server stopped before the store took them")
 
-    def reserve(self, owner: str, size: int) -> Ticket | InboxRefusal:
+    def reserve(self, owner: str, size: int) -> Ticket | ContributionReply:
         """A place for a photo of `size` bytes, or why there is none. Returns at once."""
         with self._changed:
             refusal = self._refusal(owner, size)
             if refusal is not None:
-                self._refused[refusal.reason] += 1
-                return refusal
+                reason, detail = refusal
+                self._refused[reason] += 1
+                return ContributionReply(accepted=False, candidate_id=None, reason=reason, detail=detail)
             self._reserved += 1
             self._reserved_bytes += size
             self._owners[owner] += 1
-            return Ticket(self, owner, size)
+            return Ticket(owner=owner, size=size)
+
+    def submit(self, ticket: Ticket, make: Callable[[], Contribution]) -> None:
+        """Give the photo; `make` is called by the writing thread."""
+        with self._changed:
+            self._queue.append((ticket, make))
+            self._accepted += 1
+            self._changed.notify()
+
+    def cancel(self, ticket: Ticket) -> None:
+        """Give the place back."""
+        with self._changed:
+            self._reserved -= 1
+            self._reserved_bytes -= ticket.size
+            self._owners[ticket.owner] -= 1
+            if not self._owners[ticket.owner]:
+                del self._owners[ticket.owner]
 
     def status(self) -> ContributionStatus:
         """For `.../status`."""
@@ -136,53 +143,33 @@ class Inbox:
                 error=self._error,
             )
 
-    def _refusal(self, owner: str, size: int) -> InboxRefusal | None:
+    def _refusal(self, owner: str, size: int) -> tuple[ContributionReason, str] | None:
         options, counts = self._options, self._counts
         if self._error is not None or self._closed:
             why = self._error or "the server is stopping"
-            return InboxRefusal(reason="STORE_FAILED", detail=f"the inbox cannot be written: {why}")
+            return "STORE_FAILED", f"the inbox cannot be written: {why}"
         if self._reserved >= options.max_queue or self._reserved_bytes + size > options.max_queued_bytes:
-            return InboxRefusal(
-                reason="QUEUE_FULL",
-                detail=f"{self._reserved} contributed photos ({self._reserved_bytes} bytes) wait to be "
-                "stored; send it again in a few seconds",
+            return "QUEUE_FULL", (
+                f"{self._reserved} contributed photos ({self._reserved_bytes} bytes) wait to be stored; send "
+                "it again in a few seconds"
             )
         mine = counts.waiting_by_owner.get(owner, 0) + self._owners[owner]
         stored = counts.stored_bytes + self._reserved_bytes
-        refusal = None
+        waiting = counts.waiting + self._reserved
+        refusal: tuple[ContributionReason, str]
         if mine >= options.max_owner_photos:
-            refusal = InboxRefusal(
-                reason="OWNER_LIMIT",
-                detail=f"{mine} photos of this owner wait for growth, which is as many as one owner may have",
-            )
-        elif counts.waiting + self._reserved >= options.max_photos:
-            refusal = InboxRefusal(
-                reason="INBOX_FULL",
-                detail=f"{counts.waiting + self._reserved} photos wait for growth, which is the limit",
-            )
+            told = f"{mine} photos of this owner wait for growth, which is as many as one owner may have"
+            refusal = "OWNER_LIMIT", told
+        elif waiting >= options.max_photos:
+            refusal = "INBOX_FULL", f"{waiting} photos wait for growth, which is the limit"
         elif stored + size > options.max_stored_bytes:
-            refusal = InboxRefusal(
-                reason="INBOX_FULL",
-                detail=f"the stored photos take {stored} of {options.max_stored_bytes} bytes",
-            )
-        if refusal is not None:
-            self._limited = True
-            self._changed.notify()
+            told = f"the stored photos take {stored} of {options.max_stored_bytes} bytes"
+            refusal = "INBOX_FULL", told
+        else:
+            return None
+        self._limited = True
+        self._changed.notify()
         return refusal
-
-    def _take(self, ticket: Ticket, make: Callable[[], Contribution]) -> None:
-        with self._changed:
-            self._queue.append((ticket, make))
-            self._accepted += 1
-            self._changed.notify()
-
-    def _release(self, ticket: Ticket) -> None:
-        with self._changed:
-            self._reserved -= 1
-            self._reserved_bytes -= ticket.size
-            self._owners[ticket.owner] -= 1
-            if not self._owners[ticket.owner]:
-                del self._owners[ticket.owner]
 
     def _run(self) -> None:
         while (batch := self._next()) is not None:
@@ -219,12 +206,12 @@ class Inbox:
             else:
                 self._lost += len(batch)
         for ticket in tickets:
-            self._release(ticket)
+            self.cancel(ticket)
 
     def _write_with_retries(self, contributions: list[Contribution]) -> bool:
         for pause_s in (*self._options.retry_s, None):
             try:
-                self._store.write(contributions)
+                self._store(contributions)
             except Exception as error:
                 # A store may break in many ways; the thread must live on, or photos would be lost for ever.
                 logger.warning("inbox: a write failed", exc_info=True, extra=fields("inbox_failed"))
@@ -250,7 +237,7 @@ class Inbox:
     def _refresh(self) -> None:
         """Take new counts; a store that answers again is trusted again."""
         try:
-            counts, error = self._store.counts(), None
+            counts, error = self._count(), None
         except Exception as failure:  # as for a write
             counts, error = None, f"{type(failure).__name__}: {failure}"
             logger.warning("inbox: cannot be counted", exc_info=True, extra=fields("inbox_failed"))

@@ -3,11 +3,12 @@
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
 from typing import Self
 
 from featuredb.stage_clock import StageClock
 from reloc.service.live.frames import FrameAnswerer, FrameAsk
-from reloc.service.live.latest import Arrival
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
 from reloc.service.workers.area_files import LocaliserFiles
@@ -16,6 +17,23 @@ from reloc.wire.query import ErrorCode, RequestError, parse_attachment
 from reloc.wire.track import TrackFrame, TrackPose
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arrival:
+    """A frame as it came.
+
+    Attributes:
+        header: its attachment. payload: the image file's bytes; empty where `size` is over the limit.
+        size: bytes that were sent.
+        received: `time.perf_counter` at receipt. received_at: the same by the clock.
+    """
+
+    header: bytes
+    payload: bytes
+    size: int
+    received: float
+    received_at: datetime
 
 
 class FrameError(RequestError):
@@ -90,9 +108,11 @@ class Follower:
             FollowerStoppedError: as told.
         """
         clock = StageClock(start=arrival.received)
-        header = self._header(arrival)
+        sequence: int | None = None
         try:
-            self._check_payload(arrival)
+            header = parse_attachment(TrackFrame, arrival.header)
+            sequence = header.sequence
+            self._check(header, arrival.size)
             process = self._ready()
             clock.lap("queue")
             frame = FrameAsk(
@@ -103,13 +123,17 @@ class Follower:
             )
             pose = self._asked(process, frame, arrival.payload)
         except RequestError as error:
-            raise FrameError(ErrorCode(error.code), error.message, header.sequence) from error
+            raise FrameError(ErrorCode(error.code), error.message, sequence) from error
         except (WorkerEndedError, WorkerDefectError) as error:
             self._close()
             self._check_not_stopped(error)
             logger.exception("a frame failed", extra=fields("frame_failed"))
-            code, why = self._failure(error)
-            raise FrameError(code, why, header.sequence) from error
+            how = error if isinstance(error, WorkerEndedError) else "a defect"
+            raise FrameError(
+                ErrorCode.INTERNAL,
+                f"{how} on this frame; the server's log has it. The track begins anew",
+                sequence,
+            ) from error
         self._last_time_s = header.time_s
         clock.lap("worker", pose.timings_ms)
         return pose.model_copy(update={"timings_ms": clock.milliseconds()})
@@ -135,20 +159,11 @@ class Follower:
         finally:
             watch.cancel()
 
-    def _failure(self, error: WorkerEndedError | WorkerDefectError) -> tuple[ErrorCode, str]:
-        if isinstance(error, WorkerEndedError) and error.out_of_memory:
-            return ErrorCode.TOO_LARGE, (
-                f"the frame needs more than the {self._limits.memory_bytes >> 20} MiB of memory that it may; "
-                "send smaller ones"
-            )
-        how = error if isinstance(error, WorkerEndedError) else "a defect"
-        return ErrorCode.INTERNAL, f"{how} on this frame; the server's log has it. The track begins anew"
-
     def _ready(self) -> WorkerProcess:
         """The process, a new one where it has ended, over the area in service."""
         if self._process is None or not self._process.is_alive():
             self._close()
-            self._process = WorkerProcess(self._limits, self._answerer)
+            self._process = WorkerProcess(self._limits, self._answerer.answer)
             if self._stopped:  # while it was started
                 self._process.kill()
         self._process.open(self._files())
@@ -163,37 +178,25 @@ class Follower:
             self._process.close()
             self._process = None
 
-    def _header(self, arrival: Arrival) -> TrackFrame:
-        try:
-            header = parse_attachment(TrackFrame, arrival.header)
-        except RequestError as error:
-            raise FrameError(ErrorCode(error.code), error.message, None) from error
+    def _check(self, header: TrackFrame, size: int) -> None:
+        """Raises RequestError: the header goes back, or the payload is too large."""
         if self._last is not None and header.sequence <= self._last.sequence:
-            raise FrameError(
+            raise RequestError(
                 ErrorCode.BAD_REQUEST,
                 f"sequence: expected more than {self._last.sequence}, that of the frame before, found "
                 f"{header.sequence}; number the frames from 0, and open a new session to begin again",
-                header.sequence,
             )
         self._last = header
         self._looked_at += 1
         if self._last_time_s is not None and header.time_s <= self._last_time_s:
-            raise FrameError(
+            raise RequestError(
                 ErrorCode.BAD_REQUEST,
                 f"time_s: expected more than {self._last_time_s}, that of the frame before, found "
                 f"{header.time_s}",
-                header.sequence,
             )
-        return header
-
-    def _check_payload(self, arrival: Arrival) -> None:
-        if arrival.size > self._max_bytes:
+        if size > self._max_bytes:
             raise RequestError(
                 ErrorCode.TOO_LARGE,
-                f"payload: expected at most {self._max_bytes} bytes, found {arrival.size}; send smaller or "
-                "more compressed frames",
-            )
-        if not arrival.payload:
-            raise RequestError(
-                ErrorCode.BAD_IMAGE, "payload: expected the bytes of an image file, found none"
+                f"payload: expected at most {self._max_bytes} bytes, found {size}; send smaller or more "
+                "compressed frames",
             )

@@ -6,25 +6,25 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import ImageError, InvalidValueError
+from featuredb.errors import ImageError
 from featuredb.features.decode import decode_gray, probe
 from featuredb.features.image_header import ImageHeader
+from featuredb.features.shrink import fitted_size, shrunk
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
-from featuredb.video.film import fitted_size
-from reloc.answered_view import camera_of, geo_prior
+from reloc.answered_view import geo_prior
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
+from reloc.service.handler import image_refused, query_camera
 from reloc.service.live.options import LiveOptions
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.pose_message import pose_message
 from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.values import point_of
-from reloc.wire.query import CameraRequest, ErrorCode, RequestError
+from reloc.wire.query import ErrorCode, RequestError
 from reloc.wire.track import TrackOpenRequest, TrackPose
 
 # Pixels to decode that 4K video has at most. Frames of more are served behind queries.
@@ -50,7 +50,8 @@ class FrameAsk:
 class FrameAnswerer:
     """Answers the frames of one session, in their order; where it begins anew, the track does.
 
-    See `reloc.service.workers.answering.Answerer`: until its first frame it can be sent to a process.
+    Its `answer` is a `reloc.service.workers.answering.Answerer`: until its first frame it can be sent to a
+    process.
     """
 
     def __init__(self, session: str, request: TrackOpenRequest, options: LiveOptions) -> None:
@@ -59,7 +60,9 @@ class FrameAnswerer:
             RequestError: the camera or the prior is none.
         """
         self._session, self._options = session, options
-        self._camera = None if request.camera is None else _camera(request.camera)
+        self._lens = lens = request.camera
+        if lens is not None:
+            query_camera(lens, lens.width, lens.height)
         prior = None if request.prior is None else geo_prior(request.prior)
         self._request = LocaliseRequest(prior=prior)
         self._localiser: Localiser | None = None
@@ -78,7 +81,7 @@ class FrameAnswerer:
         clock.lap("decode")
         tracker = self._tracker_for(gray, localiser)
         height, width = gray.shape
-        tracked = tracker.track(_smaller(gray, self._options.max_side_px), ask.time_s)
+        tracked = tracker.track(shrunk(gray, self._options.max_side_px), ask.time_s)
         clock.lap("track")
         point = point_of(tracked)
         camera = None if tracked.camera is None else tracked.camera.scaled_to(width, height)
@@ -102,8 +105,7 @@ class FrameAnswerer:
                 _yield_to_queries()
             gray = decode_gray(data, limits)
         except ImageError as error:
-            code = ErrorCode.TOO_LARGE if error.code == "too_large" else ErrorCode.BAD_IMAGE
-            raise RequestError(code, f"image: {error}") from error
+            raise image_refused(error) from error
         size = (gray.shape[1], gray.shape[0])
         if min(fitted_size(*size, self._options.max_side_px)) < limits.min_side_px:
             raise RequestError(
@@ -138,14 +140,8 @@ class FrameAnswerer:
 
     def _camera_for(self, gray: NDArray[np.uint8]) -> Camera | None:
         """The session's camera, of the size that is tracked."""
-        height, width = gray.shape
-        try:
-            size = fitted_size(width, height, self._options.max_side_px)
-            return None if self._camera is None else self._camera.scaled_to(*size)
-        except InvalidValueError as error:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST, f"camera: {error} (the frame has {width}x{height})"
-            ) from error
+        size = fitted_size(gray.shape[1], gray.shape[0], self._options.max_side_px)
+        return None if self._lens is None else query_camera(self._lens, *size)
 
 
 def _is_heavy(header: ImageHeader) -> bool:
@@ -164,18 +160,3 @@ def _yield_to_queries() -> None:
     for task in [int(one.name) for one in tasks.iterdir()] if tasks.exists() else [0]:
         with suppress(OSError):  # it has ended meanwhile
             os.setpriority(os.PRIO_PROCESS, task, _YIELDING)
-
-
-def _smaller(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
-    height, width = gray.shape
-    size = fitted_size(width, height, max_side_px)
-    if size == (width, height):
-        return gray
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _camera(camera: CameraRequest) -> Camera:
-    try:
-        return camera_of(camera)
-    except InvalidValueError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, f"camera: {error}") from error

@@ -9,8 +9,7 @@ from datetime import UTC, datetime
 
 from pydantic import BaseModel
 
-from reloc.service.live.follower import Follower, FollowerStoppedError, FrameError
-from reloc.service.live.latest import Arrival, LatestFrame
+from reloc.service.live.follower import Arrival, Follower, FollowerStoppedError, FrameError
 from reloc.service.logs import fields
 from reloc.service.tally import Tally
 from reloc.wire.track import EndReason, TrackEvent
@@ -57,9 +56,9 @@ class LiveSession:
         self._publish = publish
         self._tally = tally
         self._on_end = on_end
-        self._inbox = LatestFrame()
+        self._waiting: Arrival | None = None
         self._reason: EndReason | None = None
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()  # the two above
         self._states: Counter[str] = Counter()
         self._thread = threading.Thread(target=self._run, name=f"live-{name}", daemon=True)
 
@@ -69,7 +68,12 @@ class LiveSession:
     def offer(self, arrival: Arrival) -> None:
         """Leave a frame for the thread; the one that waits, if any, is dropped for it."""
         self._tally.add("frame received")
-        if not self._inbox.put(arrival):
+        with self._changed:
+            dropped = self.ending or self._waiting is not None
+            if not self.ending:
+                self._waiting = arrival
+                self._changed.notify()
+        if dropped:
             self._tally.add("frame dropped")
 
     def end(self, reason: EndReason) -> None:
@@ -77,9 +81,9 @@ class LiveSession:
 
         The frame in hand is answered, but for a client that is gone or has to make room.
         """
-        with self._lock:
+        with self._changed:
             self._reason = self._reason or reason
-        self._inbox.close()
+            self._changed.notify()
         if reason in _AT_ONCE:
             self._follower.stop()
 
@@ -107,11 +111,18 @@ class LiveSession:
     def _answer_frames(self) -> None:
         usable_until = time.perf_counter() + self._idle_timeout_s
         while self._reason is None:
-            arrival = self._inbox.take(usable_until - time.perf_counter())
+            arrival = self._next(usable_until - time.perf_counter())
             if arrival is not None and self._answered(arrival):
                 usable_until = time.perf_counter() + self._idle_timeout_s
             elif self._reason is None and time.perf_counter() >= usable_until:
                 self.end(EndReason.IDLE)
+
+    def _next(self, timeout_s: float) -> Arrival | None:
+        """The latest frame, as soon as there is one; None when none came in time, and at the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.ending or self._waiting is not None, max(timeout_s, 0.0))
+            arrival, self._waiting = self._waiting, None
+            return None if self.ending else arrival
 
     def _answered(self, arrival: Arrival) -> bool:
         """Whether the frame could be used: it has been answered then."""

@@ -1,7 +1,6 @@
 """A server's live sessions on Zenoh: opened by a query, fed by publications, ended with their clients."""
 
 import logging
-import re
 import threading
 import time
 from collections import Counter
@@ -14,17 +13,16 @@ from pydantic import BaseModel
 from zenoh.handlers import Callback
 
 from featuredb.errors import IncompatibleExtractorError
-from reloc.service.live.follower import Follower
+from reloc.localise.candidates import usable_areas
+from reloc.service.live.follower import Arrival, Follower
 from reloc.service.live.frames import FrameAnswerer
-from reloc.service.live.latest import Arrival
 from reloc.service.live.options import LiveOptions
 from reloc.service.live.session import LiveSession
 from reloc.service.logs import fields
 from reloc.service.pending import session_of
 from reloc.service.source import ServedArea
 from reloc.service.tally import Tally
-from reloc.tracking.map_ground import usable_areas
-from reloc.wire.keys import NAME_PATTERN, Keys
+from reloc.wire.keys import NAME_EXPECTED, Keys, is_name
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
     ErrorCode,
@@ -167,12 +165,8 @@ class LiveSessions:
             RequestError: why it is not opened.
         """
         for what, found in (("client", client), ("session", name)):
-            if not re.fullmatch(NAME_PATTERN, found):
-                raise RequestError(
-                    ErrorCode.BAD_REQUEST,
-                    f"{what}: expected 1..64 letters, digits, '_', '.', '-', beginning with a letter or "
-                    f"digit, found {found[:80]!r}",
-                )
+            if not is_name(found):
+                raise RequestError(ErrorCode.BAD_REQUEST, f"{what}: {NAME_EXPECTED}, found {found[:80]!r}")
         key = self._keys.track(client, name)
         attachment = None if query.attachment is None else query.attachment.to_bytes()
         request = parse_attachment(TrackOpenRequest, attachment)

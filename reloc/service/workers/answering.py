@@ -6,35 +6,29 @@ import resource
 import signal
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 from pydantic import BaseModel
 from threadpoolctl import threadpool_limits
 
-from featuredb.features.decode import DecodeLimits
-from featuredb.stage_clock import StageClock
 from reloc.localiser import Localiser
-from reloc.service.handler import answer_query
 from reloc.service.workers.area_files import MappedAreas
-from reloc.wire.query import (
-    ErrorCode,
-    ErrorReply,
-    LocaliseReply,
-    LocaliseWireRequest,
-    RequestError,
-    encode,
-)
+from reloc.wire.query import ErrorReply, RequestError, encode
 
 # What the first byte of an answer says of the rest.
 REPLY, REFUSAL, DEFECT = b"R", b"E", b"D"
 OUT_OF_MEMORY = 77  # exit code
+
+# Answers a message with an image file in the process, to which it is sent as it is when that starts.
+# Raises RequestError: why there is no answer.
+Answerer = Callable[[Any, bytes, Localiser], BaseModel]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,49 +46,11 @@ class WorkerLimits:
     processor_s: float
 
 
-class Answerer(Protocol):
-    """What answers in the process: it is sent there, as it is, when the process starts."""
-
-    def answer(self, ask: Any, data: bytes, localiser: Localiser) -> BaseModel:
-        """The answer to a message with an image file. Raises RequestError: why there is none."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenFiles:
     """The files of a localiser follow, as descriptors; it answers from now on."""
 
     keys: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ask:
-    """A query; the image's bytes follow."""
-
-    request: LocaliseWireRequest
-    request_id: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class QueryAnswerer:
-    """Answers queries, each by itself.
-
-    Attributes:
-        decode: bytes and pixels of the image.
-    """
-
-    decode: DecodeLimits
-
-    def answer(self, ask: Ask, data: bytes, localiser: Localiser) -> LocaliseReply:
-        """As `answer_query`."""
-        return answer_query(
-            data,
-            ask.request,
-            localiser,
-            limits=self.decode,
-            request_id=ask.request_id,
-            clock=StageClock(),
-        )
 
 
 @contextmanager
@@ -145,10 +101,8 @@ def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer)
                 connection.send_bytes(answer)
             except (EOFError, OSError):
                 return
-            except MemoryError:
-                os._exit(OUT_OF_MEMORY)
-            except cv2.error as error:
-                if error.code != cv2.Error.StsNoMem:
+            except (MemoryError, cv2.error) as error:
+                if not _is_out_of_memory(error):
                     raise
                 os._exit(OUT_OF_MEMORY)
             stop.busy = False
@@ -184,14 +138,16 @@ def _set_limit(which: int, wanted: int) -> None:
 
 def _answer(answerer: Answerer, ask: object, data: bytes, localiser: Localiser) -> bytes:
     try:
-        return REPLY + encode(answerer.answer(ask, data, localiser))
+        return REPLY + encode(answerer(ask, data, localiser))
     except RequestError as error:
-        return REFUSAL + encode(
-            ErrorReply(code=ErrorCode(error.code), message=error.message, request_id=None)
-        )
-    except (MemoryError, cv2.error) as error:
-        if isinstance(error, MemoryError) or error.code == cv2.Error.StsNoMem:
+        return REFUSAL + encode(ErrorReply(code=error.code, message=error.message, request_id=None))
+    except Exception as error:  # the server logs it
+        if _is_out_of_memory(error):
             raise
         return DEFECT + traceback.format_exc().encode()
-    except Exception:  # noqa: BLE001  # the server logs it
-        return DEFECT + traceback.format_exc().encode()
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    return isinstance(error, MemoryError) or (
+        isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem
+    )

@@ -11,7 +11,6 @@ import pickle
 import tempfile
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import IO, Any
 
 from featuredb.errors import StoreError
@@ -35,11 +34,8 @@ class AreaFile:
         weakref.finalize(self, self.file.close)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LocaliserFiles:
-    """A localiser as files: those of its areas, then the one that refers to them."""
-
-    files: tuple[AreaFile, ...]
+# A localiser as files: those of its areas, then the one that refers to them.
+LocaliserFiles = tuple[AreaFile, ...]
 
 
 class AreaFiles:
@@ -55,27 +51,24 @@ class AreaFiles:
         Raises:
             StoreError: the folder of temporary files has no room for them.
         """
+        parts: list[AreaFile] = []
+
+        def key_of(part: object) -> int:
+            if part not in self._written:
+                self._written[part] = self._file(part, lambda _: None)
+            parts.append(self._written[part])
+            return parts[-1].key
+
         try:
-            return self._files(localiser)
+            whole = self._file(localiser, key_of)
         except OSError as error:
             raise StoreError(
                 f"cannot write the maps into {tempfile.gettempdir()} for the worker processes: {error}. They "
                 "need as much room as in memory; free it, or set TMPDIR to another folder"
             ) from error
+        return (*parts, whole)
 
-    def _files(self, localiser: Localiser) -> LocaliserFiles:
-        parts: list[AreaFile] = []
-
-        def key_of(part: object) -> int:
-            if part not in self._written:
-                self._written[part] = self._file(part, None)
-            parts.append(self._written[part])
-            return parts[-1].key
-
-        whole = self._file(localiser, key_of)
-        return LocaliserFiles(files=(*parts, whole))
-
-    def _file(self, value: object, key_of: Callable[[object], int] | None) -> AreaFile:
+    def _file(self, value: object, key_of: Callable[[object], int | None]) -> AreaFile:
         made = AreaFile(next(self._keys))
         _write(value, made.file, key_of)
         return made
@@ -110,7 +103,7 @@ class MappedAreas:
 
 class _Pickler(pickle.Pickler):
     def __init__(
-        self, file: IO[bytes], buffers: list[pickle.PickleBuffer], key_of: Callable[[object], int]
+        self, file: IO[bytes], buffers: list[pickle.PickleBuffer], key_of: Callable[[object], int | None]
     ) -> None:
         super().__init__(file, protocol=5, buffer_callback=buffers.append)
         self._key_of = key_of
@@ -128,13 +121,14 @@ class _Unpickler(pickle.Unpickler):
         return self._parts[pid]
 
 
-def _write(value: object, file: IO[bytes], key_of: Callable[[object], int] | None) -> None:
-    """Arrays as they are, then the rest pickled, then where each of them lies."""
+def _write(value: object, file: IO[bytes], key_of: Callable[[object], int | None]) -> None:
+    """Arrays as they are, then the rest pickled, then where each of them lies.
+
+    Args:
+        key_of: of an area within that is a file of its own; None: it is none, and written along.
+    """
     stream, buffers = io.BytesIO(), list[pickle.PickleBuffer]()
-    if key_of is None:
-        pickle.Pickler(stream, protocol=5, buffer_callback=buffers.append).dump(value)
-    else:
-        _Pickler(stream, buffers, key_of).dump(value)
+    _Pickler(stream, buffers, key_of).dump(value)
     places = []
     for content in (*(buffer.raw() for buffer in buffers), stream.getbuffer()):
         file.write(bytes(-file.tell() % _ALIGNMENT))

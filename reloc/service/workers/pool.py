@@ -6,19 +6,20 @@ import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
+from functools import partial
 
 from featuredb.stage_clock import StageClock
 from featuredb.store.candidates.states import ANONYMOUS, candidate_id_of
-from reloc.service.contributions.database_inbox import contribution_of
-from reloc.service.contributions.inbox import Inbox, InboxRefusal
+from reloc.service.contributions.contribution import contribution_of
+from reloc.service.contributions.inbox import Inbox
+from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
-from reloc.service.workers.answering import Ask, QueryAnswerer, WorkerLimits
-from reloc.service.workers.area_files import AreaFiles, LocaliserFiles
+from reloc.service.workers.area_files import AreaFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
 from reloc.wire.query import (
     ContributionReply,
@@ -38,6 +39,9 @@ class WorkerPool:
     """Takes queries from the queue and answers each from the area in service at that moment.
 
     A process that is still at a query when its time is over, or that ends before its answer, is replaced.
+
+    Attributes:
+        published: the area that is answered from.
     """
 
     def __init__(
@@ -52,7 +56,7 @@ class WorkerPool:
         self._options = options
         self._inbox = inbox
         self._limits = options.worker_limits
-        self._answerer = QueryAnswerer(decode=options.limits)
+        self._answerer = partial(answer_query, limits=options.limits)
         self._files = AreaFiles()
         # A photo is named while it is localised: the query does not wait for a hash of its megabytes.
         self._namer = ThreadPoolExecutor(1, thread_name_prefix="name-photo")
@@ -75,14 +79,9 @@ class WorkerPool:
         """Workers whose process is up, and not beyond its query's deadline."""
         return len(self._up)
 
-    @property
-    def published(self) -> LocaliserFiles:
-        """The area that is answered from."""
-        return self._published
-
     def publish(self, area: ServedArea) -> None:
         """Answer from this area, beginning with the next query of each worker."""
-        self._published = self._files.of(area.localiser)
+        self.published = self._files.of(area.localiser)
 
     def start(self) -> None:
         """Start the workers; returns when one of them is ready.
@@ -147,7 +146,7 @@ class WorkerPool:
                 process = None
             try:
                 process = WorkerProcess(self._limits, self._answerer)
-                process.open(self._published)
+                process.open(self.published)
             except Exception as error:
                 if process is not None:
                     self._gone(process)
@@ -179,7 +178,13 @@ class WorkerPool:
         except WorkerEndedError as error:
             with self._changed:
                 self._up.discard(process)
-            item.refuse(_ended_error(error, self._limits, item))
+            item.refuse(
+                RequestError(
+                    ErrorCode.INTERNAL,
+                    f"{error} on this query, which concerns no other; the server's log has it under request "
+                    f"id {item.request_id}",
+                )
+            )
         except Exception as error:
             trace = {"trace": str(error)} if isinstance(error, WorkerDefectError) else {}
             told = fields("internal", request_id=item.request_id, **trace)
@@ -214,8 +219,9 @@ class WorkerPool:
         if item.answered:
             return
         name = self._namer.submit(candidate_id_of, data) if request.contribute else None
-        process.open(self._published)
-        reply = process.ask(Ask(request=request, request_id=item.request_id), data, LocaliseReply)
+        process.open(self.published)
+        asked = request.model_copy(update={"request_id": item.request_id})
+        reply = process.ask(asked, data, LocaliseReply)
         clock.lap("worker", reply.timings_ms)
         reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
         _check_deadline(item)
@@ -223,20 +229,6 @@ class WorkerPool:
             _answer_and_keep(item, data, request, reply, clock, self._inbox, name)
         else:
             item.answer(reply)
-
-
-def _ended_error(ended: WorkerEndedError, limits: WorkerLimits, item: PendingQuery) -> RequestError:
-    if ended.out_of_memory:
-        return RequestError(
-            ErrorCode.TOO_LARGE,
-            f"the query needs more than the {limits.memory_bytes >> 20} MiB of memory that it may; "
-            "send a smaller picture",
-        )
-    return RequestError(
-        ErrorCode.INTERNAL,
-        f"{ended} on this query, which concerns no other; the server's log has it under request id "
-        f"{item.request_id}",
-    )
 
 
 def _answer_and_keep(
@@ -252,9 +244,8 @@ def _answer_and_keep(
     received_at = datetime.now(UTC)
     owner = item.identity or ANONYMOUS  # never what the request claims
     place = inbox.reserve(owner, len(data))
-    if isinstance(place, InboxRefusal):
-        said = ContributionReply(accepted=False, candidate_id=None, reason=place.reason, detail=place.detail)
-        item.answer(_with_contribution(reply, said, clock))
+    if isinstance(place, ContributionReply):
+        item.answer(_with_contribution(reply, place, clock))
         return
     answered = False
     try:
@@ -264,9 +255,9 @@ def _answer_and_keep(
         answered = item.answer(_with_contribution(reply, said, clock))
     finally:
         if not answered:
-            place.cancel()
+            inbox.cancel(place)
     if answered:
-        place.submit(lambda: contribution_of(data, request, reply, received_at, owner))
+        inbox.submit(place, lambda: contribution_of(data, request, reply, received_at, owner))
 
 
 def _with_contribution(reply: LocaliseReply, said: ContributionReply, clock: StageClock) -> LocaliseReply:

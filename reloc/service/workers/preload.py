@@ -5,5 +5,5 @@ import signal
 
 # Who stops a server may tell its whole group; this process ends with the server, which needs it until then.
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
-for _name in ("reloc.service.workers.answering", "reloc.service.live.frames"):
+for _name in ("reloc.service.handler", "reloc.service.workers.answering", "reloc.service.live.frames"):
     importlib.import_module(_name)

@@ -59,16 +59,11 @@ def _without_script() -> Iterator[None]:
 
 
 class WorkerEndedError(Exception):
-    """The process has ended before it answered.
-
-    Attributes:
-        out_of_memory: the picture needed more than its limit.
-    """
+    """The process has ended before it answered."""
 
     def __init__(self, code: int | None) -> None:
         how = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
         super().__init__(f"the worker process ended with {how}")
-        self.out_of_memory = code == OUT_OF_MEMORY
 
 
 class WorkerDefectError(Exception):
@@ -84,6 +79,7 @@ class WorkerProcess:
             self._connection, theirs = _CONTEXT.Pipe()
         except OSError as error:  # too many open files
             raise WorkerEndedError(None) from error
+        self._limits = limits
         self._open: LocaliserFiles | None = None
         self._killed = False
         self._process = _CONTEXT.Process(
@@ -122,8 +118,8 @@ class WorkerProcess:
         if files is self._open:
             return
         try:
-            self._connection.send(OpenFiles(keys=tuple(file.key for file in files.files)))
-            for file in files.files:
+            self._connection.send(OpenFiles(keys=tuple(file.key for file in files)))
+            for file in files:
                 send_handle(self._connection, file.file.fileno(), self._process.pid)
             self._connection.recv_bytes()
         except (EOFError, OSError) as error:
@@ -137,8 +133,8 @@ class WorkerProcess:
             data: the image file. reply: what the answer is.
 
         Raises:
-            RequestError: why there is no answer.
-            WorkerEndedError: the process has ended.
+            RequestError: why there is no answer; TOO_LARGE where the process has ended for want of memory.
+            WorkerEndedError: the process has ended otherwise.
             WorkerDefectError: a defect.
         """
         try:
@@ -146,7 +142,14 @@ class WorkerProcess:
             self._connection.send_bytes(data)
             answer = self._connection.recv_bytes()
         except (EOFError, OSError) as error:
-            raise self._ended() from error
+            ended = self._ended()
+            if self._process.exitcode != OUT_OF_MEMORY:
+                raise ended from error
+            raise RequestError(
+                ErrorCode.TOO_LARGE,
+                f"the picture needs more than the {self._limits.memory_bytes >> 20} MiB of memory that it "
+                "may; send a smaller one",
+            ) from error
         kind, content = answer[:1], answer[1:]
         if kind == DEFECT:
             raise WorkerDefectError(content.decode())

@@ -4,8 +4,6 @@ The suffix chooses. Frames whose track is lost are rows without a pose in CSV, a
 appears whole or not at all.
 """
 
-import csv
-import io
 import json
 import os
 import secrets
@@ -18,21 +16,17 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose_documents import irregular_series
-from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS
-from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPoint
+from reloc.tracking.ground import EarthPose
+from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS, UPPER, columns_of, csv_table
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 
+_AXES = ("re", "rn", "ru", "e", "n", "u")
 _POSE = (
     *("easting", "northing", "height", "qx", "qy", "qz", "qw", "latitude", "longitude"),
     *("heading_deg", "pitch_deg", "roll_deg", "epsg", "height_datum", "map_id"),
+    *(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in UPPER),
 )
-_AXES = ("re", "rn", "ru", "e", "n", "u")
-_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
-CSV_COLUMNS = (
-    *("frame", "time_s", "state", "inliers"),
-    *_POSE,
-    *(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in _UPPER),
-    "detail",
-)
+CSV_COLUMNS = columns_of(_POSE)
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
@@ -43,7 +37,8 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     Raises:
         InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
     """
-    made = _format(path, trajectory.is_in_map)(trajectory)
+    own = next((point.in_map.map_id for point in trajectory.points if point.in_map is not None), None)
+    made = _format(path, own)(trajectory)
     content = made if isinstance(made, bytes) else made.encode()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
@@ -54,13 +49,16 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def check_format(path: Path) -> None:
+def check_format(path: Path, own_map: str | None = None) -> None:
     """Whether the suffix is one of those above.
+
+    Args:
+        own_map: id of the map without a place in whose frame the poses are.
 
     Raises:
         InvalidValueError: it is not.
     """
-    _format(path)
+    _format(path, own_map)
 
 
 def csv_text(trajectory: Trajectory) -> str:
@@ -70,35 +68,23 @@ def csv_text(trajectory: Trajectory) -> str:
     into camera axes (x right, y down, z forward); cov_* is the covariance, rad and m, axes true east, north,
     up: rotation (re, rn, ru) before displacement (e, n, u).
     """
-    out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(CSV_COLUMNS)
-    for point in trajectory.points:
-        head = (point.index, f"{point.time_s:.6f}", point.state, point.inliers)
-        if point.pose is None:
-            rows.writerow((*head, *([""] * (len(_POSE) + len(_UPPER))), point.detail))
-            continue
-        pose = point.pose
-        angles = (f"{a:.5f}" for a in pose.geopose.heading_pitch_roll_deg)
-        rows.writerow(
-            (
-                *head,
-                *(f"{v:.4f}" for v in pose.utm),
-                *(f"{q:.9f}" for q in pose.cam_from_utm_xyzw),
-                *(f"{pose.geopose.latitude_deg:.10f}", f"{pose.geopose.longitude_deg:.10f}"),
-                *angles,
-                *(pose.epsg, pose.height_datum, pose.map_id),
-                *(f"{pose.covariance[i, j]:.6e}" for i, j in _UPPER),
-                point.detail,
-            )
-        )
-    return out.getvalue()
+    return csv_table(_POSE, trajectory, lambda point: None if point.pose is None else _cells(point.pose))
+
+
+def _cells(pose: EarthPose) -> list[object]:
+    return [
+        *(f"{v:.4f}" for v in pose.utm),
+        *(f"{q:.9f}" for q in pose.cam_from_utm_xyzw),
+        *(f"{pose.geopose.latitude_deg:.10f}", f"{pose.geopose.longitude_deg:.10f}"),
+        *(f"{a:.5f}" for a in pose.geopose.heading_pitch_roll_deg),
+        *(pose.epsg, pose.height_datum, pose.map_id),
+        *(f"{pose.covariance[i, j]:.6e}" for i, j in UPPER),
+    ]
 
 
 def tum_text(trajectory: Trajectory) -> str:
     """TUM's format for evo and its like: time x y z qx qy qz qw, world from camera, world is the UTM grid."""
     found = _known(trajectory, "TUM")
-    _one_datum(trajectory, found)
     zones = {pose.epsg for _, pose in found}
     if len(zones) > 1:
         raise InvalidValueError(
@@ -118,7 +104,7 @@ def geojson_text(trajectory: Trajectory) -> str:
 
     Heights are those of the maps, in their datum, which is among the properties.
     """
-    _known(trajectory, "GeoJSON")
+    _known(trajectory, "GeoJSON", datums=True)
     features = []
     for number, stretch in enumerate(trajectory.stretches()):
         if len(stretch) > 1:
@@ -161,7 +147,6 @@ def geojson_text(trajectory: Trajectory) -> str:
 def kml_text(trajectory: Trajectory) -> str:
     """A line for each stretch without loss, for Google Earth and the like; heights as the maps have them."""
     found = _known(trajectory, "KML")
-    _one_datum(trajectory, found)
     marks = []
     for number, stretch in enumerate(trajectory.stretches()):
         places = " ".join(",".join(f"{v:.10g}" for v in _place(pose)) for _, pose in stretch)
@@ -184,7 +169,6 @@ def geopose_text(trajectory: Trajectory) -> str:
     are Unix milliseconds, or since the film's start where that is not known.
     """
     found = _known(trajectory, "GeoPose")
-    _one_datum(trajectory, found)
     start_ms = 0.0 if trajectory.start is None else 1000.0 * trajectory.start.timestamp()
     poses = [(round(start_ms + 1000.0 * point.time_s), pose.geopose) for point, pose in found]
     return json.dumps(irregular_series(poses), indent=1) + "\n"
@@ -196,7 +180,6 @@ def srt_text(trajectory: Trajectory) -> str:
     abs_alt is the height as the maps have it; angles are those of the camera.
     """
     found = _known(trajectory, "SRT")
-    _one_datum(trajectory, found)
     times = [point.time_s for point in trajectory.points]
     usual_s = float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
     ends_s = [*times[1:], times[-1] + usual_s]
@@ -239,18 +222,24 @@ _FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {
 }
 
 
-def _format(path: Path, is_in_map: bool = False) -> Callable[[Trajectory], str | bytes]:
-    formats, why = _FORMATS, ""
-    if is_in_map:
-        formats, why = OWN_FORMATS, "the track is in the frame of a map without a place: "
-    if path.suffix.lower() not in formats:
+def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str | bytes]:
+    suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else OWN_FORMATS
+    if suffix in formats:
+        return formats[suffix]
+    if own_map is None:
         raise InvalidValueError(
-            f"{path.name}: {why}expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
+            f"{path.name}: expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
         )
-    return formats[path.suffix.lower()]
+    raise InvalidValueError(
+        f"{path.name}: needs places on Earth, and map {own_map} has none: expected {' or '.join(formats)}, "
+        "with poses in the map's own frame; or place the map first: `featuredb maps` says how"
+    )
 
 
-def _known(trajectory: Trajectory, what: str) -> Sequence[tuple[TrajectoryPoint, EarthPose]]:
+def _known(
+    trajectory: Trajectory, what: str, *, datums: bool = False
+) -> Sequence[tuple[TrajectoryPoint, EarthPose]]:
+    """The frames with poses; `datums`: whether the format can have heights of several."""
     found = [(p, p.pose) for p in trajectory.points if p.pose is not None]
     if not found:
         reasons = {p.detail for p in trajectory.points if p.detail}
@@ -258,16 +247,13 @@ def _known(trajectory: Trajectory, what: str) -> Sequence[tuple[TrajectoryPoint,
             f"{trajectory.source}: no frame has a pose, a {what} file would be empty"
             + (f" ({sorted(reasons)[0]})" if reasons else "")
         )
-    return found
-
-
-def _one_datum(trajectory: Trajectory, found: Sequence[tuple[TrajectoryPoint, EarthPose]]) -> None:
-    datums = sorted({pose.height_datum for _, pose in found})
-    if len(datums) > 1:
+    several = sorted({pose.height_datum for _, pose in found})
+    if len(several) > 1 and not datums:
         raise InvalidValueError(
-            f"{trajectory.source}: the track crosses from maps with heights {datums[0]} to {datums[1]}, "
+            f"{trajectory.source}: the track crosses from maps with heights {several[0]} to {several[1]}, "
             "which this format cannot say; write CSV or GeoJSON, or name maps of one datum"
         )
+    return found
 
 
 def _place(pose: EarthPose) -> list[float]:

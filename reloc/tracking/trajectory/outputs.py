@@ -8,7 +8,6 @@ from pathlib import Path
 
 from featuredb.errors import FeatureDbError, InvalidValueError
 from reloc.tracking.trajectory.files import check_format, write_trajectory
-from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS
 from reloc.tracking.trajectory.values import Trajectory
 
 _NOTHING_FOUND, _FAILED = 1, 2  # exit codes: no frame was localised; a file could not be written
@@ -31,21 +30,6 @@ def check_outputs(files: Sequence[Path]) -> None:
     for file in files:
         check_format(file)
         _check_folder(file)
-
-
-def check_outputs_in_map(files: Sequence[Path], map_id: str) -> None:
-    """Of a track in the frame of a map without a place, which says nothing of places on Earth.
-
-    Raises:
-        InvalidValueError: a file that needs them.
-    """
-    for file in files:
-        if file.suffix.lower() not in OWN_FORMATS:
-            raise InvalidValueError(
-                f"{file.name}: needs places on Earth, and map {map_id} has none: expected "
-                f"{' or '.join(OWN_FORMATS)}, with poses in the map's own frame; or place the map first: "
-                "`featuredb maps` says how"
-            )
 
 
 def write_outputs(files: Sequence[Path], trajectory: Trajectory) -> Outputs:

@@ -6,20 +6,40 @@ Its columns and keys are called otherwise than those of tracks on Earth, so that
 import csv
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from featuredb.geometry.rotation import quaternion_from_matrix
 from reloc.localise.result import OwnPose
-from reloc.tracking.trajectory.values import Trajectory
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 
 _AXES = ("rx", "ry", "rz", "x", "y", "z")
-_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 _POSE = (
     *("own_x", "own_y", "own_z", "own_qx", "own_qy", "own_qz", "own_qw"),
     *("own_unit", "own_z_is_up", "unplaced_map"),
-    *(f"own_cov_{_AXES[i]}_{_AXES[j]}" for i, j in _UPPER),
+    *(f"own_cov_{_AXES[i]}_{_AXES[j]}" for i, j in UPPER),
 )
-OWN_CSV_COLUMNS = ("frame", "time_s", "state", "inliers", *_POSE, "detail")
+
+
+def columns_of(pose: Sequence[str]) -> tuple[str, ...]:
+    """Those of a table of frames whose poses have these."""
+    return ("frame", "time_s", "state", "inliers", *pose, "detail")
+
+
+OWN_CSV_COLUMNS = columns_of(_POSE)
+
+
+def csv_table(
+    pose: Sequence[str], trajectory: Trajectory, cells: Callable[[TrajectoryPoint], Sequence[object] | None]
+) -> str:
+    """One row a frame; `cells`: those of its pose, in the columns `pose`, None where it has none."""
+    out = io.StringIO()
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(columns_of(pose))
+    for point in trajectory.points:
+        own = cells(point) or [""] * len(pose)
+        rows.writerow((point.index, f"{point.time_s:.6f}", point.state, point.inliers, *own, point.detail))
+    return out.getvalue()
 
 
 def own_csv_text(trajectory: Trajectory) -> str:
@@ -29,13 +49,7 @@ def own_csv_text(trajectory: Trajectory) -> str:
     tells the scale); own_qx .. own_qw turn the frame's axes into camera axes (x right, y down, z forward);
     own_cov_* is the covariance, axes of the frame: rotation (rx, ry, rz) in rad before displacement.
     """
-    out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(OWN_CSV_COLUMNS)
-    for point in trajectory.points:
-        pose = [""] * len(_POSE) if point.in_map is None else _cells(point.in_map)
-        rows.writerow((point.index, f"{point.time_s:.6f}", point.state, point.inliers, *pose, point.detail))
-    return out.getvalue()
+    return csv_table(_POSE, trajectory, lambda point: None if point.in_map is None else _cells(point.in_map))
 
 
 def own_json_text(trajectory: Trajectory) -> str:
@@ -78,7 +92,7 @@ def _cells(pose: OwnPose) -> list[str]:
         *(f"{v:.9g}" for v in pose.cam_from_map.center),
         *(f"{q:.9f}" for q in quaternion_from_matrix(pose.cam_from_map.rotation)),
         *(_unit(pose), str(pose.frame.upright).lower(), pose.map_id),
-        *(f"{pose.covariance[i, j]:.6e}" for i, j in _UPPER),
+        *(f"{pose.covariance[i, j]:.6e}" for i, j in UPPER),
     ]
 
 

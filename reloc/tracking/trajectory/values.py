@@ -10,18 +10,9 @@ from datetime import datetime
 from itertools import groupby
 
 from featuredb.errors import InvalidValueError
-from featuredb.geo.geopose import geopose_from_camera
-from featuredb.geometry.rotation import quaternion_from_matrix
-from reloc.localise.result import OnEarth, OwnPose
-from reloc.tracking.ground import StandingInMap
+from reloc.localise.result import OwnPose
+from reloc.tracking.ground import EarthPose
 from reloc.tracking.tracked_frame import TrackedFrame, TrackState
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EarthPose(OnEarth):
-    """Where the camera was; `map_id`: of the map, or the scan, whose points most landmarks are."""
-
-    map_id: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,14 +49,12 @@ class Trajectory:
     """The frames of one video, in order.
 
     Attributes:
-        source: name of the video. database, version: that was asked.
+        source: name of the video.
         start: when the film's clock showed 0, timezone-aware; None: not known.
     """
 
     source: str
     points: tuple[TrajectoryPoint, ...]
-    database: str = ""
-    version: int = -1
     start: datetime | None = None
 
     @property
@@ -87,7 +76,14 @@ class Trajectory:
 
 def point_of(frame: TrackedFrame) -> TrajectoryPoint:
     """A tracked frame on Earth, or in its map where that has no place."""
-    pose = _pose(frame)
+    pose: EarthPose | OwnPose | None = None
+    if (
+        frame.ground is not None
+        and frame.cam_from_local is not None
+        and frame.rows is not None
+        and frame.covariance is not None
+    ):
+        pose = frame.ground.posed(frame.rows, frame.cam_from_local, frame.covariance)
     return TrajectoryPoint(
         index=frame.index,
         time_s=frame.time_s,
@@ -96,26 +92,4 @@ def point_of(frame: TrackedFrame) -> TrajectoryPoint:
         in_map=pose if isinstance(pose, OwnPose) else None,
         inliers=frame.inliers,
         detail=frame.detail,
-    )
-
-
-def _pose(frame: TrackedFrame) -> EarthPose | OwnPose | None:
-    ground, pose = frame.ground, frame.cam_from_local
-    if pose is None or ground is None or frame.rows is None or frame.covariance is None:
-        return None
-    stands = ground.standing(frame.rows, pose.center, frame.covariance)
-    if isinstance(stands, StandingInMap):
-        return OwnPose(
-            map_id=stands.map_id, frame=stands.frame, cam_from_map=pose, covariance=stands.covariance
-        )
-    return EarthPose(
-        epsg=stands.epsg,
-        utm=ground.frame.utm_from_enu(pose.center, stands.epsg),
-        height_datum=stands.height_datum,
-        cam_from_utm_xyzw=quaternion_from_matrix(
-            pose.rotation @ ground.frame.grid_from_enu(pose.center, stands.epsg).T
-        ),
-        geopose=geopose_from_camera(pose, ground.frame),
-        covariance=stands.covariance,
-        map_id=stands.map_id,
     )

@@ -160,7 +160,7 @@ def _hypothesis(
     if pose is None:
         return None
     pose = refine_pose(kept.pixels, kept.points, pose, settings)
-    tolerance_px = settings.tolerance_rel * max(views.camera.width, views.camera.height)
+    tolerance_px = settings.tolerance_px(views.camera)
     error = reprojection_errors(raw.pixels, raw.points, pose.camera, pose.cam_from_local)
     testimony = independent(views.camera, raw.take(error < tolerance_px))
     return FrameHypothesis(
@@ -179,7 +179,7 @@ def _hypothesis(
 
 def _rival(views: FrameViews, kept: FrameMatches, best: PoseHypothesis, settings: PoseOptions) -> int:
     """Inliers of the best pose among the matches that the winner does not explain."""
-    tolerance_px = settings.tolerance_rel * max(views.camera.width, views.camera.height)
+    tolerance_px = settings.tolerance_px(views.camera)
     error = reprojection_errors(kept.pixels, kept.points, best.camera, best.cam_from_local)
     # What lies a little off the winner is its own: slopes, a bent scan, a lens that is not quite right.
     rest = kept.take(error > 4.0 * tolerance_px)

@@ -1,4 +1,4 @@
-"""Contributed photos as a database keeps them: what of the query and of its answer goes with the photo."""
+"""A contributed photo as a database keeps it: what of the query and of its answer goes with it."""
 
 from dataclasses import asdict
 from datetime import datetime
@@ -6,8 +6,6 @@ from typing import Any
 
 from featuredb.features.exif.read import ExifInfo, read_exif
 from featuredb.features.image_header import read_header
-from featuredb.store import Database
-from featuredb.store.candidates.photos import InboxCounts, contribute, count_candidates
 from featuredb.store.candidates.states import Contribution
 from reloc.wire.query import LocaliseReply, LocaliseWireRequest
 
@@ -15,29 +13,6 @@ _ANSWER = {
     "request_id", "status", "reason", "detail", "position", "utm", "height_datum", "covariance", "accuracy",
     "confidence", "camera", "matches", "inliers", "residual_rms_px", "maps",
 }  # fmt: skip
-
-
-class DatabaseInbox:
-    """Where contributions go; the methods may take seconds."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-
-    def write(self, contributions: list[Contribution]) -> None:
-        """Store them in one append.
-
-        Raises:
-            StoreError
-        """
-        contribute(self._database, contributions)
-
-    def counts(self) -> InboxCounts:
-        """How much is stored.
-
-        Raises:
-            StoreError
-        """
-        return count_candidates(self._database)
 
 
 def contribution_of(
