@@ -26,17 +26,6 @@ _EVEN = np.uint32(0x00FF00FF)
 
 
 @compiled
-def widest_in_tiles(apart_m: Float32, widest_m: Float32, first: int, end: int) -> None:
-    """Fill (tiles down, tiles across) with the largest of apart_m (h, w), rows of tiles `first` to `end`."""
-    height, width = apart_m.shape
-    widest_m[first:end] = 0.0
-    for y in range(first * TILE_PX, min(end * TILE_PX, height)):
-        row = widest_m[y // TILE_PX]
-        for x in range(width):
-            row[x // TILE_PX] = max(row[x // TILE_PX], apart_m[y, x])
-
-
-@compiled
 def close_holes(
     nearness: Float32,
     apart_m: Float32,
@@ -68,7 +57,7 @@ def close_holes(
         index: (h, w) changed: -1 where a hole was closed.
         finished: (h, w) changed: the paint with holes closed.
     """
-    height, width = nearness.shape
+    width = nearness.shape[1]
     chosen, limit = np.empty(width, np.int32), np.empty((len(radii), width), np.float32)
     for y in range(first, end):
         finished[y] = paint[y]
