@@ -17,7 +17,6 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
 from featuredb.stage_clock import StageClock
 from ingest.clusters.graph import ClusterOptions, find_clusters
-from ingest.clusters.join import JoinOptions
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
 from ingest.executor import Executor, Progress, no_progress
 from ingest.fingerprint import options_fingerprint
@@ -53,7 +52,6 @@ class MapMakingOptions:
     pairs: PairOptions = field(default_factory=PairOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)
     clusters: ClusterOptions = field(default_factory=ClusterOptions)
-    joining: JoinOptions = field(default_factory=JoinOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
     gps: GpsOptions = field(default_factory=GpsOptions)
     elsewhere: ElsewhereOptions = field(default_factory=ElsewhereOptions)
@@ -199,8 +197,7 @@ def _reconstruct(
         workspace,
         options.sfm,
         executor,
-        joining=options.joining,
-        progress=progress,
+        progress,
     )
 
 

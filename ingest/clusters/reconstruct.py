@@ -15,11 +15,11 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.clusters.graph import PhotoBlock, PhotoCluster
-from ingest.clusters.join import JoinedModel, JoinOptions, hangs_together, join
+from ingest.clusters.join import JoinedModel, hangs_together, join
 from ingest.colmap.adjust import adjust_posed
-from ingest.colmap.bridge import Model, read_model, read_models, write_posed
+from ingest.colmap.bridge import Model, posed, read_model, read_models
 from ingest.executor import Executor, Lost, Progress, no_progress
-from ingest.fingerprint import digest, options_fingerprint
+from ingest.fingerprint import digest
 from ingest.sfm.mapper import (
     SfmOptions,
     SfmTask,
@@ -108,7 +108,6 @@ class _JoinTask:
     blocks: tuple[Path, ...]
     rows: tuple[tuple[int, ...], ...]
     own: tuple[frozenset[int], ...]
-    options: JoinOptions
     folder: Path
 
     def __str__(self) -> str:
@@ -123,8 +122,6 @@ def reconstruct_clusters(
     workspace: Workspace,
     options: SfmOptions,
     executor: Executor,
-    *,
-    joining: JoinOptions,
     progress: Progress = no_progress,
 ) -> Reconstruction:
     """Reconstruct clusters, or find what an earlier run left of them.
@@ -150,7 +147,7 @@ def reconstruct_clusters(
     failed = {t.folder: o.reason for t, o in zip(todo, outcomes, strict=True) if isinstance(o, Lost)}
 
     joins = [
-        _join_task(cluster, task, tasks, failed, workspace, joining)
+        _join_task(cluster, task, tasks, failed, workspace)
         for cluster, task, tasks in zip(clusters, whole, block_tasks, strict=True)
         if len(cluster.blocks) > 1
     ]
@@ -227,7 +224,6 @@ def _join_task(
     tasks: Sequence[_BlockTask],
     failed: Mapping[Path, str],
     workspace: Workspace,
-    options: JoinOptions,
 ) -> _JoinTask:
     place = {row: k for k, row in enumerate(cluster.rows)}
 
@@ -237,13 +233,12 @@ def _join_task(
     good: list[tuple[PhotoBlock, _BlockTask]] = [
         (b, t) for b, t in zip(cluster.blocks, tasks, strict=True) if t.folder not in failed
     ]
-    key = digest(sfm.key(), options_fingerprint(options), *(t.folder.name for _, t in good))[:24]
+    key = digest(sfm.key(), *(t.folder.name for _, t in good))[:24]
     return _JoinTask(
         sfm=sfm,
         blocks=tuple(t.folder for _, t in good),
         rows=tuple(rows(b.rows) for b, _ in good),
         own=tuple(frozenset(rows(b.own)) for b, _ in good),
-        options=options,
         folder=workspace.models(key),
     )
 
@@ -290,7 +285,7 @@ def _join(task: _JoinTask) -> None:
         database = Path(scratch) / "colmap.db"
         photos = task.sfm.write_database(database)
         taken: set[int] = set()
-        groups = deque(join(models, task.options))
+        groups = deque(join(models))
         number = 0
         while groups:
             group = groups.popleft()
@@ -300,7 +295,7 @@ def _join(task: _JoinTask) -> None:
             folder = output / str(number)
             folder.mkdir()
             number += 1
-            write_posed(folder, _cameras(group, models, task.sfm), photos, poses)
+            posed(_cameras(group, models, task.sfm), photos, poses).write(str(folder))
             kept = adjust_posed(
                 folder,
                 database,
@@ -310,11 +305,7 @@ def _join(task: _JoinTask) -> None:
             )
             if len(group.members) > 1 and (
                 len(kept) < _MOSTLY * len(poses)
-                or not hangs_together(
-                    read_model(folder),
-                    [models[m].rows.tolist() for m in group.members],
-                    task.options.min_points,
-                )
+                or not hangs_together(read_model(folder), [models[m].rows.tolist() for m in group.members])
             ):
                 _LOG.info("%s: the joint of %d photos does not hold; apart again", task, len(poses))
                 shutil.rmtree(folder, ignore_errors=True)

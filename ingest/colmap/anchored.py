@@ -23,8 +23,10 @@ from ingest.colmap.bridge import (
     Model,
     SfmPhoto,
     TwoView,
+    model_of,
+    posed,
     quiet,
-    read_model,
+    triangulation_settings,
     with_observations,
     write_database,
 )
@@ -215,17 +217,7 @@ def triangulate_posed(
     with quiet(), tempfile.TemporaryDirectory(prefix="featuredb-points-") as scratch:
         database = Path(scratch) / "colmap.db"
         write_database(database, [(camera, True) for camera in cameras], photos, geometries)
-        reconstruction = pycolmap.Reconstruction()
-        for c, camera in enumerate(cameras):
-            reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(c + 1))
-        for k, (photo, pose) in enumerate(zip(photos, poses, strict=True)):
-            image = pycolmap.Image(name=photo.name, camera_id=photo.camera_row + 1, image_id=k + 1)
-            reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
-        settings = pycolmap.IncrementalPipelineOptions()
-        settings.extract_colors = False
-        settings.triangulation.ignore_two_view_tracks = False
-        settings.num_threads = 1
-        settings.random_seed = 0
+        settings = triangulation_settings()
         error_px = _MAX_ERROR_PX * pixel_scale(*cameras)
         settings.triangulation.create_max_angle_error = 2.0
         settings.mapper.filter_max_reproj_error = error_px
@@ -236,7 +228,9 @@ def triangulate_posed(
         output = Path(scratch) / "points"
         output.mkdir()
         found = pycolmap.triangulate_points(
-            reconstruction, str(database), scratch, str(output), clear_points=True, options=settings
+            posed(cameras, photos, dict(enumerate(poses))),
+            *(str(database), scratch, str(output)),
+            clear_points=True,
+            options=settings,
         )
-        found.write(str(output))
-        return read_model(output)
+        return model_of(found)
