@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.decode import decode_gray, probe
-from featuredb.features.image_header import ImageHeader
+from featuredb.features.stored_image import ImageHeader
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from featuredb.video.film import fitted_size
