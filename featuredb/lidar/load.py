@@ -18,8 +18,8 @@ from featuredb.render.cloud import CloudNodes, PointCloud
 from featuredb.render.spacing import point_spacing
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_points
+from featuredb.store.tables import UTM_COORDINATES
 
-_UTM = ("easting", "northing", "height")
 _RGB = ("red", "green", "blue")
 
 _GREY = 128  # of points that have neither colour nor intensity in a cloud that has
@@ -82,12 +82,17 @@ def load_cloud(
     """
     if not isinstance(database, Database):
         database = Database.open(database)
-    scans = _chosen(database, scan_ids)
+    scans = chosen_scans(database, scan_ids)
+    datums = sorted({scan.height_datum for scan in scans})
+    if len(datums) > 1:
+        raise ScanError(
+            f"expected scans with heights of one datum, found {', '.join(datums)}; choose among the scans"
+        )
     boxes = {scan.scan_id: _utm_box(frame, box_local, scan.epsg) for scan in scans}
     touched = [s for s in scans if (b := boxes[s.scan_id]) is None or s.box.touches(*b)]
     rgb = bool(touched) and all(scan.colour for scan in touched)
     intensity = bool(touched) and all(scan.has_intensity for scan in touched)
-    columns = (*_UTM, *(_RGB if rgb else ()), *(("intensity",) if intensity else ()))
+    columns = (*UTM_COORDINATES, *(_RGB if rgb else ()), *(("intensity",) if intensity else ()))
     parts: list[_Part] = []
     total = 0
     for level in range(max((len(scan.level_points) for scan in touched), default=0)):
@@ -108,27 +113,27 @@ def load_cloud(
                 (*columns, "classification", "node", "node_spacing_m"),
             )
             if len(table):
-                utm = np.stack([table[name].to_numpy() for name in _UTM], axis=1)
+                utm = np.stack([table[name].to_numpy() for name in UTM_COORDINATES], axis=1)
                 parts.append(_Part(level, utm, scan.epsg, table))
     return _cloud(frame, scans[0].height_datum, parts, rgb, intensity)
 
 
-def _chosen(database: Database, scan_ids: Sequence[str] | None) -> list[ScanSummary]:
+def chosen_scans(database: Database, scan_ids: Sequence[str] | None) -> list[ScanSummary]:
+    """The scans meant, by ids or their first letters; None: all that are not retired.
+
+    Raises:
+        ScanNotFoundError: the database has no scan, or not one of those.
+    """
     scans = list_scans(database)
     if scan_ids is not None:
-        missing = sorted(set(scan_ids) - {scan.scan_id for scan in scans})
+        missing = sorted(i for i in scan_ids if not any(s.scan_id.startswith(i) for s in scans))
         if missing:
             raise ScanNotFoundError(
                 f"no scan {', '.join(missing)}; `featuredb lidar list` lists what there is"
             )
-        scans = [scan for scan in scans if scan.scan_id in scan_ids]
+        scans = [s for s in scans if s.scan_id.startswith(tuple(scan_ids))]
     if not scans:
         raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
-    datums = sorted({scan.height_datum for scan in scans})
-    if len(datums) > 1:
-        raise ScanError(
-            f"expected scans with heights of one datum, found {', '.join(datums)}; choose among the scans"
-        )
     return scans
 
 

@@ -7,14 +7,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError, ScanNotFoundError
+from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.lidar.load import PlanBox, load_cloud
+from featuredb.lidar.load import PlanBox, chosen_scans, load_cloud
 from featuredb.store import Database
-from featuredb.store.scans import ScanSummary, list_scans
+from featuredb.store.scans import ScanSummary
 from ingest.register.anchor.start.files import RoughPose, read_pose
 from ingest.track.scan_ground import ScanFinder, ScanGround
 from reloc.localise.result import LocaliseRequest
@@ -83,7 +83,11 @@ def finder_for(
         )
     area = maps.grounds[0].area
     scan = _over(
-        area.frame, area.image_center[area.searched_images()], _scan(database, asked.scans), database, rough
+        area.frame,
+        area.image_center[area.searched_images()],
+        chosen_scans(database, asked.scans),
+        database,
+        rough,
     )
     return MapOverScanFinder(maps, scan), version
 
@@ -99,23 +103,8 @@ def _maps(database: Database, asked: FilmGround, options: TrackOptions) -> tuple
     return MapFinder(areas), localiser.snapshot
 
 
-def _scan(database: Database, ids: tuple[str, ...] | None) -> list[ScanSummary]:
-    """The scans meant, by ids or their first letters."""
-    scans = list_scans(database)
-    if ids is not None:
-        missing = [i for i in ids if not any(s.scan_id.startswith(i) for s in scans)]
-        if missing:
-            raise ScanNotFoundError(
-                f"no scan {', '.join(missing)}; `featuredb lidar list` lists what there is"
-            )
-        scans = [s for s in scans if any(s.scan_id.startswith(i) for i in ids)]
-    if not scans:
-        raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
-    return scans
-
-
 def _on_scan(database: Database, asked: FilmGround, rough: RoughPose) -> ScanFinder:
-    scans = _scan(database, asked.scans)
+    scans = chosen_scans(database, asked.scans)
     epsg = scans[0].epsg
     east, north, _ = rough.utm.tolist()
     frame = LocalFrame.from_utm(east, north, min(s.box.min_height for s in scans), epsg)
