@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ScanError, ScanNotFoundError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geo.near_frame import near_enu_from_utm
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.render.cloud import CloudNodes, PointCloud
 from featuredb.render.spacing import point_spacing
@@ -153,16 +152,8 @@ def _utm_box(frame: LocalFrame, box: PlanBox | None, epsg: int) -> PlanBox | Non
 
 def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, intensity: bool) -> PointCloud:
     """The parts one after the other, in the frame, with their nodes."""
-    starts = np.concatenate([[0], np.cumsum([len(part.utm) for part in parts], dtype=np.int64)])
-    xyz = np.empty((int(starts[-1]), 3), np.float32)
-    for epsg in {part.epsg for part in parts}:
-        ours = [(part, start) for part, start in zip(parts, starts[:-1], strict=True) if part.epsg == epsg]
-        enu = near_enu_from_utm(frame, np.concatenate([part.utm for part, _ in ours]), epsg)
-        row = 0
-        for part, start in ours:
-            n = len(part.utm)
-            xyz[start : start + n] = enu[row : row + n]
-            row += n
+    placed = (frame.enu_from_utm(part.utm, part.epsg).astype(np.float32) for part in parts)
+    xyz = np.concatenate([np.empty((0, 3), np.float32), *placed])
     return PointCloud(
         frame=frame,
         height_datum=datum,
@@ -177,17 +168,16 @@ def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, int
 
 def _bytes(parts: Sequence[_Part], names: Sequence[str]) -> NDArray[np.uint8]:
     """Columns of all parts as (n, columns) uint8; where a point has no value, its intensity or a grey."""
-    values = np.empty((sum(len(part.utm) for part in parts), len(names)), np.uint8)
-    for axis, name in enumerate(names):
-        row = 0
-        for part in parts:
-            column: Any = part.columns[name]
-            if column.null_count:
-                grey = part.columns["intensity"] if "intensity" in part.columns.column_names else None
-                column = pc.coalesce(column, *([] if grey is None else [grey]), pa.scalar(_GREY, pa.int16()))
-            values[row : row + len(part.utm), axis] = column.to_numpy()
-            row += len(part.utm)
-    return values
+    columns = [np.stack([_filled(part.columns, name) for name in names], axis=1) for part in parts]
+    return np.concatenate([np.empty((0, len(names)), np.uint8), *columns])
+
+
+def _filled(table: pa.Table, name: str) -> NDArray[np.uint8]:
+    column: Any = table[name]
+    if column.null_count:
+        grey = [table["intensity"]] if "intensity" in table.column_names else []
+        column = pc.coalesce(column, *grey, pa.scalar(_GREY, pa.int16()))
+    return np.asarray(column.to_numpy(), dtype=np.uint8)
 
 
 def _nodes(xyz: NDArray[np.float32], parts: Sequence[_Part]) -> CloudNodes:
