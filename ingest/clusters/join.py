@@ -159,15 +159,10 @@ def _same(one: Sim3, other: Sim3, model: Model) -> bool:
     Errors add up along the way, hence three times what one joint may have.
     """
     poses = model.cam_from_sfm[:: max(1, len(model.cam_from_sfm) // 20)]
-    depth = one.scale * float(np.median(_depths(model)))
+    depth = one.scale * float(np.median(model.distances()))
     apart = [np.linalg.norm(one.act_on_pose(p).center - other.act_on_pose(p).center) / depth for p in poses]
     angle = one.act_on_pose(poses[0]).angle_to_deg(other.act_on_pose(poses[0]))
     return angle <= 3 * _MAX_ROTATION_DEG and float(np.median(apart)) <= 3 * _MAX_CENTER_OVER_DEPTH
-
-
-def _depths(model: Model) -> FloatArray:
-    """Distance of every observation's point to its camera."""
-    return np.asarray(np.linalg.norm(model.xyz[model.point_of] - model.centers()[model.photo_of], axis=1))
 
 
 def _way(tree: Sequence[Joint], start: int, end: int) -> list[Joint] | None:

@@ -143,7 +143,7 @@ def reconstruct_clusters(
 
     todo = [t for tasks in block_tasks for t in tasks if not t.folder.is_dir()]
     todo.sort(key=lambda t: -len(t.sfm.views))  # the longest first, so that no worker is late with it
-    outcomes = executor.map("reconstruct", _reconstruct_block, todo, progress)
+    outcomes = executor.map("reconstruct", _reconstructed, todo, progress)
     failed = {t.folder: o.reason for t, o in zip(todo, outcomes, strict=True) if isinstance(o, Lost)}
 
     joins = [
@@ -152,7 +152,7 @@ def reconstruct_clusters(
         if len(cluster.blocks) > 1
     ]
     waiting = [j for j in joins if not j.folder.is_dir()]
-    joined = executor.map("join", _join_blocks, waiting, progress)
+    joined = executor.map("join", _reconstructed, waiting, progress)
     failed |= {t.folder: o.reason for t, o in zip(waiting, joined, strict=True) if isinstance(o, Lost)}
     return _collected(clusters, block_tasks, joins, failed, options, reused=_count(block_tasks) - len(todo))
 
@@ -243,28 +243,18 @@ def _join_task(
     )
 
 
-def _reconstruct_block(task: _BlockTask) -> Lost | None:
-    """What goes wrong with one block costs that block."""
+def _reconstructed(task: _BlockTask | _JoinTask) -> Lost | None:
+    """What goes wrong with one block or cluster costs that one."""
     try:
-        reconstruct(task.sfm, task.folder)
+        if isinstance(task, _JoinTask):
+            _join(task)
+        else:
+            reconstruct(task.sfm, task.folder)
     except _OF_THE_DATA as error:
-        return _lost(task, error)
+        _LOG.error("%s: not reconstructed", task, exc_info=error)
+        text = f"reconstruction failed with {type(error).__name__}: {error}; the next run tries it again"
+        return Lost(task=str(task), reason=text)
     return None
-
-
-def _join_blocks(task: _JoinTask) -> Lost | None:
-    """What goes wrong with one cluster costs that cluster."""
-    try:
-        _join(task)
-    except _OF_THE_DATA as error:
-        return _lost(task, error)
-    return None
-
-
-def _lost(task: _BlockTask | _JoinTask, error: Exception) -> Lost:
-    _LOG.error("%s: not reconstructed", task, exc_info=error)
-    text = f"reconstruction failed with {type(error).__name__}: {error}; the next run tries it again"
-    return Lost(task=str(task), reason=text)
 
 
 def _join(task: _JoinTask) -> None:

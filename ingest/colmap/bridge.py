@@ -95,6 +95,10 @@ class Model:
         """Camera centres (k, 3)."""
         return np.array([pose.center for pose in self.cam_from_sfm]).reshape(-1, 3)
 
+    def distances(self) -> FloatArray:
+        """Distance (m,) of every observation's point to its camera."""
+        return np.asarray(np.linalg.norm(self.xyz[self.point_of] - self.centers()[self.photo_of], axis=1))
+
     def pixels(self, keypoints: Sequence[NDArray[np.floating[Any]]]) -> FloatArray:
         """Pixels (m, 2) of the observations, from those of each photo's keypoints (n, 2)."""
         xy = np.zeros((len(self.point_of), 2))
