@@ -1,5 +1,6 @@
 """What a film is followed by, from a database: its maps, its scans, or both."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -154,16 +155,23 @@ class MapOverScan:
         self, gray: NDArray[np.uint8], camera: Camera, pose: Rigid3, options: TrackOptions
     ) -> Keyframe | Unmatched:
         """By the maps, or where they know nothing, by the scan; both reasons where that knows nothing."""
-        by_map = self.maps.match(gray, camera, pose, options)
+        return self.first_of(
+            self.maps.match(gray, camera, pose, options),
+            lambda: self.scan.match(gray, camera, pose, options),
+        )
+
+    def first_of(
+        self, by_map: Keyframe | Unmatched, ask_scan: Callable[[], Keyframe | Unmatched]
+    ) -> Keyframe | Unmatched:
+        """What the maps found, else what the scan finds, on this ground; else both reasons."""
         if isinstance(by_map, Keyframe):
-            self.scan.seen_elsewhere(
-                by_map.cam_from_local
-            )  # where it is looked for on the scan, were it lost
+            self.scan.seen_elsewhere(by_map.cam_from_local)  # where the scan looks for it, were it lost
             return replace(by_map, ground=self)
-        by_scan = self.scan.match(gray, camera, pose, options)
+        by_scan = ask_scan()
         if isinstance(by_scan, Keyframe):
             return replace(by_scan, ground=self)
-        return _both(by_map, by_scan)
+        detail = f"{by_map.detail}; on the scan: {by_scan.reason}: {by_scan.detail}"
+        return Unmatched(reason=by_map.reason, detail=detail)
 
     def standing(
         self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray
@@ -203,22 +211,10 @@ class MapOverScanFinder:
         self, gray: NDArray[np.uint8], request: LocaliseRequest, options: TrackOptions
     ) -> Keyframe | Unmatched:
         """By the maps, or where they do not know the frame, by the scan."""
-        by_map = self._maps.find(gray, request, options)
-        if isinstance(by_map, Keyframe):
-            self._scan.ground.seen_elsewhere(by_map.cam_from_local)
-            return replace(by_map, ground=self._ground)
-        by_scan = self._scan.find(gray, request, options)
-        if isinstance(by_scan, Keyframe):
-            return replace(by_scan, ground=self._ground)
-        return _both(by_map, by_scan)
+        return self._ground.first_of(
+            self._maps.find(gray, request, options), lambda: self._scan.find(gray, request, options)
+        )
 
     def has(self, ground: Ground) -> bool:
         """Whether the track is on these."""
         return ground is self._ground
-
-
-def _both(by_map: Unmatched, by_scan: Unmatched) -> Unmatched:
-    return Unmatched(
-        reason=by_map.reason,
-        detail=f"{by_map.detail}; on the scan: {by_scan.reason}: {by_scan.detail}",
-    )
