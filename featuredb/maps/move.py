@@ -13,7 +13,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapParts, MapPoints, Placement
 from featuredb.maps.unplaced_map import UnplacedMap
 
-_UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))  # order of MapPoints.covariance
+_UPPER = np.triu_indices(3)  # order of MapPoints.covariance
 # Fields that a map keeps where it gets a place.
 _STAYING = {f.name for f in fields(MapParts)} - {"images", "points", "status", "parents"}
 
