@@ -126,7 +126,7 @@ def placed_by_gps(
 def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[TaggedElsewhere]:
     """Groups of photos whose GPS contradicts a placement that is accepted."""
     _, with_gps, placed = placed_by_gps(model, [photos[r] for r in model.rows], options.gps)
-    return tagged_elsewhere(model, with_gps, placed, options.elsewhere) if placed.reason is None else []
+    return tagged_elsewhere(model, with_gps, placed) if placed.reason is None else []
 
 
 def _left_out(

@@ -24,7 +24,6 @@ from ingest.map_builder import MapOptions
 from ingest.photos.duplicates import copies_of
 from ingest.photos.photo import CameraSharing, Photo, gps_priors, local_frame_of, photo_cameras
 from ingest.register.gps import GpsOptions
-from ingest.register.tagged_elsewhere import ElsewhereOptions
 from ingest.sfm.extract import FeatureFiles, extract_photos, features_key, read_keypoints
 from ingest.sfm.mapper import SfmOptions, SfmView
 from ingest.sfm.matching import Matched, MatchOptions, PhotoView, match_pairs
@@ -54,7 +53,6 @@ class MapMakingOptions:
     clusters: ClusterOptions = field(default_factory=ClusterOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
     gps: GpsOptions = field(default_factory=GpsOptions)
-    elsewhere: ElsewhereOptions = field(default_factory=ElsewhereOptions)
     maps: MapOptions = field(default_factory=MapOptions)
     cameras: CameraSharing = "shared"
     min_tie: int = 30

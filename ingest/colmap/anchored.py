@@ -126,7 +126,7 @@ def adjust_anchored(
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
-    priors = lenses.priors(model.cameras)
+    priors, pixels = lenses.priors(model.cameras), model.pixels(keypoints)
     state = model
     keypoint_px = _LOSS_PX * pixel_scale(*model.cameras)
     variance_px2 = keypoint_px**2  # until the model has settled
@@ -150,7 +150,8 @@ def adjust_anchored(
             cam_from_sfm=found.cam_from_block,
             xyz=found.xyz,
         )
-        observation, kept = _fitting(state, keypoints, fixed)
+        observation = _fitting(state, state.xyz, state.point_of, state.photo_of, pixels)
+        kept = _fitting(state, fixed.xyz, fixed.point_of, fixed.photo_of, fixed.pixels)
         observation &= _in_tracks(state, observation)
     return Anchored(model=with_observations(state, observation), fixed_kept=kept)
 
@@ -179,21 +180,20 @@ def block_and_marks(
 
 
 def _fitting(
-    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which observations of free and of fixed points lie within the tolerance."""
-    free = np.zeros(len(model.point_of), dtype=np.bool_)
-    held = np.zeros(len(fixed.point_of), dtype=np.bool_)
+    model: Model,
+    xyz: FloatArray,
+    point_of: NDArray[np.int64],
+    photo_of: NDArray[np.int64],
+    pixels: FloatArray,
+) -> NDArray[np.bool_]:
+    """(m,) which observations of points xyz (n, 3) at pixels (m, 2) lie within the tolerance."""
+    fits = np.zeros(len(point_of), dtype=np.bool_)
     for k, pose in enumerate(model.cam_from_sfm):
         camera = model.cameras[int(model.camera_of[k])]
-        limit = _MAX_ERROR_PX * pixel_scale(camera)
-        mine = np.flatnonzero(model.photo_of == k)
-        pixels = camera.project(pose.act(model.xyz[model.point_of[mine]]))
-        free[mine] = np.linalg.norm(pixels - keypoints[k][model.keypoint_of[mine]], axis=1) < limit
-        mine = np.flatnonzero(fixed.photo_of == k)
-        pixels = camera.project(pose.act(fixed.xyz[fixed.point_of[mine]]))
-        held[mine] = np.linalg.norm(pixels - fixed.pixels[mine], axis=1) < limit
-    return free, held
+        mine = np.flatnonzero(photo_of == k)
+        off = camera.project(pose.act(xyz[point_of[mine]])) - pixels[mine]
+        fits[mine] = np.linalg.norm(off, axis=1) < _MAX_ERROR_PX * pixel_scale(camera)
+    return fits
 
 
 def _in_tracks(model: Model, observation: NDArray[np.bool_]) -> NDArray[np.bool_]:
