@@ -37,11 +37,10 @@ def move_map(
     """
     move = in_frame(new_from_old, frame or feature_map.frame, feature_map.frame)
     placement = feature_map.placement
-    adjoint = move.adjoint()
     moved = replace(
         placement,
         local_from_sfm=placement.local_from_sfm if is_identity(move) else move @ placement.local_from_sfm,
-        covariance=_symmetric(adjoint @ placement.covariance @ adjoint.T)
+        covariance=move.carried(placement.covariance)
         if covariance is None
         else np.asarray(covariance, dtype=np.float64),
         evidence=dict(placement.evidence),
@@ -101,8 +100,7 @@ def covariance_in_frame(covariance: FloatArray, frame: LocalFrame, other: LocalF
     """The covariance (7, 7) of a left perturbation, of coordinates in another local frame."""
     if frame == other:
         return np.asarray(covariance, dtype=np.float64)
-    adjoint = Sim3.from_rigid3(other.enu_from(frame)).adjoint()
-    return _symmetric(adjoint @ np.asarray(covariance, dtype=np.float64) @ adjoint.T)
+    return Sim3.from_rigid3(other.enu_from(frame)).carried(covariance)
 
 
 def moved_image(image: MapImage, move: Sim3) -> MapImage:
@@ -135,7 +133,3 @@ def full_covariances(upper: NDArray[np.float32]) -> FloatArray:
     full[:, _UPPER[0], _UPPER[1]] = upper
     full[:, _UPPER[1], _UPPER[0]] = upper
     return full
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)
