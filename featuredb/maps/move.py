@@ -18,24 +18,16 @@ _UPPER = np.triu_indices(3)  # order of MapPoints.covariance
 _STAYING = {f.name for f in fields(MapParts)} - {"images", "points", "status", "parents"}
 
 
-def move_map(
-    feature_map: FeatureMap,
-    new_from_old: Sim3,
-    frame: LocalFrame | None = None,
-    *,
-    covariance: FloatArray | None = None,
-) -> FeatureMap:
+def move_map(feature_map: FeatureMap, move: Sim3, *, covariance: FloatArray | None = None) -> FeatureMap:
     """The map where a similarity takes it; its local frame, ids, observations and lenses stay.
 
     A move that is the identity, bit for bit, leaves points, poses and their covariances bit for bit.
 
     Args:
-        new_from_old: of coordinates in `frame`, metres.
-        frame: in which the similarity is meant; default: the map's own.
+        move: of coordinates in the map's local frame, metres.
         covariance: (7, 7) of the new placement, left perturbation in the map's own frame; default: the old
             one, carried along.
     """
-    move = in_frame(new_from_old, frame or feature_map.frame, feature_map.frame)
     placement = feature_map.placement
     moved = replace(
         placement,
