@@ -158,16 +158,17 @@ def ask_all(world: "World", client: "Client") -> list[DemoAnswer]:
 
 
 def _ask(world: "World", client: "Client", group: str, path: Path, *, has_truth: bool) -> DemoAnswer:
-    from featuredb.simworld.scoring import pose_error
+    from featuredb.simworld.scoring import pose_difference
 
     start = time.perf_counter()
     reply = client.localise(path, timeout_s=60.0)
     wall_ms = 1000.0 * (time.perf_counter() - start)
     error = None
     if has_truth and reply.utm is not None:
-        name = path.relative_to(world.folder).as_posix()
-        place = (reply.utm.easting, reply.utm.northing, reply.utm.height)
-        error = pose_error(world.truth, name, reply.utm.epsg, place, reply.utm.cam_from_utm_xyzw)
+        true = world.truth.images[path.relative_to(world.folder).as_posix()].cam_from_local
+        utm = reply.utm
+        place = (utm.easting, utm.northing, utm.height)
+        error = pose_difference(world.truth.frame, true, utm.epsg, place, utm.cam_from_utm_xyzw)
     return DemoAnswer(group=group, name=path.name, reply=reply, error=error, wall_ms=wall_ms)
 
 

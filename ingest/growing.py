@@ -8,14 +8,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from featuredb.errors import FeatureDbError
-from featuredb.features.extractor import ExtractorOptions
 from featuredb.store import Database
 from featuredb.store.candidates.photos import list_candidates, refuse
 from featuredb.store.candidates.states import Candidate
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
 from ingest.growth.growth_report import GrowthReport, PhotoFate
-from ingest.growth.run import extractor_for, grow
+from ingest.growth.run import grow
 from ingest.growth.values import GrowthOptions, GrowthPhotos, no_photos
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.workspace import Workspace, default_root, remove_leftovers
@@ -30,7 +29,7 @@ class GrowingOptions:
 
     Attributes:
         growth: from reconstructions to promoted maps.
-        making: from photos to reconstructions; whether descriptors are upright follows the active maps.
+        making: from photos to reconstructions.
         workers: processes of extraction, matching and reconstruction, threads of localisation; 1 runs
             everything in one thread of this process.
         work: work folder; default inside the database.
@@ -65,10 +64,10 @@ def grow_candidates(
     waiting = waiting_photos(database, work, progress)
     photos = waiting.photos[:_MOST_PHOTOS]
     if options.workers == 1:
-        new, unreadable = _prepared(database, waiting, work, options, InProcessExecutor(), progress)
+        new, unreadable = _prepared(waiting, work, options, InProcessExecutor(), progress)
     else:
         with PoolExecutor(options.workers) as pool:
-            new, unreadable = _prepared(database, waiting, work, options, pool, progress)
+            new, unreadable = _prepared(waiting, work, options, pool, progress)
     report = grow(database, new, work, replace(options.growth, threads=options.workers))
     refused = _refuse(database, {**waiting.unusable, **unreadable}, report, now, options)
     left = len(waiting.photos) - len(photos)
@@ -94,7 +93,6 @@ def reconstructed_photos(done: Reconstructed, candidate_ids: Mapping[int, str] |
 
 
 def _prepared(
-    database: Database,
     waiting: CandidatePhotos,
     work: Path,
     options: GrowingOptions,
@@ -105,9 +103,7 @@ def _prepared(
     photos = waiting.photos[:_MOST_PHOTOS]
     if not photos:
         return no_photos(), {}
-    extractor: ExtractorOptions = extractor_for(database.snapshot(), options.making.extractor)
-    making = replace(options.making, extractor=extractor)
-    done = reconstruct_photos(photos, Workspace(root=work), making, executor, progress=progress)
+    done = reconstruct_photos(photos, Workspace(root=work), options.making, executor, progress=progress)
     ids = dict(zip((p.name for p in photos), waiting.candidate_ids, strict=False))
     rows = {row: ids[photo.name] for row, photo in enumerate(done.usable)}
     return reconstructed_photos(done, rows), {

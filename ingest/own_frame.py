@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +40,7 @@ def own_frame_of(model: Model) -> tuple[Sim3, OwnFrame]:
     points' median. People and gimbals hold cameras level: the direction across all photos' horizontal image
     axes is the vertical, if these axes point far enough apart; then z is up.
     """
-    centers = model.centers()
-    distances = np.linalg.norm(model.xyz[model.point_of] - centers[model.photo_of], axis=1)
-    median = float(np.median(distances))
+    median = float(np.median(model.distances()))
     scale = NOMINAL_DISTANCE / median if median > 0 else 1.0
     up = vertical_of(model.cam_from_sfm)
     rotation = np.eye(3) if up is None else rotation_to_up(up)
@@ -80,15 +79,9 @@ def held_of(poses: Sequence[Rigid3], angles: Sequence[CameraAngles | None] = ())
     parts = [part for part in (_by_yaw(told), _by_tilt(tilted) or _level(poses)) if part is not None]
     if not parts:
         return None
-    last = parts[-1]
-    return replace(
-        last,
-        directions=np.concatenate([part.directions for part in parts]),
-        across=np.concatenate([part.across for part in parts]),
-        along=np.concatenate([part.along for part in parts]),
-        sigma_rad=np.concatenate([part.sigma_rad for part in parts]),
-        joint_rad=np.concatenate([part.joint_rad for part in parts]),
-    )
+    rows = ("directions", "across", "along", "sigma_rad", "joint_rad")
+    joined: dict[str, Any] = {n: np.concatenate([getattr(part, n) for part in parts]) for n in rows}
+    return replace(parts[-1], **joined)
 
 
 def _by_tilt(photos: Sequence[tuple[FloatArray, CameraAngles]]) -> Held | None:

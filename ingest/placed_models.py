@@ -126,24 +126,36 @@ def placed_by_gps(
 def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[TaggedElsewhere]:
     """Groups of photos whose GPS contradicts a placement that is accepted."""
     _, with_gps, placed = placed_by_gps(model, [photos[r] for r in model.rows], options.gps)
-    return tagged_elsewhere(model, with_gps, placed, options.elsewhere) if placed.reason is None else []
+    return tagged_elsewhere(model, with_gps, placed) if placed.reason is None else []
+
+
+def _by_gps(
+    model: Model, photos: Sequence[Photo], options: MapMakingOptions
+) -> tuple[Component, LocalFrame | None]:
+    """A model as GPS places it or refuses to, without a map yet; and the frame.
+
+    Args:
+        photos: all usable ones.
+    """
+    chosen = tuple(photos[r] for r in model.rows)
+    frame, with_gps, placed = placed_by_gps(model, chosen, options.gps)
+    component = Component(
+        model=model,
+        photos=chosen,
+        with_gps=with_gps,
+        placement=placed,
+        feature_map=None,
+        reason_code=placed.reason or "",
+        reason=placed.message,
+    )
+    return component, frame
 
 
 def _left_out(
     model: Model, photos: Sequence[Photo], options: MapMakingOptions, code: str, reason: str
 ) -> Component:
     """Photos that are in no map."""
-    chosen = [photos[r] for r in model.rows]
-    _, with_gps, placed = placed_by_gps(model, chosen, options.gps)
-    return Component(
-        model=model,
-        photos=tuple(chosen),
-        with_gps=with_gps,
-        placement=placed,
-        feature_map=None,
-        reason_code=code,
-        reason=reason,
-    )
+    return replace(_by_gps(model, photos, options)[0], reason_code=code, reason=reason)
 
 
 def _component(
@@ -163,17 +175,8 @@ def _component(
         photos: all usable ones.
         features: of the model's.
     """
-    chosen = [photos[r] for r in model.rows]
-    frame, with_gps, placed = placed_by_gps(model, chosen, options.gps)
-    component = Component(
-        model=model,
-        photos=tuple(chosen),
-        with_gps=with_gps,
-        placement=placed,
-        feature_map=None,
-        reason_code=placed.reason or "",
-        reason=placed.message,
-    )
+    component, frame = _by_gps(model, photos, options)
+    chosen, with_gps, placed = component.photos, component.with_gps, component.placement
     if survey is not None:
         return _by_control(component, frame, features, identity, options, survey)
     if (

@@ -17,7 +17,6 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
 from featuredb.stage_clock import StageClock
 from ingest.clusters.graph import ClusterOptions, find_clusters
-from ingest.clusters.join import JoinOptions
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
 from ingest.executor import Executor, Progress, no_progress
 from ingest.fingerprint import options_fingerprint
@@ -25,7 +24,6 @@ from ingest.map_builder import MapOptions
 from ingest.photos.duplicates import copies_of
 from ingest.photos.photo import CameraSharing, Photo, gps_priors, local_frame_of, photo_cameras
 from ingest.register.gps import GpsOptions
-from ingest.register.tagged_elsewhere import ElsewhereOptions
 from ingest.sfm.extract import FeatureFiles, extract_photos, features_key, read_keypoints
 from ingest.sfm.mapper import SfmOptions, SfmView
 from ingest.sfm.matching import Matched, MatchOptions, PhotoView, match_pairs
@@ -53,10 +51,8 @@ class MapMakingOptions:
     pairs: PairOptions = field(default_factory=PairOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)
     clusters: ClusterOptions = field(default_factory=ClusterOptions)
-    joining: JoinOptions = field(default_factory=JoinOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
     gps: GpsOptions = field(default_factory=GpsOptions)
-    elsewhere: ElsewhereOptions = field(default_factory=ElsewhereOptions)
     maps: MapOptions = field(default_factory=MapOptions)
     cameras: CameraSharing = "shared"
     min_tie: int = 30
@@ -199,8 +195,7 @@ def _reconstruct(
         workspace,
         options.sfm,
         executor,
-        joining=options.joining,
-        progress=progress,
+        progress,
     )
 
 

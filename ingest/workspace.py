@@ -131,22 +131,23 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Read what `write_arrays` wrote."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, BadZipFile) as error:
-        raise IngestError(f"{path}: expected a stage's npz file, {error}; delete it and run again") from error
+    with _archive(path) as archive:
+        return {name: archive[name] for name in archive.files}
 
 
 def read_array(path: Path, name: str) -> NDArray[Any]:
     """One array of an npz file that `write_arrays` wrote; the others are not read."""
+    with _archive(path) as archive:
+        return np.asarray(archive[name])
+
+
+@contextmanager
+def _archive(path: Path) -> Iterator[Any]:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return np.asarray(archive[name])
+            yield archive
     except (OSError, ValueError, KeyError, BadZipFile) as error:
-        raise IngestError(
-            f"{path}: expected a stage's npz file with {name!r}, {error}; delete it and run again"
-        ) from error
+        raise IngestError(f"{path}: expected a stage's npz file, {error}; delete it and run again") from error
 
 
 def remove_leftovers(root: Path) -> int:

@@ -22,7 +22,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.scoring import PoseError, pose_error
+from featuredb.simworld.scoring import PoseError, pose_difference
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database
 from reloc.client import Client
@@ -91,9 +91,9 @@ def ask(database: Database, truth: Truth, photos: Sequence[Path]) -> list[PoseEr
     ):
         replies = {photo: client.localise(photo, timeout_s=60.0).utm for photo in photos}
     return [
-        pose_error(
-            truth,
-            f"{photo.parent.name}/{photo.name}",
+        pose_difference(
+            truth.frame,
+            truth.images[f"{photo.parent.name}/{photo.name}"].cam_from_local,
             utm.epsg,
             (utm.easting, utm.northing, utm.height),
             utm.cam_from_utm_xyzw,

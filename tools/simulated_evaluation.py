@@ -19,7 +19,7 @@ from pathlib import Path
 
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.negatives import NEGATIVE_KINDS
-from featuredb.simworld.scoring import PoseError, pose_error, summarise
+from featuredb.simworld.scoring import PoseError, pose_difference, summarise
 from featuredb.simworld.world import World
 from featuredb.store import Database
 from ingest.demo import ingest_world, make_world
@@ -86,14 +86,14 @@ def ask_world(world: World, localiser: Localiser) -> list[Asked]:
 def _ask(world: World, localiser: Localiser, group: str, path: Path) -> Asked:
     pose = answer_of(localiser, path).pose
     name = path.relative_to(world.folder).as_posix()
-    true = world.truth.images.get(name)
+    true, frame = world.truth.images.get(name), world.truth.frame
     if pose is None or true is None:
         return Asked(group=group, pose=pose, error=None, true_in_area=None)
     return Asked(
         group=group,
         pose=pose,
-        error=pose_error(world.truth, name, pose.epsg, pose.utm, pose.cam_from_utm_xyzw),
-        true_in_area=true.cam_from_local @ world.truth.frame.enu_from(pose.frame),
+        error=pose_difference(frame, true.cam_from_local, pose.epsg, pose.utm, pose.cam_from_utm_xyzw),
+        true_in_area=true.cam_from_local @ frame.enu_from(pose.frame),
     )
 
 

@@ -269,12 +269,19 @@ class Problem:
         for xyz, photo, xy, one in zip(
             marks.xyz, marks.photo_of.tolist(), marks.xy, variance.tolist(), strict=True
         ):
-            lens = int(self._block.camera_of[photo])
-            model = pycolmap.CameraModelId.__members__[self._block.cameras[lens].model]
-            cost = cost_functions.ReprojErrorCost(
-                camera_model_id=model, point2D_cov=one * np.eye(2), point2D=xy, point3D=xyz
-            )
-            self._ceres.add_residual_block(cost, self._loss, [self._poses[photo], self._lenses[lens]])
+            cost, parameters = self._reprojection(photo, one, point2D=xy, point3D=xyz)
+            self._ceres.add_residual_block(cost, self._loss, parameters)
+
+    def _reprojection(
+        self, photo: int, variance: float, **points: FloatArray
+    ) -> tuple[Any, list[FloatArray]]:
+        """The cost of a pixel of a photo, and the parameters of its pose and lens."""
+        lens = int(self._block.camera_of[photo])
+        model = pycolmap.CameraModelId.__members__[self._block.cameras[lens].model]
+        cost = cost_functions.ReprojErrorCost(
+            camera_model_id=model, point2D_cov=variance * np.eye(2), **points
+        )
+        return cost, [self._poses[photo], self._lenses[lens]]
 
     def _add_centers(self, priors: CenterPriors) -> None:
         unit = 1.0 / (self._terms.keypoint_px**2 * self._terms.dilution)
@@ -303,12 +310,8 @@ class Problem:
         for point, photo, xy in zip(
             targets.point_of.tolist(), targets.photo_of.tolist(), targets.xy, strict=True
         ):
-            lens = int(self._block.camera_of[photo])
-            model = pycolmap.CameraModelId.__members__[self._block.cameras[lens].model]
-            cost = cost_functions.ReprojErrorCost(
-                camera_model_id=model, point2D_cov=unit * targets.sigma_px**2 * np.eye(2), point2D=xy
-            )
-            parameters = [self._points[point], self._poses[photo], self._lenses[lens]]
+            cost, parameters = self._reprojection(photo, unit * targets.sigma_px**2, point2D=xy)
+            parameters = [self._points[point], *parameters]
             self._targets.append(self._ceres.add_residual_block(cost, None, parameters))
         survey = targets.survey
         for point, xyz, covariance in zip(

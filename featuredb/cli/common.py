@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from decimal import Decimal
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.plain_json import plain
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, TaskID
 
     from featuredb.store import Database
 
@@ -153,6 +153,18 @@ def count_bars() -> "Progress":
         TimeRemainingColumn(),
         console=Console(stderr=True),
     )
+
+
+def drawn(bars: "Progress", titles: Mapping[str, str]) -> Callable[[str, int, int], None]:
+    """A callback progress(stage, done, total) that draws a bar for each stage, under its title."""
+    tasks: dict[str, TaskID] = {}
+
+    def draw(stage: str, done: int, total: int) -> None:
+        if stage not in tasks:
+            tasks[stage] = bars.add_task(titles.get(stage, stage), total=total)
+        bars.update(tasks[stage], completed=done, total=total)
+
+    return draw
 
 
 def format_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

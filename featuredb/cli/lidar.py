@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from featuredb.cli.common import (
     add_command,
     count_bars,
+    drawn,
     format_table,
     open_database,
     place_for_database,
@@ -212,11 +213,4 @@ def _progress(quiet: bool) -> Iterator["OnProgress"]:
         yield lambda step, done, total: None
         return
     with bars:
-        tasks: dict[str, Any] = {}
-
-        def show(step: str, done: int, total: int) -> None:
-            if step not in tasks:
-                tasks[step] = bars.add_task(_TITLES[step], total=total)
-            bars.update(tasks[step], completed=done, total=total)
-
-        yield show
+        yield drawn(bars, _TITLES)

@@ -73,7 +73,7 @@ def shots_of(feature_map: FeatureMap) -> Iterator[PosedPhoto]:
                 height_m=height,
                 quaternion_xyzw=placed.quaternion_xyzw,
             ),
-            height_datum="ellipsoidal" if converted.converted else feature_map.height_datum,
+            height_datum=feature_map.height_datum if converted.height_m is None else "ellipsoidal",
             map_height_m=placed.height_m,
             map_height_datum=feature_map.height_datum,
             sigma_enu_m=sigmas[3:],

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
 from featuredb.features.heif import heic_pixels
-from featuredb.features.image_header import ImageHeader, read_header
+from featuredb.features.image_header import read_header
+from featuredb.features.stored_image import ImageHeader
 
 # libjpeg fills what a scan does not cover with coefficients 0, which is this grey.
 _JPEG_FILL = 128

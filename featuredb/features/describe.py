@@ -1,16 +1,20 @@
 """Descriptors at keypoints that another program has found: this extractor's, in its own scale space."""
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
-from featuredb.features.extractor import ExtractorOptions, rootsift_8bit
+from featuredb.features.extractor import (
+    OCTAVE_LAYERS,
+    SIGMA,
+    ExtractorOptions,
+    create_sift,
+    rootsift_8bit,
+    shrunk,
+)
 from featuredb.geometry.arrays import FloatArray
 
-OCTAVE_LAYERS, SIGMA = 3, 1.6  # of the extractor
 # The smallest diameter that the extractor finds: half a layer below the first, in the doubled image.
 _FINEST_PX = 0.999 * 2.0 * SIGMA * 2.0 ** (0.5 / OCTAVE_LAYERS - 1.0)
 
@@ -44,9 +48,7 @@ def describe_at(
             zip(places.tolist(), diameters.tolist(), angle, strict=True)
         )
     ]
-    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
-    sift = create(nOctaveLayers=OCTAVE_LAYERS, sigma=SIGMA, enable_precise_upscale=True)
-    kept, raw = sift.compute(small, keypoints)
+    kept, raw = create_sift().compute(small, keypoints)
     if [k.class_id for k in kept] != list(range(len(xy))):
         raise ImageError(f"expected descriptors of {len(xy)} keypoints, OpenCV gives {len(kept)}")
     return rootsift_8bit(raw)
@@ -60,13 +62,10 @@ def shrunk_for(
     Args:
         gray, xy, scale: as for `describe_at`, at least one keypoint.
     """
-    height, width = gray.shape
-    factor = min(1.0, ExtractorOptions().max_side_px / max(height, width))
-    if float(scale.min()) * factor < _FINEST_PX:
-        factor = 1.0
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    small = gray if factor == 1.0 else np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
-    ratio = np.array([small.shape[1] / width, small.shape[0] / height])
+    small = shrunk(gray, ExtractorOptions().max_side_px)
+    if float(scale.min()) * max(small.shape) / max(gray.shape) < _FINEST_PX:
+        small = gray
+    ratio = np.array(small.shape[::-1]) / gray.shape[::-1]
     return small, xy.astype(np.float64) * ratio - 0.5, scale.astype(np.float64) * ratio.mean()
 
 

@@ -18,8 +18,7 @@ from featuredb.features.selection import spread_strongest
 
 # Raise when a change to this module makes descriptors that older maps cannot be compared with.
 _DESCRIPTOR_VERSION = "rootsift8-opencv-1"
-_OCTAVE_LAYERS = 3
-_SIGMA = 1.6
+OCTAVE_LAYERS, SIGMA = 3, 1.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +64,7 @@ class ExtractorOptions:
         Size and number of features are not part of it: they change how many keypoints there are,
         not what a descriptor means.
         """
-        text = f"{_DESCRIPTOR_VERSION};upright={self.upright};layers={_OCTAVE_LAYERS};sigma={_SIGMA}"
+        text = f"{_DESCRIPTOR_VERSION};upright={self.upright};layers={OCTAVE_LAYERS};sigma={SIGMA}"
         return (
             f"{_DESCRIPTOR_VERSION}{'-upright' if self.upright else ''}-"
             + (hashlib.sha256(text.encode()).hexdigest()[:12])
@@ -90,16 +89,12 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
     height, width = gray.shape
     if min(height, width) < 32:
         raise ImageError(f"extract: expected at least 32x32 pixels, found {width}x{height}")
-    small = _shrink(gray, options.max_side_px)
-    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
-    sift = create(
+    small = shrunk(gray, options.max_side_px)
+    sift = create_sift(
         # OpenCV keeps the strongest; describing them in the same pass shares the scale pyramid.
         nfeatures=0 if options.upright else int(options.oversample * options.max_features),
-        nOctaveLayers=_OCTAVE_LAYERS,
         contrastThreshold=options.contrast_threshold,
         edgeThreshold=options.edge_threshold,
-        sigma=_SIGMA,
-        enable_precise_upscale=True,
     )
     if options.upright:
         keypoints, raw = sift.compute(small, _upright(sift.detect(small, None)))
@@ -122,7 +117,14 @@ def rootsift_8bit(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(np.clip(np.rint(512.0 * np.sqrt(sift / total)), 0, 255), dtype=np.uint8)
 
 
-def _shrink(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
+def create_sift(**options: Any) -> Any:
+    """OpenCV's SIFT with this extractor's scale space, and more options by OpenCV's names."""
+    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
+    return create(nOctaveLayers=OCTAVE_LAYERS, sigma=SIGMA, enable_precise_upscale=True, **options)
+
+
+def shrunk(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
+    """The photo (h, w) area-averaged down to this longer side; smaller ones stay."""
     height, width = gray.shape
     factor = max_side_px / max(height, width)
     if factor >= 1.0:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, MissingExtraError
 from featuredb.extras import require
+from featuredb.features.stored_image import ImageHeader
 
 STILL_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1", b"avif"})
 SEQUENCE_BRANDS = frozenset({b"hevc", b"hevx", b"msf1", b"avis"})
@@ -30,27 +31,6 @@ _ORIENTATIONS: dict[tuple[int, int | None], int] = {
     **{(0, 0): 4, (1, 0): 5, (2, 0): 2, (3, 0): 7},  # top and bottom change places
     **{(0, 1): 2, (1, 1): 7, (2, 1): 4, (3, 1): 5},  # left and right do
 }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeifHeader:
-    """The primary picture of a HEIF file.
-
-    Attributes:
-        avif: coded as AV1, and not as HEVC.
-        width, height: pixels before the file's boxes turn the picture.
-        orientation: how it is to be turned, as EXIF says it, 1..8.
-        exif, xmp: (start, stop) in the file's bytes of the TIFF stream and of the packet, or None.
-        end: offset after the last byte that is used.
-    """
-
-    avif: bool
-    width: int
-    height: int
-    orientation: int
-    exif: tuple[int, int] | None
-    xmp: tuple[int, int] | None
-    end: int
 
 
 @dataclass(slots=True)
@@ -94,8 +74,13 @@ class _Meta:
     used: dict[int, list[int]] = field(default_factory=dict)
     idat: int = 0
 
+    @property
+    def is_avif(self) -> bool:
+        """Coded as AV1, and not as HEVC."""
+        return b"av01" in self.types.values()
 
-def read_heif(data: bytes) -> HeifHeader:
+
+def read_heif(data: bytes) -> ImageHeader:
     """Size, orientation and metadata of the primary picture.
 
     Raises:
@@ -115,8 +100,8 @@ def read_heif(data: bytes) -> HeifHeader:
         exif = (exif[0] + skipped, exif[1]) if exif[0] + skipped < exif[1] else None
         if exif is not None and data[exif[0] : exif[0] + 6] == b"Exif\0\0":
             exif = (exif[0] + 6, exif[1])
-    return HeifHeader(
-        avif=b"av01" in meta.types.values(),
+    return ImageHeader(
+        format="AVIF" if meta.is_avif else "HEIC",
         width=width,
         height=height,
         orientation=orientation,
@@ -275,7 +260,7 @@ def _geometry(meta: _Meta) -> tuple[int, int, int]:
         if kind == b"ispe":
             body.number(4)
             size = body.number(4), body.number(4)
-        elif kind == b"clap" and b"av01" not in meta.types.values():  # libheif cuts, OpenCV does not
+        elif kind == b"clap" and not meta.is_avif:  # libheif cuts, OpenCV does not
             width, per_width, height, per_height = (body.number(4) for _ in range(4))
             coded = size
             size = round(width / max(per_width, 1)), round(height / max(per_height, 1))

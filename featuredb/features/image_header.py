@@ -7,11 +7,11 @@ allocate nothing, warn nobody and cost well under a millisecond.
 import re
 import struct
 import zlib
-from dataclasses import dataclass
 
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
 from featuredb.features.heif import SEQUENCE_BRANDS, STILL_BRANDS, read_heif
+from featuredb.features.stored_image import ImageHeader
 
 IMAGE_ERROR_CODES = (
     "unreadable",  # the file could not be opened or is not a regular file
@@ -30,30 +30,6 @@ _JPEG_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 # Encoders write about ten scans; each scan costs a pass over the image, which makes a cheap bomb.
 _MAX_JPEG_SCANS = 100
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ImageHeader:
-    """Format and size of an image as stored.
-
-    Attributes:
-        format: JPEG, PNG, WEBP, TIFF, BMP, HEIC or AVIF.
-        width, height: pixels as stored, before EXIF orientation.
-        orientation: 1..8 where the format says it in place of EXIF, or None.
-        exif: (start, stop) of the TIFF stream with the EXIF in the file's bytes, or None.
-        xmp: (start, stop) of the XMP packet, or None.
-        scans: passes over the picture that decoding takes; more than one in progressive JPEGs.
-        end: offset after the last byte of the image; cameras append previews and videos behind it.
-    """
-
-    format: str
-    width: int
-    height: int
-    exif: tuple[int, int] | None = None
-    xmp: tuple[int, int] | None = None
-    scans: int = 1
-    end: int = 0
-    orientation: int | None = None
 
 
 def check_signature(head: bytes) -> None:
@@ -89,16 +65,7 @@ def read_header(data: bytes) -> ImageHeader:
     if data[:4] == b"RIFF":
         return _webp(data)
     if data[4:8] == b"ftyp":
-        heif = read_heif(data)
-        return ImageHeader(
-            format="AVIF" if heif.avif else "HEIC",
-            width=heif.width,
-            height=heif.height,
-            exif=heif.exif,
-            xmp=heif.xmp,
-            end=heif.end,
-            orientation=heif.orientation,
-        )
+        return read_heif(data)
     return _bmp(data) if _is_bmp(data) else _tiff(data)
 
 
@@ -294,9 +261,8 @@ def _tiff(data: bytes) -> ImageHeader:
             break
     else:
         raise ImageError("the TIFF does not say where its pixels lie", "broken")
-    xmp = None
     return ImageHeader(
-        format="TIFF", width=int(width), height=int(height), exif=(0, len(data)), xmp=xmp, end=len(data)
+        format="TIFF", width=int(width), height=int(height), exif=(0, len(data)), end=len(data)
     )
 
 

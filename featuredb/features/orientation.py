@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.features.describe import OCTAVE_LAYERS, SIGMA, octave_and_layer, shrunk_for
+from featuredb.features.describe import octave_and_layer, shrunk_for
+from featuredb.features.extractor import OCTAVE_LAYERS, SIGMA
 from featuredb.geometry.arrays import FloatArray
 
 _BINS = 36

@@ -19,6 +19,18 @@ class Points(NamedTuple):
         return np.asarray(rows[0] if self.single else rows, dtype=np.float64)
 
 
+def check_place(name: str, latitude_deg: float, longitude_deg: float) -> None:
+    """
+    Raises:
+        InvalidValueError: no latitude in [-90, 90] and longitude in [-180, 180] degrees.
+    """
+    if not (abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0):  # false for NaN too
+        raise InvalidValueError(
+            f"{name}: expected latitude in [-90, 90] and longitude in [-180, 180] degrees, found "
+            f"{latitude_deg}, {longitude_deg}"
+        )
+
+
 def as_points(name: str, value: ArrayLike) -> Points:
     """Rows (n, 3) float64 of an array (n, 3) or of one point (3,).
 

@@ -53,10 +53,6 @@ class HeightConversion:
                 f"height {self.height_m!r} and reason {self.reason!r}"
             )
 
-    @property
-    def converted(self) -> bool:
-        return self.height_m is not None
-
 
 def check_datum(name: str) -> HeightDatum:
     """The datum of that name.

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from featuredb.errors import InvalidValueError
+from featuredb.geo.checks import check_place
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
@@ -45,11 +46,7 @@ class GeoPose:
     def __post_init__(self) -> None:
         for name in ("latitude_deg", "longitude_deg", "height_m"):
             object.__setattr__(self, name, float(getattr(self, name)))
-        if not (abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0):
-            raise InvalidValueError(
-                "GeoPose: expected latitude in [-90, 90] and longitude in [-180, 180] degrees, found "
-                f"{self.latitude_deg}, {self.longitude_deg}"
-            )
+        check_place("GeoPose", self.latitude_deg, self.longitude_deg)
         if not math.isfinite(self.height_m):
             raise InvalidValueError(f"GeoPose.height_m: expected a finite number, found {self.height_m}")
         quaternion = np.array(self.quaternion_xyzw, dtype=np.float64)

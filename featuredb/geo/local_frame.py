@@ -18,15 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from featuredb.errors import InvalidValueError
-from featuredb.geo.checks import as_geodetic, as_points, as_utm
-from featuredb.geo.projections import (
-    ecef_from_geodetic,
-    enu_from_ecef_rotation,
-    geodetic_from_ecef,
-    lat_lon_h_from_utm,
-    utm_from_lat_lon_h,
-)
-from featuredb.geo.utm import geodetic_from_utm, meridian_convergence_deg, zone_of
+from featuredb.geo.checks import as_geodetic, as_points, check_place
+from featuredb.geo.projections import ecef_from_geodetic, enu_from_ecef_rotation, geodetic_from_ecef
+from featuredb.geo.utm import geodetic_from_utm, meridian_convergence_deg, utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 
@@ -47,12 +41,7 @@ class LocalFrame:
     def __post_init__(self) -> None:
         for name in ("latitude_deg", "longitude_deg", "height_m"):
             object.__setattr__(self, name, float(getattr(self, name)))
-        # The comparisons are false for NaN too.
-        if not (abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0):
-            raise InvalidValueError(
-                "LocalFrame: expected latitude in [-90, 90] and longitude in [-180, 180] degrees, found "
-                f"{self.latitude_deg}, {self.longitude_deg}"
-            )
+        check_place("LocalFrame", self.latitude_deg, self.longitude_deg)
         if not np.isfinite(self.height_m):
             raise InvalidValueError(f"LocalFrame.height_m: expected a finite number, found {self.height_m}")
 
@@ -77,20 +66,14 @@ class LocalFrame:
             GeodesyError: not a UTM code, coordinates that look like degrees or that PROJ cannot convert.
             InvalidValueError: wrong shape or not finite.
         """
-        zone, hemisphere = zone_of(epsg)
-        points = as_utm("LocalFrame.enu_from_utm", utm)
-        geodetic = lat_lon_h_from_utm(points.rows, zone, hemisphere == "south")
-        return points.shaped_like_input(self._enu_from_ecef(ecef_from_geodetic(geodetic)))
+        return self.enu_from_geodetic(geodetic_from_utm(utm, epsg))
 
     def utm_from_enu(self, enu: ArrayLike, epsg: int) -> FloatArray:
         """UTM easting, northing, height in metres of points (n, 3) or (3,) of this frame, same shape.
 
         The inverse of `enu_from_utm`, same errors.
         """
-        zone, hemisphere = zone_of(epsg)
-        points = as_points("LocalFrame.utm_from_enu", enu)
-        geodetic = self._geodetic(points.rows)
-        return points.shaped_like_input(utm_from_lat_lon_h(geodetic, zone, hemisphere == "south"))
+        return utm_from_geodetic(self.geodetic_from_enu(enu), epsg)
 
     def enu_from_geodetic(self, lat_lon_h: ArrayLike) -> FloatArray:
         """East, north, up in metres of latitude, longitude (degrees), height (m), (n, 3) or (3,).

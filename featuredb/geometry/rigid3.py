@@ -101,13 +101,6 @@ class Rigid3:
         """Transform points (..., 3) of the source frame into the target frame, (..., 3) float64."""
         return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
 
-    def adjoint(self) -> FloatArray:
-        """(6, 6) matrix with T exp(xi) = exp(Ad xi) T for xi = (omega, nu)."""
-        ad = np.zeros((6, 6))
-        ad[:3, :3] = ad[3:, 3:] = self.rotation
-        ad[3:, :3] = skew(self.translation) @ self.rotation
-        return ad
-
     @property
     def quaternion_xyzw(self) -> FloatArray:
         """Hamilton quaternion (x, y, z, w), w >= 0."""

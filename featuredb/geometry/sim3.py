@@ -110,11 +110,11 @@ class Sim3:
         ad[4:, 4:] = self.scale * self.rotation
         return ad
 
-    def compose_covariance(self, covariance: ArrayLike, other_covariance: ArrayLike) -> FloatArray:
-        """Covariance (7, 7) of `self @ other` for independent errors of both, to first order."""
+    def carried(self, covariance: ArrayLike) -> FloatArray:
+        """Covariance (7, 7) of `self @ other` for that of `other`, to first order."""
         ad = self.adjoint()
-        other = np.asarray(other_covariance, dtype=np.float64)
-        return np.asarray(covariance, dtype=np.float64) + ad @ other @ ad.T
+        result = ad @ np.asarray(covariance, dtype=np.float64) @ ad.T
+        return np.asarray(0.5 * (result + result.T))
 
     def matrix(self) -> FloatArray:
         """(4, 4) homogeneous matrix [sR t; 0 1]."""

@@ -116,26 +116,6 @@ def add_scan(
     return AddResult(created=created, scan=find_scan(database, scan_id))
 
 
-def crs_of_file(file: ScanFile, options: AddOptions) -> ScanCrs:
-    """The CRS of one file, under the options.
-
-    Raises:
-        GeodesyError: as featuredb.geo.crs.scan.scan_crs; the message names the file.
-    """
-    # The header says which of the two counts; where that one is missing, it is the other.
-    wkt = file.wkt if file.wkt_counts or not file.geo_keys else None
-    try:
-        return scan_crs(
-            wkt=wkt,
-            geo_keys=None if wkt else file.geo_keys,
-            override=options.crs,
-            height_unit=options.height_unit,
-            height_datum=options.height_datum,
-        )
-    except GeodesyError as error:
-        raise GeodesyError(f"{file.path}: {error}") from error
-
-
 def _ortho_identity(ortho: OrthoChoice | None) -> list[str]:
     """What tells the ortho image and its use from others: name apart, so that a copy is the same."""
     if ortho is None:
@@ -161,8 +141,16 @@ def _place_all(files: Sequence[ScanFile], options: AddOptions) -> list[ScanInput
     inputs: list[ScanInput] = []
     epsg = options.epsg
     for file in files:
-        crs = crs_of_file(file, options)
+        # The header says which of the two counts; where that one is missing, it is the other.
+        wkt = file.wkt if file.wkt_counts or not file.geo_keys else None
         try:
+            crs = scan_crs(
+                wkt=wkt,
+                geo_keys=None if wkt else file.geo_keys,
+                override=options.crs,
+                height_unit=options.height_unit,
+                height_datum=options.height_datum,
+            )
             to_utm = utm_transform(crs, file.low, file.high, epsg)
         except GeodesyError as error:
             raise GeodesyError(f"{file.path}: {error}") from error

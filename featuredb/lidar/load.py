@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ScanError, ScanNotFoundError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geo.near_frame import near_enu_from_utm
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.render.cloud import CloudNodes, PointCloud
 from featuredb.render.spacing import point_spacing
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_points
+from featuredb.store.tables import UTM_COORDINATES
 
-_UTM = ("easting", "northing", "height")
 _RGB = ("red", "green", "blue")
 
 _GREY = 128  # of points that have neither colour nor intensity in a cloud that has
@@ -82,12 +81,17 @@ def load_cloud(
     """
     if not isinstance(database, Database):
         database = Database.open(database)
-    scans = _chosen(database, scan_ids)
+    scans = chosen_scans(database, scan_ids)
+    datums = sorted({scan.height_datum for scan in scans})
+    if len(datums) > 1:
+        raise ScanError(
+            f"expected scans with heights of one datum, found {', '.join(datums)}; choose among the scans"
+        )
     boxes = {scan.scan_id: _utm_box(frame, box_local, scan.epsg) for scan in scans}
     touched = [s for s in scans if (b := boxes[s.scan_id]) is None or s.box.touches(*b)]
     rgb = bool(touched) and all(scan.colour for scan in touched)
     intensity = bool(touched) and all(scan.has_intensity for scan in touched)
-    columns = (*_UTM, *(_RGB if rgb else ()), *(("intensity",) if intensity else ()))
+    columns = (*UTM_COORDINATES, *(_RGB if rgb else ()), *(("intensity",) if intensity else ()))
     parts: list[_Part] = []
     total = 0
     for level in range(max((len(scan.level_points) for scan in touched), default=0)):
@@ -108,27 +112,27 @@ def load_cloud(
                 (*columns, "classification", "node", "node_spacing_m"),
             )
             if len(table):
-                utm = np.stack([table[name].to_numpy() for name in _UTM], axis=1)
+                utm = np.stack([table[name].to_numpy() for name in UTM_COORDINATES], axis=1)
                 parts.append(_Part(level, utm, scan.epsg, table))
     return _cloud(frame, scans[0].height_datum, parts, rgb, intensity)
 
 
-def _chosen(database: Database, scan_ids: Sequence[str] | None) -> list[ScanSummary]:
+def chosen_scans(database: Database, scan_ids: Sequence[str] | None) -> list[ScanSummary]:
+    """The scans meant, by ids or their first letters; None: all that are not retired.
+
+    Raises:
+        ScanNotFoundError: the database has no scan, or not one of those.
+    """
     scans = list_scans(database)
     if scan_ids is not None:
-        missing = sorted(set(scan_ids) - {scan.scan_id for scan in scans})
+        missing = sorted(i for i in scan_ids if not any(s.scan_id.startswith(i) for s in scans))
         if missing:
             raise ScanNotFoundError(
                 f"no scan {', '.join(missing)}; `featuredb lidar list` lists what there is"
             )
-        scans = [scan for scan in scans if scan.scan_id in scan_ids]
+        scans = [s for s in scans if s.scan_id.startswith(tuple(scan_ids))]
     if not scans:
         raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
-    datums = sorted({scan.height_datum for scan in scans})
-    if len(datums) > 1:
-        raise ScanError(
-            f"expected scans with heights of one datum, found {', '.join(datums)}; choose among the scans"
-        )
     return scans
 
 
@@ -148,16 +152,8 @@ def _utm_box(frame: LocalFrame, box: PlanBox | None, epsg: int) -> PlanBox | Non
 
 def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, intensity: bool) -> PointCloud:
     """The parts one after the other, in the frame, with their nodes."""
-    starts = np.concatenate([[0], np.cumsum([len(part.utm) for part in parts], dtype=np.int64)])
-    xyz = np.empty((int(starts[-1]), 3), np.float32)
-    for epsg in {part.epsg for part in parts}:
-        ours = [(part, start) for part, start in zip(parts, starts[:-1], strict=True) if part.epsg == epsg]
-        enu = near_enu_from_utm(frame, np.concatenate([part.utm for part, _ in ours]), epsg)
-        row = 0
-        for part, start in ours:
-            n = len(part.utm)
-            xyz[start : start + n] = enu[row : row + n]
-            row += n
+    placed = (frame.enu_from_utm(part.utm, part.epsg).astype(np.float32) for part in parts)
+    xyz = np.concatenate([np.empty((0, 3), np.float32), *placed])
     return PointCloud(
         frame=frame,
         height_datum=datum,
@@ -172,17 +168,16 @@ def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, int
 
 def _bytes(parts: Sequence[_Part], names: Sequence[str]) -> NDArray[np.uint8]:
     """Columns of all parts as (n, columns) uint8; where a point has no value, its intensity or a grey."""
-    values = np.empty((sum(len(part.utm) for part in parts), len(names)), np.uint8)
-    for axis, name in enumerate(names):
-        row = 0
-        for part in parts:
-            column: Any = part.columns[name]
-            if column.null_count:
-                grey = part.columns["intensity"] if "intensity" in part.columns.column_names else None
-                column = pc.coalesce(column, *([] if grey is None else [grey]), pa.scalar(_GREY, pa.int16()))
-            values[row : row + len(part.utm), axis] = column.to_numpy()
-            row += len(part.utm)
-    return values
+    columns = [np.stack([_filled(part.columns, name) for name in names], axis=1) for part in parts]
+    return np.concatenate([np.empty((0, len(names)), np.uint8), *columns])
+
+
+def _filled(table: pa.Table, name: str) -> NDArray[np.uint8]:
+    column: Any = table[name]
+    if column.null_count:
+        grey = [table["intensity"]] if "intensity" in table.column_names else []
+        column = pc.coalesce(column, *grey, pa.scalar(_GREY, pa.int16()))
+    return np.asarray(column.to_numpy(), dtype=np.uint8)
 
 
 def _nodes(xyz: NDArray[np.float32], parts: Sequence[_Part]) -> CloudNodes:

@@ -11,8 +11,8 @@ from featuredb.geo.tiles import tile_bounds
 from featuredb.lidar.formats.las_stream import LasStream
 from featuredb.store.database import Database
 from featuredb.store.scans import ScanSummary, count_points, scan_points
+from featuredb.store.tables import UTM_COORDINATES
 
-_UTM = ("easting", "northing", "height")
 _RGB = ("red", "green", "blue")
 # Read at once; some 60 bytes each.
 _LARGEST_PIECE = 2_000_000
@@ -69,9 +69,9 @@ def _points(
     database: Database, scan: ScanSummary, level: int, box: Box
 ) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]], NDArray[np.uint8] | None]:
     """Coordinates (n, 3), columns by laspy's names and colours (n, 3) of the half-open box."""
-    names = (*_UTM, *_RGB, "intensity", "classification", "node")
+    names = (*UTM_COORDINATES, *_RGB, "intensity", "classification", "node")
     table = scan_points(database, scan, level, box, names)
-    utm = np.stack([table[name].to_numpy() for name in _UTM], axis=1)
+    utm = np.stack([table[name].to_numpy() for name in UTM_COORDINATES], axis=1)
     e0, n0, e1, n1 = box
     inside = (utm[:, 0] >= e0) & (utm[:, 0] < e1) & (utm[:, 1] >= n0) & (utm[:, 1] < n1)
     table, utm = table.filter(inside), utm[inside]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from featuredb.errors import InvalidValueError
+from featuredb.geo.checks import check_place
 from featuredb.geo.datum import check_datum
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import zone_of
@@ -44,11 +45,7 @@ class GeoPrior:
     sigma_vertical_m: float
 
     def __post_init__(self) -> None:
-        if not (-90 <= self.latitude_deg <= 90 and -180 <= self.longitude_deg <= 180):
-            raise InvalidValueError(
-                "GeoPrior: expected latitude in [-90, 90] and longitude in [-180, 180] degrees, "
-                f"found {self.latitude_deg}, {self.longitude_deg}"
-            )
+        check_place("GeoPrior", self.latitude_deg, self.longitude_deg)
         if self.height_m is not None and not np.isfinite(self.height_m):
             raise InvalidValueError(
                 f"GeoPrior.height_m: expected a finite number or None, found {self.height_m}"

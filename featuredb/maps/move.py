@@ -13,35 +13,26 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapParts, MapPoints, Placement
 from featuredb.maps.unplaced_map import UnplacedMap
 
-_UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))  # order of MapPoints.covariance
+_UPPER = np.triu_indices(3)  # order of MapPoints.covariance
 # Fields that a map keeps where it gets a place.
 _STAYING = {f.name for f in fields(MapParts)} - {"images", "points", "status", "parents"}
 
 
-def move_map(
-    feature_map: FeatureMap,
-    new_from_old: Sim3,
-    frame: LocalFrame | None = None,
-    *,
-    covariance: FloatArray | None = None,
-) -> FeatureMap:
+def move_map(feature_map: FeatureMap, move: Sim3, *, covariance: FloatArray | None = None) -> FeatureMap:
     """The map where a similarity takes it; its local frame, ids, observations and lenses stay.
 
     A move that is the identity, bit for bit, leaves points, poses and their covariances bit for bit.
 
     Args:
-        new_from_old: of coordinates in `frame`, metres.
-        frame: in which the similarity is meant; default: the map's own.
+        move: of coordinates in the map's local frame, metres.
         covariance: (7, 7) of the new placement, left perturbation in the map's own frame; default: the old
             one, carried along.
     """
-    move = in_frame(new_from_old, frame or feature_map.frame, feature_map.frame)
     placement = feature_map.placement
-    adjoint = move.adjoint()
     moved = replace(
         placement,
         local_from_sfm=placement.local_from_sfm if is_identity(move) else move @ placement.local_from_sfm,
-        covariance=_symmetric(adjoint @ placement.covariance @ adjoint.T)
+        covariance=move.carried(placement.covariance)
         if covariance is None
         else np.asarray(covariance, dtype=np.float64),
         evidence=dict(placement.evidence),
@@ -101,8 +92,7 @@ def covariance_in_frame(covariance: FloatArray, frame: LocalFrame, other: LocalF
     """The covariance (7, 7) of a left perturbation, of coordinates in another local frame."""
     if frame == other:
         return np.asarray(covariance, dtype=np.float64)
-    adjoint = Sim3.from_rigid3(other.enu_from(frame)).adjoint()
-    return _symmetric(adjoint @ np.asarray(covariance, dtype=np.float64) @ adjoint.T)
+    return Sim3.from_rigid3(other.enu_from(frame)).carried(covariance)
 
 
 def moved_image(image: MapImage, move: Sim3) -> MapImage:
@@ -135,7 +125,3 @@ def full_covariances(upper: NDArray[np.float32]) -> FloatArray:
     full[:, _UPPER[0], _UPPER[1]] = upper
     full[:, _UPPER[1], _UPPER[0]] = upper
     return full
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)

@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
-from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
 from featuredb.render.rendering import Rendering
 from featuredb.render.splats import FINEST_PX, NEAR_M, BlockPlanes, draw_splats, project_points
 from featuredb.render.surfaces import apart_px, block_planes, close_holes, surfaces_of
-from featuredb.render.threads import over_rows, thread_count
+from featuredb.render.threads import thread_count
 
 # Splats wider than this show which way they lie; then there are few, and drawing them again is cheap.
 _WORTH_REDRAWING_PX = 2.5
@@ -58,7 +57,7 @@ def render(
             splats = draw_splats(points, camera, threads, planes)
     surfaces = surfaces_of(splats, planes, focal_px, threads)
     surfaces = close_holes(surfaces, splats, planes, focal_px, threads)
-    rgb, intensity = _painted(surfaces.paint, cloud, options.attributes, threads)
+    rgb, intensity = _painted(surfaces.paint, cloud, options.attributes)
     return Rendering(
         camera=camera,
         cam_from_local=cam_from_local,
@@ -71,15 +70,12 @@ def render(
 
 
 def _painted(
-    paint: NDArray[np.uint32], cloud: PointCloud, attributes: bool, threads: int
+    paint: NDArray[np.uint32], cloud: PointCloud, attributes: bool
 ) -> tuple[NDArray[np.uint8] | None, NDArray[np.uint8] | None]:
     """Colours (h, w, 3) and intensity (h, w), those that the cloud has and that are wanted."""
-    loops = compiled_module("featuredb.render.loops.picture_loops")
-    with_rgb, with_intensity = (
-        attributes and cloud.rgb is not None,
-        attributes and cloud.intensity is not None,
+    channels = paint.astype("<u4").view(np.uint8).reshape(*paint.shape, 4)
+    with_rgb, with_intensity = (attributes and of is not None for of in (cloud.rgb, cloud.intensity))
+    return (
+        np.ascontiguousarray(channels[..., :3]) if with_rgb else None,
+        np.ascontiguousarray(channels[..., 3]) if with_intensity else None,
     )
-    rgb = np.empty((*paint.shape, 3) if with_rgb else (0, 0, 3), np.uint8)
-    intensity = np.empty(paint.shape if with_intensity else (0, 0), np.uint8)
-    over_rows(lambda first, end: loops.unpack(paint, rgb, intensity, first, end), len(paint), threads)
-    return rgb if with_rgb else None, intensity if with_intensity else None

@@ -4,9 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.rays import pixel_rays
-from featuredb.render.compiled import compiled_module
 from featuredb.render.rendering import Rendering
-from featuredb.render.threads import over_rows, thread_count
 
 _WIDEST_STEP_PX = 12  # as the largest splat
 
@@ -15,7 +13,8 @@ _WIDEST_STEP_PX = 12  # as the largest splat
 # all azimuths.
 _LIGHT_AZIMUTH_DEG, _LIGHT_ELEVATION_DEG = 315.0, 45.0
 _AMBIENT = 0.25  # share of the light that falls from everywhere: keeps surfaces apart that are turned away
-_STEEPEST_DEG = 84.0  # a steeper change of depth counts as an edge; ground seen at 6 degrees is still ground
+# A steeper change of depth counts as an edge: 84 degrees; ground seen at 6 degrees is still ground.
+_STEEPEST_SLOPE = float(np.tan(np.radians(84.0)))
 
 
 def shaded_relief(rendering: Rendering) -> NDArray[np.uint8]:
@@ -23,27 +22,42 @@ def shaded_relief(rendering: Rendering) -> NDArray[np.uint8]:
 
     Normals come from differences of depth over the distance between neighbouring points in the picture,
     never across a depth edge.
-
-    Raises:
-        MissingExtraError: numba is not installed.
     """
-    loops = compiled_module("featuredb.render.loops.relief_loops")
     x, y = pixel_rays(rendering.camera)
+    points = np.stack([x * rendering.depth, y * rendering.depth, rendering.depth], axis=2)
+    step = point_distance_px(rendering)
+    # Down times across points towards the camera (x right, y down, z forward).
+    normal = np.cross(_along_surface(points, x, y, step, 0), _along_surface(points, x, y, 0, step))
     azimuth, elevation = np.radians([_LIGHT_AZIMUTH_DEG, _LIGHT_ELEVATION_DEG])
     to_light = np.array(
         [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)]
     )
-    to_light = rendering.cam_from_local.rotation @ to_light
-    step, steepest = point_distance_px(rendering), float(np.tan(np.radians(_STEEPEST_DEG)))
-    picture = np.empty(rendering.depth.shape, np.uint8)
-    over_rows(
-        lambda first, end: loops.shade(
-            rendering.depth, x, y, to_light, step, steepest, _AMBIENT, picture, first, end
-        ),
-        len(picture),
-        thread_count(0),
-    )
-    return picture
+    length = np.linalg.norm(normal, axis=2)
+    lit = normal @ (rendering.cam_from_local.rotation @ to_light).astype(np.float32)
+    light = _AMBIENT + (1.0 - _AMBIENT) * np.maximum(lit / np.maximum(length, np.float32(1e-30)), 0.0)
+    return np.where(length > 0.0, np.rint(255.0 * light), 0.0).astype(np.uint8)
+
+
+def _along_surface(
+    points: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32], down: int, right: int
+) -> NDArray[np.float32]:
+    """(h, w, 3) the step in space along a surface from before a pixel to behind it; zero without neighbours.
+
+    Of the two halves the one across a depth edge is left out.
+
+    Args:
+        points: (h, w, 3) in camera axes, NaN where nothing is seen. x, y: (h, w) rays of the pixels.
+        down, right: pixels to the neighbour behind.
+    """
+    height, width = x.shape
+    first, second = np.s_[: height - down, : width - right], np.s_[down:, right:]
+    result = np.zeros_like(points)
+    apart = np.hypot(x[second] - x[first], y[second] - y[first]) * np.float32(_STEEPEST_SLOPE)
+    change = points[second] - points[first]
+    for here in (first, second):
+        same = np.abs(change[..., 2]) < apart * points[here][..., 2]
+        result[here] += np.where(same[..., None], change, np.float32(0.0))
+    return result
 
 
 def point_distance_px(rendering: Rendering) -> int:

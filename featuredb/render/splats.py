@@ -12,7 +12,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.lens import lens_numbers
-from featuredb.render.threads import mapped, over_rows
+from featuredb.render.threads import mapped
 
 NEAR_M = 0.3  # nothing closer is drawn: a camera does not stand in a wall
 # Points closer together than this in the picture are left to coarser levels: two to three points a pixel at
@@ -132,12 +132,8 @@ def draw_splats(
 
     nearest, *others = mapped(draw_part, _balanced(points.count, threads), threads)
 
-    def merge_rows(first: int, end: int) -> None:
-        for other in others:
-            loops.merge(nearest, other, first, end)
-
-    if others:
-        over_rows(merge_rows, len(nearest), threads)
+    for other in others:
+        np.minimum(nearest, other, out=nearest)
     return Splats(points=points, nearest=nearest)
 
 

@@ -72,7 +72,7 @@ def close_holes(
     s = surfaces
     radii = _radii(splats, focal_px)
     closed = _closings(s.nearness, radii, threads)
-    widest = _widest_m(s.apart_m, radii, threads)
+    widest = _widest_m(s.apart_m, radii)
     paint = np.empty_like(s.paint)
     over_rows(
         lambda first, end: loops.close_holes(
@@ -135,11 +135,10 @@ def _closings(nearness: NDArray[np.float32], radii: NDArray[np.int32], threads: 
     return closed
 
 
-def _widest_m(apart_m: NDArray[np.float32], radii: NDArray[np.int32], threads: int) -> NDArray[np.float32]:
+def _widest_m(apart_m: NDArray[np.float32], radii: NDArray[np.int32]) -> NDArray[np.float32]:
     """The largest distance between points within each of k radii of tiles: (k, tiles down, tiles across)."""
-    loops = compiled_module("featuredb.render.loops.hole_loops")
-    tile = loops.TILE_PX
-    in_tile = np.empty((-(-apart_m.shape[0] // tile), -(-apart_m.shape[1] // tile)), np.float32)
-    over_rows(lambda first, end: loops.widest_in_tiles(apart_m, in_tile, first, end), len(in_tile), threads)
+    tile = compiled_module("featuredb.render.loops.hole_loops").TILE_PX
+    rows, columns = (np.arange(0, size, tile) for size in apart_m.shape)
+    in_tile = np.maximum.reduceat(np.maximum.reduceat(apart_m, rows, axis=0), columns, axis=1)
     reach = [-(-int(r) // tile) for r in radii]
     return np.stack([cv2.dilate(in_tile, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in reach])

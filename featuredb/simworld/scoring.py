@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
-from featuredb.simworld.truth import Truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,21 +34,15 @@ class PoseError:
         return float(np.hypot(self.horizontal_m, self.up_m))
 
 
-def pose_error(truth: Truth, name: str, epsg: int, utm: ArrayLike, cam_from_utm_xyzw: ArrayLike) -> PoseError:
-    """Error of an answer given in UTM.
-
-    Args:
-        name: the photo's name in the truth.
-        utm: (3,) easting, northing, ellipsoidal height in the zone `epsg`.
-        cam_from_utm_xyzw: (4,) rotation of grid axes into camera axes.
-    """
-    return pose_difference(truth.frame, truth.images[name].cam_from_local, epsg, utm, cam_from_utm_xyzw)
-
-
 def pose_difference(
     frame: LocalFrame, cam_from_local: Rigid3, epsg: int, utm: ArrayLike, cam_from_utm_xyzw: ArrayLike
 ) -> PoseError:
-    """An answer given in UTM, as in `pose_error`, minus a pose given in a local frame."""
+    """An answer given in UTM minus a pose given in a local frame.
+
+    Args:
+        utm: (3,) easting, northing, ellipsoidal height in the zone `epsg`.
+        cam_from_utm_xyzw: (4,) rotation of grid axes into camera axes.
+    """
     center = frame.enu_from_utm(np.asarray(utm, dtype=np.float64), epsg)
     offset = center - cam_from_local.center
     rotation = matrix_from_quaternion(cam_from_utm_xyzw) @ frame.grid_from_enu(center, epsg)

@@ -5,10 +5,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rich.progress import Progress, TaskID
-
-from featuredb.cli.common import count_bars
-from ingest.executor import Progress as ProgressCallback
+from featuredb.cli.common import count_bars, drawn
+from ingest.executor import Progress
 
 _TITLES = {
     "scan": "Reading files",
@@ -20,29 +18,18 @@ _TITLES = {
 
 
 @contextmanager
-def progress_bars(quiet: bool = False) -> Iterator[ProgressCallback]:
+def progress_bars(quiet: bool = False) -> Iterator[Progress]:
     """Yields a callback progress(stage, done, total) that draws on stderr."""
     if quiet:
         yield lambda stage, done, total: None
     elif (counting := count_bars()).console.is_terminal:
         with counting as bars:
-            yield _drawn(bars)
+            yield drawn(bars, _TITLES)
     else:
         yield _logged()
 
 
-def _drawn(bars: Progress) -> ProgressCallback:
-    tasks: dict[str, TaskID] = {}
-
-    def draw(stage: str, done: int, total: int) -> None:
-        if stage not in tasks:
-            tasks[stage] = bars.add_task(_TITLES.get(stage, stage), total=total)
-        bars.update(tasks[stage], completed=done, total=total)
-
-    return draw
-
-
-def _logged() -> ProgressCallback:
+def _logged() -> Progress:
     """A finished stage is one line: files and pipes want no redrawing."""
     before = time.monotonic()  # when the stage before ended
     told: set[str] = set()

@@ -32,8 +32,7 @@ class ListedMaps:
     bounds: Mapping[str, PlaceBounds]
 
     def __getitem__(self, row: int) -> MapSummary | UnplacedSummary:
-        every: tuple[MapSummary | UnplacedSummary, ...] = (*self.placed, *self.unplaced)
-        return every[row]
+        return list(self)[row]
 
     def __len__(self) -> int:
         return len(self.placed) + len(self.unplaced)

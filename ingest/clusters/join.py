@@ -23,28 +23,14 @@ from ingest.sfm.links import tied_parts
 
 _LOG = logging.getLogger(__name__)
 _KEYPOINTS = 1 << 32  # more than any photo has
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JoinOptions:
-    """When two models that share photos are one.
-
-    Attributes:
-        min_photos: that agree; one photo may be wrong in one of the models.
-        min_share: of the shared photos that agree.
-        min_points: that both models have and that fit the similarity.
-        max_error_over_depth: of a pair of points, over the distance to the camera: what two adjustments of
-            the same points differ by at a few percent of uncertain depth.
-        max_rotation_deg: between a photo's two orientations.
-        max_center_over_depth: between a photo's two centres, over the distance to its points.
-    """
-
-    min_photos: int = 3
-    min_share: float = 0.5
-    min_points: int = 30
-    max_error_over_depth: float = 0.03
-    max_rotation_deg: float = 2.0
-    max_center_over_depth: float = 0.05
+_MIN_PHOTOS = 3  # that agree; one photo may be wrong in one of the models
+_MIN_SHARE = 0.5  # of the shared photos that agree
+_MIN_POINTS = 30  # that both models have and that fit the similarity
+# Of a pair of points, over the distance to the camera: what two adjustments of the same points differ by at a
+# few percent of uncertain depth.
+_MAX_ERROR_OVER_DEPTH = 0.03
+_MAX_ROTATION_DEG = 2.0  # between a photo's two orientations
+_MAX_CENTER_OVER_DEPTH = 0.05  # between a photo's two centres, over the distance to its points
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,39 +64,33 @@ class JoinedModel:
     first_from: tuple[Sim3, ...]
 
 
-def join(models: Sequence[Model], options: JoinOptions) -> list[JoinedModel]:
+def join(models: Sequence[Model]) -> list[JoinedModel]:
     """Groups of models that agree, largest model first. `rows` of all models number the same photos."""
     joints = []
     for a, b in itertools.combinations(range(len(models)), 2):
         shared = np.intersect1d(models[a].rows, models[b].rows)
-        if len(shared) >= options.min_photos:
-            joint = find_joint(models, a, b, shared, options)
+        if len(shared) >= _MIN_PHOTOS:
+            joint = find_joint(models, a, b, shared)
             if joint is not None:
                 joints.append(joint)
-    held = _consistent(joints, models, options)
+    held = _consistent(joints, models)
     return _groups(held, models)
 
 
-def find_joint(
-    models: Sequence[Model], first: int, second: int, shared: NDArray[np.int64], options: JoinOptions
-) -> Joint | None:
+def find_joint(models: Sequence[Model], first: int, second: int, shared: NDArray[np.int64]) -> Joint | None:
     """The similarity between two models by the photos they share, or None where they do not agree."""
     a, b = models[first], models[second]
     point_a, point_b, depth = common_points(a, b)
-    if len(point_a) < options.min_points:
+    if len(point_a) < _MIN_POINTS:
         return None
     target, source = a.xyz[point_a], b.xyz[point_b]
-    tolerance = options.max_error_over_depth * depth
+    tolerance = _MAX_ERROR_OVER_DEPTH * depth
     sim = _robust_similarity(source, target, tolerance)
     if sim is None:
         return None
     inliers = int((np.linalg.norm(target - sim.act(source), axis=1) <= tolerance).sum())
-    agreeing = _agreeing(a, b, shared, sim, float(np.median(depth)), options)
-    good = (
-        inliers >= options.min_points
-        and agreeing >= options.min_photos
-        and agreeing >= options.min_share * len(shared)
-    )
+    agreeing = _agreeing(a, b, shared, sim, float(np.median(depth)))
+    good = inliers >= _MIN_POINTS and agreeing >= _MIN_PHOTOS and agreeing >= _MIN_SHARE * len(shared)
     if not good:
         _LOG.info("models %d and %d: %d of %d shared photos agree", first, second, agreeing, len(shared))
         return None
@@ -141,23 +121,18 @@ def _robust_similarity(source: FloatArray, target: FloatArray, tolerance: FloatA
     return best
 
 
-def _agreeing(
-    a: Model, b: Model, shared: NDArray[np.int64], sim: Sim3, depth: float, options: JoinOptions
-) -> int:
+def _agreeing(a: Model, b: Model, shared: NDArray[np.int64], sim: Sim3, depth: float) -> int:
     """How many shared photos have the same pose in both models."""
     count = 0
     for row in shared:
         pose_a = a.cam_from_sfm[int(np.searchsorted(a.rows, row))]
         pose_b = sim.act_on_pose(b.cam_from_sfm[int(np.searchsorted(b.rows, row))])
         apart = float(np.linalg.norm(pose_a.center - pose_b.center))
-        count += (
-            pose_a.angle_to_deg(pose_b) <= options.max_rotation_deg
-            and apart <= options.max_center_over_depth * depth
-        )
+        count += pose_a.angle_to_deg(pose_b) <= _MAX_ROTATION_DEG and apart <= _MAX_CENTER_OVER_DEPTH * depth
     return count
 
 
-def _consistent(joints: Sequence[Joint], models: Sequence[Model], options: JoinOptions) -> list[Joint]:
+def _consistent(joints: Sequence[Joint], models: Sequence[Model]) -> list[Joint]:
     """A forest of joints, strongest first; where another joint contradicts it, its weakest one on the way
     between the two models goes."""
     tree: list[Joint] = []
@@ -167,7 +142,7 @@ def _consistent(joints: Sequence[Joint], models: Sequence[Model], options: JoinO
             tree.append(joint)
             continue
         through = _along(way, joint.first)
-        if not _same(joint.first_from_second, through, models[joint.second], options):
+        if not _same(joint.first_from_second, through, models[joint.second]):
             weakest = min(way, key=lambda j: j.points)
             _LOG.warning(
                 "models %d and %d are apart by their own photos from where others put them: the joint of "
@@ -178,23 +153,16 @@ def _consistent(joints: Sequence[Joint], models: Sequence[Model], options: JoinO
     return tree
 
 
-def _same(one: Sim3, other: Sim3, model: Model, options: JoinOptions) -> bool:
+def _same(one: Sim3, other: Sim3, model: Model) -> bool:
     """Whether two similarities put the model's cameras at the same place, within what joints allow.
 
     Errors add up along the way, hence three times what one joint may have.
     """
     poses = model.cam_from_sfm[:: max(1, len(model.cam_from_sfm) // 20)]
-    depth = one.scale * float(np.median(_depths(model)))
+    depth = one.scale * float(np.median(model.distances()))
     apart = [np.linalg.norm(one.act_on_pose(p).center - other.act_on_pose(p).center) / depth for p in poses]
     angle = one.act_on_pose(poses[0]).angle_to_deg(other.act_on_pose(poses[0]))
-    return (
-        angle <= 3 * options.max_rotation_deg and float(np.median(apart)) <= 3 * options.max_center_over_depth
-    )
-
-
-def _depths(model: Model) -> FloatArray:
-    """Distance of every observation's point to its camera."""
-    return np.asarray(np.linalg.norm(model.xyz[model.point_of] - model.centers()[model.photo_of], axis=1))
+    return angle <= 3 * _MAX_ROTATION_DEG and float(np.median(apart)) <= 3 * _MAX_CENTER_OVER_DEPTH
 
 
 def _way(tree: Sequence[Joint], start: int, end: int) -> list[Joint] | None:
@@ -234,11 +202,11 @@ def _groups(tree: Sequence[Joint], models: Sequence[Model]) -> list[JoinedModel]
     return sorted(groups, key=lambda g: -sum(len(models[k].rows) for k in g.members))
 
 
-def hangs_together(model: Model, parts: Sequence[Sequence[int]], least_points: int) -> bool:
-    """Whether chains of photos with so many points in common tie most photos of each part to one whole.
+def hangs_together(model: Model, parts: Sequence[Sequence[int]]) -> bool:
+    """Whether chains of photos with enough points in common tie most photos of each part to one whole.
 
     Args:
         model: of all of them. parts: rows of the models that were joined; others do not count.
     """
-    whole = np.isin(model.rows, tied_parts(model, least_points)[0])
+    whole = np.isin(model.rows, tied_parts(model, _MIN_POINTS)[0])
     return all(float(whole[here].mean()) > 0.5 for part in parts if (here := np.isin(model.rows, part)).any())

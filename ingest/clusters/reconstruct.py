@@ -15,11 +15,11 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.clusters.graph import PhotoBlock, PhotoCluster
-from ingest.clusters.join import JoinedModel, JoinOptions, hangs_together, join
+from ingest.clusters.join import JoinedModel, hangs_together, join
 from ingest.colmap.adjust import adjust_posed
-from ingest.colmap.bridge import Model, read_model, read_models, write_posed
+from ingest.colmap.bridge import Model, posed, read_model, read_models
 from ingest.executor import Executor, Lost, Progress, no_progress
-from ingest.fingerprint import digest, options_fingerprint
+from ingest.fingerprint import digest
 from ingest.sfm.mapper import (
     SfmOptions,
     SfmTask,
@@ -108,7 +108,6 @@ class _JoinTask:
     blocks: tuple[Path, ...]
     rows: tuple[tuple[int, ...], ...]
     own: tuple[frozenset[int], ...]
-    options: JoinOptions
     folder: Path
 
     def __str__(self) -> str:
@@ -123,8 +122,6 @@ def reconstruct_clusters(
     workspace: Workspace,
     options: SfmOptions,
     executor: Executor,
-    *,
-    joining: JoinOptions,
     progress: Progress = no_progress,
 ) -> Reconstruction:
     """Reconstruct clusters, or find what an earlier run left of them.
@@ -146,16 +143,16 @@ def reconstruct_clusters(
 
     todo = [t for tasks in block_tasks for t in tasks if not t.folder.is_dir()]
     todo.sort(key=lambda t: -len(t.sfm.views))  # the longest first, so that no worker is late with it
-    outcomes = executor.map("reconstruct", _reconstruct_block, todo, progress)
+    outcomes = executor.map("reconstruct", _reconstructed, todo, progress)
     failed = {t.folder: o.reason for t, o in zip(todo, outcomes, strict=True) if isinstance(o, Lost)}
 
     joins = [
-        _join_task(cluster, task, tasks, failed, workspace, joining)
+        _join_task(cluster, task, tasks, failed, workspace)
         for cluster, task, tasks in zip(clusters, whole, block_tasks, strict=True)
         if len(cluster.blocks) > 1
     ]
     waiting = [j for j in joins if not j.folder.is_dir()]
-    joined = executor.map("join", _join_blocks, waiting, progress)
+    joined = executor.map("join", _reconstructed, waiting, progress)
     failed |= {t.folder: o.reason for t, o in zip(waiting, joined, strict=True) if isinstance(o, Lost)}
     return _collected(clusters, block_tasks, joins, failed, options, reused=_count(block_tasks) - len(todo))
 
@@ -227,7 +224,6 @@ def _join_task(
     tasks: Sequence[_BlockTask],
     failed: Mapping[Path, str],
     workspace: Workspace,
-    options: JoinOptions,
 ) -> _JoinTask:
     place = {row: k for k, row in enumerate(cluster.rows)}
 
@@ -237,39 +233,28 @@ def _join_task(
     good: list[tuple[PhotoBlock, _BlockTask]] = [
         (b, t) for b, t in zip(cluster.blocks, tasks, strict=True) if t.folder not in failed
     ]
-    key = digest(sfm.key(), options_fingerprint(options), *(t.folder.name for _, t in good))[:24]
+    key = digest(sfm.key(), *(t.folder.name for _, t in good))[:24]
     return _JoinTask(
         sfm=sfm,
         blocks=tuple(t.folder for _, t in good),
         rows=tuple(rows(b.rows) for b, _ in good),
         own=tuple(frozenset(rows(b.own)) for b, _ in good),
-        options=options,
         folder=workspace.models(key),
     )
 
 
-def _reconstruct_block(task: _BlockTask) -> Lost | None:
-    """What goes wrong with one block costs that block."""
+def _reconstructed(task: _BlockTask | _JoinTask) -> Lost | None:
+    """What goes wrong with one block or cluster costs that one."""
     try:
-        reconstruct(task.sfm, task.folder)
+        if isinstance(task, _JoinTask):
+            _join(task)
+        else:
+            reconstruct(task.sfm, task.folder)
     except _OF_THE_DATA as error:
-        return _lost(task, error)
+        _LOG.error("%s: not reconstructed", task, exc_info=error)
+        text = f"reconstruction failed with {type(error).__name__}: {error}; the next run tries it again"
+        return Lost(task=str(task), reason=text)
     return None
-
-
-def _join_blocks(task: _JoinTask) -> Lost | None:
-    """What goes wrong with one cluster costs that cluster."""
-    try:
-        _join(task)
-    except _OF_THE_DATA as error:
-        return _lost(task, error)
-    return None
-
-
-def _lost(task: _BlockTask | _JoinTask, error: Exception) -> Lost:
-    _LOG.error("%s: not reconstructed", task, exc_info=error)
-    text = f"reconstruction failed with {type(error).__name__}: {error}; the next run tries it again"
-    return Lost(task=str(task), reason=text)
 
 
 def _join(task: _JoinTask) -> None:
@@ -290,7 +275,7 @@ def _join(task: _JoinTask) -> None:
         database = Path(scratch) / "colmap.db"
         photos = task.sfm.write_database(database)
         taken: set[int] = set()
-        groups = deque(join(models, task.options))
+        groups = deque(join(models))
         number = 0
         while groups:
             group = groups.popleft()
@@ -300,7 +285,7 @@ def _join(task: _JoinTask) -> None:
             folder = output / str(number)
             folder.mkdir()
             number += 1
-            write_posed(folder, _cameras(group, models, task.sfm), photos, poses)
+            posed(_cameras(group, models, task.sfm), photos, poses).write(str(folder))
             kept = adjust_posed(
                 folder,
                 database,
@@ -310,11 +295,7 @@ def _join(task: _JoinTask) -> None:
             )
             if len(group.members) > 1 and (
                 len(kept) < _MOSTLY * len(poses)
-                or not hangs_together(
-                    read_model(folder),
-                    [models[m].rows.tolist() for m in group.members],
-                    task.options.min_points,
-                )
+                or not hangs_together(read_model(folder), [models[m].rows.tolist() for m in group.members])
             ):
                 _LOG.info("%s: the joint of %d photos does not hold; apart again", task, len(poses))
                 shutil.rmtree(folder, ignore_errors=True)

@@ -23,7 +23,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap.bridge import SfmPhoto, quiet, whole_model_of
+from ingest.colmap.bridge import SfmPhoto, quiet, triangulation_settings, whole_model_of
 from ingest.colmap.precision import linearise, shared_variance_px2
 from ingest.positions.center_priors import center_priors
 
@@ -51,8 +51,6 @@ class AdjustOptions:
             (`ingest.colmap.precision.shared_variance_px2`) count as one against these priors and positions: a
             lens model's faults are common to whole photos too. On `brighton`, from above, EXIF's focal length
             of 2311 px comes to 2602 with 1, 2357 with 10, 2322 with 50, where its scan says 2296.
-        use_positions: GPS positions take part, robustly, as noisy as they are among themselves
-            (`ingest.positions.center_priors`).
         max_iterations: of Ceres.
         threads: one gives the same numbers in every run.
     """
@@ -66,7 +64,6 @@ class AdjustOptions:
         )
     )
     dilution: float = 50.0
-    use_positions: bool = True
     max_iterations: int = 60
     threads: int = 1
 
@@ -181,7 +178,7 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
         for camera, camera_id in zip(block.cameras, camera_ids, strict=True)
     ]
     for _ in range(_ROUNDS):
-        centers = _center_priors(block, image_ids, known.photos) if options.use_positions else None
+        centers = _center_priors(block, image_ids, known.photos)
         terms = Terms(
             keypoint_px=loss_scale_px,
             dilution=options.dilution * block_variance_px2(block) / loss_scale_px**2,
@@ -265,17 +262,11 @@ def _center_priors(block: Block, image_ids: list[int], photos: tuple[SfmPhoto, .
 
 def _triangulated_anew(reconstruction: Any, database: Path, folder: Path) -> Any:
     """The same poses and lenses with points triangulated from all matches again."""
-    stored = pycolmap.Database.open(str(database))
-    try:  # COLMAP refuses a database whose cameras are of another model
+    with pycolmap.Database.open(str(database)) as stored:
+        # COLMAP refuses a database whose cameras are of another model.
         for camera_id in sorted({reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()}):
             stored.update_camera(reconstruction.camera(camera_id))
-    finally:
-        stored.close()
-    settings = pycolmap.IncrementalPipelineOptions()
-    settings.extract_colors = False
-    settings.triangulation.ignore_two_view_tracks = False
-    settings.num_threads = 1
-    settings.random_seed = 0
+    settings, place = triangulation_settings(), str(folder)
     return pycolmap.triangulate_points(
-        reconstruction, str(database), str(folder), str(folder), clear_points=True, options=settings
+        reconstruction, str(database), place, place, clear_points=True, options=settings
     )

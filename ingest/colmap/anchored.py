@@ -23,8 +23,10 @@ from ingest.colmap.bridge import (
     Model,
     SfmPhoto,
     TwoView,
+    model_of,
+    posed,
     quiet,
-    read_model,
+    triangulation_settings,
     with_observations,
     write_database,
 )
@@ -124,7 +126,7 @@ def adjust_anchored(
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
-    priors = lenses.priors(model.cameras)
+    priors, pixels = lenses.priors(model.cameras), model.pixels(keypoints)
     state = model
     keypoint_px = _LOSS_PX * pixel_scale(*model.cameras)
     variance_px2 = keypoint_px**2  # until the model has settled
@@ -148,7 +150,8 @@ def adjust_anchored(
             cam_from_sfm=found.cam_from_block,
             xyz=found.xyz,
         )
-        observation, kept = _fitting(state, keypoints, fixed)
+        observation = _fitting(state, state.xyz, state.point_of, state.photo_of, pixels)
+        kept = _fitting(state, fixed.xyz, fixed.point_of, fixed.photo_of, fixed.pixels)
         observation &= _in_tracks(state, observation)
     return Anchored(model=with_observations(state, observation), fixed_kept=kept)
 
@@ -177,21 +180,20 @@ def block_and_marks(
 
 
 def _fitting(
-    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which observations of free and of fixed points lie within the tolerance."""
-    free = np.zeros(len(model.point_of), dtype=np.bool_)
-    held = np.zeros(len(fixed.point_of), dtype=np.bool_)
+    model: Model,
+    xyz: FloatArray,
+    point_of: NDArray[np.int64],
+    photo_of: NDArray[np.int64],
+    pixels: FloatArray,
+) -> NDArray[np.bool_]:
+    """(m,) which observations of points xyz (n, 3) at pixels (m, 2) lie within the tolerance."""
+    fits = np.zeros(len(point_of), dtype=np.bool_)
     for k, pose in enumerate(model.cam_from_sfm):
         camera = model.cameras[int(model.camera_of[k])]
-        limit = _MAX_ERROR_PX * pixel_scale(camera)
-        mine = np.flatnonzero(model.photo_of == k)
-        pixels = camera.project(pose.act(model.xyz[model.point_of[mine]]))
-        free[mine] = np.linalg.norm(pixels - keypoints[k][model.keypoint_of[mine]], axis=1) < limit
-        mine = np.flatnonzero(fixed.photo_of == k)
-        pixels = camera.project(pose.act(fixed.xyz[fixed.point_of[mine]]))
-        held[mine] = np.linalg.norm(pixels - fixed.pixels[mine], axis=1) < limit
-    return free, held
+        mine = np.flatnonzero(photo_of == k)
+        off = camera.project(pose.act(xyz[point_of[mine]])) - pixels[mine]
+        fits[mine] = np.linalg.norm(off, axis=1) < _MAX_ERROR_PX * pixel_scale(camera)
+    return fits
 
 
 def _in_tracks(model: Model, observation: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -215,17 +217,7 @@ def triangulate_posed(
     with quiet(), tempfile.TemporaryDirectory(prefix="featuredb-points-") as scratch:
         database = Path(scratch) / "colmap.db"
         write_database(database, [(camera, True) for camera in cameras], photos, geometries)
-        reconstruction = pycolmap.Reconstruction()
-        for c, camera in enumerate(cameras):
-            reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(c + 1))
-        for k, (photo, pose) in enumerate(zip(photos, poses, strict=True)):
-            image = pycolmap.Image(name=photo.name, camera_id=photo.camera_row + 1, image_id=k + 1)
-            reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
-        settings = pycolmap.IncrementalPipelineOptions()
-        settings.extract_colors = False
-        settings.triangulation.ignore_two_view_tracks = False
-        settings.num_threads = 1
-        settings.random_seed = 0
+        settings = triangulation_settings()
         error_px = _MAX_ERROR_PX * pixel_scale(*cameras)
         settings.triangulation.create_max_angle_error = 2.0
         settings.mapper.filter_max_reproj_error = error_px
@@ -236,7 +228,9 @@ def triangulate_posed(
         output = Path(scratch) / "points"
         output.mkdir()
         found = pycolmap.triangulate_points(
-            reconstruction, str(database), scratch, str(output), clear_points=True, options=settings
+            posed(cameras, photos, dict(enumerate(poses))),
+            *(str(database), scratch, str(output)),
+            clear_points=True,
+            options=settings,
         )
-        found.write(str(output))
-        return read_model(output)
+        return model_of(found)

@@ -95,6 +95,10 @@ class Model:
         """Camera centres (k, 3)."""
         return np.array([pose.center for pose in self.cam_from_sfm]).reshape(-1, 3)
 
+    def distances(self) -> FloatArray:
+        """Distance (m,) of every observation's point to its camera."""
+        return np.asarray(np.linalg.norm(self.xyz[self.point_of] - self.centers()[self.photo_of], axis=1))
+
     def pixels(self, keypoints: Sequence[NDArray[np.floating[Any]]]) -> FloatArray:
         """Pixels (m, 2) of the observations, from those of each photo's keypoints (n, 2)."""
         xy = np.zeros((len(self.point_of), 2))
@@ -168,18 +172,14 @@ def write_database(
         cameras: with whether the focal length is known beforehand.
         geometries: of pairs of rows.
     """
-    database = pycolmap.Database.open(str(path))
-    try:
-        with pycolmap.DatabaseTransaction(database):
-            for row, (camera, focal_known) in enumerate(cameras):
-                _write_camera(database, row + 1, camera, focal_known)
-            for row, photo in enumerate(photos):
-                _write_photo(database, row + 1, photo)
-            for (i, j), view in sorted(geometries.items()):
-                database.write_matches(i + 1, j + 1, view.inliers)
-                database.write_two_view_geometry(i + 1, j + 1, _geometry(view))
-    finally:
-        database.close()
+    with pycolmap.Database.open(str(path)) as database, pycolmap.DatabaseTransaction(database):
+        for row, (camera, focal_known) in enumerate(cameras):
+            _write_camera(database, row + 1, camera, focal_known)
+        for row, photo in enumerate(photos):
+            _write_photo(database, row + 1, photo)
+        for (i, j), view in sorted(geometries.items()):
+            database.write_matches(i + 1, j + 1, view.inliers)
+            database.write_two_view_geometry(i + 1, j + 1, _geometry(view))
 
 
 def _write_camera(database: Any, camera_id: int, camera: Camera, focal_known: bool) -> None:
@@ -198,15 +198,6 @@ def _write_photo(database: Any, image_id: int, photo: SfmPhoto) -> None:
     frame.add_data_id(image.data_id)
     database.write_frame(frame, use_frame_id=True)
     database.write_keypoints(image_id, photo.keypoints)
-    if photo.prior_position is not None and photo.prior_covariance is not None:
-        prior = pycolmap.PosePrior(
-            pose_prior_id=image_id,
-            corr_data_id=image.data_id,
-            position=photo.prior_position,
-            position_covariance=photo.prior_covariance,
-            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
-        )
-        database.write_pose_prior(prior, use_pose_prior_id=True)
 
 
 def run_incremental(
@@ -247,10 +238,8 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def write_posed(
-    folder: Path, cameras: Sequence[Camera], photos: Sequence[SfmPhoto], poses: Mapping[int, Rigid3]
-) -> None:
-    """A model folder of posed photos without points.
+def posed(cameras: Sequence[Camera], photos: Sequence[SfmPhoto], poses: Mapping[int, Rigid3]) -> Any:
+    """A pycolmap.Reconstruction of posed photos without points; ids are rows + 1.
 
     Args:
         cameras: by the photos' camera_row.
@@ -263,7 +252,17 @@ def write_posed(
         photo = photos[row]
         image = pycolmap.Image(name=photo.name, camera_id=photo.camera_row + 1, image_id=row + 1)
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
-    reconstruction.write(str(folder))
+    return reconstruction
+
+
+def triangulation_settings() -> Any:
+    """What all triangulation of posed photos has in common."""
+    settings = pycolmap.IncrementalPipelineOptions()
+    settings.extract_colors = False
+    settings.triangulation.ignore_two_view_tracks = False
+    settings.num_threads = 1
+    settings.random_seed = 0
+    return settings
 
 
 def read_models(output: Path) -> list[Model]:

@@ -51,7 +51,7 @@ class DaskExecutor:
         self._address = address
         self._client = _connected(address)
         try:
-            self._client.register_plugin(_thread_caps(1))
+            self._client.register_plugin(_thread_caps())
             _require_shared(self._client, address, [p.absolute() for p in shared])
         except BaseException:
             self._client.close()
@@ -166,15 +166,15 @@ def _connected(address: str) -> Any:
         ) from error
 
 
-def _thread_caps(threads: int) -> Any:
-    """A plugin that caps the threads of every worker, those that come later too."""
+def _thread_caps() -> Any:
+    """A plugin that gives the libraries of every worker one thread, those that come later too."""
     from distributed import WorkerPlugin
 
     class ThreadCaps(WorkerPlugin):  # type: ignore[misc]  # it has no types
         name = "featuredb-thread-caps"
 
         def setup(self, worker: Any) -> None:
-            cap_threads(threads)
+            cap_threads()
 
     return ThreadCaps()
 

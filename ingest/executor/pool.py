@@ -121,9 +121,9 @@ class PoolExecutor:
                 worker.send(todo.popleft(), function, items)
         starting = sum(not w.ready for w in self._workers)
         if todo and len(self._workers) < most and starting < len(todo):
-            with capped_environment(1):
+            with capped_environment():
                 while len(self._workers) < most and starting < len(todo):
-                    self._workers.append(_Worker(1))
+                    self._workers.append(_Worker())
                     starting += 1
 
     def _buried(self, stage: str, worker: "_Worker") -> None:
@@ -164,12 +164,12 @@ class PoolExecutor:
 class _Worker:
     """One process and the pipe to it."""
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection: Connection
         self.connection, child = context.Pipe()
         self._process: SpawnProcess = context.Process(
-            target=serve, args=(child, threads), name="featuredb-worker", daemon=True
+            target=serve, args=(child,), name="featuredb-worker", daemon=True
         )
         self._process.start()
         child.close()  # else its end would never be seen here

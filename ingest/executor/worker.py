@@ -20,10 +20,10 @@ READY = b"ready"
 
 
 @contextmanager
-def capped_environment(threads: int) -> Iterator[None]:
-    """Set the thread variables for the children that start meanwhile."""
+def capped_environment() -> Iterator[None]:
+    """One thread for the libraries of the children that start meanwhile."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
         yield
     finally:
@@ -34,21 +34,21 @@ def capped_environment(threads: int) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def cap_threads(threads: int) -> None:
-    """Caps for libraries that do not read the environment, or are loaded already."""
+def cap_threads() -> None:
+    """One thread for libraries that do not read the environment, or are loaded already."""
     import cv2
     from threadpoolctl import threadpool_limits
 
-    cv2.setNumThreads(threads)
-    threadpool_limits(threads)
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
 
 
-def serve(connection: Connection, threads: int) -> None:
+def serve(connection: Connection) -> None:
     """Answer tasks until the parent hangs up: (function, item) in, (True, result) or (False, error) out."""
     leave_out_pandas()
     threading.Thread(target=_end_with_parent, name="end-with-parent", daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
-    cap_threads(threads)
+    cap_threads()
     try:
         connection.send_bytes(READY)
         while True:

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from featuredb.features.extractor import ExtractorOptions
-from featuredb.store import Database, Snapshot
+from featuredb.store import Database
 from featuredb.store.candidates.photos import mark_used
 from featuredb.store.candidates.states import OPERATOR
 from ingest.colmap.bridge import Model
@@ -41,13 +40,6 @@ _MOST_ROUNDS = 10  # a bound on one run; each round needs a promotion
 # had joined from five places fell apart at 0.10 into parts of one place each, but for ten photos; at 0.25
 # right ones do, too.
 _SPLIT_LINKS = (0.10, 0.15, 0.25)
-
-
-def extractor_for(snapshot: Snapshot, options: ExtractorOptions) -> ExtractorOptions:
-    """The options whose descriptors fit the active maps': most maps decide whether they are upright."""
-    active = [m for m in snapshot.maps() if m.status == "active"]
-    upright = sum("-upright-" in m.extractor_fingerprint for m in active)
-    return replace(options, upright=upright > len(active) / 2) if active else options
 
 
 def grow(

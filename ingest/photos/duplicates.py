@@ -13,7 +13,6 @@ that differ of 256:
 A threshold of 24 bits lies between 18 and 44. `tests/integration/test_scan_real.py` measures it again.
 """
 
-import itertools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -50,13 +49,13 @@ def picture_hash(gray: NDArray[np.uint8]) -> str:
     return np.packbits(low > np.median(low)).tobytes().hex()
 
 
-def hash_bits(hashes: Sequence[str]) -> NDArray[np.uint8]:
-    """Picture hashes as bytes (n, 32)."""
-    return np.frombuffer(bytes.fromhex("".join(hashes)), dtype=np.uint8).reshape(len(hashes), -1)
+def hash_bits(hashes: Sequence[str]) -> NDArray[np.uint64]:
+    """Picture hashes as words (n, 4)."""
+    return np.frombuffer(bytes.fromhex("".join(hashes)), dtype=np.uint64).reshape(len(hashes), -1)
 
 
-def hash_distances(one: NDArray[np.uint8], others: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Number of differing bits (n,) between a picture hash (32,) and others (n, 32), both as bytes."""
+def hash_distances(one: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Number of differing bits (n,) between a picture hash (4,) and others (n, 4), both as words."""
     return np.asarray(np.bitwise_count(others ^ one).sum(axis=1, dtype=np.int64))
 
 
@@ -76,8 +75,7 @@ def near_duplicates(photos: Sequence[Photo], hashes: Sequence[str]) -> dict[str,
 
     The copy with most pixels is kept, then one with a position, then the first by name. Photos that both
     say when, where or with what they were taken must agree in it, so that a scene that stands still and
-    is photographed twice keeps both photos; of a site's photos only the picture counts. The time grows
-    linearly with the number of photos.
+    is photographed twice keeps both photos; of a site's photos only the picture counts.
 
     Args:
         photos: usable ones.
@@ -85,51 +83,21 @@ def near_duplicates(photos: Sequence[Photo], hashes: Sequence[str]) -> dict[str,
     """
     if not photos:
         return {}
-    bits = hash_bits(hashes)
-    buckets = _Buckets(bits, MAX_BITS)
+    bits, kept = hash_bits(hashes), np.zeros(len(photos), dtype=np.bool_)
     copies: dict[str, tuple[str, int]] = {}
     for i in sorted(range(len(photos)), key=lambda i: _preference(photos[i])):
-        candidates = buckets.near(i)
-        distances = hash_distances(bits[i], bits[candidates])
+        distances = hash_distances(bits[i], bits)
         near = [
-            (int(distances[k]), int(candidates[k]))
-            for k in np.flatnonzero(distances <= MAX_BITS)
-            if _agree(photos[i], photos[int(candidates[k])])
+            (int(distances[k]), k)
+            for k in np.flatnonzero(kept & (distances <= MAX_BITS)).tolist()
+            if _agree(photos[i], photos[k])
         ]
         if near:
             distance, best = min(near)
             copies[photos[i].name] = (photos[best].name, distance)
         else:
-            buckets.keep(i)
+            kept[i] = True
     return copies
-
-
-class _Buckets:
-    """Finds the kept hashes near another without looking at all of them.
-
-    Hashes that differ in at most b bits agree in at least one of b + 1 bands of bits.
-    """
-
-    def __init__(self, bits: NDArray[np.uint8], max_bits: int) -> None:
-        edges = np.linspace(0, 8 * bits.shape[1], max_bits + 2).astype(int)
-        single = np.unpackbits(bits, axis=1)
-        weights = 1 << np.arange(int(np.diff(edges).max()), dtype=np.int64)
-        self._keys = np.stack(
-            [single[:, a:b] @ weights[: b - a] for a, b in itertools.pairwise(edges)], axis=1
-        )
-        self._kept: list[dict[int, list[int]]] = [{} for _ in range(max_bits + 1)]
-
-    def near(self, i: int) -> NDArray[np.int64]:
-        """Kept rows that share a band with row i, rising."""
-        found: set[int] = set()
-        for band, key in zip(self._kept, self._keys[i].tolist(), strict=True):
-            found.update(band.get(key, ()))
-        return np.array(sorted(found), dtype=np.int64)
-
-    def keep(self, i: int) -> None:
-        """Row i is one that others may be copies of."""
-        for band, key in zip(self._kept, self._keys[i].tolist(), strict=True):
-            band.setdefault(key, []).append(i)
 
 
 def copies_of(photos: Sequence[Photo], matched: "Matched") -> dict[int, int]:

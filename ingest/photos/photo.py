@@ -127,13 +127,7 @@ def shared_key(photo: Photo, sharing: CameraSharing) -> str:
 
 def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
     """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
-    gps = np.array(
-        [
-            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
-            for p in photos
-            if p.gps is not None
-        ]
-    )
+    gps = _geodetic(photos)
     if not len(gps):
         return None
     latitude, longitude, height = np.median(gps, axis=0)
@@ -146,16 +140,16 @@ def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
 
 def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> FloatArray:
     """East, north, up (n, 3) in metres of photos with GPS; height 0 where the photo has none."""
-    geodetic = np.array(
-        [
-            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
-            for p in photos
-            if p.gps is not None
-        ]
-    )
+    geodetic = _geodetic(photos)
     if frame is None:
         frame = LocalFrame(latitude_deg=geodetic[0, 0], longitude_deg=geodetic[0, 1], height_m=0.0)
     return frame.enu_from_geodetic(geodetic)
+
+
+def _geodetic(photos: Sequence[Photo]) -> FloatArray:
+    """Latitude, longitude, height (n, 3) of photos with GPS."""
+    known = [photo.gps for photo in photos if photo.gps is not None]
+    return np.array([[gps.latitude_deg, gps.longitude_deg, gps.height_m or 0.0] for gps in known])
 
 
 def gps_priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:

@@ -7,6 +7,7 @@ folder, keyed by name, size and modification time, spares that the next time.
 import hashlib
 import os
 import stat
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -87,11 +88,7 @@ class ScanResult:
     @property
     def skipped(self) -> dict[str, int]:
         """Number of skipped files by reason code."""
-        counts: dict[str, int] = {}
-        for photo in self.photos:
-            if photo.status == "skipped":
-                counts[photo.reason_code] = counts.get(photo.reason_code, 0) + 1
-        return counts
+        return Counter(photo.reason_code for photo in self.photos if photo.status == "skipped")
 
 
 def scan_folder(

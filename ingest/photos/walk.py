@@ -1,19 +1,17 @@
 """The files of a folder, in an order that depends on their names only, and what a scan found out of them."""
 
-import dataclasses
 import json
 import logging
 import os
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
-from typing import Any
+
+from pydantic import TypeAdapter
 
 from featuredb.errors import IngestError
 from featuredb.features.exif.read import ExifInfo
-from featuredb.geometry.camera_angles import CameraAngles
 from ingest.workspace import write_json
 
 
@@ -124,6 +122,9 @@ class ExaminedFile:
     exif: ExifInfo | None = None
 
 
+_EXAMINED = TypeAdapter(dict[str, ExaminedFile])
+
+
 def write_cache(path: Path, key: str, examined: dict[str, ExaminedFile]) -> None:
     """Write atomically.
 
@@ -132,11 +133,7 @@ def write_cache(path: Path, key: str, examined: dict[str, ExaminedFile]) -> None
         key: of the options that matter to it.
         examined: by name within the folder.
     """
-    files = {name: dataclasses.asdict(e) for name, e in examined.items()}
-    for record in files.values():
-        if record["exif"] and record["exif"]["capture_time"]:
-            record["exif"]["capture_time"] = record["exif"]["capture_time"].isoformat()
-    write_json(path, {"key": key, "files": files})
+    write_json(path, {"key": key, "files": _EXAMINED.dump_python(examined, mode="json")})
 
 
 def read_cache(path: Path, key: str) -> dict[str, ExaminedFile]:
@@ -145,20 +142,9 @@ def read_cache(path: Path, key: str) -> dict[str, ExaminedFile]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["key"] != key:
             return {}
-        return {name: _from_json(record) for name, record in content["files"].items()}
+        return _EXAMINED.validate_python(content["files"])
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         _log.warning("%s: scan cache not used, every file is read again: %r", path, error)
         return {}
-
-
-def _from_json(record: dict[str, Any]) -> ExaminedFile:
-    exif = record.pop("exif")
-    if exif is None:
-        return ExaminedFile(**record)
-    time = exif["capture_time"]
-    exif["capture_time"] = datetime.fromisoformat(time) if time else None
-    exif["warnings"] = tuple(exif["warnings"])
-    exif["angles"] = CameraAngles(**exif["angles"]) if exif["angles"] else None
-    return ExaminedFile(**record, exif=ExifInfo(**exif))

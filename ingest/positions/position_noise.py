@@ -250,7 +250,7 @@ def fit_noisy(
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(
         local_from_sfm=middle @ state.sim,
-        covariance=middle.adjoint() @ covariance[1:, 1:] @ middle.adjoint().T,
+        covariance=middle.carried(covariance[1:, 1:]),
         noise=Noise(white=(float(white[0]), float(white[1])), drift=(float(drift[0]), float(drift[1]))),
         lag_s=state.lag_s,
         checked_turn_rad=float(np.sqrt(np.linalg.eigvalsh(checked)[-1])),

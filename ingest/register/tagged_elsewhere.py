@@ -19,30 +19,17 @@ from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsPlacement
 from ingest.sfm.links import link_shares
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ElsewhereOptions:
-    """When positions that do not fit say that their photos are elsewhere.
-
-    In two simulated communities (500 and 5,000 photos, geotags of 8 m)
-    five groups that look-alikes had joined were off by 5.4 to 11 times the noise, two that were wrong
-    by 13 and 21 m by less; 62 groups of right photos by up to 4.1 times, one by 1.4 km: its tags were wrong.
-
-    Attributes:
-        min_link: photos of a group are tied to each other by links (see `ingest.sfm.links`) of at least this.
-        min_photos: of a group that agree with each other, and they are more than half of it.
-        min_offset: common offset over the noise, the root mean square of the horizontal residuals of those
-            that fit.
-        min_offset_m: and at least so many metres: a receiver that loses its correction for some photos of a
-            flight is off by less.
-        max_spread: distance of two offsets that agree, over the least common offset.
-    """
-
-    min_link: float = 0.25
-    min_photos: int = 2
-    min_offset: float = 5.0
-    min_offset_m: float = 10.0
-    max_spread: float = 0.75
+# When positions that do not fit say that their photos are elsewhere. In two simulated communities (500 and
+# 5,000 photos, geotags of 8 m) five groups that look-alikes had joined were off by 5.4 to 11 times the noise,
+# two that were wrong by 13 and 21 m by less; 62 groups of right photos by up to 4.1 times, one by 1.4 km: its
+# tags were wrong.
+_MIN_LINK = 0.25  # photos of a group are tied by links (see `ingest.sfm.links`) of at least this
+_MIN_PHOTOS = 2  # of a group that agree with each other, and they are more than half of it
+# Common offset over the noise, the root mean square of the horizontal residuals of those that fit, ...
+_MIN_OFFSET = 5.0
+# ... and at least so many metres: a receiver that loses its correction for some photos is off by less.
+_MIN_OFFSET_M = 10.0
+_MAX_SPREAD = 0.75  # distance of two offsets that agree, over the least common offset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,48 +44,34 @@ class TaggedElsewhere:
     offset_m: float
 
 
-def tagged_elsewhere(
-    model: Model, with_gps: Sequence[int], placed: GpsPlacement, options: ElsewhereOptions
-) -> list[TaggedElsewhere]:
+def tagged_elsewhere(model: Model, with_gps: Sequence[int], placed: GpsPlacement) -> list[TaggedElsewhere]:
     """Groups of photos that the positions contradict together, and photos without position that hang on them.
 
     Args:
         with_gps: photos with a position, by place among the model's rows; rows of the placement's residuals.
         placed: the model by these positions.
     """
-    groups = agreeing_groups(model, with_gps, placed, options)
-    return [g for g in groups if g.offset_m >= least_offset_m(placed, options)]
-
-
-def least_offset_m(placed: GpsPlacement, options: ElsewhereOptions) -> float:
-    """The common offset that counts."""
-    noise_m = float(np.sqrt((placed.residuals_m[placed.inliers, :2] ** 2).sum(axis=1).mean()))
-    return max(options.min_offset_m, options.min_offset * noise_m)
-
-
-def agreeing_groups(
-    model: Model, with_gps: Sequence[int], placed: GpsPlacement, options: ElsewhereOptions
-) -> list[TaggedElsewhere]:
-    """Groups of photos outside the placement whose positions agree, however far they are off."""
     offset_of = {k: r[:2] for k, r in zip(with_gps, placed.residuals_m, strict=True)}
     outside = [k for k, fits in zip(with_gps, placed.inliers.tolist(), strict=True) if not fits]
-    if len(outside) < options.min_photos or placed.local_from_sfm is None:
+    if len(outside) < _MIN_PHOTOS or placed.local_from_sfm is None:
         return []
-    within_m = options.max_spread * least_offset_m(placed, options)
+    noise_m = float(np.sqrt((placed.residuals_m[placed.inliers, :2] ** 2).sum(axis=1).mean()))
+    least_m = max(_MIN_OFFSET_M, _MIN_OFFSET * noise_m)
     links = link_shares(model)
-    tied = links[np.ix_(outside, outside)] >= options.min_link
+    tied = links[np.ix_(outside, outside)] >= _MIN_LINK
     count, label = connected_components(sparse.csr_array(tied.astype(np.int8)), directed=False)
     untagged = [k for k in range(len(model.rows)) if k not in offset_of]
     found = []
     for number in range(count):
         members = [k for k, of in zip(outside, label.tolist(), strict=True) if of == number]
         offsets = np.array([offset_of[k] for k in members])
-        agreeing = _agreeing(offsets, within_m)
-        if agreeing.sum() < max(options.min_photos, len(members) // 2 + 1):
+        agreeing = _agreeing(offsets, _MAX_SPREAD * least_m)
+        if agreeing.sum() < max(_MIN_PHOTOS, len(members) // 2 + 1):
             continue
-        hanging = [k for k in untagged if links[k].max() >= options.min_link and links[k].argmax() in members]
+        hanging = [k for k in untagged if links[k].max() >= _MIN_LINK and links[k].argmax() in members]
         offset_m = float(np.linalg.norm(offsets[agreeing].mean(axis=0)))
-        found.append(TaggedElsewhere(photos=tuple(sorted([*members, *hanging])), offset_m=offset_m))
+        if offset_m >= least_m:
+            found.append(TaggedElsewhere(photos=tuple(sorted([*members, *hanging])), offset_m=offset_m))
     return found
 
 

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,6 @@ from ingest.workspace import atomic_folder
 logger = logging.getLogger(__name__)
 
 _VERSION = 2  # raised when the same task would give other models
-PriorUse = Literal["none", "bundle"]
 _MANY_PHOTOS = 8  # of one lens: a film's keyframes, not a visitor's photos
 _MOSTLY = 0.5  # of the photos; fewer with a lens that people have, and the start is to blame
 
@@ -41,8 +40,6 @@ class SfmOptions:
 
     Attributes:
         camera_model: COLMAP's model of every camera whose EXIF gives no better one.
-        position_priors: "bundle" puts GPS positions into the bundle adjustment, "none" keeps them for
-            the placement afterwards.
         refine_focal: focal lengths of EXIF are a start; kept as they are otherwise.
         min_model_photos: smaller models are dropped; three photos are the least that a placement by
             positions needs.
@@ -53,14 +50,12 @@ class SfmOptions:
         filter_max_error_px: observations with a larger reprojection error are dropped, at
             `error_reference_side_px`, growing with the image.
         error_reference_side_px: keypoints are located on images of about this size.
-        keep_two_view_tracks: points seen by two photos only are triangulated too.
         seed: of all random choices.
         threads: of bundle adjustment; one gives the same numbers in every run.
         adjust: the final adjustment of each model.
     """
 
     camera_model: str = "SIMPLE_RADIAL"
-    position_priors: PriorUse = "none"
     refine_focal: bool = True
     focal_from_view_graph: bool = True
     min_model_photos: int = 3
@@ -68,7 +63,6 @@ class SfmOptions:
     least_inlier_ratio: float = 0.6
     filter_max_error_px: float = 4.0
     error_reference_side_px: int = 1600
-    keep_two_view_tracks: bool = True
     seed: int = 0
     threads: int = 1
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
@@ -281,14 +275,12 @@ def mapping_settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
         # of six matches, grow with its sixth power. From three points a photo of which only a quarter of the
         # matches is right is still found nine times in ten.
         "mapper.abs_pose_min_inlier_ratio": options.least_inlier_ratio,
-        "use_prior_position": options.position_priors == "bundle",
-        "use_robust_loss_on_prior_position": options.position_priors == "bundle",
         "mapper.filter_max_reproj_error": options.filter_max_error_px * zoom,
         "mapper.init_max_error": 4.0 * zoom,
         "mapper.abs_pose_max_error": 8.0 * zoom,
         "triangulation.merge_max_reproj_error": options.filter_max_error_px * zoom,
         "triangulation.complete_max_reproj_error": options.filter_max_error_px * zoom,
-        "triangulation.ignore_two_view_tracks": not options.keep_two_view_tracks,
+        "triangulation.ignore_two_view_tracks": False,
     }
 
 

@@ -1,7 +1,7 @@
 """Stage: matches of each pair of photos, verified by two-view geometry, one file a pair."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from ingest.colmap.bridge import TwoView, verify_pair
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.sfm.extract import read_features
-from ingest.sfm.overlays import OverlayOptions, is_copy, without_overlay
+from ingest.sfm.overlays import is_copy, without_overlay
 from ingest.sfm.pairs import Pair
 from ingest.workspace import Workspace, read_array, read_arrays, write_arrays
 
@@ -39,7 +39,6 @@ class MatchOptions:
         least_first: a pair with fewer matches among them is not matched further.
         min_inliers: pairs with fewer verified matches do not count. Pairs of `brighton` and `lewis` had
             none at all; repeated structure gives more, and two good photos hundreds.
-        overlays: what is a watermark, and what is a copy.
         seed: of RANSAC.
     """
 
@@ -50,7 +49,6 @@ class MatchOptions:
     first_features: int = 3000
     least_first: int = 6
     min_inliers: int = 20
-    overlays: OverlayOptions = field(default_factory=OverlayOptions)
     seed: int = 0
 
 
@@ -245,7 +243,7 @@ def _match_pair(task: MatchTask, a: Features, other: PhotoView, target: Path) ->
     b = read_features(other.features).features
     options, sizes = task.options, ((a.width, a.height), (b.width, b.height))
     matches = pair_matches(a, b, options)
-    matches = without_overlay(a.xy, b.xy, *sizes, matches, options.overlays)
+    matches = without_overlay(a.xy, b.xy, *sizes, matches)
     side = max(a.width, a.height, b.width, b.height)
     view = verify_pair(
         task.photo.camera,
@@ -260,7 +258,7 @@ def _match_pair(task: MatchTask, a: Features, other: PhotoView, target: Path) ->
     if view.is_watermark:
         view = replace(view, inliers=view.inliers[:0])
     pixels = a.xy[view.inliers[:, 0]], b.xy[view.inliers[:, 1]]
-    copy = is_copy(pixels[0].astype(np.float64), pixels[1].astype(np.float64), *sizes, options.overlays)
+    copy = is_copy(pixels[0].astype(np.float64), pixels[1].astype(np.float64), *sizes)
     write_arrays(target, view.arrays() | {"copy": np.array(copy)})
     return len(view.inliers), copy
 

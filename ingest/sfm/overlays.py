@@ -4,45 +4,30 @@ A watermark or a frame stands at the same pixels of all photos that it was put o
 perfectly, and would tie together photos of different towns.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OverlayOptions:
-    """What counts as an overlay and as a copy. Pixels are those of an image of `reference_side_px`.
-
-    Attributes:
-        still_px: matches that move less between photos of one size stand still. Hands and drones move by
-            tens of pixels from one photo to the next.
-        most_still: up to this share of the matches, those that stand still are dropped and the rest is
-            judged by itself; above it, they are either all there is, or the camera stood still.
-        overlay_area: matches that stand still within less than this share of the picture are an overlay;
-            a camera that stands still has them all over.
-        copy_px: of matches of two encodings of one picture, cut and resized as may be.
-        copy_share: of the verified matches that fit one shift and zoom.
-        copy_turn_deg: between the two; people cut and scale what they copy.
-        copy_inside: of the smaller picture's area that lies in the other. Neighbours of a flight over flat
-            ground fit a shift and zoom as well, but overlap in part.
-        copy_matches: fewer say nothing.
-        reference_side_px: keypoints are located on images of about this size.
-    """
-
-    still_px: float = 1.5
-    most_still: float = 0.5
-    overlay_area: float = 0.25
-    copy_px: float = 2.0
-    copy_share: float = 0.9
-    copy_turn_deg: float = 0.3
-    copy_inside: float = 0.95
-    copy_matches: int = 50
-    reference_side_px: int = 1600
-
+# Pixels are those of an image of this longer side, on which keypoints are located.
+_REFERENCE_SIDE_PX = 1600
+# Matches that move less between photos of one size stand still. Hands and drones move by tens of pixels from
+# one photo to the next.
+_STILL_PX = 1.5
+# Up to this share of the matches, those that stand still are dropped and the rest is judged by itself; above
+# it, they are either all there is, or the camera stood still.
+_MOST_STILL = 0.5
+# Matches that stand still within less than this share of the picture are an overlay; a camera that stands
+# still has them all over.
+_OVERLAY_AREA = 0.25
+_COPY_PX = 2.0  # of matches of two encodings of one picture, cut and resized as may be
+_COPY_SHARE = 0.9  # of the verified matches that fit one shift and zoom
+_COPY_TURN_DEG = 0.3  # between the two; people cut and scale what they copy
+# Of the smaller picture's area that lies in the other. Neighbours of a flight over flat ground fit a shift
+# and zoom as well, but overlap in part.
+_COPY_INSIDE = 0.95
+_COPY_MATCHES = 50  # fewer say nothing
 
 Size = tuple[int, int]
 """Width and height, pixels."""
@@ -54,7 +39,6 @@ def without_overlay(
     size_a: Size,
     size_b: Size,
     matches: NDArray[np.uint32],
-    options: OverlayOptions,
 ) -> NDArray[np.uint32]:
     """Matches (m, 2) without those that stand still as a watermark or a frame does.
 
@@ -64,30 +48,30 @@ def without_overlay(
     if size_a != size_b or not len(matches):
         return matches
     a, b = xy_a[matches[:, 0]].astype(np.float64), xy_b[matches[:, 1]].astype(np.float64)
-    zoom = max(1.0, max(size_a) / options.reference_side_px)
-    still = np.linalg.norm(a - b, axis=1) <= options.still_px * zoom
-    if still.mean() > options.most_still and _area(a[still], size_a) >= options.overlay_area:
+    zoom = max(1.0, max(size_a) / _REFERENCE_SIDE_PX)
+    still = np.linalg.norm(a - b, axis=1) <= _STILL_PX * zoom
+    if still.mean() > _MOST_STILL and _area(a[still], size_a) >= _OVERLAY_AREA:
         return matches
     return np.asarray(matches[~still])
 
 
-def is_copy(a: FloatArray, b: FloatArray, size_a: Size, size_b: Size, options: OverlayOptions) -> bool:
+def is_copy(a: FloatArray, b: FloatArray, size_a: Size, size_b: Size) -> bool:
     """Whether verified matches are those of two copies of one picture, one perhaps cut or framed.
 
     Args:
         a, b: (m, 2) pixels of both.
     """
-    if len(a) < options.copy_matches:
+    if len(a) < _COPY_MATCHES:
         return False
-    zoom = max(1.0, max(*size_a, *size_b) / options.reference_side_px)
+    zoom = max(1.0, max(*size_a, *size_b) / _REFERENCE_SIDE_PX)
     scale, shift = _zoom_and_shift(a, b)
     errors = np.linalg.norm(scale * a + shift - b, axis=1)
-    if (errors <= options.copy_px * zoom).mean() < options.copy_share:
+    if (errors <= _COPY_PX * zoom).mean() < _COPY_SHARE:
         return False
     turned, _ = cv2.estimateAffinePartial2D(a, b, method=cv2.LMEDS)
-    if turned is None or abs(np.degrees(np.arctan2(turned[1, 0], turned[0, 0]))) > options.copy_turn_deg:
+    if turned is None or abs(np.degrees(np.arctan2(turned[1, 0], turned[0, 0]))) > _COPY_TURN_DEG:
         return False
-    return _inside(scale, shift, size_a, size_b) >= options.copy_inside
+    return _inside(scale, shift, size_a, size_b) >= _COPY_INSIDE
 
 
 def _zoom_and_shift(a: FloatArray, b: FloatArray) -> tuple[float, FloatArray]:

@@ -53,24 +53,18 @@ def calibrate_focals(database: Path, scratch: Path, *, seed: int) -> dict[int, f
 
 def start_from(database: Path, focal_px: Mapping[int, float]) -> None:
     """Write focal lengths into a database as where mapping starts; they do not count as known."""
-    opened = pycolmap.Database.open(str(database))
-    try:
+    with pycolmap.Database.open(str(database)) as opened:
         for camera in opened.read_all_cameras():
             if camera.camera_id in focal_px:
                 params = camera.params
                 params[camera.focal_length_idxs()] = focal_px[camera.camera_id]
                 camera.params = params
                 opened.update_camera(camera)
-    finally:
-        opened.close()
 
 
 def _cameras(database: Path) -> list[pycolmap.Camera]:
-    opened = pycolmap.Database.open(str(database))
-    try:
+    with pycolmap.Database.open(str(database)) as opened:
         return list(opened.read_all_cameras())
-    finally:
-        opened.close()
 
 
 # Films straight ahead: a reconstruction that begins with all photos at once, not with two of them.

@@ -1,5 +1,6 @@
 """What a film is followed by, from a database: its maps, its scans, or both."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -7,14 +8,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError, ScanNotFoundError
+from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.lidar.load import PlanBox, load_cloud
+from featuredb.lidar.load import PlanBox, chosen_scans, load_cloud
 from featuredb.store import Database
-from featuredb.store.scans import ScanSummary, list_scans
+from featuredb.store.scans import ScanSummary
 from ingest.register.anchor.start.files import RoughPose, read_pose
 from ingest.track.scan_ground import ScanFinder, ScanGround
 from reloc.localise.candidates import usable_areas
@@ -82,7 +83,11 @@ def finder_for(database: Database, asked: FilmGround, camera: Camera | None, opt
         )
     area = maps.grounds[0].area
     scan = _over(
-        area.frame, area.image_center[area.searched_images()], _scan(database, asked.scans), database, rough
+        area.frame,
+        area.image_center[area.searched_images()],
+        chosen_scans(database, asked.scans),
+        database,
+        rough,
     )
     return MapOverScanFinder(maps, scan)
 
@@ -97,23 +102,8 @@ def _maps(database: Database, asked: FilmGround, options: TrackOptions) -> MapFi
     return MapFinder(usable_areas(localiser.areas_of(asked.maps), fingerprint))
 
 
-def _scan(database: Database, ids: tuple[str, ...] | None) -> list[ScanSummary]:
-    """The scans meant, by ids or their first letters."""
-    scans = list_scans(database)
-    if ids is not None:
-        missing = [i for i in ids if not any(s.scan_id.startswith(i) for s in scans)]
-        if missing:
-            raise ScanNotFoundError(
-                f"no scan {', '.join(missing)}; `featuredb lidar list` lists what there is"
-            )
-        scans = [s for s in scans if any(s.scan_id.startswith(i) for i in ids)]
-    if not scans:
-        raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
-    return scans
-
-
 def _on_scan(database: Database, asked: FilmGround, rough: RoughPose) -> ScanFinder:
-    scans = _scan(database, asked.scans)
+    scans = chosen_scans(database, asked.scans)
     epsg = scans[0].epsg
     east, north, _ = rough.utm.tolist()
     frame = LocalFrame.from_utm(east, north, min(s.box.min_height for s in scans), epsg)
@@ -163,16 +153,23 @@ class MapOverScan:
         self, gray: NDArray[np.uint8], camera: Camera, pose: Rigid3, options: TrackOptions
     ) -> Keyframe | Unmatched:
         """By the maps, or where they know nothing, by the scan; both reasons where that knows nothing."""
-        by_map = self.maps.match(gray, camera, pose, options)
+        return self.first_of(
+            self.maps.match(gray, camera, pose, options),
+            lambda: self.scan.match(gray, camera, pose, options),
+        )
+
+    def first_of(
+        self, by_map: Keyframe | Unmatched, ask_scan: Callable[[], Keyframe | Unmatched]
+    ) -> Keyframe | Unmatched:
+        """What the maps found, else what the scan finds, on this ground; else both reasons."""
         if isinstance(by_map, Keyframe):
-            self.scan.seen_elsewhere(
-                by_map.cam_from_local
-            )  # where it is looked for on the scan, were it lost
+            self.scan.seen_elsewhere(by_map.cam_from_local)  # where the scan looks for it, were it lost
             return replace(by_map, ground=self)
-        by_scan = self.scan.match(gray, camera, pose, options)
+        by_scan = ask_scan()
         if isinstance(by_scan, Keyframe):
             return replace(by_scan, ground=self)
-        return _both(by_map, by_scan)
+        detail = f"{by_map.detail}; on the scan: {by_scan.reason}: {by_scan.detail}"
+        return Unmatched(reason=by_map.reason, detail=detail)
 
     def posed(self, rows: NDArray[np.int64], pose: Rigid3, measured: FloatArray) -> EarthPose | OwnPose:
         """By that of which more landmarks are."""
@@ -210,22 +207,10 @@ class MapOverScanFinder:
         self, gray: NDArray[np.uint8], request: LocaliseRequest, options: TrackOptions
     ) -> Keyframe | Unmatched:
         """By the maps, or where they do not know the frame, by the scan."""
-        by_map = self._maps.find(gray, request, options)
-        if isinstance(by_map, Keyframe):
-            self._scan.ground.seen_elsewhere(by_map.cam_from_local)
-            return replace(by_map, ground=self._ground)
-        by_scan = self._scan.find(gray, request, options)
-        if isinstance(by_scan, Keyframe):
-            return replace(by_scan, ground=self._ground)
-        return _both(by_map, by_scan)
+        return self._ground.first_of(
+            self._maps.find(gray, request, options), lambda: self._scan.find(gray, request, options)
+        )
 
     def has(self, ground: Ground) -> bool:
         """Whether the track is on these."""
         return ground is self._ground
-
-
-def _both(by_map: Unmatched, by_scan: Unmatched) -> Unmatched:
-    return Unmatched(
-        reason=by_map.reason,
-        detail=f"{by_map.detail}; on the scan: {by_scan.reason}: {by_scan.detail}",
-    )

@@ -13,7 +13,6 @@ import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geo.near_frame import near_enu_from_utm
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import MapPoints
 from featuredb.store import Database
@@ -87,7 +86,7 @@ def sampled(count: int, wanted: int) -> NDArray[np.int64]:
 def map_points(points: MapPoints, epsg: int, frame: LocalFrame, wanted: int) -> DrawnPoints:
     """At most `wanted` points of a map in the place's frame."""
     rows = sampled(len(points), wanted)
-    return drawn_points(near_enu_from_utm(frame, points.utm[rows], epsg), points.rgb[rows], len(points))
+    return drawn_points(frame.enu_from_utm(points.utm[rows], epsg), points.rgb[rows], len(points))
 
 
 def scan_points_in(
@@ -119,7 +118,7 @@ def scan_points_in(
         rgb.append(_colours(table, colour)[rows])
     places, colours = np.concatenate(utm), np.concatenate(rgb)
     mixed = sampled(len(places), len(places))
-    return drawn_points(near_enu_from_utm(frame, places[mixed], scan.epsg), colours[mixed], of)
+    return drawn_points(frame.enu_from_utm(places[mixed], scan.epsg), colours[mixed], of)
 
 
 def _colours(table: pa.Table, names: tuple[str, ...]) -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.adjust import _drop_bogus_lenses
-from ingest.colmap.bridge import SfmPhoto, read_models, write_posed
+from ingest.colmap.bridge import SfmPhoto, posed, read_models
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(900.0, 500.0, 400.0, 0.01))
 
@@ -18,7 +18,7 @@ def written(folder: Path, focal_px: float) -> Path:
     """A model of two photos of one camera each; the second camera has this focal length."""
     folder.mkdir(parents=True)
     photos = [SfmPhoto(name=f"{k}.jpg", camera_row=k, keypoints=np.zeros((4, 2), np.float32)) for k in (0, 1)]
-    write_posed(folder, [CAMERA, CAMERA], photos, dict.fromkeys((0, 1), Rigid3.identity()))
+    posed([CAMERA, CAMERA], photos, dict.fromkeys((0, 1), Rigid3.identity())).write(str(folder))
     model = pycolmap.Reconstruction(str(folder))
     camera = model.camera(2)
     camera.params = np.array([focal_px, *camera.params[1:]])

@@ -19,7 +19,7 @@ from featuredb.store import Database
 from featuredb.store.encode import content_digest
 from ingest.clusters import reconstruct
 from ingest.clusters.graph import ClusterOptions
-from ingest.clusters.join import JoinedModel, JoinOptions
+from ingest.clusters.join import JoinedModel
 from ingest.colmap.bridge import Model
 from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
@@ -92,7 +92,7 @@ def test_a_wrong_joint_is_undone_and_the_blocks_stay_apart(
 ) -> None:
     """Blocks laid on top of each other at random: no match fits, yet no block is lost for it."""
 
-    def at_random(models: Sequence[Model], options: JoinOptions) -> list[JoinedModel]:
+    def at_random(models: Sequence[Model]) -> list[JoinedModel]:
         rng = np.random.default_rng(1)
         turned = [Sim3.exp(np.append(rng.normal(0, 1, 4), rng.normal(0, 5, 3))) for _ in models]
         return [JoinedModel(members=tuple(range(len(models))), first_from=tuple(turned))]

@@ -11,7 +11,7 @@ import pytest
 from featuredb.errors import StoreError
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.move import move_map
+from featuredb.maps.move import in_frame, move_map
 from featuredb.store import Database
 from featuredb.store.changes import IMPORTED
 from ingest.growth.graph.map_graph import placed_maps
@@ -343,7 +343,8 @@ def test_a_map_that_only_an_import_holds_stays_where_it_is(tmp_path: Path) -> No
     for feature_map in (first, second):
         _add(database, feature_map)
     database.commit_map(
-        move_map(first, east(0.1), FRAME, covariance=first.placement.covariance), replaces="m1"
+        move_map(first, in_frame(east(0.1), FRAME, first.frame), covariance=first.placement.covariance),
+        replaces="m1",
     )
     before = database.poll_version()
     done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
@@ -361,7 +362,8 @@ def test_a_parent_that_is_placed_anew_takes_its_children_along(tmp_path: Path) -
     )
     database = _database(tmp_path, first, child)
     right = replace(
-        move_map(first, east(-2.0), FRAME, covariance=_ANCHOR.placement.covariance), status="active"
+        move_map(first, in_frame(east(-2.0), FRAME, first.frame), covariance=_ANCHOR.placement.covariance),
+        status="active",
     )
     result = database.commit_map(right, replaces="A")
     assert result.flagged == ("m1",)

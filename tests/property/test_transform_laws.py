@@ -133,9 +133,8 @@ def test_composition_is_associative(case: tuple[tuple[Transform, Transform], Tra
 
 
 @LAWS
-@given(st.one_of(st.tuples(rigids, rigid_tangents()), st.tuples(sims, sim_tangents())))
-def test_adjoint_moves_a_tangent_across(case: tuple[Transform, FloatArray]) -> None:
-    transform, tangent = case
+@given(sims, sim_tangents())
+def test_adjoint_moves_a_tangent_across(transform: Sim3, tangent: FloatArray) -> None:
     # T G(xi) T^-1 = G(Ad xi), exactly, for matrices of the algebra.
     moved = transform.matrix() @ generator(tangent) @ np.linalg.inv(transform.matrix())
     expected = generator(transform.adjoint() @ tangent)
@@ -173,9 +172,7 @@ def test_covariance_of_product_against_numerical_jacobian(seed: int) -> None:
     first, second = random_covariance(rng, size), random_covariance(rng, size)
     both = np.block([[first, np.zeros((size, size))], [np.zeros((size, size)), second]])
     expected = jacobian @ both @ jacobian.T
-    np.testing.assert_allclose(
-        outer.compose_covariance(first, second), expected, atol=1e-7 * np.abs(expected).max()
-    )
+    np.testing.assert_allclose(first + outer.carried(second), expected, atol=1e-7 * np.abs(expected).max())
 
 
 @LAWS

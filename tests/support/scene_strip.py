@@ -14,7 +14,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapStatus, Placement
 from featuredb.maps.lineage import GROWTH
-from featuredb.maps.move import move_map
+from featuredb.maps.move import in_frame, move_map
 from featuredb.store import Database
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.photos import contribute, mark_confirmed, mark_used
@@ -94,7 +94,7 @@ def strip_map(
     )
     made = replace(made, images=images, status=status or ("quarantined" if parents else "active"))
     if move is not None:
-        made = move_map(made, move, FRAME, covariance=made.placement.covariance)
+        made = move_map(made, in_frame(move, FRAME, made.frame), covariance=made.placement.covariance)
     return grown(made, parents, drift_m) if parents else made
 
 

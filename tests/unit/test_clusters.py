@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.clusters.graph import ClusterOptions, Graph, PhotoBlock, PhotoCluster, find_clusters
-from ingest.clusters.join import JoinOptions, common_points, hangs_together, join
+from ingest.clusters.join import common_points, hangs_together, join
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
 from ingest.colmap.bridge import Model
 from ingest.executor import InProcessExecutor
@@ -136,7 +136,7 @@ def test_models_that_share_photos_are_joined() -> None:
     sims = [_sim(k) for k in range(3)]
     columns = [(0, 1, 2, 3), (3, 4, 5), (5, 6)]
     models = [_model(c, s, 0.02, seed=k) for k, (c, s) in enumerate(zip(columns, sims, strict=True))]
-    (joined,) = join(models, JoinOptions())
+    (joined,) = join(models)
     assert joined.members[0] == 0
     assert sorted(joined.members) == [0, 1, 2]
     _assert_in_place(models, sims, np.array(joined.members), joined.first_from)
@@ -144,7 +144,7 @@ def test_models_that_share_photos_are_joined() -> None:
 
 def test_models_that_share_nothing_stay_apart() -> None:
     models = [_model((0, 1, 2), _sim(0)), _model((4, 5), _sim(1))]
-    assert [j.members for j in join(models, JoinOptions())] == [(0,), (1,)]
+    assert [j.members for j in join(models)] == [(0,), (1,)]
 
 
 @pytest.mark.parametrize("wrong", ["bent", "points", "poses"])
@@ -159,7 +159,7 @@ def test_models_that_disagree_are_not_joined(wrong: str) -> None:
         turn = Rigid3.exp(np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]))
         other = replace(other, cam_from_sfm=tuple(turn @ p for p in other.cam_from_sfm))
     assert len(common_points(one, other)[0]) > 100  # they share plenty
-    assert [j.members for j in join([one, other], JoinOptions())] == [(0,), (1,)]
+    assert [j.members for j in join([one, other])] == [(0,), (1,)]
 
 
 def test_a_joint_that_contradicts_the_others_breaks_the_weakest() -> None:
@@ -184,7 +184,7 @@ def test_a_joint_that_contradicts_the_others_breaks_the_weakest() -> None:
         photo_of=np.concatenate([false.photo_of, two.photo_of + 5]),
         keypoint_of=np.concatenate([false.keypoint_of, two.keypoint_of]),
     )
-    groups = join(models, JoinOptions())
+    groups = join(models)
     # Two of the three joints hold, or fewer: never all three models in one frame by contradicting joints.
     assert len(groups) == 2
 
@@ -192,13 +192,14 @@ def test_a_joint_that_contradicts_the_others_breaks_the_weakest() -> None:
 def test_joined_models_hang_together_by_points_in_common() -> None:
     first, second = range(100), range(1000, 1100)
     apart = model_of(first, first, second, second)
-    assert not hangs_together(apart, [[0, 1], [2, 3]], 30)
+    assert not hangs_together(apart, [[0, 1], [2, 3]])
     tied = model_of(first, range(60, 130), range(90, 1050), second)
-    assert hangs_together(tied, [[0, 1], [2, 3]], 30)
-    assert not hangs_together(tied, [[0, 1], [2, 3]], 51)
+    assert hangs_together(tied, [[0, 1], [2, 3]])
+    weak = model_of(first, range(60, 130), range(105, 1050), second)
+    assert not hangs_together(weak, [[0, 1], [2, 3]])
     # A single photo that is hardly tied does not make a joint wrong.
     loose = model_of(first, first, first, first, range(95, 105))
-    assert hangs_together(loose, [[0, 1], [2, 3, 4]], 30)
+    assert hangs_together(loose, [[0, 1], [2, 3, 4]])
 
 
 @pytest.mark.parametrize(
@@ -240,5 +241,4 @@ def _two_towns(work: Path) -> Reconstruction:
         Workspace(root=work),
         SfmOptions(),
         InProcessExecutor(),
-        joining=JoinOptions(),
     )

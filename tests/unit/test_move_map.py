@@ -18,15 +18,15 @@ _FAR = LocalFrame.from_utm(EASTING + 900.0, NORTHING - 400.0, HEIGHT + 30.0, EPS
 
 def test_identity_keeps_every_bit() -> None:
     feature_map = random_map(3)
-    moved = move_map(feature_map, Sim3.identity(), _FAR, covariance=feature_map.placement.covariance)
+    moved = move_map(feature_map, Sim3.identity(), covariance=feature_map.placement.covariance)
     assert_same_map(feature_map, moved)
 
 
 @pytest.mark.parametrize("frame", [None, _FAR])
 def test_points_and_cameras_move_alike(frame: LocalFrame | None) -> None:
     feature_map = random_map(1)
-    moved = move_map(feature_map, _MOVE, frame)
     there = frame or feature_map.frame
+    moved = move_map(feature_map, in_frame(_MOVE, there, feature_map.frame))
     np.testing.assert_allclose(
         moved.points_local(there), _MOVE.act(feature_map.points_local(there)), atol=1e-6
     )
@@ -41,7 +41,7 @@ def test_points_and_cameras_move_alike(frame: LocalFrame | None) -> None:
 def test_pixels_stay_where_they_were() -> None:
     """What a camera sees does not change when the world moves with it."""
     feature_map = random_map(2)
-    moved = move_map(feature_map, _MOVE, _FAR)
+    moved = move_map(feature_map, in_frame(_MOVE, _FAR, feature_map.frame))
     for old, new in zip(feature_map.images, moved.images, strict=True):
         before = old.cam_from_local.act(feature_map.points_local())
         after = new.cam_from_local.act(moved.points_local())

@@ -11,10 +11,9 @@ from featuredb.maps.feature_map import GeoPrior
 from ingest.photos.duplicates import MAX_BITS, copies_of, near_duplicates
 from ingest.photos.photo import Photo
 from ingest.sfm.matching import Matched
-from ingest.sfm.overlays import OverlayOptions, is_copy, without_overlay
+from ingest.sfm.overlays import is_copy, without_overlay
 
 _SIZE = (1600, 1200)
-_OPTIONS = OverlayOptions()
 
 
 def _spread(count: int, seed: int, size: tuple[int, int] = _SIZE) -> NDArray[np.float32]:
@@ -30,23 +29,23 @@ def test_a_watermark_is_dropped_and_the_rest_stays() -> None:
     mark = np.array([1400, 1130], np.float32) + _spread(30, 1, (150, 40))
     a = np.concatenate([scene, mark])
     b = np.concatenate([scene + np.float32([35, -12]), mark + np.float32(0.4)])
-    kept = without_overlay(a, b, _SIZE, _SIZE, _pairs(90), _OPTIONS)
+    kept = without_overlay(a, b, _SIZE, _SIZE, _pairs(90))
     assert kept[:, 0].tolist() == list(range(60))
 
 
 def test_photos_that_share_a_watermark_only_share_nothing() -> None:
     mark = np.array([1400, 1130], np.float32) + _spread(80, 1, (150, 40))
-    assert not len(without_overlay(mark, mark, _SIZE, _SIZE, _pairs(80), _OPTIONS))
+    assert not len(without_overlay(mark, mark, _SIZE, _SIZE, _pairs(80)))
 
 
 def test_a_camera_that_stands_still_keeps_its_matches() -> None:
     scene = _spread(200, 2)
-    assert len(without_overlay(scene, scene + np.float32(0.3), _SIZE, _SIZE, _pairs(200), _OPTIONS)) == 200
+    assert len(without_overlay(scene, scene + np.float32(0.3), _SIZE, _SIZE, _pairs(200))) == 200
 
 
 def test_nothing_stands_still_between_photos_of_two_sizes() -> None:
     mark = _spread(80, 1, (150, 40))
-    assert len(without_overlay(mark, mark, _SIZE, (800, 600), _pairs(80), _OPTIONS)) == 80
+    assert len(without_overlay(mark, mark, _SIZE, (800, 600), _pairs(80))) == 80
 
 
 @pytest.mark.parametrize(
@@ -60,7 +59,7 @@ def test_copies_are_told(scale: float, shift: tuple[float, float], size: tuple[i
     noise = np.random.default_rng(4).normal(0, 0.4, a.shape)
     b = scale * a + shift + noise
     seen = ((b > 0) & (b < size)).all(axis=1)
-    assert is_copy(a[seen], b[seen], _SIZE, size, _OPTIONS)
+    assert is_copy(a[seen], b[seen], _SIZE, size)
 
 
 @pytest.mark.parametrize("kind", ["neighbour on flat ground", "turned", "relief", "few"])
@@ -75,7 +74,7 @@ def test_neighbours_are_no_copies(kind: str) -> None:
     elif kind == "relief":
         b = a + np.random.default_rng(6).normal(0, 8, a.shape)
     seen = ((b > 0) & (b < _SIZE)).all(axis=1)
-    assert not is_copy(a[seen], b[seen], _SIZE, _SIZE, _OPTIONS)
+    assert not is_copy(a[seen], b[seen], _SIZE, _SIZE)
 
 
 def _photo(name: str, owner: str, width: int = 1600, **more: object) -> Photo:

@@ -1,12 +1,8 @@
 """Parts of adding a scan, without files: outliers, intensities, levels, frames of millions of points."""
 
 import numpy as np
-import pytest
 from scipy.spatial.distance import cdist
 
-from featuredb.geo.local_frame import LocalFrame
-from featuredb.geo.near_frame import near_enu_from_utm
-from featuredb.geo.utm import utm_from_geodetic
 from featuredb.lidar.intensity import stretch_of
 from featuredb.lidar.levels import COARSEST_SPACING_M, finest_level, order_by_level
 from featuredb.lidar.outliers import OutlierOptions, find_outliers, outlier_ratio
@@ -124,14 +120,3 @@ def test_levels_of_pieces_are_those_of_the_whole() -> None:
         of_part = np.empty(int(piece.sum()), int)
         of_part[part.order] = part.level
         assert (of_part != level[piece]).mean() < 1e-3  # rounding of 0.03 mm at a cell's edge
-
-
-@pytest.mark.parametrize("extent_m", [200.0, 3000.0, 100_000.0])
-def test_the_fast_way_into_a_frame_is_the_exact_one(extent_m: float) -> None:
-    rng = np.random.default_rng(2)
-    center = utm_from_geodetic([60.2, 11.9, 300.0], 32632)  # at the zone's edge, where convergence is large
-    utm = center + rng.uniform(-0.5, 0.5, (4000, 3)) * [extent_m, extent_m, 500.0]
-    frame = LocalFrame.from_utm(*center, 32632)
-    np.testing.assert_allclose(
-        near_enu_from_utm(frame, utm, 32632), frame.enu_from_utm(utm, 32632), atol=1.5e-4
-    )

@@ -23,7 +23,6 @@ from featuredb.simworld.flight import (
 from featuredb.simworld.town.materials import FACADE_LENGTH_M, town_textures, water_texture
 from featuredb.simworld.town.noise import fractal, periodic
 from featuredb.simworld.town.scene import Faces, Scene
-from featuredb.simworld.town.solids import car, instances
 from featuredb.simworld.town.texture import Texture
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
 
@@ -115,19 +114,6 @@ def test_solids_look_outward(town: Scene) -> None:
 def test_a_town_too_small_is_refused() -> None:
     with pytest.raises(InvalidValueError, match="150 m"):
         make_town(1, size_m=(100.0, 300.0))
-
-
-def test_instances_equal_the_solid_built_in_place() -> None:
-    template = car(0, 0, 0, 0, (1, 1, 1), 9)
-    placed = instances(template, [[3.0, -2.0, 0.5], [1.0, 1.0, 0.0]], [30.0, 200.0], [[0.5, 0.4, 0.3]] * 2)
-    n = len(template)
-    for i, direct in enumerate(
-        (car(3.0, -2.0, 0.5, 30.0, (0.5, 0.4, 0.3), 9), car(1.0, 1.0, 0.0, 200.0, (0.5, 0.4, 0.3), 9))
-    ):
-        for name in ("origin", "edge_s", "edge_t", "tint"):
-            np.testing.assert_allclose(
-                getattr(placed, name)[i * n : (i + 1) * n], getattr(direct, name), atol=1e-12
-            )
 
 
 def test_cars_and_waves_differ_from_moment_to_moment(town: Scene) -> None:

@@ -9,7 +9,7 @@ import pytest
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
-from ingest.register.tagged_elsewhere import ElsewhereOptions, tagged_elsewhere
+from ingest.register.tagged_elsewhere import tagged_elsewhere
 from tests.support.posed_models import model_of
 
 _TWIN = (11, 12, 13)  # photos of a twin of the house that 10 shows
@@ -44,13 +44,13 @@ def placed(
 
 def found(model: Model, with_gps: list[int], placement: GpsPlacement) -> list[tuple[int, ...]]:
     assert placement.reason is None
-    return [g.photos for g in tagged_elsewhere(model, with_gps, placement, ElsewhereOptions())]
+    return [g.photos for g in tagged_elsewhere(model, with_gps, placement)]
 
 
 def test_positions_that_agree_on_another_place() -> None:
     model = walk()
     with_gps, placement = placed(model, dict.fromkeys(_TWIN, (30.0, -40.0)))
-    (group,) = tagged_elsewhere(model, with_gps, placement, ElsewhereOptions())
+    (group,) = tagged_elsewhere(model, with_gps, placement)
     assert group.photos == _TWIN
     assert group.offset_m == pytest.approx(50.0, abs=5.0)
 

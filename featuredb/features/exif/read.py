@@ -20,7 +20,8 @@ from featuredb.features.exif.gps import (
     gps_sigmas,
 )
 from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
-from featuredb.features.image_header import ImageHeader, read_header
+from featuredb.features.image_header import read_header
+from featuredb.features.stored_image import ImageHeader
 from featuredb.geometry.camera_angles import CameraAngles
 
 # Diagonal of the 24 x 36 mm frame to which "35 mm equivalent" refers (CIPA DCG-001).

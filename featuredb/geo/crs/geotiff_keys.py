@@ -8,23 +8,13 @@ transverse Mercator, Lambert's conformal conic with two parallels, and Albers' e
 from collections.abc import Mapping
 
 from pyproj import CRS
-from pyproj.crs import (  # type: ignore[attr-defined]
-    CompoundCRS,
-    CoordinateOperation,
-    Datum,
-    GeographicCRS,
-    ProjectedCRS,
-)
-from pyproj.crs.coordinate_operation import (
-    AlbersEqualAreaConversion,
-    LambertConformalConic2SPConversion,
-    TransverseMercatorConversion,
-)
+from pyproj.crs import CompoundCRS, Datum, GeographicCRS, ProjectedCRS  # type: ignore[attr-defined]
 from pyproj.crs.coordinate_system import Cartesian2DCS
 from pyproj.crs.enums import Cartesian2DCSAxis
 from pyproj.exceptions import CRSError
 
 from featuredb.errors import GeodesyError
+from featuredb.geo.heights import FOOT_M, US_SURVEY_FOOT_M
 
 GeoKeys = Mapping[int, int | float | str]
 
@@ -33,8 +23,26 @@ _DATUM, _PROJECTION, _UNITS = 2050, 3075, 3076
 _USER_DEFINED = 32767
 _UNIT_AXES = {
     9001: (1.0, Cartesian2DCSAxis.EASTING_NORTHING),
-    9002: (0.3048, Cartesian2DCSAxis.EASTING_NORTHING_FT),
-    9003: (1200.0 / 3937.0, Cartesian2DCSAxis.EASTING_NORTHING_US_FT),
+    9002: (FOOT_M, Cartesian2DCSAxis.EASTING_NORTHING_FT),
+    9003: (US_SURVEY_FOOT_M, Cartesian2DCSAxis.EASTING_NORTHING_US_FT),
+}
+# By the code of the method: PROJ's name of it, and the keys of its parameters, the first that is there.
+_METHODS: dict[object, tuple[str, dict[str, tuple[int, ...]]]] = {
+    1: ("tmerc", {"lat_0": (3081,), "lon_0": (3080,), "k_0": (3092,), "x_0": (3082,), "y_0": (3083,)}),
+    8: (
+        "lcc",
+        {
+            **{"lat_0": (3085, 3081), "lon_0": (3084, 3080), "lat_1": (3078,), "lat_2": (3079,)},
+            **{"x_0": (3086, 3082), "y_0": (3087, 3083)},
+        },
+    ),
+    11: (
+        "aea",
+        {
+            **{"lat_0": (3081, 3085), "lon_0": (3080, 3084), "lat_1": (3078,), "lat_2": (3079,)},
+            **{"x_0": (3082, 3086), "y_0": (3083, 3087)},
+        },
+    ),
 }
 _VERTICAL_OF_DATUM = {5103: 5703, 5171: 5773, 1027: 3855}  # writers put the datum's code for the CRS's
 
@@ -101,38 +109,18 @@ def _own_projection(keys: GeoKeys, demand: str) -> CRS:
 
     unit_m, axes = _UNIT_AXES.get(int(number(_UNITS)) or 9001, (0.0, None))
     projection, geodetic = keys.get(_PROJECTION), _geodetic(keys)
-    if axes is None or geodetic is None or projection not in (1, 8, 11):
+    if axes is None or geodetic is None or projection not in _METHODS:
         raise GeodesyError(
             f"the file's GeoTIFF keys define a projection of their own that is not understood: "
             f"{_shown(keys)}; {demand}"
         )
-    conversion: CoordinateOperation
-    if projection == 1:
-        conversion = TransverseMercatorConversion(
-            latitude_natural_origin=number(3081),
-            longitude_natural_origin=number(3080),
-            false_easting=number(3082) * unit_m,
-            false_northing=number(3083) * unit_m,
-            scale_factor_natural_origin=number(3092) or 1.0,
-        )
-    elif projection == 8:
-        conversion = LambertConformalConic2SPConversion(
-            latitude_false_origin=number(3085, 3081),
-            longitude_false_origin=number(3084, 3080),
-            latitude_first_parallel=number(3078),
-            latitude_second_parallel=number(3079),
-            easting_false_origin=number(3086, 3082) * unit_m,
-            northing_false_origin=number(3087, 3083) * unit_m,
-        )
-    else:
-        conversion = AlbersEqualAreaConversion(
-            latitude_first_parallel=number(3078),
-            latitude_second_parallel=number(3079),
-            latitude_false_origin=number(3081, 3085),
-            longitude_false_origin=number(3080, 3084),
-            easting_false_origin=number(3082, 3086) * unit_m,
-            northing_false_origin=number(3083, 3087) * unit_m,
-        )
+    method, parameters = _METHODS[projection]
+    values = {name: number(*sources) for name, sources in parameters.items()}
+    values |= {name: values[name] * unit_m for name in ("x_0", "y_0")}
+    if not values.get("k_0", 1.0):
+        values["k_0"] = 1.0
+    conversion = CRS.from_dict({"proj": method, **values}).coordinate_operation
+    assert conversion is not None  # a projection has one
     return ProjectedCRS(
         conversion,
         name=str(keys.get(1026) or keys.get(3073) or "projection defined by the file").strip("| \x00"),

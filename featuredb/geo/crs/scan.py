@@ -104,10 +104,10 @@ def scan_crs(
         )
     _check_axes(crs, source)
     is_3d = vertical is None and len(crs.axis_info) == 3
-    unit, unit_m, reason = _height_unit(
+    unit, unit_m, reason = height_unit_of(
         crs, vertical, is_3d, height_unit, geo_keys if source != "--crs" else None
     )
-    datum = _height_datum(vertical, is_3d)
+    datum = height_datum_of(vertical, is_3d)
     if height_datum is not None:
         stated = check_datum(height_datum)
         if datum not in (stated, "unknown"):
@@ -171,10 +171,18 @@ def _check_axes(crs: CRS, source: str) -> None:
         )
 
 
-def _height_unit(
-    crs: CRS, vertical: CRS | None, is_3d: bool, stated: str | None, geo_keys: GeoKeys | None
+def height_unit_of(
+    crs: CRS,
+    vertical: CRS | None,
+    is_3d: bool,
+    stated: str | None = None,
+    geo_keys: GeoKeys | None = None,
 ) -> tuple[str, float, str]:
-    """Name of the unit of Z, metres per unit, and why."""
+    """Name of the unit of Z, metres per unit, and why.
+
+    Args:
+        crs: without the vertical part. stated: by a person.
+    """
     if stated is not None:
         if stated not in HEIGHT_UNITS:
             raise GeodesyError(f"--height-unit: expected one of {', '.join(HEIGHT_UNITS)}, found {stated!r}")
@@ -214,7 +222,8 @@ _UNIT_CODES = {
 }
 
 
-def _height_datum(vertical: CRS | None, is_3d: bool) -> HeightDatum:
+def height_datum_of(vertical: CRS | None, is_3d: bool) -> HeightDatum:
+    """What heights are counted from, "unknown" where the system does not say."""
     if is_3d:
         return "ellipsoidal"
     if vertical is None:

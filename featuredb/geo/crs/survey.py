@@ -15,11 +15,11 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from featuredb.errors import GeodesyError
+from featuredb.geo.crs.scan import height_datum_of, height_unit_of
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
 
 _UTM_WORDS = re.compile(r"^\s*WGS\s*-?84\s+UTM\s+(?:zone\s+)?(\d{1,2})\s*([NS])\s*$", re.IGNORECASE)
-_DATUM_OF_EPSG: dict[int, HeightDatum] = {5703: "navd88", 6360: "navd88", 5773: "egm96", 3855: "egm2008"}
 _EXAMPLES = "e.g. EPSG:32611, WGS84 UTM 11N or +proj=utm +zone=11 +datum=WGS84 +units=m +no_defs"
 
 
@@ -67,12 +67,14 @@ def survey_crs(text: str) -> SurveyCrs:
             f"expected a plane or geographic reference system, {_EXAMPLES}; found {crs.name!r} "
             f"({crs.type_name})"
         )
+    vertical = crs.sub_crs_list[1] if crs.is_compound else None
+    is_3d = vertical is None and len(crs.axis_info) == 3
     return SurveyCrs(
         definition=definition,
         name=crs.name if crs.name != "unknown" else definition,
         geographic=bool(plane.is_geographic),
-        height_unit_m=_height_unit_m(crs, plane),
-        height_datum=_height_datum(crs),
+        height_unit_m=height_unit_of(crs if is_3d else plane, vertical, is_3d)[1],
+        height_datum=height_datum_of(vertical, is_3d),
     )
 
 
@@ -107,17 +109,3 @@ def _plane_part(crs: CRS) -> CRS:
     """The horizontal part of a compound system; any other as it is, without a bound transformation."""
     part = crs.sub_crs_list[0] if crs.is_compound else crs
     return part.to_2d()
-
-
-def _height_unit_m(crs: CRS, plane: CRS) -> float:
-    if len(crs.axis_info) >= 3:
-        return float(crs.axis_info[2].unit_conversion_factor)
-    return 1.0 if plane.is_geographic else float(plane.axis_info[0].unit_conversion_factor)
-
-
-def _height_datum(crs: CRS) -> HeightDatum:
-    if crs.is_compound:
-        vertical = crs.sub_crs_list[1]
-        return _DATUM_OF_EPSG.get(vertical.to_epsg() or 0, "unknown")
-    three = crs.is_geographic and len(crs.axis_info) == 3
-    return "ellipsoidal" if three else "unknown"

@@ -97,9 +97,7 @@ def utm_transform(crs: ScanCrs, low: FloatArray, high: FloatArray, epsg: int | N
             epsg=epsg, description="none, it is in UTM already", accuracy_m=0.0, z_scale=crs.height_unit_m,
             with_heights=False, notes=tuple(notes), _transformer=None,
         )  # fmt: skip
-    group = _operations(source, target.to_3d() if crs.is_3d else target, west, south, east, north)
-    if not group.transformers:
-        raise GeodesyError(f"PROJ knows no way from {crs.name} to EPSG:{epsg}; {DEMAND}")
+    group = _operations(source, target.to_3d() if crs.is_3d else target, (west, south, east, north), DEMAND)
     best = group.transformers[0]
     if not group.best_available and group.unavailable_operations:
         missing = group.unavailable_operations[0]
@@ -151,12 +149,8 @@ def raster_from_utm(wkt: str, epsg: int, place: FloatArray) -> Callable[[FloatAr
         return lambda utm: np.array(utm, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_utm((place[0], place[1], 0.0), epsg)
     x, y = float(longitude), float(latitude)
-    group = _operations(source, target, x - _REACH_DEG, y - _REACH_DEG, x + _REACH_DEG, y + _REACH_DEG)
-    if not group.transformers:
-        raise GeodesyError(
-            f"PROJ knows no way from {source.name!r} to EPSG:{epsg}; warp the image by gdalwarp"
-        )
-    best = group.transformers[0]
+    box = (x - _REACH_DEG, y - _REACH_DEG, x + _REACH_DEG, y + _REACH_DEG)
+    best = _operations(source, target, box, "warp the image by gdalwarp").transformers[0]
 
     def convert(utm: FloatArray) -> FloatArray:
         try:
@@ -171,13 +165,21 @@ def raster_from_utm(wkt: str, epsg: int, place: FloatArray) -> Callable[[FloatAr
 
 
 def _operations(
-    source: CRS, target: CRS, west: float, south: float, east: float, north: float
+    source: CRS, target: CRS, box: tuple[float, float, float, float], advice: str
 ) -> TransformerGroup:
-    """What PROJ knows between two systems at a place, best stated accuracy first."""
+    """What PROJ knows between two systems in a box of degrees, best stated accuracy first.
+
+    Raises:
+        GeodesyError: nothing; with the advice.
+    """
+    west, south, east, north = box
     area: Any = AreaOfInterest(west, max(south, -90.0), east, min(north, 90.0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # whoever adds a scan is told of a missing grid
-        return TransformerGroup(source, target, always_xy=True, area_of_interest=area)
+        group = TransformerGroup(source, target, always_xy=True, area_of_interest=area)
+    if not group.transformers:
+        raise GeodesyError(f"PROJ knows no way from {source.name} to {target.name}; {advice}")
+    return group
 
 
 def _geographic_box(

@@ -9,7 +9,7 @@ import numpy as np
 
 from featuredb.errors import ScanFileError
 from featuredb.file_digest import file_sha256
-from featuredb.lidar.formats.las import LONGEST_COORDINATE, UNCLASSIFIED, RawPoints, ScanFile
+from featuredb.lidar.formats.las import LONGEST_COORDINATE, UNCLASSIFIED, RawPoints, ScanFile, measured
 from featuredb.lidar.formats.ortho_image import import_rasterio
 
 SUFFIXES = (".tif", ".tiff")
@@ -36,11 +36,7 @@ def open_dsm(path: Path) -> ScanFile:
     with _opened(path) as file:
         _check(path, file)
         wkt = file.crs.to_wkt() if file.crs else None
-    points, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
-    for part in read_dsm(path, 1_000_000):
-        if len(part):
-            points += len(part)
-            low, high = np.minimum(low, part.xyz.min(axis=0)), np.maximum(high, part.xyz.max(axis=0))
+    points, low, high = measured(read_dsm(path, 1_000_000))
     if not points:
         raise ScanFileError(f"{path}: expected heights, found a raster in which every cell is empty")
     return ScanFile(

@@ -6,7 +6,7 @@ names the file: what was expected, what was found, what to do.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,7 +107,7 @@ def open_scan_file(path: Path) -> ScanFile:
         and (first.xyz >= low - slack).all()
         and (first.xyz <= high + slack).all()
     ):
-        low, high = _measured_box(path)
+        _, low, high = measured(read_points(path, 1_000_000))
     return ScanFile(
         path=path,
         sha256=file_sha256(path),
@@ -270,12 +270,8 @@ def _raw_points(points: Any) -> RawPoints:
     rgb = None
     if {"red", "green", "blue"} <= names:
         rgb = np.stack([np.asarray(points[name], np.uint16) for name in ("red", "green", "blue")], axis=1)
-    scales, offsets = points.scales, points.offsets
-    xyz = np.empty((len(points), 3))
-    for axis, name in enumerate("XYZ"):
-        xyz[:, axis] = np.asarray(points[name], np.float64) * scales[axis] + offsets[axis]
     return RawPoints(
-        xyz=xyz,
+        xyz=np.stack([np.asarray(points[name], np.float64) for name in "xyz"], axis=1),
         rgb=rgb,
         intensity=np.array(points["intensity"], dtype=np.uint16),
         classification=classification,
@@ -283,10 +279,11 @@ def _raw_points(points: Any) -> RawPoints:
     )
 
 
-def _measured_box(path: Path) -> tuple[FloatArray, FloatArray]:
-    """The box of the points themselves."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for points in read_points(path, 1_000_000):
-        if len(points):
-            low, high = np.minimum(low, points.xyz.min(axis=0)), np.maximum(high, points.xyz.max(axis=0))
-    return low, high
+def measured(chunks: Iterable[RawPoints]) -> tuple[int, FloatArray, FloatArray]:
+    """How many points there are, and the corners (3,) of their box; infinite without any."""
+    count, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
+    for points in chunks:
+        count += len(points)
+        low = np.minimum(low, points.xyz.min(axis=0, initial=np.inf))
+        high = np.maximum(high, points.xyz.max(axis=0, initial=-np.inf))
+    return count, low, high

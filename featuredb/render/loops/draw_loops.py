@@ -247,14 +247,6 @@ def lies_on(
 
 
 @compiled
-def merge(nearest: UInt64, other: UInt64, first: int, end: int) -> None:
-    """Draw rows `first` to `end` of another z-buffer into this one."""
-    for y in range(first, end):
-        for x in range(nearest.shape[1]):
-            nearest[y, x] = min(nearest[y, x], other[y, x])
-
-
-@compiled
 def slot_of(packed: np.uint64) -> np.int64:
     """The slot in a pixel of a z-buffer that is not NOTHING."""
     return np.int64(packed & _LOW_HALF)

@@ -1,8 +1,8 @@
 """Compiled loops that close holes between splats; see `compiled_module`.
 
 Depths are handled as their inverses, "nearness": zero is nothing at all, and planes are linear in the pixel.
-Most pixels need only their eight neighbours: short loops without branches, which vectorise, decide for a row
-at a time by which closing each pixel might be closed and which of its neighbours show that surface.
+A short loop without branches, which vectorises, decides for a row at a time by which closing each pixel might
+be closed; those few are then closed one by one.
 """
 
 import numpy as np
@@ -14,7 +14,6 @@ from featuredb.render.loops.draw_loops import lies_on
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
 UInt32 = NDArray[np.uint32]
 Number = float | np.float32
 
@@ -24,23 +23,6 @@ _NOTHING = np.float32(0.0)
 # Every second byte of paint: so the sums over the widest ring around a hole, 256 pixels at a radius of 32,
 # just fit, 16 bits each.
 _EVEN = np.uint32(0x00FF00FF)
-
-# Of each set of the 3 x 3 pixels around one, a bit each from the upper left: how many, and the sums of their
-# offsets across and down.
-_COUNT = np.array([sum(bits >> b & 1 for b in range(9)) for bits in range(512)], np.float64)
-_ACROSS = np.array([sum((b % 3 - 1) * (bits >> b & 1) for b in range(9)) for bits in range(512)], np.float64)
-_DOWN = np.array([sum((b // 3 - 1) * (bits >> b & 1) for b in range(9)) for bits in range(512)], np.float64)
-
-
-@compiled
-def widest_in_tiles(apart_m: Float32, widest_m: Float32, first: int, end: int) -> None:
-    """Fill (tiles down, tiles across) with the largest of apart_m (h, w), rows of tiles `first` to `end`."""
-    height, width = apart_m.shape
-    widest_m[first:end] = 0.0
-    for y in range(first * TILE_PX, min(end * TILE_PX, height)):
-        row = widest_m[y // TILE_PX]
-        for x in range(width):
-            row[x // TILE_PX] = max(row[x // TILE_PX], apart_m[y, x])
 
 
 @compiled
@@ -75,65 +57,23 @@ def close_holes(
         index: (h, w) changed: -1 where a hole was closed.
         finished: (h, w) changed: the paint with holes closed.
     """
-    height, width = nearness.shape
-    chosen, around, wide = np.empty(width, np.int32), np.empty(width, np.int32), np.empty(width, np.int64)
-    level, limit = np.empty(width, np.float32), np.empty((len(radii), width), np.float32)
-    values, aparts = np.empty(width, np.float32), np.empty(width, np.float32)
-    even, odd = np.empty(width, np.uint32), np.empty(width, np.uint32)
+    width = nearness.shape[1]
+    chosen, limit = np.empty(width, np.int32), np.empty((len(radii), width), np.float32)
     for y in range(first, end):
         finished[y] = paint[y]
         if y == first or y % TILE_PX == 0:
             for k in range(len(radii)):
                 scale = np.float32(reach_per_spacing * focal / (radii[k] - 0.5))
                 _spread_tiles(widest_m[k, y // TILE_PX], scale, limit[k])
-        chosen[:], level[:], around[:] = -1, 0.0, 0
+        chosen[:] = -1
         for k in range(len(radii)):
             _choose(
                 *(nearness[y], apart_m[y], closed[k, y], closed[max(k - 1, 0), y], limit[k]),
                 *(np.int32(k), np.float32(focal), chosen),
             )
-            _level_of(chosen, np.int32(k), closed[k, y], level)
-        values[:], aparts[:], even[:], odd[:] = 0.0, 0.0, 0, 0
-        for dy in range(3):
-            ny = y + dy - 1
-            if 0 <= ny < height:
-                bit = np.int32(1 << 3 * dy)
-                _mark_members(nearness[ny], apart_m[ny], level, bit, around)
-                _add_members(nearness[ny], around, bit, values)
-                _add_members(apart_m[ny], around, bit, aparts)
-                _add_paint(paint[ny], around, bit, np.uint32(0), even)
-                _add_paint(paint[ny], around, bit, np.uint32(8), odd)
-        left = 0
-        for x in range(width):
-            k, bits = chosen[x], around[x]
-            if k < 0:
-                continue
-            if bits == 0:
-                wide[left] = x
-                left += 1
-                continue
-            own = np.float64(nearness[y, x])
-            share = 1.0 / _COUNT[bits]
-            found, apart = values[x] * share, aparts[x] * share
-            # Where points are about a pixel apart, a slope between two pixels is not worth its price.
-            if apart * focal * found > 2.0 and len(planes):
-                row, column = y // side, x // side
-                off_x, off_y = _ACROSS[bits] * share, _DOWN[bits] * share
-                found -= _change(
-                    *(planes[row, column, 0], planes[row, column, 1], planes[row, column, 2]),
-                    *(x + 0.5 - (column + 0.5) * side, y + 0.5 - (row + 0.5) * side),
-                    *(off_x, off_y, found, apart, focal),
-                )
-            if _closes(own, found, apart, level[x], radii[k], focal, reach_per_spacing):
-                depth[y, x] = 1.0 / found
-                index[y, x] = -1
-                finished[y, x] = _mean_paint(even[x], odd[x], share)
-            else:
-                wide[left] = x
-                left += 1
         _search_rings(
             *(nearness, apart_m, paint, planes, side, closed, radii, focal, reach_per_spacing),
-            *(y, wide[:left], chosen, depth, index, finished),
+            *(y, chosen, depth, index, finished),
         )
 
 
@@ -178,49 +118,6 @@ def _as_before(closing: Number, lower: Number, focal: Number) -> bool:
 
 
 @compiled
-def _level_of(chosen: Int32, k: np.int32, closing: Float32, level: Float32) -> None:
-    for x in range(len(level)):
-        level[x] = closing[x] if chosen[x] == k else level[x]
-
-
-@compiled
-def _mark_members(near: Float32, apart_m: Float32, level: Float32, bit: np.int32, around: Int32) -> None:
-    """Mark which of three neighbours in a row, this or that beside it, show the surface at `level`."""
-    nothing = np.int32(0)
-    for x in range(1, len(near) - 1):
-        there = level[x]
-        # Never where there is nothing: there, both are zero.
-        w = near[x - 1]
-        left = bit if abs(there - w) < _SAME_SURFACE * apart_m[x - 1] * w * there else nothing
-        w = near[x]
-        middle = bit if abs(there - w) < _SAME_SURFACE * apart_m[x] * w * there else nothing
-        w = near[x + 1]
-        right = bit if abs(there - w) < _SAME_SURFACE * apart_m[x + 1] * w * there else nothing
-        around[x] |= left | middle << 1 | right << 2
-
-
-@compiled
-def _add_members(row: Float32, around: Int32, bit: np.int32, total: Float32) -> None:
-    """Add the marked neighbours among three in a row."""
-    for x in range(1, len(row) - 1):
-        left = row[x - 1] if around[x] & bit else _NOTHING
-        middle = row[x] if around[x] & (bit << 1) else _NOTHING
-        right = row[x + 1] if around[x] & (bit << 2) else _NOTHING
-        total[x] += left + middle + right
-
-
-@compiled
-def _add_paint(row: UInt32, around: Int32, bit: np.int32, shift: np.uint32, total: UInt32) -> None:
-    """Add every second byte of the paint, from the one at `shift`, of the marked neighbours among three."""
-    nothing = np.uint32(0)
-    for x in range(1, len(row) - 1):
-        left = (row[x - 1] >> shift) & _EVEN if around[x] & bit else nothing
-        middle = (row[x] >> shift) & _EVEN if around[x] & (bit << 1) else nothing
-        right = (row[x + 1] >> shift) & _EVEN if around[x] & (bit << 2) else nothing
-        total[x] += left + middle + right
-
-
-@compiled
 def _search_rings(
     nearness: Float32,
     apart_m: Float32,
@@ -232,7 +129,6 @@ def _search_rings(
     focal: float,
     reach_per_spacing: float,
     y: int,
-    columns: Int64,
     chosen: Int32,
     depth: Float32,
     index: Int32,
@@ -241,11 +137,10 @@ def _search_rings(
     """Close pixels of row y by rings around them, searched outwards until one holds pixels of the surface.
 
     Args:
-        columns: (n,) where.
-        chosen: (w,) the largest closing that may close each pixel; smaller ones are tried after it.
+        chosen: (w,) the largest closing that may close each pixel, or -1; smaller ones are tried after it.
     """
     height, width = nearness.shape
-    for x in columns:
+    for x in np.flatnonzero(chosen >= 0):
         own, own_apart = np.float64(nearness[y, x]), np.float64(apart_m[y, x])
         k, ring = int(chosen[x]), 1
         while k >= 0:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from featuredb.render.compiled import compiled
 from featuredb.render.loops.draw_loops import NOTHING, lies_on, slot_of
 
-Bytes = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
@@ -84,17 +83,3 @@ def show_splats(
             depth[y, x] = 1.0 / value
             index[y, x] = shows[slot, 0]
             paint[y, x] = shows[slot, 1]
-
-
-@compiled
-def unpack(paint: UInt32, rgb: Bytes, intensity: Bytes, first: int, end: int) -> None:
-    """Colours (h, w, 3) and intensity (h, w) from paint; either may be empty."""
-    for y in range(first, end):
-        if len(rgb):
-            for x in range(paint.shape[1]):
-                rgb[y, x, 0] = paint[y, x] & 255
-                rgb[y, x, 1] = (paint[y, x] >> 8) & 255
-                rgb[y, x, 2] = (paint[y, x] >> 16) & 255
-        if len(intensity):
-            for x in range(paint.shape[1]):
-                intensity[y, x] = paint[y, x] >> 24

@@ -11,7 +11,7 @@ from featuredb.simworld.camera.raster import Rendered, render
 from featuredb.simworld.camera.sensor import SensorOptions, expose, jpeg_bytes
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.town.scene import Faces, Scene
-from featuredb.simworld.town.solids import car, instances
+from featuredb.simworld.town.solids import car
 from featuredb.simworld.town.texture import Image8
 
 _SUPERSAMPLE = 2  # rays per pixel and direction; with one, thin things flicker and edges are jagged
@@ -48,7 +48,7 @@ def moving_cars(scene: Scene, moment: int, time_s: float = 0.0) -> Faces:
         time_s: after that moment; they drive on, and come in again where their street begins.
     """
     rng = np.random.default_rng((scene.seed, moment, 6))
-    places, yaws = [], []
+    places = []
     for s in scene.plan.streets:
         for lane, heading in ((-0.25 * s.width, 0.0), (0.25 * s.width, 180.0)):
             for _ in range(rng.poisson((s.end - s.start) / _CAR_SPACING_M)):
@@ -58,12 +58,13 @@ def moving_cars(scene: Scene, moment: int, time_s: float = 0.0) -> Faces:
                     a = s.start + 4 + (a - s.start - 4 + ahead) % (s.end - s.start - 8)
                 x, y = (a, s.at + lane) if s.along == "x" else (s.at - lane, a)
                 over_water = scene.plan.river[0] - 3 < y < scene.plan.river[1] + 3
-                places.append((x, y, 0.03 if over_water else float(scene.plan.height(y))))
-                yaws.append(heading + (0.0 if s.along == "x" else 90.0))
+                base = 0.03 if over_water else float(scene.plan.height(y))
+                places.append((x, y, base, heading + (0.0 if s.along == "x" else 90.0)))
     n = len(places)
     tints = rng.uniform(0.15, 1.0, (n, 1)) * rng.uniform(0.6, 1.0, (n, 3))
-    template = car(0.0, 0.0, 0.0, 0.0, (1.0, 1.0, 1.0), _MOVING_ID)
-    cars = instances(template, np.reshape(places, (n, 3)), yaws, tints)
+    cars = Faces.concatenate(
+        [car(*place, tint.tolist(), _MOVING_ID) for place, tint in zip(places, tints, strict=True)]
+    )
     return cars.shaded(scene.plan.to_sun).moved(scene.enu_from_town, np.zeros(3))
 
 

@@ -1,7 +1,6 @@
 """Faces of simple solids: boxes, houses, walls. All functions are pure and give `Faces` in town axes."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -149,30 +148,3 @@ def car(x: float, y: float, base: float, yaw_deg: float, tint: Sequence[float], 
     corner = np.array([x, y, base + 1.46]) - 0.9 * top[0] - 0.75 * top[1]
     lid = face(corner, 1.8 * top[0], 1.5 * top[1], "car", object_id, tint=tint)
     return Faces.concatenate([body, cabin, lid])
-
-
-def instances(template: Faces, positions: ArrayLike, yaw_deg: ArrayLike, tints: ArrayLike) -> Faces:
-    """Copies of a template that stands at the origin: positions (n, 3), turns (n,), tints (n, 3)."""
-    places, a = np.asarray(positions, dtype=np.float64), np.radians(np.asarray(yaw_deg, dtype=np.float64))
-    turns = np.zeros((len(places), 3, 3))
-    turns[:, 0, 0], turns[:, 0, 1] = np.cos(a), -np.sin(a)
-    turns[:, 1, 0], turns[:, 1, 1], turns[:, 2, 2] = np.sin(a), np.cos(a), 1.0
-    n = len(places)
-
-    def turned(vectors: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("nij,fj->nfi", turns, vectors), dtype=np.float64)
-
-    def repeated(rows: Any) -> Any:
-        return np.tile(rows, (n,) + (1,) * (rows.ndim - 1))
-
-    return Faces(
-        origin=(turned(template.origin) + places[:, None]).reshape(-1, 3),
-        edge_s=turned(template.edge_s).reshape(-1, 3),
-        edge_t=turned(template.edge_t).reshape(-1, 3),
-        triangle=repeated(template.triangle),
-        texture=repeated(template.texture),
-        uv=repeated(template.uv),
-        detail_uv=repeated(template.detail_uv),
-        tint=(template.tint[None] * np.asarray(tints, dtype=np.float64)[:, None]).reshape(-1, 3),
-        object_id=repeated(template.object_id),
-    )

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import covariance_in_frame, in_frame, move_map
@@ -264,14 +263,12 @@ def _carried(
 ) -> Edge:
     """An overlap in the coordinates of the new places: Z' = X_other Z X_map^-1."""
     other = in_frame(corrections[edge.map_id], maps[edge.map_id].frame, maps[map_id].frame)
-    adjoint = other.adjoint()
-    covariance: FloatArray = adjoint @ edge.covariance @ adjoint.T
     return replace(
         edge,
         place=places[edge.map_id],
         other_from_map=other @ edge.other_from_map @ corrections[map_id].inverse(),
-        covariance=0.5 * (covariance + covariance.T),
-        shared=adjoint @ edge.shared,
+        covariance=other.carried(edge.covariance),
+        shared=other.adjoint() @ edge.shared,
     )
 
 

@@ -90,19 +90,17 @@ def localise_photo(
     Args:
         camera: known intrinsics, of an image that a map holds for example; None: as the photo tells.
     """
-    upright = "-upright-" in features.fingerprint
-    settings = replace(QUERY, extractor=replace(QUERY.extractor, upright=upright))
     usable = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
-    if not usable or features.fingerprint != settings.extractor.fingerprint:
+    if not usable or features.fingerprint != QUERY.extractor.fingerprint:
         return "NO_COVERAGE: no active map has descriptors of this photo's extractor"
     few = features.take(np.arange(min(_MOST_FEATURES, len(features))))
     request = LocaliseRequest(
         camera=camera, camera_key=photo.camera_key or None, exif_focal_px=photo.focal_px, prior=photo.gps
     )
-    outcome = localise_features(few, request, usable, settings)
+    outcome = localise_features(few, request, usable, QUERY)
     by_prior = outcome.best is not None
     if not by_prior and photo.gps is not None:
-        again = _elsewhere(few, request, outcome, usable, settings)
+        again = _elsewhere(few, request, outcome, usable)
         outcome = again if again.best is not None else outcome
     if outcome.best is None:
         return f"{outcome.result.reason}: {outcome.result.detail}"
@@ -122,7 +120,6 @@ def _elsewhere(
     request: LocaliseRequest,
     first: Localised,
     areas: Sequence[IndexedArea],
-    settings: LocaliseOptions,
 ) -> Localised:
     """A photo that was not found within its geotag's reach, looked for beyond it.
 
@@ -130,8 +127,8 @@ def _elsewhere(
     all places compete once more; and what was found in vain near the geotag stays a rival.
     """
     tried = None if first.result.reason in ("CONTRADICTS_PRIOR", "AMBIGUOUS") else request.prior
-    found = localise_features(features, replace(request, prior=None, beyond=tried), areas, settings)
-    rival = settings.acceptance.rival_share * found.result.inliers
+    found = localise_features(features, replace(request, prior=None, beyond=tried), areas, QUERY)
+    rival = QUERY.acceptance.rival_share * found.result.inliers
     return first if tried is not None and first.result.inliers >= rival else found
 
 

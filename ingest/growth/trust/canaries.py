@@ -16,7 +16,6 @@ from typing import Any, Literal
 import numpy as np
 
 from featuredb.features.decode import DecodeLimits, decode_gray
-from featuredb.features.extractor import ExtractorOptions
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
@@ -238,8 +237,7 @@ def _ask(
     features: Features, request: LocaliseRequest, localiser: Localiser, map_ids: tuple[str, ...] | None
 ) -> LocaliseResult:
     areas = [a for a in localiser.areas_of(map_ids) if a.area.extractor_fingerprint == features.fingerprint]
-    upright = "-upright-" in features.fingerprint
-    options = LocaliseOptions(extractor=ExtractorOptions(upright=upright), acceptance=_OWN_FEATURES)
+    options = LocaliseOptions(acceptance=_OWN_FEATURES)
     return localise_features(features, request, areas, options).result
 
 

@@ -207,7 +207,7 @@ def _vertical_of_map(feature_map: FeatureMap, points: FloatArray, frame_from_map
     method = feature_map.placement.method
     if method == "gcp":
         return None
-    covariance = frame_from_map.compose_covariance(np.zeros((7, 7)), feature_map.placement.covariance)
+    covariance = frame_from_map.carried(feature_map.placement.covariance)
     return vertical_of(frame_from_map, covariance, points, f"the map's placement by {method}")
 
 

@@ -150,8 +150,7 @@ def placed_map(
     assert structure.covariance is not None  # accepted
     map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
     move = map_from_cloud @ structure.new_from_old @ map_from_cloud.inverse()
-    adjoint = map_from_cloud.adjoint()
-    covariance = adjoint @ structure.covariance @ adjoint.T
+    covariance = map_from_cloud.carried(structure.covariance)
     if adjustment is None:
         block = block_of_map(feature_map).moved(move)
         rms_m, evidence = structure.figures["residual_rms_m"], {"structure": structure.figures}

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
 from featuredb.features.decode import decode_gray, probe
-from featuredb.features.image_header import ImageHeader
 from featuredb.features.shrink import fitted_size, shrunk
+from featuredb.features.stored_image import ImageHeader
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from reloc.answered_view import geo_prior
