@@ -205,29 +205,6 @@ class StoreSuite:
                 counts.append(next(session.query("select count(*) from points").rows)[0])
         assert counts == [50, 120]
 
-    def test_threads_that_commit_the_same_and_different_maps(self, database: Database, place: Place) -> None:
-        results = []
-
-        def commit(seed: int) -> None:
-            results.append(place.open().commit_map(random_map(seed)))
-
-        threads = [threading.Thread(target=commit, args=(seed,)) for seed in (1, 1, 1, 2, 3, 4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(120)
-        assert sorted((r.map_id, r.created) for r in results) == [
-            ("map-1", False),
-            ("map-1", False),
-            ("map-1", True),
-            ("map-2", True),
-            ("map-3", True),
-            ("map-4", True),
-        ]
-        assert len(database.snapshot().rows()) == 4
-        report = verify(database)
-        assert report.ok
-
     def test_two_processes_and_a_reader_that_never_sees_half_a_map(
         self, database: Database, place: Place
     ) -> None:
@@ -254,6 +231,29 @@ class StoreSuite:
 
 class ChangesSuite(StoreSuite):
     """What changes do to the rows of `maps`, too: the code is the same wherever they lie."""
+
+    def test_threads_that_commit_the_same_and_different_maps(self, database: Database, place: Place) -> None:
+        results = []
+
+        def commit(seed: int) -> None:
+            results.append(place.open().commit_map(random_map(seed)))
+
+        threads = [threading.Thread(target=commit, args=(seed,)) for seed in (1, 1, 1, 2, 3, 4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(120)
+        assert sorted((r.map_id, r.created) for r in results) == [
+            ("map-1", False),
+            ("map-1", False),
+            ("map-1", True),
+            ("map-2", True),
+            ("map-3", True),
+            ("map-4", True),
+        ]
+        assert len(database.snapshot().rows()) == 4
+        report = verify(database)
+        assert report.ok
 
     def test_time_travel_and_rollback(self, database: Database) -> None:
         database.commit_map(random_map(1))
