@@ -9,13 +9,14 @@ import argparse
 import os
 import subprocess
 import sys
-import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 # Two tests run at a time on two cores: threads of their libraries beside them would only wait for each other.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+# OpenCV's even take time while they wait: a sixth of that of SIFT.
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 # Some machines tell Python not to keep bytecode. Then every process compiles all that it imports,
 # for seconds, and tests start many processes.
 _ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | _ONE_THREAD
@@ -35,21 +36,19 @@ def main() -> int:
     steps = [
         ("format", [python, "-m", "ruff", "format", "--check", "."]),
         ("lint", [python, "-m", "ruff", "check", "."]),
-        ("import rules", [str(Path(python).with_name("lint-imports"))]),
         ("tests", [*pytest, "-m", "not slow"] if args.fast else pytest),
     ]
     if args.all:
         steps.append(("studies", [*pytest, "--evaluations"]))
-    # Types take one core, and tests wait now and then: beside them they take little time of their own.
-    with tempfile.TemporaryFile() as said:
-        types = subprocess.Popen(
-            [python, "-m", "mypy"], cwd=ROOT, env=_ENVIRONMENT, stdout=said, stderr=subprocess.STDOUT
-        )
+    # These take one core, and tests wait now and then: beside them they take little time of their own.
+    beside = {"types": [python, "-m", "mypy"], "import rules": [str(Path(python).with_name("lint-imports"))]}
+    with ThreadPoolExecutor(max_workers=1) as runs:
+        said = {name: runs.submit(_said, command) for name, command in beside.items()}
         failed = [name for name, command in steps if not _passes(name, command)]
-        code = types.wait()
-        said.seek(0)
-        print(f"== types\n{said.read().decode()}== types: {_verdict(code)}", flush=True)
-    failed += ["types"] if code != 0 else []
+        for name, done in said.items():
+            code, text = done.result()
+            print(f"== {name}\n{text}== {name}: {_verdict(code)}", flush=True)
+            failed += [name] if code != 0 else []
     print(f"failed: {', '.join(failed)}" if failed else "all checks passed")
     return 1 if failed else 0
 
@@ -60,6 +59,20 @@ def _passes(name: str, command: list[str]) -> bool:
     code = subprocess.run(command, cwd=ROOT, env=_ENVIRONMENT, check=False).returncode
     print(f"== {name}: {_verdict(code)}, {time.monotonic() - start:.0f} s", flush=True)
     return code == 0
+
+
+def _said(command: list[str]) -> tuple[int, str]:
+    """Run a command: its exit code, and all that it writes."""
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env=_ENVIRONMENT,
+        check=False,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    return done.returncode, done.stdout
 
 
 def _verdict(code: int) -> str:

@@ -1,6 +1,7 @@
 """`featuredb anchor --near`: a map without a place is found on the scan, or said not to be there."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,12 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import moved_image
 from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store import Database
+from ingest.register.anchor import frames
+from ingest.register.anchor.start import first_place
 from tests.support.hill_map import hill_map
 from tests.support.hill_photos import FRAME, hill_photos
 from tests.support.hill_scan import write_hill_scan
+from tests.support.remembered import remembered
 
 # The map's own frame is upside down, turned and of another size.
 OWN_FROM_LOCAL = Sim3(scale=0.4, rotation=so3_exp([3.0, 0.5, -1.0]), translation=np.array([7.0, -5.0, 2.0]))
@@ -46,12 +50,21 @@ def words(made: Path, tmp_path: Path, texture: int) -> list[str]:
     placed = Database.open(made / "db").snapshot()
     database = Database.create(tmp_path / "db")
     database.commit_map(without_place(placed.load_map(placed.maps()[0].map_id)))
-    add_scan(database, [write_hill_scan(tmp_path / "scan.laz", texture_seed=texture)])
+    add_scan(database, [write_hill_scan(tmp_path / "scan.laz", texture_seed=texture, half_side_m=35.0)])
     near = FRAME.geodetic_from_enu(_AWAY_M)
     return [
         *("anchor", str(tmp_path / "db"), "adrift", "--photos", str(made / "photos"), "--quiet", "--auto"),
         *("--out", str(tmp_path / "out"), f"--near={near[0]:.6f},{near[1]:.6f},150"),
     ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _found_once() -> Iterator[None]:
+    """Two tests begin with the same map on the same scan."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(first_place, "found_from_above", remembered(first_place.found_from_above))
+        patch.setattr(frames, "register_frame", remembered(frames.register_frame))
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -98,8 +98,10 @@ def test_a_wrong_joint_is_undone_and_the_blocks_stay_apart(
         return [JoinedModel(members=tuple(range(len(models))), first_from=tuple(turned))]
 
     monkeypatch.setattr(reconstruct, "join", at_random)
-    for done in ("features", "matches"):
+    for done in ("features", "matches", "models"):
         shutil.copytree(work / done, tmp_path / "work" / done)
+    # Blocks are as they were; what was joined of them came last.
+    shutil.rmtree(max((tmp_path / "work" / "models").iterdir(), key=lambda made: made.stat().st_mtime_ns))
     database = Database.create(tmp_path / "db")
     report = ingest_photos(database, hills[0], replace(_OPTIONS, work=tmp_path / "work"))
     poses = {photo.name: photo.cam_from_local for photo in hills[1]}

@@ -11,9 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from featuredb.features.extractor import ExtractorOptions
-from ingest.cli import video
-from ingest.register.anchor import frames
 from tests.support.doc_commands import (
     ROOT,
     Block,
@@ -27,8 +24,8 @@ from tests.support.doc_commands import (
 )
 from tests.support.doc_folder import go_on, inside, make_folder
 from tests.support.doc_runner import CommandFailedError, PageRun, is_free, ports
+from tests.support.doc_short import STARTUP, shorten
 from tests.support.doc_usage import UsageError, check_usage
-from tests.support.remembered import remembered
 
 _REAL_DATA = "needs photos or scans that are not in the repository"
 _BY_HAND = "needs a person's clicks; tools/paper.py runs the same with picks, tests/browser the page"
@@ -59,7 +56,6 @@ PYTHON_NOT_RUN = {
 }
 # The page that makes the database; the others begin with what it leaves.
 _FIRST = "docs/quickstart.md"
-_FEATURES = 1500  # of a photo
 _LANGUAGES = {"sh", "python", "sql", "json", "text"}
 
 _NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
@@ -106,16 +102,8 @@ def run_page(page: str, folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def in_short() -> Iterator[None]:
-    """Commands start no workers, which take long, and what the same photo gave before is not sought anew.
-
-    docs/anchoring.md and the tutorials register the same frames on the same scan.
-    A map of few features is adjusted and compared sooner; how good it is, the demo says.
-    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("os.cpu_count", lambda: 1)
-        patch.setitem(ExtractorOptions.__init__.__kwdefaults__, "max_features", _FEATURES)
-        patch.setattr(video, "_FEATURES", _FEATURES)
-        patch.setattr(frames, "register_frame", remembered(frames.register_frame))
+        shorten(patch)
         yield
 
 
@@ -146,11 +134,19 @@ def test_the_commands_of_a_page_run(after_first: Path, tmp_path: Path, page: str
 def test_a_notebook_runs(after_first: Path, tmp_path: Path, notebook: Path) -> None:
     here = Path(shutil.copytree(after_first, tmp_path / "here"))
     shutil.copy(notebook, here)
+    startup = tmp_path / "ipython" / "profile_default" / "startup"
+    startup.mkdir(parents=True)
+    (startup / "short.py").write_text(STARTUP)
     programs = Path(sys.executable).parent
     done = subprocess.run(
         [programs / "jupyter-execute", "--timeout=600", notebook.name],
         cwd=here,
-        env={**os.environ, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"},
+        env={
+            **os.environ,
+            "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}",
+            "PYTHONPATH": str(ROOT),
+            "IPYTHONDIR": str(tmp_path / "ipython"),
+        },
         capture_output=True,
         text=True,
         check=False,

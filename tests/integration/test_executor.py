@@ -197,10 +197,10 @@ def test_dask_workers_on_their_way_are_waited_for(tmp_path: Path, monkeypatch: p
         empty.scale(1)
         with DaskExecutor(empty.scheduler_address, shared=[tmp_path]) as dask:
             assert dask.map("squares", square, [3]) == [9]
-    monkeypatch.setattr(dask_cluster, "_CONNECT_S", 5.0)  # the scheduler itself is reached
+    monkeypatch.setattr(dask_cluster, "_CONNECT_S", 2.0)  # the scheduler itself is reached
     with (
         distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
-        pytest.raises(IngestError, match="found none within 5 s"),
+        pytest.raises(IngestError, match="found none within 2 s"),
     ):
         DaskExecutor(empty.scheduler_address, shared=[tmp_path])
 

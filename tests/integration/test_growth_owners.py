@@ -100,7 +100,7 @@ def test_newcomers_beside_an_anchor_add_what_both_show(database: Database) -> No
     assert -10.1 < east["west"].min() < -9.0  # the anchor begins at -10 m, her map at -20 m
 
 
-@pytest.mark.parametrize("refused", ["near", "wall"])
+@pytest.mark.parametrize("refused", ["near", pytest.param("wall", marks=pytest.mark.evaluation)])
 def test_a_map_that_canaries_refuse_makes_no_record(
     database: Database, monkeypatch: pytest.MonkeyPatch, refused: str
 ) -> None:

@@ -101,6 +101,7 @@ def test_a_reconstruction_is_placed_and_becomes_a_map(
     assert np.median(nearest) < 0.1
 
 
+@pytest.mark.evaluation
 def test_the_bound_of_drift_holds(area: IndexedArea) -> None:
     """Independent photos, matches and noise: no point of the map is further off than the map says (95 %)."""
     beyond = 0

@@ -1,6 +1,7 @@
 """`featuredb ingest video`: a film over the test hills becomes a map where its telemetry has them."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +17,13 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database
 from featuredb.video.telemetry.read import read_telemetry
 from featuredb.video.writer import VideoWriter
+from ingest.video import keyframe_files
 from ingest.video.film_time import film_start
 from ingest.video.keyframes import KeyframeOptions
 from ingest.video.stills import StillsOptions, make_stills
 from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.planar_map import field_texture, view
+from tests.support.remembered import remembered
 
 _RATE_HZ = 10.0
 # For what telemetry does: a handful of photos, each of which is looked at for what is burnt in.
@@ -37,6 +40,14 @@ def _pose(frame: int) -> Rigid3:
 
 def _clock(time_s: float) -> str:
     return f"00:00:{int(time_s):02d},{round(1000 * (time_s % 1)):03d}"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _looked_at_once() -> Iterator[None]:
+    """Most tests choose the same keyframes, in which the same is burnt in: nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(keyframe_files, "find_burnt_in", remembered(keyframe_files.find_burnt_in))
+        yield
 
 
 @pytest.fixture(scope="module")

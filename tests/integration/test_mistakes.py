@@ -1,14 +1,13 @@
 """What people mistype ends at once: one line says what to do, by options that exist, and nothing is made.
 
-Each runs as a program of its own, so that nothing that a library writes is missed.
+What a library writes past Python is seen as well: it is all that comes to the file descriptors.
 """
 
 import argparse
 import ast
+import logging
 import re
 import socket
-import subprocess
-import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -17,8 +16,9 @@ import laspy
 import numpy as np
 import pytest
 
-from featuredb.cli.main import COMMAND_GROUP, build_parser
+from featuredb.cli.main import COMMAND_GROUP, build_parser, main
 from featuredb.store import Database
+from reloc.client import Client
 from tests.conftest import REPOSITORY
 from tests.support import planar_map as field
 
@@ -103,31 +103,27 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "featuredb.cli", *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120.0,
-    )
-
-
 def contents(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_ends_in_one_line_that_says_what_to_do(folder: Path, mistake: str) -> None:
+def test_a_mistake_ends_in_one_line_that_says_what_to_do(
+    folder: Path, mistake: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     command, said = MISTAKES[mistake]
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
         words = command.format(port=nobody.getsockname()[1]).split()
     before = contents(folder)
-    done = run(folder, *words)
-    assert (done.returncode, done.stdout) == (2, ""), done
-    (line,) = done.stderr.splitlines()
+    monkeypatch.chdir(folder)
+    monkeypatch.setitem(Client.__init__.__kwdefaults__, "connect_timeout_s", 0.5)
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])  # the command logs as it does in its own process
+    capfd.readouterr()
+    code = main(words)
+    done = capfd.readouterr()
+    assert (code, done.out) == (2, ""), done
+    (line,) = done.err.splitlines()
     assert line.startswith("featuredb: ")
     assert re.search(said, line), line
     assert contents(folder) == before
@@ -158,13 +154,15 @@ def test_every_option_that_a_text_names_exists() -> None:
     assert [(module, option) for module, option in named if option not in known | of_others] == []
 
 
-def test_frames_with_a_rate_are_tracked(folder: Path, tmp_path: Path) -> None:
+def test_frames_with_a_rate_are_tracked(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     texture = field.field_texture(1)
     for k in range(3):
         frame = field.render(texture, field.view(0.5 * k, -6.0, 40.0, 8.0, 33.0), seed=k)
         cv2.imwrite(str(tmp_path / f"{k}.png"), frame)
     out = tmp_path / "track.csv"
-    done = run(folder, "track", "field.db", str(tmp_path), "--fps", "2", "--out", str(out))
-    assert done.returncode == 0, done.stderr
-    assert "3 frames" in done.stdout
-    assert "from 0.00 s to 1.00 s" in done.stdout
+    assert main(["track", str(folder / "field.db"), str(tmp_path), "--fps", "2", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "3 frames" in said
+    assert "from 0.00 s to 1.00 s" in said

@@ -135,7 +135,7 @@ def test_sources_follow_what_the_scan_has() -> None:
     assert available_sources(place().intensity) == ("intensity", "shaded")
 
 
-@pytest.mark.slow
+@pytest.mark.evaluation
 def test_intensity_alone_from_a_wrong_prior() -> None:
     """The pose is found; so small and wide a photo is at the limit of what is believed."""
     here = place()

@@ -264,7 +264,8 @@ def test_a_southern_prior_is_understood():
     assert parse_prior(args.prior) == PriorRequest(lat=-33.86, lon=151.21, sigma_m=25.0)
 
 
-def test_bad_arguments_are_explained(photos, tmp_path, capsys):
+def test_bad_arguments_are_explained(photos, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(Client.__init__.__kwdefaults__, "connect_timeout_s", 0.5)
     image = str(photos / "a.png")
     assert run("query", image, "--prior", "91,0,5") == 2
     assert "LAT,LON,SIGMA_M" in capsys.readouterr().err

@@ -29,7 +29,7 @@ from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.hill_walk import anchored_database
 from tests.support.made_once import made_once
 from tests.support.planar_map import field_texture
-from tests.support.tracked_film import CUT, FRAMES, OPTIONS, pose_at, tracked
+from tests.support.tracked_film import CUT, FRAMES, OPTIONS, film_frames, pose_at, tracked
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +43,8 @@ def areas(anchored: Path) -> tuple[IndexedArea, ...]:
 
 
 @pytest.fixture(scope="module")
-def film() -> list[np.ndarray]:
-    texture, other = field_texture(1), field_texture(9)
-    return [_render(other if i in CUT else texture, pose_at(i), i) for i in range(FRAMES)]
+def film(tmp_path_factory: pytest.TempPathFactory) -> list[np.ndarray]:
+    return film_frames(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

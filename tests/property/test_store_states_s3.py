@@ -67,7 +67,10 @@ def test_an_entry_that_was_taken_is_known_for_ones_own(
     assert verify(database).problems == ()
 
 
-@pytest.mark.parametrize("first", [0, 5, 12, 20])
+@pytest.mark.parametrize(
+    "first",
+    [0, pytest.param(5, marks=pytest.mark.evaluation), 12, pytest.param(20, marks=pytest.mark.evaluation)],
+)
 def test_a_store_that_does_not_answer_is_not_damaged(
     store: FaultyStore, database: Database, first: int
 ) -> None:

@@ -38,7 +38,7 @@ from tools.worlds.flight_path import PathOptions
 
 _LICENCE = "CC-BY-4.0"
 _TOWN = WorldOptions(
-    town_size_m=(260.0, 230.0),
+    town_size_m=(190.0, 170.0),
     flight=FlightOptions(lines=3, per_line=3, oblique=0, width=512, gps_error="rtk"),
     queries=1,
     query_width=512,
@@ -73,7 +73,7 @@ _FILM = FilmOptions(
     height=270,
     samples=1,
 )
-_FIRST_NAME = 30  # so that DJI_0034.JPG is in the middle of the park
+_FIRST_NAME = 27  # so that DJI_0034.JPG registers best
 
 
 def make_folder(folder: Path) -> Path:

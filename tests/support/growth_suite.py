@@ -104,25 +104,6 @@ class GrowthSuite:
         assert load_image(database, one) == contribution(1).image
         assert find_candidate(database, one).state == "waiting"
 
-    def test_compact_and_vacuum_keep_the_inbox(self, database: Database) -> None:
-        ids = [contribute(database, [contribution(i)])[0] for i in range(4)]
-        refuse(database, {ids[0]: ("BLUR", "blurred")})
-        saved = compact(database)
-        assert saved["candidate_images"] == 3
-        assert saved["candidates"] == 4
-        vacuum(database, VacuumOptions(orphan_grace_h=0, file_grace_h=0))
-        assert dict(load_images(database, ids)) == {i: contribution(k).image for k, i in enumerate(ids)}
-        dry = vacuum(database, NOTHING_KEPT, dry_run=True)
-        assert dry.candidate_images == (ids[0],)
-        assert load_image(database, ids[0])
-        assert vacuum(database, NOTHING_KEPT).candidate_images == (ids[0],)
-        with pytest.raises(CandidateNotFoundError):
-            load_image(database, ids[0])
-        assert find_candidate(database, ids[0]).reason_code == "BLUR"
-        assert vacuum(database, NOTHING_KEPT).candidate_images == ()
-        report = verify(database)
-        assert (report.ok, report.candidates, report.orphans) == (True, 4, ())
-
     def test_threads_that_contribute_at_once(self, database: Database, place: Place) -> None:
         contribute(database, [contribution(99)])
 
@@ -143,6 +124,25 @@ class GrowthSuite:
 
 class DecisionsSuite(GrowthSuite):
     """What is decided about photos, known queries and maps, too: the code is the same wherever they lie."""
+
+    def test_compact_and_vacuum_keep_the_inbox(self, database: Database) -> None:
+        ids = [contribute(database, [contribution(i)])[0] for i in range(4)]
+        refuse(database, {ids[0]: ("BLUR", "blurred")})
+        saved = compact(database)
+        assert saved["candidate_images"] == 3
+        assert saved["candidates"] == 4
+        vacuum(database, VacuumOptions(orphan_grace_h=0, file_grace_h=0))
+        assert dict(load_images(database, ids)) == {i: contribution(k).image for k, i in enumerate(ids)}
+        dry = vacuum(database, NOTHING_KEPT, dry_run=True)
+        assert dry.candidate_images == (ids[0],)
+        assert load_image(database, ids[0])
+        assert vacuum(database, NOTHING_KEPT).candidate_images == (ids[0],)
+        with pytest.raises(CandidateNotFoundError):
+            load_image(database, ids[0])
+        assert find_candidate(database, ids[0]).reason_code == "BLUR"
+        assert vacuum(database, NOTHING_KEPT).candidate_images == ()
+        report = verify(database)
+        assert (report.ok, report.candidates, report.orphans) == (True, 4, ())
 
     def test_used_counts_while_the_map_lives(self, database: Database) -> None:
         ids = contribute(database, [contribution(1), contribution(2)])

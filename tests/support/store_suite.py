@@ -116,15 +116,6 @@ class StoreSuite:
         assert len(database.snapshot().rows()) == 1
         assert database.poll_version() == first.version
 
-    def test_several_maps_in_one_commit(self, database: Database) -> None:
-        database.commit_map(random_map(1))
-        results = database.commit_maps([random_map(i) for i in (1, 2, 3)])
-        assert [r.created for r in results] == [False, True, True]
-        assert database.poll_version() == 2
-        assert len(database.snapshot().maps()) == 3
-        with pytest.raises(StoreError, match="different"):
-            database.commit_maps([random_map(4), random_map(4)])
-
     def test_a_commit_whose_answer_was_lost(
         self, database: Database, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -159,25 +150,6 @@ class StoreSuite:
         assert database.snapshot().rows() == []
         assert len(verify(database).orphans) == 1
 
-    def test_time_travel_and_rollback(self, database: Database) -> None:
-        database.commit_map(random_map(1))
-        database.commit_map(random_map(2))
-        between = database.snapshot().timestamp
-        database.retire("map-1", "test")
-        assert [len(database.snapshot(v).maps()) for v in (0, 1, 2, 3)] == [0, 1, 2, 1]
-        assert database.snapshot(between).version == 2
-        assert database.rollback(2) == 4
-        assert {m.map_id for m in database.snapshot().maps()} == {"map-1", "map-2"}
-        assert_same_map(database.snapshot().load_map("map-1"), random_map(1))
-        assert len(database.snapshot(3).maps()) == 1
-        history = database.history()
-        assert [e.operation for e in history] == ["rollback", "retire", "commit", "commit", "init"]
-        assert history[1].maps == ("map-1",)
-        assert history[1].reason == "test"
-        for wrong in (99, datetime(2000, 1, 1, tzinfo=UTC), datetime(2000, 1, 1)):
-            with pytest.raises(SnapshotNotFoundError):
-                database.snapshot(wrong)
-
     def test_a_snapshot_stays_what_it_was(self, database: Database) -> None:
         database.commit_map(random_map(1))
         snapshot = database.snapshot()
@@ -188,18 +160,6 @@ class StoreSuite:
         assert [m.map_id for m in snapshot.maps()] == ["map-1"]
         # Its files are gone, but the rows live on in the compacted ones.
         assert_same_map(snapshot.load_map("map-1"), random_map(1))
-
-    def test_compact_keeps_every_row(self, database: Database) -> None:
-        for seed in range(4):
-            database.commit_map(random_map(seed))
-        files = verify(database).files
-        saved = compact(database)
-        report = verify(database)
-        assert report.ok
-        assert report.files == files - sum(saved.values())
-        assert all(count > 0 for count in saved.values())
-        for seed in range(4):
-            assert_same_map(database.snapshot().load_map(f"map-{seed}"), random_map(seed))
 
     def test_vacuum_keeps_what_kept_versions_name(self, database: Database) -> None:
         database.commit_map(random_map(1))
@@ -245,29 +205,6 @@ class StoreSuite:
                 counts.append(next(session.query("select count(*) from points").rows)[0])
         assert counts == [50, 120]
 
-    def test_threads_that_commit_the_same_and_different_maps(self, database: Database, place: Place) -> None:
-        results = []
-
-        def commit(seed: int) -> None:
-            results.append(place.open().commit_map(random_map(seed)))
-
-        threads = [threading.Thread(target=commit, args=(seed,)) for seed in (1, 1, 1, 2, 3, 4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(120)
-        assert sorted((r.map_id, r.created) for r in results) == [
-            ("map-1", False),
-            ("map-1", False),
-            ("map-1", True),
-            ("map-2", True),
-            ("map-3", True),
-            ("map-4", True),
-        ]
-        assert len(database.snapshot().rows()) == 4
-        report = verify(database)
-        assert report.ok
-
     def test_two_processes_and_a_reader_that_never_sees_half_a_map(
         self, database: Database, place: Place
     ) -> None:
@@ -294,6 +231,69 @@ class StoreSuite:
 
 class ChangesSuite(StoreSuite):
     """What changes do to the rows of `maps`, too: the code is the same wherever they lie."""
+
+    def test_threads_that_commit_the_same_and_different_maps(self, database: Database, place: Place) -> None:
+        results = []
+
+        def commit(seed: int) -> None:
+            results.append(place.open().commit_map(random_map(seed)))
+
+        threads = [threading.Thread(target=commit, args=(seed,)) for seed in (1, 1, 1, 2, 3, 4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(120)
+        assert sorted((r.map_id, r.created) for r in results) == [
+            ("map-1", False),
+            ("map-1", False),
+            ("map-1", True),
+            ("map-2", True),
+            ("map-3", True),
+            ("map-4", True),
+        ]
+        assert len(database.snapshot().rows()) == 4
+        report = verify(database)
+        assert report.ok
+
+    def test_time_travel_and_rollback(self, database: Database) -> None:
+        database.commit_map(random_map(1))
+        database.commit_map(random_map(2))
+        between = database.snapshot().timestamp
+        database.retire("map-1", "test")
+        assert [len(database.snapshot(v).maps()) for v in (0, 1, 2, 3)] == [0, 1, 2, 1]
+        assert database.snapshot(between).version == 2
+        assert database.rollback(2) == 4
+        assert {m.map_id for m in database.snapshot().maps()} == {"map-1", "map-2"}
+        assert_same_map(database.snapshot().load_map("map-1"), random_map(1))
+        assert len(database.snapshot(3).maps()) == 1
+        history = database.history()
+        assert [e.operation for e in history] == ["rollback", "retire", "commit", "commit", "init"]
+        assert history[1].maps == ("map-1",)
+        assert history[1].reason == "test"
+        for wrong in (99, datetime(2000, 1, 1, tzinfo=UTC), datetime(2000, 1, 1)):
+            with pytest.raises(SnapshotNotFoundError):
+                database.snapshot(wrong)
+
+    def test_compact_keeps_every_row(self, database: Database) -> None:
+        for seed in range(4):
+            database.commit_map(random_map(seed))
+        files = verify(database).files
+        saved = compact(database)
+        report = verify(database)
+        assert report.ok
+        assert report.files == files - sum(saved.values())
+        assert all(count > 0 for count in saved.values())
+        for seed in range(4):
+            assert_same_map(database.snapshot().load_map(f"map-{seed}"), random_map(seed))
+
+    def test_several_maps_in_one_commit(self, database: Database) -> None:
+        database.commit_map(random_map(1))
+        results = database.commit_maps([random_map(i) for i in (1, 2, 3)])
+        assert [r.created for r in results] == [False, True, True]
+        assert database.poll_version() == 2
+        assert len(database.snapshot().maps()) == 3
+        with pytest.raises(StoreError, match="different"):
+            database.commit_maps([random_map(4), random_map(4)])
 
     def test_what_cannot_be_committed(self, database: Database) -> None:
         with pytest.raises(StoreError, match="retired"):
