@@ -11,8 +11,8 @@ from featuredb.features.extractor import (
     ExtractorOptions,
     create_sift,
     rootsift_8bit,
-    shrunk,
 )
+from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
 
 # The smallest diameter that the extractor finds: half a layer below the first, in the doubled image.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.features import Features
 from featuredb.features.selection import spread_strongest
+from featuredb.features.shrink import shrunk
 
 # Raise when a change to this module makes descriptors that older maps cannot be compared with.
 _DESCRIPTOR_VERSION = "rootsift8-opencv-1"
@@ -121,16 +122,6 @@ def create_sift(**options: Any) -> Any:
     """OpenCV's SIFT with this extractor's scale space, and more options by OpenCV's names."""
     create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
     return create(nOctaveLayers=OCTAVE_LAYERS, sigma=SIGMA, enable_precise_upscale=True, **options)
-
-
-def shrunk(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
-    """The photo (h, w) area-averaged down to this longer side; smaller ones stay."""
-    height, width = gray.shape
-    factor = max_side_px / max(height, width)
-    if factor >= 1.0:
-        return gray
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _upright(keypoints: "list[cv2.KeyPoint]") -> "list[cv2.KeyPoint]":
