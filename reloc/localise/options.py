@@ -87,7 +87,12 @@ class PoseOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocaliseOptions:
-    """All of the localisation's settings."""
+    """All of the localisation's settings.
+
+    Attributes:
+        small_share: largest share of a pose's variance that may come from the picture where it is answered by
+            the small one: a tenth makes its radius five hundredths larger than an exact picture would.
+    """
 
     extractor: ExtractorOptions = field(
         default_factory=lambda: ExtractorOptions(max_side_px=1000, max_features=3000, oversample=1.25)
@@ -96,3 +101,4 @@ class LocaliseOptions:
     matching: PointMatchOptions = field(default_factory=PointMatchOptions)
     pose: PoseOptions = field(default_factory=PoseOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
+    small_share: float = 0.1

@@ -9,11 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, IncompatibleExtractorError, InvalidValueError
-from featuredb.features.extractor import ExtractorOptions
+from featuredb.features.extractor import ExtractorOptions, extract
+from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.lens_uncertainty import LensUncertainty
+from reloc.localise import localise as localise_module
 from reloc.localise import search
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise
@@ -246,6 +248,56 @@ def test_giving_up_early_changes_no_answer(
         assert (a.pose is None) == (b.pose is None)
         if a.pose is not None and b.pose is not None:
             assert np.array_equal(a.pose.utm, b.pose.utm)
+
+
+def large(texture: NDArray[np.uint8], truth: Rigid3, seed: int) -> NDArray[np.uint8]:
+    """A photo of twice the size, as sharp as one of 640 px can be."""
+    return np.asarray(cv2.resize(render(texture, truth, seed), (1280, 960)), dtype=np.uint8)
+
+
+def extracted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The longer sides at which features are extracted, as they are."""
+    asked: list[int] = []
+
+    def noted(gray: NDArray[np.uint8], options: ExtractorOptions) -> Features:
+        asked.append(options.max_side_px)
+        return extract(gray, options)
+
+    monkeypatch.setattr(localise_module, "extract", noted)
+    return asked
+
+
+def test_a_small_picture_answers_where_the_map_is_what_is_not_known(
+    field_map: FeatureMap, texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A map within a metre: centimetres of the picture are no matter. One within millimetres: they are."""
+    photo, request = large(texture, POSE, 5), replace(KNOWN, camera=CAMERA.scaled_to(1280, 960))
+    asked = extracted(monkeypatch)
+    loose = replace(
+        field_map,
+        placement=replace(field_map.placement, covariance=np.diag([1e-6] + [1e-4] * 3 + [1.0] * 3)),
+    )
+    result = localise(photo, request, [indexed(loose)])
+    assert asked == [500]
+    assert pose_errors(result, POSE)[0] < 0.1
+    asked.clear()
+    result = localise(photo, request, [indexed(field_map)])
+    assert asked == [500, 1000]
+    assert pose_errors(result, POSE)[0] < 0.05
+
+
+def test_what_a_small_picture_does_not_settle_is_asked_of_a_large_one(
+    area: IndexedArea, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = replace(KNOWN, camera=CAMERA.scaled_to(1280, 960))
+    asked = extracted(monkeypatch)
+    assert localise(large(field_texture(77), POSE, 3), request, [area]).pose is None
+    assert asked == [500, 1000]
+    asked.clear()
+    # No larger picture brings a map within reach.
+    far = replace(request, prior=prior_at(area, 5000.0))
+    assert localise(large(field_texture(77), POSE, 3), far, [area]).reason == "NO_COVERAGE"
+    assert asked == [500]
 
 
 def test_a_blank_photo_has_too_few_features(area: IndexedArea) -> None:
