@@ -72,7 +72,8 @@ def localise(
     areas = usable_areas(areas, options.extractor.fingerprint)
     clock = StageClock()
     small = _small_picture(options.extractor)
-    if max(gray.shape) > small.max_side_px:
+    # Who asks for inliers wants as many and as exact ones as there are.
+    if max(gray.shape) > small.max_side_px and not request.want_inliers:
         features = extract(gray, small)
         clock.lap("features")
         found = _localised(features, request, areas, options, snapshot, clock)

@@ -281,6 +281,9 @@ def test_a_small_picture_answers_where_the_map_is_what_is_not_known(
     assert asked == [500]
     assert pose_errors(result, POSE)[0] < 0.1
     asked.clear()
+    localise(photo, replace(request, want_inliers=True), [indexed(loose)])
+    assert asked == [1000]
+    asked.clear()
     result = localise(photo, request, [indexed(field_map)])
     assert asked == [500, 1000]
     assert pose_errors(result, POSE)[0] < 0.05
