@@ -46,8 +46,8 @@ def usable_areas(areas: Sequence[IndexedArea], fingerprint: str) -> list[Indexed
     if areas and not usable:
         raise IncompatibleExtractorError(
             f"the maps were made by extractor {areas[0].area.extractor_fingerprint}, photos and frames here "
-            f"use {fingerprint}: their descriptors cannot be compared; use the same extractor options "
-            "(upright or not) as the ingest"
+            f"use {fingerprint}: their descriptors cannot be compared; ingest the photos of these maps "
+            "again with this version"
         )
     return usable
 

@@ -85,10 +85,9 @@ def localise(
 
 
 def _small_picture(extractor: ExtractorOptions) -> ExtractorOptions:
-    """The picture that is asked first: half as large, a quarter of the time."""
-    return replace(
-        extractor, max_side_px=extractor.max_side_px // 2, max_features=extractor.max_features // 3
-    )
+    """The picture that is asked first: of 640 px where the large one has 1000, in less than half the time."""
+    side_px = max(extractor.max_side_px * 16 // 25, 64)
+    return replace(extractor, max_side_px=side_px, max_features=max(extractor.max_features // 2, 1))
 
 
 def _is_enough(small: Localised, options: LocaliseOptions) -> bool:
@@ -101,7 +100,7 @@ def _is_enough(small: Localised, options: LocaliseOptions) -> bool:
         return False
     if result.own_position is not None and result.own_position.role != "agrees":
         return False
-    sure = result.evidence.log_nfa > lines.settled_log_nfa and result.evidence.spread >= lines.min_spread
+    sure = result.evidence.log_nfa > lines.settled_log_nfa and result.evidence.spread >= options.small_spread
     measured, all_of_it = small.uncertainty.covariance, result.pose.covariance
     return sure and all(
         np.trace(measured[part, part]) <= options.small_share * np.trace(all_of_it[part, part])

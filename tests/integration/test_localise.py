@@ -278,14 +278,14 @@ def test_a_small_picture_answers_where_the_map_is_what_is_not_known(
         placement=replace(field_map.placement, covariance=np.diag([1e-6] + [1e-4] * 3 + [1.0] * 3)),
     )
     result = localise(photo, request, [indexed(loose)])
-    assert asked == [500]
+    assert asked == [640]
     assert pose_errors(result, POSE)[0] < 0.1
     asked.clear()
     localise(photo, replace(request, want_inliers=True), [indexed(loose)])
     assert asked == [1000]
     asked.clear()
     result = localise(photo, request, [indexed(field_map)])
-    assert asked == [500, 1000]
+    assert asked == [640, 1000]
     assert pose_errors(result, POSE)[0] < 0.05
 
 
@@ -295,12 +295,12 @@ def test_what_a_small_picture_does_not_settle_is_asked_of_a_large_one(
     request = replace(KNOWN, camera=CAMERA.scaled_to(1280, 960))
     asked = extracted(monkeypatch)
     assert localise(large(field_texture(77), POSE, 3), request, [area]).pose is None
-    assert asked == [500, 1000]
+    assert asked == [640, 1000]
     asked.clear()
     # No larger picture brings a map within reach.
     far = replace(request, prior=prior_at(area, 5000.0))
     assert localise(large(field_texture(77), POSE, 3), far, [area]).reason == "NO_COVERAGE"
-    assert asked == [500]
+    assert asked == [640]
 
 
 def test_a_blank_photo_has_too_few_features(area: IndexedArea) -> None:
