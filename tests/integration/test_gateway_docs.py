@@ -40,7 +40,7 @@ def here(tmp_path, monkeypatch):
 def test_the_python_client_runs(here, capsys):
     (program,) = programs("python")
     exec(compile(here(program), "docs/gateway.md", "exec"), {})
-    assert re.match(r"\{'lon': 8\.4\d+, 'lat': 49\.0\d+, 'h': .*'position': 0\.1", capsys.readouterr().out)
+    assert re.match(r"\{'lat': 49\.0\d+, 'lon': 8\.4\d+, 'h': .*'position': 0\.1", capsys.readouterr().out)
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")

@@ -255,6 +255,12 @@ def large(texture: NDArray[np.uint8], truth: Rigid3, seed: int) -> NDArray[np.ui
     return np.asarray(cv2.resize(render(texture, truth, seed), (1280, 960)), dtype=np.uint8)
 
 
+def loosely_placed(field_map: FeatureMap) -> IndexedArea:
+    """Within three metres: so much that centimetres of the picture are no matter."""
+    covariance = np.diag([1e-4] + [1e-3] * 3 + [9.0] * 3)
+    return indexed(replace(field_map, placement=replace(field_map.placement, covariance=covariance)))
+
+
 def extracted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The longer sides at which features are extracted, as they are."""
     asked: list[int] = []
@@ -270,23 +276,36 @@ def extracted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_a_small_picture_answers_where_the_map_is_what_is_not_known(
     field_map: FeatureMap, texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A map within a metre: centimetres of the picture are no matter. One within millimetres: they are."""
+    """A map within metres: centimetres of the picture are no matter. One within millimetres: they are."""
     photo, request = large(texture, POSE, 5), replace(KNOWN, camera=CAMERA.scaled_to(1280, 960))
     asked = extracted(monkeypatch)
-    loose = replace(
-        field_map,
-        placement=replace(field_map.placement, covariance=np.diag([1e-6] + [1e-4] * 3 + [1.0] * 3)),
-    )
-    result = localise(photo, request, [indexed(loose)])
+    loose = loosely_placed(field_map)
+    result = localise(photo, request, [loose])
     assert asked == [640]
     assert pose_errors(result, POSE)[0] < 0.1
     asked.clear()
-    localise(photo, replace(request, want_inliers=True), [indexed(loose)])
+    localise(photo, replace(request, want_inliers=True), [loose])
     assert asked == [1000]
     asked.clear()
     result = localise(photo, request, [indexed(field_map)])
     assert asked == [640, 1000]
     assert pose_errors(result, POSE)[0] < 0.05
+
+
+def test_a_picture_of_the_place_in_another_picture_is_asked_of_a_large_one(
+    field_map: FeatureMap, texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of which the small picture alone would be sure enough, by what a large one has to be."""
+    photo = large(field_texture(9), view(2.63, -5.43, 68.324, 8.839, 158.196), 30)
+    inner = render(texture, view(-7.173, 5.242, 68.324, 16.255, 332.634), 30)
+    photo[120:764, 284:1142] = cv2.resize(inner, (858, 644), interpolation=cv2.INTER_AREA)
+    request, area = replace(KNOWN, camera=CAMERA.scaled_to(1280, 960)), loosely_placed(field_map)
+    asked = extracted(monkeypatch)
+    assert localise(photo, request, [area]).reason == "AMBIGUOUS"
+    assert asked == [640, 1000]
+    asked.clear()
+    localise(photo, request, [area], replace(LocaliseOptions(), small_spread=0.6))
+    assert asked == [640]
 
 
 def test_what_a_small_picture_does_not_settle_is_asked_of_a_large_one(
