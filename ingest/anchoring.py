@@ -16,7 +16,7 @@ from featuredb.errors import RegistrationError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray, decode_rgb
 from featuredb.geo.utm import geodetic_from_utm, utm_from_geodetic
 from featuredb.geo.words import way_words
-from featuredb.lidar.load import load_cloud
+from featuredb.lidar.load import chosen_scans, load_cloud
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
@@ -49,7 +49,7 @@ class AnchorRequest:
     Attributes:
         map_id: or its first letters, if no other map begins so.
         photos: folder of the map's photos.
-        scan_ids: empty for all scans around the map.
+        scan_ids: or their first letters; empty for all scans around the map.
         out: folder of pictures and report, None for ./anchor-MAP.
         frames: how many to register, None for the default.
         auto: place the map without a person.
@@ -212,6 +212,9 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
     snapshot = database.snapshot()
     summary = snapshot.find(request.map_id)
     loaded = snapshot.load_any(summary.map_id)
+    if request.scan_ids:
+        meant = chosen_scans(database, request.scan_ids)
+        request = replace(request, scan_ids=tuple(scan.scan_id for scan in meant))
     files = find_photos(loaded, request.photos)
     first: FirstPlace | None = None
     if isinstance(loaded, UnplacedMap):

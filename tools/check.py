@@ -1,8 +1,8 @@
-"""Everything that must hold before a change goes in: format, lint, types, import rules, tests, the demo.
+"""Everything that must hold before a change goes in: format, lint, types, import rules, tests.
 
-uv run --extra dev python tools/check.py            all of it
-uv run --extra dev python tools/check.py --fast     without slow tests, of which the demo is one
-uv run --extra dev python tools/check.py --all      also the studies that tests leave out
+uv run --extra dev python tools/check.py            all of it; of the tests one is the demo on a small town
+uv run --extra dev python tools/check.py --fast     without slow tests, of which that is one
+uv run --extra dev python tools/check.py --all      also the studies, of which the whole demo is one
 """
 
 import argparse
@@ -25,8 +25,12 @@ _ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTE
 def main() -> int:
     parser = argparse.ArgumentParser(description="Run all checks of the repository.")
     how_much = parser.add_mutually_exclusive_group()
-    how_much.add_argument("--fast", action="store_true", help="leave out slow tests and the demo")
-    how_much.add_argument("--all", action="store_true", help="also run the studies (pytest --evaluations)")
+    how_much.add_argument(
+        "--fast", action="store_true", help="leave out slow tests, also the demo on a small town"
+    )
+    how_much.add_argument(
+        "--all", action="store_true", help="also run the studies and the whole demo (pytest --evaluations)"
+    )
     args = parser.parse_args()
     python = sys.executable
     # Two at a time, a file on one worker each, since modules share what they have made; in the order of

@@ -80,8 +80,13 @@ def utm_from_lat_lon_h(lat_lon_h: FloatArray, zone: int, south: bool) -> FloatAr
 
 
 def lat_lon_h_from_utm(utm: FloatArray, zone: int, south: bool) -> FloatArray:
-    """Latitude, longitude (degrees), height (n, 3) of easting, northing, height (n, 3) in metres."""
-    return _transform(_DEGREES_IN + _utm_definition(zone, south), utm, inverse=True)[:, [1, 0, 2]]
+    """Latitude, longitude (degrees), height (n, 3) of easting, northing, height (n, 3) in metres.
+
+    At the antimeridian PROJ leaves longitudes of up to 1e-12 radians beyond 180 degrees.
+    """
+    geodetic = _transform(_DEGREES_IN + _utm_definition(zone, south), utm, inverse=True)[:, [1, 0, 2]]
+    geodetic[:, 1] = np.clip(geodetic[:, 1], -180.0, 180.0)
+    return geodetic
 
 
 def shift_heights(lat_lon_h: FloatArray, grid: Path, after: str = "") -> FloatArray:

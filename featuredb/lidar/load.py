@@ -67,7 +67,7 @@ def load_cloud(
         frame: local frame of the result; anywhere near the scans.
         box_local: (east0, north0, east1, north1) metres in `frame`; what lies in the box is loaded, and a
             little around it where the frame is turned against the UTM grid. None for everything.
-        scan_ids: the scans to load; None for all that are not retired.
+        scan_ids: the scans to load, as `chosen_scans`; None for all that are not retired.
         largest_points: finer levels are left out from the one on that would exceed this many points.
 
     Returns:
@@ -118,22 +118,32 @@ def load_cloud(
 
 
 def chosen_scans(database: Database, scan_ids: Sequence[str] | None) -> list[ScanSummary]:
-    """The scans meant, by ids or their first letters; None: all that are not retired.
+    """The scans meant, oldest first, by ids or their first letters; None: all that are not retired.
 
     Raises:
-        ScanNotFoundError: the database has no scan, or not one of those.
+        ScanNotFoundError: the database has no scan, or not one of those, or several ids begin so.
     """
     scans = list_scans(database)
     if scan_ids is not None:
-        missing = sorted(i for i in scan_ids if not any(s.scan_id.startswith(i) for s in scans))
-        if missing:
-            raise ScanNotFoundError(
-                f"no scan {', '.join(missing)}; `featuredb lidar list` lists what there is"
-            )
-        scans = [s for s in scans if s.scan_id.startswith(tuple(scan_ids))]
+        meant = {_full_id(scans, start) for start in scan_ids}
+        scans = [s for s in scans if s.scan_id in meant]
     if not scans:
         raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
     return scans
+
+
+def _full_id(scans: Sequence[ScanSummary], start: str) -> str:
+    """The id that is meant by itself, or by its first letters if no other begins so."""
+    ids = [scan.scan_id for scan in scans]
+    found = [start] if start in ids else [i for i in ids if start and i.startswith(start)]
+    if len(found) > 1:
+        raise ScanNotFoundError(
+            f"{start}: {len(found)} scans begin so ({', '.join(sorted(found)[:4])}); write more of the id"
+        )
+    if not found:
+        said = f"no scan {start}" if start else "expected a scan's id or its first letters, found nothing"
+        raise ScanNotFoundError(f"{said}; `featuredb lidar list` lists what there is")
+    return found[0]
 
 
 def _utm_box(frame: LocalFrame, box: PlanBox | None, epsg: int) -> PlanBox | None:

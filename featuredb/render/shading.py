@@ -50,8 +50,10 @@ def _along_surface(
         down, right: pixels to the neighbour behind.
     """
     height, width = x.shape
-    first, second = np.s_[: height - down, : width - right], np.s_[down:, right:]
     result = np.zeros_like(points)
+    if down >= height or right >= width:
+        return result  # no pixel has a neighbour
+    first, second = np.s_[: height - down, : width - right], np.s_[down:, right:]
     apart = np.hypot(x[second] - x[first], y[second] - y[first]) * np.float32(_STEEPEST_SLOPE)
     change = points[second] - points[first]
     for here in (first, second):

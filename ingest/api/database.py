@@ -119,7 +119,7 @@ class FeatureDatabase:
             map_id: of the map; for a scan its first letters are enough.
             control_points: OpenDroneMap's gcp_list.txt, as `featuredb register`.
             photos: the map's photos, whose frames are registered to the scans, as `featuredb anchor`.
-            scans: ids; empty: all around the map.
+            scans: ids or their first letters; empty: all around the map.
             auto: place it by the scan if every gate is passed; else frames are only proposed.
             confirm: names of proposed frames by which it is placed.
             picks, pose: file of picked points, or of a rough pose, of the photo `image`.

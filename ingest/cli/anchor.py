@@ -35,7 +35,11 @@ def register(subparsers: Any) -> None:
         "--photos", type=Path, required=True, metavar="FOLDER", help="the photos that the map was made of"
     )
     anchor.add_argument(
-        "--scan", action="append", default=[], metavar="ID", help="default: all scans around the map"
+        "--scan",
+        action="append",
+        default=[],
+        metavar="ID",
+        help="id of a scan, or its first letters; default: all scans around the map",
     )
     anchor.add_argument("--out", type=Path, metavar="DIR", help="pictures and report; default: ./anchor-MAP")
     anchor.add_argument("--frames", type=int, metavar="N", help="to register; default: 3")

@@ -155,9 +155,12 @@ def test_frames_are_proposed_and_one_is_confirmed(
     words = ["anchor", str(database), old.map_id, "--photos", str(photos), "--out", str(out), "--quiet"]
     assert main([*words, "--confirm", "photo_04.jpg"]) == 2
     assert "nothing has been proposed" in capsys.readouterr().err
-    assert main([*words, "--frames", "1"]) == 0
+    scan_id = list_scans(Database.open(database))[0].scan_id
+    assert main([*words, "--frames", "1", "--scan", scan_id[:8]]) == 0
     said = capsys.readouterr().out
     assert Database.open(database).poll_version() == version, "a proposal changes nothing"
+    assert f"--scan {scan_id} " in said
+    words += ["--scan", scan_id]
     page = (out / "anchor.html").read_text()
     assert "http" not in page
     (proposed,) = json.loads((out / "proposals.json").read_text())["frames"]
@@ -300,6 +303,7 @@ def test_picks_with_an_outlier_start_a_map_that_lies_elsewhere(
         (["--photos", "missing"], "found no folder"),
         (["--photos", "."], "none of the 9 photos"),
         (["--scan", "nowhere"], "no scan nowhere"),
+        (["--scan", ""], "expected a scan's id"),
         (["--auto", "--confirm", "photo_04.jpg"], "--auto or --confirm"),
         (["--frames", "0"], "--frames"),
         (["--image", "photo_04.jpg"], "give one of them"),

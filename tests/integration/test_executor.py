@@ -15,6 +15,7 @@ from featuredb.errors import IngestError
 from ingest.executor import InProcessExecutor, Lost, PoolExecutor
 
 _MINUTE_S = 60.0
+_OPENCV_THREADS = "OPENCV_FOR_THREADS_NUM"  # set while all tests run; caps must hold without it
 
 
 def square(value: int) -> int:
@@ -131,6 +132,7 @@ def test_workers_have_their_threads_capped_and_the_parent_keeps_its_environment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv(_OPENCV_THREADS, raising=False)
     with PoolExecutor(1) as pool:
         (caps,) = pool.map("caps", thread_caps, [0])
     assert caps == ("1", 1)
@@ -140,10 +142,12 @@ def test_workers_have_their_threads_capped_and_the_parent_keeps_its_environment(
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     distributed = pytest.importorskip("distributed", reason="needs the extra `dask`")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    ) as cluster:
-        yield cluster
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv(_OPENCV_THREADS, raising=False)
+        with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+        ) as cluster:
+            yield cluster
 
 
 @pytest.mark.slow

@@ -101,11 +101,13 @@ def test_a_reconstruction_is_placed_and_becomes_a_map(
     assert np.median(nearest) < 0.1
 
 
-@pytest.mark.evaluation
-def test_the_bound_of_drift_holds(area: IndexedArea) -> None:
+@pytest.mark.parametrize(
+    "seeds", [range(1), pytest.param(range(1, 4), marks=pytest.mark.evaluation)], ids=["one", "more"]
+)
+def test_the_bound_of_drift_holds(area: IndexedArea, seeds: range) -> None:
     """Independent photos, matches and noise: no point of the map is further off than the map says (95 %)."""
     beyond = 0
-    for seed in range(4):
+    for seed in seeds:
         rng = np.random.default_rng(100 + seed)
         new = take_photos(rng, POINTS, DESCRIPTORS, walk(4), camera_key=KEY)
         found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
@@ -114,7 +116,7 @@ def test_the_bound_of_drift_holds(area: IndexedArea) -> None:
         growth = grown.feature_map.placement.evidence["growth"]
         bound = drift_m(np.reshape(growth["covariance_relative"], (7, 7)), places_of(grown.feature_map))
         beyond += int(centers_error(grown, new).max() > bound)
-    assert beyond <= 1
+    assert beyond <= len(seeds) // 2
 
 
 def test_one_localised_photo_is_not_enough(

@@ -1,6 +1,7 @@
 """Scans of every kind go into a database and come back; broken ones leave nothing."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -16,13 +17,14 @@ from featuredb.errors import (
 )
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.lidar.add import add_scan
-from featuredb.lidar.load import load_cloud, scan_frame
+from featuredb.lidar.load import chosen_scans, load_cloud, scan_frame
 from featuredb.lidar.options import AddOptions, ScanLabels
 from featuredb.store import Database
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.scans import find_scan, list_scans, retire_scan
 from featuredb.store.sql import SqlSession
 from featuredb.store.verify import verify
+from ingest.register.anchor.start.first_place import scans_of_one_zone
 from tests.support.las_files import SOUTH, WEST, grid_points, write_scan
 from tests.support.stored_scans import sorted_rows, stored
 
@@ -244,6 +246,22 @@ def test_what_cannot_be_loaded_together(database: Database, tmp_path: Path) -> N
         load_cloud(database, frame)
     with pytest.raises(ScanNotFoundError, match="no scan 77"):
         load_cloud(database, frame, scan_ids=["77"])
+
+
+def test_scans_are_known_by_their_first_letters(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_scan(tmp_path / "a.laz", grid_points())
+    scan = add_scan(database, [path]).scan
+    assert chosen_scans(database, [scan.scan_id[:6], scan.scan_id]) == chosen_scans(database, None)
+    assert scans_of_one_zone(database, [scan.scan_id[:6]]) == scans_of_one_zone(database, [])
+    with pytest.raises(ScanNotFoundError, match=r"expected a scan.*found nothing.*lidar list"):
+        chosen_scans(database, [scan.scan_id, ""])
+    three = [replace(scan, scan_id=name) for name in ("abc", "abcd1", "abcd2")]
+    monkeypatch.setattr("featuredb.lidar.load.list_scans", lambda _: three)
+    assert chosen_scans(database, ["abcd2", "abc"]) == [three[0], three[2]]
+    with pytest.raises(ScanNotFoundError, match=r"abcd: 2 scans begin so \(abcd1, abcd2\); write more"):
+        chosen_scans(database, ["abcd"])
 
 
 def test_retire_and_add_again(database: Database, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,8 @@ import ast
 import logging
 import re
 import socket
+import subprocess
+import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -127,6 +129,23 @@ def test_a_mistake_ends_in_one_line_that_says_what_to_do(
     assert line.startswith("featuredb: ")
     assert re.search(said, line), line
     assert contents(folder) == before
+
+
+@pytest.mark.parametrize("mistake", ["frames without times", "the EPSG code of another country"])
+def test_a_process_of_its_own_writes_no_more_than_the_line(folder: Path, mistake: str) -> None:
+    """Libraries may write while they are first imported; these two import most of them."""
+    command, said = MISTAKES[mistake]
+    done = subprocess.run(
+        [sys.executable, "-m", "featuredb.cli", *command.split()],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (2, ""), done
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("featuredb: ")
+    assert re.search(said, line), line
 
 
 def options_of(parser: argparse.ArgumentParser) -> set[str]:

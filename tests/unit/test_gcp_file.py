@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 
 from featuredb.errors import ControlFileError, GeodesyError
 from featuredb.geo.crs.survey import geodetic_from_survey, survey_crs
@@ -96,6 +96,12 @@ def test_feet_and_compound_systems() -> None:
     file = parse_control_file("EPSG:2994\n636000 849000 400 1 2 a.jpg", "f")
     assert file.lat_lon_h[0, 2] == pytest.approx(400 * 0.3048)
     assert any("unit of 0.3048 m" in note for note in file.notes)
+
+
+def test_a_third_axis_says_what_heights_count_from_only_beside_degrees() -> None:
+    plane = survey_crs(CRS("EPSG:2263").to_3d().to_wkt())  # New York in US survey feet
+    assert (plane.height_datum, plane.geographic) == ("unknown", False)
+    assert survey_crs("EPSG:4979").height_datum == "ellipsoidal"
 
 
 @pytest.mark.parametrize("text", ["EPSG:5703", "EPSG:4978", "WGS84 UTM 61N", "here"])

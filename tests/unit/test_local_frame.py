@@ -229,3 +229,13 @@ def test_longitudes_stay_in_range_at_the_antimeridian(latitude: float) -> None:
     geodetic = frame.geodetic_from_enu(enu)
     assert np.abs(geodetic[:, 1]).max() <= 180.0
     np.testing.assert_allclose(frame.enu_from_geodetic(geodetic), enu, rtol=0, atol=2e-8)
+
+
+@pytest.mark.parametrize("epsg", [32601, 32660, 32701, 32760])
+def test_utm_at_the_antimeridian_has_a_place(epsg: int) -> None:
+    """PROJ's longitude may lie a rounding beyond 180 degrees."""
+    latitudes = np.linspace(0.0, 80.0, 161) * (-1.0 if epsg > 32700 else 1.0)
+    places = np.column_stack([latitudes, np.full(len(latitudes), 180.0), np.zeros(len(latitudes))])
+    utm = utm_from_geodetic(places, epsg)
+    frame = LocalFrame(latitude_deg=latitudes[80], longitude_deg=180.0, height_m=0.0)
+    np.testing.assert_allclose(frame.enu_from_utm(utm, epsg), frame.enu_from_geodetic(places), atol=1e-6)

@@ -294,6 +294,16 @@ def test_relief_sees_no_slope_across_a_step() -> None:
     assert (np.abs(picture[np.hypot(x, y) < 0.6].astype(float) - flat) < 12).mean() > 0.98
 
 
+def test_a_picture_smaller_than_the_distance_of_points_has_no_relief(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shading, "point_distance_px", lambda _: 12)
+    camera = Camera(model="SIMPLE_PINHOLE", width=16, height=10, params=(12, 8, 5))
+    rendering = render(cloud_of(lattice(0.5, 14.0, 0.0)), camera, DOWN)
+    assert rendering.valid.any()
+    picture = shaded_relief(rendering)
+    assert picture.shape == (10, 16)
+    assert not picture.any()
+
+
 def test_without_numba_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "featuredb.render.loops.level_loops", raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)

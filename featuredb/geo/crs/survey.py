@@ -74,7 +74,9 @@ def survey_crs(text: str) -> SurveyCrs:
         name=crs.name if crs.name != "unknown" else definition,
         geographic=bool(plane.is_geographic),
         height_unit_m=height_unit_of(crs if is_3d else plane, vertical, is_3d)[1],
-        height_datum=height_datum_of(vertical, is_3d),
+        # Surveys' plane systems count heights from a benchmark more often than from the ellipsoid, whatever
+        # their third axis is called: a person may say.
+        height_datum=height_datum_of(vertical, is_3d and plane.is_geographic),
     )
 
 

@@ -22,7 +22,7 @@ from featuredb.store import Database
 from ingest.anchoring import Anchoring, AnchorRequest, anchor
 from ingest.register.anchor.files import PhotoFiles, find_photos
 from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
-from ingest.register.anchor.start.first_place import StartFiles, chosen_scans
+from ingest.register.anchor.start.first_place import StartFiles, scans_of_one_zone
 from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
 from ingest.register.anchor.start.picks import focal_sigma_rel, least_picks, prior_of_picks
 
@@ -47,7 +47,7 @@ class PickSession:
     def __init__(self, database: Database, request: AnchorRequest, loaded: AnyMap) -> None:
         self.database, self.request, self.map = database, request, loaded
         self.files: PhotoFiles = find_photos(loaded, request.photos)
-        scans = chosen_scans(database, request.scan_ids)
+        scans = scans_of_one_zone(database, request.scan_ids)
         self.scan_ids = tuple(scan.scan_id for scan in scans)
         self.epsg = scans[0].epsg
         self.cloud: PointCloud = load_cloud(database, scan_frame(scans[0]), scan_ids=self.scan_ids)

@@ -10,13 +10,13 @@ import numpy as np
 from featuredb.errors import InvalidValueError, RegistrationError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
-from featuredb.lidar.load import load_cloud
+from featuredb.lidar.load import chosen_scans, load_cloud
 from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
 from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
-from featuredb.store.scans import ScanSummary, list_scans
+from featuredb.store.scans import ScanSummary
 from ingest.register.anchor.start.files import RoughPose, read_picks, read_pose
 from ingest.register.anchor.start.from_above import found_from_above
 from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks
@@ -180,6 +180,7 @@ def first_place(
     Raises:
         RegistrationError: nothing says where, the photo does not see the scan from there, or the map is not
             found.
+        ScanNotFoundError: the database has no scan, or not the one that is meant.
     """
     if not files:
         raise RegistrationError(
@@ -187,7 +188,7 @@ def first_place(
             "--near=LAT,LON (looks for it within 250 m), --page (click the same spots in photo and scan), "
             "--picks FILE or --pose FILE"
         )
-    scans = chosen_scans(database, scan_ids)
+    scans = scans_of_one_zone(database, scan_ids)
     ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
     started: list[StartedImage] = []
     if files.near is not None:
@@ -265,15 +266,14 @@ def _put_by(
     return place_by_photo(unplaced, started.image, started.camera, started.prior, cloud)
 
 
-def chosen_scans(database: Database, scan_ids: Sequence[str]) -> list[ScanSummary]:
-    """The scans of these ids, or all, which must be of one zone.
+def scans_of_one_zone(database: Database, scan_ids: Sequence[str]) -> list[ScanSummary]:
+    """The scans of these ids or their first letters, or all, which must be of one zone.
 
     Raises:
-        RegistrationError: there is none, or they are of several zones.
+        ScanNotFoundError: there is none, or letters do not say which.
+        RegistrationError: they are of several zones.
     """
-    scans = [s for s in list_scans(database) if not scan_ids or s.scan_id in scan_ids]
-    if not scans:
-        raise RegistrationError(f"{database.url} has no such scan; add one by `featuredb lidar add`")
+    scans = chosen_scans(database, scan_ids or None)
     if len({scan.epsg for scan in scans}) > 1:
         raise RegistrationError(
             "the scans are of several UTM zones, and nothing says in which the map lies; name one by --scan"
