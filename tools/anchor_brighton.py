@@ -7,7 +7,8 @@
 2. `featuredb lidar add` adds the scan; `featuredb anchor --auto` places the map by it.
 3. A server answers for each held-out photo, as `featuredb query` asks: nothing but the file.
 4. The answers are compared with poses that tools/scan_poses.py finds by registering each photo to the scan
-   directly (kept in the file of --poses). Before anchoring, too, to show what it changed.
+   directly (kept in the file of --poses). Before anchoring, too, to show what it changed. Beside the errors
+   (medians): the 68 % radii that the answers state, and how many times the errors these are.
 5. Of the map as GPS placed it: its focal length beside the scan's, with the standard deviation that the map
    stores, and how far its cameras are from the scan's poses after a similarity (median).
 
@@ -25,7 +26,7 @@ from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
 from tools.figures import write_figures
-from tools.real_photos import ask_poses, error_figures, ingest
+from tools.real_photos import HeldOutRow, ask_poses, error_figures, ingest
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
 
@@ -44,8 +45,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     after = ask_poses(anchored, args.photos, args.held_out, truth.frame, truth.poses)
     sys.stdout.write("".join(f"{row}\n" for row in after))
     figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
-    write_figures(args.json, figures | shape)
+    write_figures(args.json, figures | stated(after) | shape)
     return 0
+
+
+def stated(rows: Sequence[HeldOutRow]) -> dict[str, float]:
+    """The radii that answers state (68 %), and over their errors; medians."""
+    answered = [(row, row.error) for row in rows if row.error is not None]
+    if not answered:
+        return {}
+    return {
+        "stated_m": float(np.median([row.position_68_m for row, _ in answered])),
+        "stated_deg": float(np.median([row.orientation_68_deg for row, _ in answered])),
+        "stated_over_m": float(np.median([row.position_68_m / error.position_m for row, error in answered])),
+        "stated_over_deg": float(
+            np.median([row.orientation_68_deg / error.angle_deg for row, error in answered])
+        ),
+    }
 
 
 def anchored_on(database: Path, scan: Path, photos: Path, out: Path) -> Database:
