@@ -414,7 +414,7 @@ def test_a_pattern_that_fits_itself_is_never_answered_wrongly(
 
 def test_what_cannot_be_compared_or_used_raises(area: IndexedArea, photo: NDArray[np.uint8]) -> None:
     upright = LocaliseOptions(extractor=ExtractorOptions(upright=True))
-    with pytest.raises(IncompatibleExtractorError, match="same extractor options"):
+    with pytest.raises(IncompatibleExtractorError, match="again with this version"):
         localise(photo, KNOWN, [area], upright)
     for image in (np.zeros((1, 3000), np.uint8), photo.astype(np.float32), np.zeros((480, 640, 3), np.uint8)):
         with pytest.raises(ImageError):
