@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from reloc.wire.track import TrackPose
 
 _SAID_EVERY_S = 1.0  # of the film's clock, for people
+_SWITCH_S = (
+    5e-4  # after which a pose that has come gets Python from the next frame; by default it waits for 5 ms
+)
 
 
 def register(subparsers: Any) -> None:
@@ -73,6 +76,7 @@ def run_live(args: argparse.Namespace) -> int:
     from reloc.client.film import stream_film
     from reloc.tracking.trajectory.outputs import check_outputs, exit_code, write_outputs
 
+    sys.setswitchinterval(_SWITCH_S)
     check_outputs(args.out)
     camera, prior = parse_camera(args.camera), parse_prior(args.prior)
     with Client(args.connect, args.database, config_path=args.config) as client:
