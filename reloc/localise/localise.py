@@ -1,8 +1,8 @@
 """One photo against indexed maps: a pose, or a reason why there is none.
 
 The steps, in order: features; clusters of map images that may show the same; 2D-3D matches inside each
-cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance. They are done with the photo
-made small, and again with a larger one where that does not settle it.
+cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance. Where all maps are placed by
+positions alone, they are done with the photo made small, and with a larger one if that does not settle it.
 """
 
 from collections.abc import Callable, Sequence
@@ -73,7 +73,7 @@ def localise(
     clock = StageClock()
     small = _small_picture(options.extractor)
     # Who asks for inliers wants as many and as exact ones as there are.
-    if max(gray.shape) > small.max_side_px and not request.want_inliers:
+    if max(gray.shape) > small.max_side_px and not request.want_inliers and _placed_loosely(areas):
         features = extract(gray, small)
         clock.lap("features")
         found = _localised(features, request, areas, options, snapshot, clock)
@@ -88,6 +88,11 @@ def _small_picture(extractor: ExtractorOptions) -> ExtractorOptions:
     """The picture that is asked first: of 640 px where the large one has 1000, in less than half the time."""
     side_px = max(extractor.max_side_px * 16 // 25, 64)
     return replace(extractor, max_side_px=side_px, max_features=max(extractor.max_features // 2, 1))
+
+
+def _placed_loosely(areas: Sequence[IndexedArea]) -> bool:
+    """Whether all maps are placed by positions alone; others are known to centimetres, as a picture is."""
+    return all(m.placement.method == "gps" for indexed in areas for m in indexed.area.maps)
 
 
 def _is_enough(small: Localised, options: LocaliseOptions) -> bool:

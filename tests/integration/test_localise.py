@@ -258,7 +258,8 @@ def large(texture: NDArray[np.uint8], truth: Rigid3, seed: int) -> NDArray[np.ui
 def loosely_placed(field_map: FeatureMap) -> IndexedArea:
     """Within three metres: so much that centimetres of the picture are no matter."""
     covariance = np.diag([1e-4] + [1e-3] * 3 + [9.0] * 3)
-    return indexed(replace(field_map, placement=replace(field_map.placement, covariance=covariance)))
+    placement = replace(field_map.placement, method="gps", covariance=covariance)
+    return indexed(replace(field_map, placement=placement))
 
 
 def extracted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -287,9 +288,13 @@ def test_a_small_picture_answers_where_the_map_is_what_is_not_known(
     localise(photo, replace(request, want_inliers=True), [loose])
     assert asked == [1000]
     asked.clear()
-    result = localise(photo, request, [indexed(field_map)])
+    exact = replace(field_map, placement=replace(field_map.placement, method="gps"))
+    result = localise(photo, request, [indexed(exact)])
     assert asked == [640, 1000]
     assert pose_errors(result, POSE)[0] < 0.05
+    asked.clear()
+    localise(photo, request, [loose, indexed(field_map)])  # one is placed by a scan
+    assert asked == [1000]
 
 
 def test_a_picture_of_the_place_in_another_picture_is_asked_of_a_large_one(
@@ -309,9 +314,9 @@ def test_a_picture_of_the_place_in_another_picture_is_asked_of_a_large_one(
 
 
 def test_what_a_small_picture_does_not_settle_is_asked_of_a_large_one(
-    area: IndexedArea, monkeypatch: pytest.MonkeyPatch
+    field_map: FeatureMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    request = replace(KNOWN, camera=CAMERA.scaled_to(1280, 960))
+    request, area = replace(KNOWN, camera=CAMERA.scaled_to(1280, 960)), loosely_placed(field_map)
     asked = extracted(monkeypatch)
     assert localise(large(field_texture(77), POSE, 3), request, [area]).pose is None
     assert asked == [640, 1000]
