@@ -11,9 +11,8 @@ if TYPE_CHECKING:
     from reloc.wire.track import TrackPose
 
 _SAID_EVERY_S = 1.0  # of the film's clock, for people
-_SWITCH_S = (
-    5e-4  # after which a pose that has come gets Python from the next frame; by default it waits for 5 ms
-)
+# Python changes threads after so long: a pose that has come need not wait 5 ms for the next frame.
+_SWITCH_S = 5e-4
 
 
 def register(subparsers: Any) -> None:

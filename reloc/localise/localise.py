@@ -1,8 +1,7 @@
 """One photo against indexed maps: a pose, or a reason why there is none.
 
 The steps, in order: features; clusters of map images that may show the same; 2D-3D matches inside each
-cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance. Where all maps are placed by
-positions alone, they are done with the photo made small, and with a larger one if that does not settle it.
+cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.features.extractor import ExtractorOptions, extract
+from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.stage_clock import StageClock
@@ -71,46 +70,9 @@ def localise(
     options = options or LocaliseOptions()
     areas = usable_areas(areas, options.extractor.fingerprint)
     clock = StageClock()
-    small = _small_picture(options.extractor)
-    # Who asks for inliers wants as many and as exact ones as there are.
-    if max(gray.shape) > small.max_side_px and not request.want_inliers and _placed_loosely(areas):
-        features = extract(gray, small)
-        clock.lap("features")
-        found = _localised(features, request, areas, options, snapshot, clock)
-        if _is_enough(found, options):
-            return found.result
     features = extract(gray, options.extractor)
     clock.lap("features")
     return _localised(features, request, areas, options, snapshot, clock).result
-
-
-def _small_picture(extractor: ExtractorOptions) -> ExtractorOptions:
-    """The picture that is asked first: of 640 px where the large one has 1000, in less than half the time."""
-    side_px = max(extractor.max_side_px * 16 // 25, 64)
-    return replace(extractor, max_side_px=side_px, max_features=max(extractor.max_features // 2, 1))
-
-
-def _placed_loosely(areas: Sequence[IndexedArea]) -> bool:
-    """Whether all maps are placed by positions alone; others are known to centimetres, as a picture is."""
-    return all(m.placement.method == "gps" for indexed in areas for m in indexed.area.maps)
-
-
-def _is_enough(small: Localised, options: LocaliseOptions) -> bool:
-    """Whether a larger picture would say the same: no map is in reach, or the pose is sure, and what the
-    picture adds to its uncertainty is little beside the map's own."""
-    result, lines = small.result, options.acceptance
-    if result.reason == "NO_COVERAGE":
-        return True
-    if result.pose is None or small.uncertainty is None or result.evidence is None:
-        return False
-    if result.own_position is not None and result.own_position.role != "agrees":
-        return False
-    sure = result.evidence.log_nfa > lines.settled_log_nfa and result.evidence.spread >= options.small_spread
-    measured, all_of_it = small.uncertainty.covariance, result.pose.covariance
-    return sure and all(
-        np.trace(measured[part, part]) <= options.small_share * np.trace(all_of_it[part, part])
-        for part in (slice(0, 3), slice(3, 6))
-    )
 
 
 def localise_features(

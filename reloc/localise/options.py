@@ -87,16 +87,7 @@ class PoseOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocaliseOptions:
-    """All of the localisation's settings.
-
-    Attributes:
-        small_share: largest share of a pose's variance that may come from the picture where it is answered by
-            the small one: a tenth makes its radius five hundredths larger than an exact picture would.
-        small_spread: smallest `spread` of a photo that the small picture answers. What the large one finds
-            ambiguous must go on to it: of 360 photos of a field in another picture, beside another part of
-            it, or half covered, 25 were answered by a picture of 500 px with 0.6, and 0 by one of 640 px
-            with 0.8.
-    """
+    """All of the localisation's settings."""
 
     extractor: ExtractorOptions = field(
         default_factory=lambda: ExtractorOptions(max_side_px=1000, max_features=3000, oversample=1.25)
@@ -105,5 +96,3 @@ class LocaliseOptions:
     matching: PointMatchOptions = field(default_factory=PointMatchOptions)
     pose: PoseOptions = field(default_factory=PoseOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
-    small_share: float = 0.1
-    small_spread: float = 0.8

@@ -9,13 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, IncompatibleExtractorError, InvalidValueError
-from featuredb.features.extractor import ExtractorOptions, extract
-from featuredb.features.features import Features
+from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.lens_uncertainty import LensUncertainty
-from reloc.localise import localise as localise_module
 from reloc.localise import search
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise
@@ -248,83 +246,6 @@ def test_giving_up_early_changes_no_answer(
         assert (a.pose is None) == (b.pose is None)
         if a.pose is not None and b.pose is not None:
             assert np.array_equal(a.pose.utm, b.pose.utm)
-
-
-def large(texture: NDArray[np.uint8], truth: Rigid3, seed: int) -> NDArray[np.uint8]:
-    """A photo of twice the size, as sharp as one of 640 px can be."""
-    return np.asarray(cv2.resize(render(texture, truth, seed), (1280, 960)), dtype=np.uint8)
-
-
-def loosely_placed(field_map: FeatureMap) -> IndexedArea:
-    """Within three metres: so much that centimetres of the picture are no matter."""
-    covariance = np.diag([1e-4] + [1e-3] * 3 + [9.0] * 3)
-    placement = replace(field_map.placement, method="gps", covariance=covariance)
-    return indexed(replace(field_map, placement=placement))
-
-
-def extracted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The longer sides at which features are extracted, as they are."""
-    asked: list[int] = []
-
-    def noted(gray: NDArray[np.uint8], options: ExtractorOptions) -> Features:
-        asked.append(options.max_side_px)
-        return extract(gray, options)
-
-    monkeypatch.setattr(localise_module, "extract", noted)
-    return asked
-
-
-def test_a_small_picture_answers_where_the_map_is_what_is_not_known(
-    field_map: FeatureMap, texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A map within metres: centimetres of the picture are no matter. One within millimetres: they are."""
-    photo, request = large(texture, POSE, 5), replace(KNOWN, camera=CAMERA.scaled_to(1280, 960))
-    asked = extracted(monkeypatch)
-    loose = loosely_placed(field_map)
-    result = localise(photo, request, [loose])
-    assert asked == [640]
-    assert pose_errors(result, POSE)[0] < 0.1
-    asked.clear()
-    localise(photo, replace(request, want_inliers=True), [loose])
-    assert asked == [1000]
-    asked.clear()
-    exact = replace(field_map, placement=replace(field_map.placement, method="gps"))
-    result = localise(photo, request, [indexed(exact)])
-    assert asked == [640, 1000]
-    assert pose_errors(result, POSE)[0] < 0.05
-    asked.clear()
-    localise(photo, request, [loose, indexed(field_map)])  # one is placed by a scan
-    assert asked == [1000]
-
-
-def test_a_picture_of_the_place_in_another_picture_is_asked_of_a_large_one(
-    field_map: FeatureMap, texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One of which the small picture alone would be sure enough, by what a large one has to be."""
-    photo = large(field_texture(9), view(2.63, -5.43, 68.324, 8.839, 158.196), 30)
-    inner = render(texture, view(-7.173, 5.242, 68.324, 16.255, 332.634), 30)
-    photo[120:764, 284:1142] = cv2.resize(inner, (858, 644), interpolation=cv2.INTER_AREA)
-    request, area = replace(KNOWN, camera=CAMERA.scaled_to(1280, 960)), loosely_placed(field_map)
-    asked = extracted(monkeypatch)
-    assert localise(photo, request, [area]).reason == "AMBIGUOUS"
-    assert asked == [640, 1000]
-    asked.clear()
-    localise(photo, request, [area], replace(LocaliseOptions(), small_spread=0.6))
-    assert asked == [640]
-
-
-def test_what_a_small_picture_does_not_settle_is_asked_of_a_large_one(
-    field_map: FeatureMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    request, area = replace(KNOWN, camera=CAMERA.scaled_to(1280, 960)), loosely_placed(field_map)
-    asked = extracted(monkeypatch)
-    assert localise(large(field_texture(77), POSE, 3), request, [area]).pose is None
-    assert asked == [640, 1000]
-    asked.clear()
-    # No larger picture brings a map within reach.
-    far = replace(request, prior=prior_at(area, 5000.0))
-    assert localise(large(field_texture(77), POSE, 3), far, [area]).reason == "NO_COVERAGE"
-    assert asked == [640]
 
 
 def test_a_blank_photo_has_too_few_features(area: IndexedArea) -> None:
