@@ -39,7 +39,7 @@ _MIN_SIGMA_REL = 0.00025
 _MIN_SURFACE_M = 0.03  # of a scan's surface against map points; roughness of grass and pavement
 # Structure from motion over flat ground was 25 % off on `brighton`; most lenses are centred, pixels square.
 _LENS = LensWidths(focal_rel=0.3, aspect_rel=0.002, center_rel=0.02, radial=0.1, tangential=0.003)
-# So many times less do observations of the map's points say of a lens that is told to a query
+# What lenses leave open counts so many times in the poses' covariances
 # (`ingest.colmap.adjust.AdjustOptions.dilution`, measured there).
 _LENS_DILUTION = AdjustOptions().dilution
 _ROUNDS = 25  # of looking up the scan's planes; it ends earlier when points move by less than _SETTLED_M
@@ -121,7 +121,7 @@ def adjust_to_scan(
     reason, message = _gate(block, figures)
     if reason is not None:
         return LidarAdjustment(reason=reason, message=message, figures=figures)
-    poses, lenses = _left_open(block, control, surface, start.cameras)
+    poses, lenses = _left_open(block, control, surface, structure, start)
     return LidarAdjustment(
         reason=None,
         message="adjusted to the scan",
@@ -232,23 +232,20 @@ def _terms(
 
 
 def _left_open(
-    block: Block, control: Marks, surface: Surface, lenses: tuple[Camera, ...]
+    block: Block, control: Marks, surface: Surface, structure: StructurePlacement, start: Block
 ) -> tuple[tuple[FloatArray, ...], LensUncertainty | None]:
     """(6, 6) of each pose with all that points and lenses leave open, and what is left open of the lenses.
 
-    Residuals count with their spread as it is. As neighbours err alike, they count by as much less as the
-    keypoints' do; what photos say of a lens, by as much less as they disagree about it.
-
-    Args:
-        lenses: as they were before, around which the priors lie.
+    Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
+    or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
     """
-    problem = Problem(block, _terms(block, control, surface, lenses, 1e-6, 1e-3))
-    found, _ = problem.honest_marginals()
-    factor = design_effect(*residuals_of(block), longest_side(block.cameras))
-    left = [factor * found.lens(c) for c in range(len(block.cameras))]
-    photos = np.bincount(block.camera_of, minlength=len(left)).tolist()
-    uncertainty = uncertainty_of_lenses(block.cameras, left, photos, _LENS_DILUTION)
-    return tuple(factor * found.poses()), uncertainty
+    found = Problem(block, _terms(block, control, surface, start.cameras, 1e-6, 1e-3)).marginals()
+    shared = design_effect(*residuals_of(block), longest_side(block.cameras))
+    factor = max(float(structure.figures["neighbours_factor"]), shared)
+    lenses = [factor * _LENS_DILUTION * found.lens(c) for c in range(len(block.cameras))]
+    photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
+    uncertainty = uncertainty_of_lenses(block.cameras, lenses, photos, _LENS_DILUTION)
+    return tuple(factor * found.poses(_LENS_DILUTION)), uncertainty
 
 
 def _spread(residuals: FloatArray) -> float:
