@@ -45,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     write_truth(inputs / "truth.json", truth)
     work = args.work / f"run-{args.seed}"
     shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
     made = work / "made"
     seconds = _ingest(made, inputs / "films", work)
     found = read_film_maps(made, work / "report", truth)
