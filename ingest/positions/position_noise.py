@@ -19,6 +19,7 @@ from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from ingest.positions.one_height import told_once
 from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean, stated_sigma
 
 _TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
@@ -204,6 +205,7 @@ def fit_noisy(
         times_s: (n,) of capture; None: in the order given, and nothing is known of a lag.
         held: how the photos are held.
     """
+    sigmas = told_once(positions, sigmas)
     stated = np.array([stated_sigma(sigmas[:, axes]) for axes in _AXES])
     middle = Sim3(scale=1.0, rotation=np.eye(3), translation=np.median(np.nan_to_num(positions), axis=0))
     speed, order = np.zeros_like(centers), np.arange(len(centers), dtype=np.float64)

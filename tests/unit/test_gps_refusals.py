@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from ingest.placed_models import placement_evidence
 from ingest.register.gps import place_by_gps
@@ -72,6 +73,20 @@ def test_positions_without_heights_place_a_map() -> None:
     evidence = placement_evidence(placed, [SimpleNamespace(name=f"{k}.jpg") for k in range(20)])
     json.dumps(evidence, allow_nan=False)  # a map keeps it
     assert evidence["residuals_enu_m"]["0.jpg"][2] is None
+
+
+def test_one_height_for_all_photos_does_not_level_their_way() -> None:
+    """A street that rises by nine metres, every photo told the same height."""
+    turn = np.linspace(0.0, 6.0, 30)
+    positions = np.column_stack([50.0 * turn, 40.0 * np.sin(turn), 1.5 * turn])
+    noise = np.random.default_rng(1).normal(0.0, 1.0, (30, 3)) * [2.0, 2.0, 0.0]
+    noise[:, 2] = 4.0 - positions[:, 2]
+    placed = place(positions, noise, np.tile([4.0, 4.0, 10.0], (30, 1)))
+    assert placed.reason is None
+    assert placed.local_from_sfm is not None
+    assert placed.covariance is not None
+    off = (TRUE @ placed.local_from_sfm.inverse()).log()
+    assert off @ np.linalg.solve(placed.covariance, off) < chi2.ppf(0.99, 7)
 
 
 def test_a_refusal_without_heights_names_none() -> None:
