@@ -1,4 +1,4 @@
-"""The documentation in short: its commands, and notebooks, which begin with `STARTUP`."""
+"""The documentation in short."""
 
 import pytest
 
@@ -9,7 +9,6 @@ from ingest.register.anchor.anchor_map import AnchorOptions
 from tests.support.remembered import remembered
 
 FEATURES = 1500  # of a photo
-STARTUP = "import pytest\nfrom tests.support.doc_short import shorten\nshorten(pytest.MonkeyPatch())\n"
 
 
 def shorten(patch: pytest.MonkeyPatch) -> None:
