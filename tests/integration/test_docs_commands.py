@@ -119,9 +119,9 @@ def ipython(folder: Path) -> Iterator[InteractiveShell]:
 
 
 @pytest.fixture(scope="module")
-def in_short() -> Iterator[None]:
+def in_short(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        shorten(patch)
+        shorten(patch, tmp_path_factory.mktemp("work"))
         yield
 
 
