@@ -28,21 +28,26 @@ def frozen_array(
         raise InvalidValueError(f"{name}: expected an array of {target}, found {value!r:.200}") from error
     if given.size and given.dtype.kind not in "biuf":
         raise InvalidValueError(f"{name}: expected numbers, found an array of {given.dtype}")
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
-        array = np.array(given, dtype=target)
+    if given.dtype == target:
+        array = np.array(given)
+    else:
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
+            array = np.array(given, dtype=target)
     if target.kind in "biu" and given.dtype != target and not np.array_equal(array, given):
         raise InvalidValueError(
             f"{name}: expected values that {target} can hold, found others in an array of {given.dtype}"
         )
-    wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
-    if array.ndim != len(shape) or any(
-        s is not None and s != a for s, a in zip(shape, array.shape, strict=True)
-    ):
+    if array.shape != shape and not _fits(array.shape, shape):
+        wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
         raise InvalidValueError(f"{name}: expected shape {wanted}, found {array.shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise InvalidValueError(f"{name}: expected finite numbers, found NaN or infinity")
     array.setflags(write=False)
     return array
+
+
+def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
+    return len(found) == len(shape) and all(s in (None, a) for s, a in zip(shape, found, strict=True))
 
 
 def freeze(value: object, dtype: DTypeLike = np.float64, **shapes: tuple[int | None, ...]) -> None:

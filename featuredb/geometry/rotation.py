@@ -109,6 +109,20 @@ def determinant(matrix: FloatArray) -> float:
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
 
+def is_rotation(matrix: FloatArray, tolerance: float) -> bool:
+    """Whether a matrix (3, 3) times its transpose is the identity to this tolerance, with determinant +1."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    return (
+        abs(a * a + b * b + c * c - 1.0) <= tolerance
+        and abs(d * d + e * e + f * f - 1.0) <= tolerance
+        and abs(g * g + h * h + i * i - 1.0) <= tolerance
+        and abs(a * d + b * e + c * f) <= tolerance
+        and abs(a * g + b * h + c * i) <= tolerance
+        and abs(d * g + e * h + f * i) <= tolerance
+        and determinant(matrix) >= 0.0
+    )
+
+
 def nearest_rotation(matrix: ArrayLike) -> FloatArray:
     """The rotation (3, 3) nearest to a 3x3 matrix in the Frobenius norm (orthogonal Procrustes).
 

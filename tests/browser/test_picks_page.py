@@ -15,6 +15,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from ingest.anchoring import AnchorRequest
+from ingest.register.anchor.anchor_map import AnchorOptions
 from ingest.register.picks_page.server import create_app
 from ingest.register.picks_page.session import PickSession
 from reloc.localise.result import LocaliseRequest
@@ -29,6 +30,14 @@ from tests.support.maps import without_place
 pytestmark = pytest.mark.slow
 OFFSET = np.array([1.5, -1.0, 8.0])
 SPOTS = [(0.2, 0.2), (0.8, 0.22), (0.78, 0.8), (0.22, 0.78), (0.5, 0.4), (0.45, 0.65), (0.7, 0.5)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _two_frames() -> Iterator[None]:
+    """Two that agree are enough."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(AnchorOptions.__init__.__kwdefaults__, "frames", 2)
+        yield
 
 
 @pytest.fixture(scope="module")

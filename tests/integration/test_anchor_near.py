@@ -16,6 +16,7 @@ from featuredb.maps.move import moved_image
 from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store import Database
 from ingest.register.anchor import frames
+from ingest.register.anchor.anchor_map import AnchorOptions
 from ingest.register.anchor.start import first_place
 from tests.support.hill_map import hill_map
 from tests.support.hill_photos import FRAME, hill_photos
@@ -60,8 +61,9 @@ def words(made: Path, tmp_path: Path, texture: int) -> list[str]:
 
 @pytest.fixture(scope="module", autouse=True)
 def _found_once() -> Iterator[None]:
-    """Two tests begin with the same map on the same scan."""
+    """Two tests begin with the same map on the same scan; two frames that agree are enough."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(AnchorOptions.__init__.__kwdefaults__, "frames", 2)
         patch.setattr(first_place, "found_from_above", remembered(first_place.found_from_above))
         patch.setattr(frames, "register_frame", remembered(frames.register_frame))
         yield

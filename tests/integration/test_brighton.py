@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 
 from featuredb.features.decode import decode_gray
+from featuredb.features.extractor import ExtractorOptions
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.store import Database
 from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
+from ingest.reconstruction import MapMakingOptions
+from ingest.report.values import IngestReport
 from reloc.localise.localise import localise
 from reloc.service.handler import localise_request
 from reloc.wire.query import LocaliseWireRequest, RequestOptions
 from tests.support.scenes import indexed
-from tools.real_photos import Ingest, ingest
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
@@ -33,20 +35,29 @@ def photos(shared_data: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The work folder of all ingests here: features and matches are made once."""
-    return tmp_path_factory.mktemp("work")
+def options(tmp_path_factory: pytest.TempPathFactory) -> IngestOptions:
+    """Of all ingests here: features and matches are made once, in this process, and few of them."""
+    return IngestOptions(
+        scan=ScanOptions(exclude=_HELD_OUT),
+        work=tmp_path_factory.mktemp("work"),
+        workers=1,
+        making=MapMakingOptions(extractor=ExtractorOptions(max_features=8000)),
+    )
 
 
 @pytest.fixture(scope="module")
-def part(photos: Path, work: Path, tmp_path_factory: pytest.TempPathFactory) -> Ingest:
+def part(
+    photos: Path, options: IngestOptions, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Database, IngestReport]:
     """A database without the held-out photos."""
-    return ingest(tmp_path_factory.mktemp("part") / "db", photos, _HELD_OUT, work)
+    database = Database.create(tmp_path_factory.mktemp("part") / "db")
+    return database, ingest_photos(database, photos, options)
 
 
-def test_cameras_are_where_their_gps_says(part: Ingest) -> None:
-    assert (part.usable, part.registered) == (8, 8)
-    snapshot = Database.open(part.database).snapshot()
+def test_cameras_are_where_their_gps_says(part: tuple[Database, IngestReport]) -> None:
+    database, report = part
+    assert report.count("registered") == 8
+    snapshot = database.snapshot()
     (summary,) = snapshot.maps()
     feature_map = snapshot.load_map(summary.map_id)
     assert feature_map.epsg == 32615
@@ -62,17 +73,20 @@ def test_cameras_are_where_their_gps_says(part: Ingest) -> None:
     assert np.median(feature_map.points_local()[:, 2]) < -20
 
 
-def test_the_same_ingest_again_changes_nothing(part: Ingest, photos: Path, work: Path) -> None:
-    options = IngestOptions(scan=ScanOptions(exclude=_HELD_OUT), work=work, workers=1)
-    again = ingest_photos(Database.open(part.database), photos, options)
+def test_the_same_ingest_again_changes_nothing(
+    part: tuple[Database, IngestReport], photos: Path, options: IngestOptions
+) -> None:
+    again = ingest_photos(part[0], photos, options)
     assert {p.name for p in again.photos if p.status == "skipped"} == set(_HELD_OUT)
     assert [m.status for m in again.maps] == ["already_there"]
     assert [s.reused == s.total for s in again.stages if s.total] == [True] * 4
 
 
-def test_a_photos_own_position_settles_which_of_two_places_it_shows(part: Ingest, photos: Path) -> None:
+def test_a_photos_own_position_settles_which_of_two_places_it_shows(
+    part: tuple[Database, IngestReport], photos: Path
+) -> None:
     """The same park once more, three kilometres to the east; a photo of the map, and one held out."""
-    snapshot = Database.open(part.database).snapshot()
+    snapshot = part[0].snapshot()
     park = snapshot.load_map(snapshot.maps()[0].map_id)
     easting, northing, height = park.frame.utm_from_enu(np.zeros(3), park.epsg)
     frame = LocalFrame.from_utm(easting + 3000.0, northing, height, park.epsg)

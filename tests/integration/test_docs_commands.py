@@ -1,5 +1,6 @@
 """Every command line of the documentation is run, or at least read by its own program; none is left out."""
 
+import atexit
 import json
 import os
 import shutil
@@ -7,9 +8,13 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import nbformat
 import pytest
+from IPython.core.interactiveshell import InteractiveShell
+from traitlets.config import Config
 
 from tests.support.doc_commands import (
     ROOT,
@@ -24,7 +29,7 @@ from tests.support.doc_commands import (
 )
 from tests.support.doc_folder import go_on, inside, make_folder
 from tests.support.doc_runner import CommandFailedError, PageRun, is_free, ports
-from tests.support.doc_short import STARTUP, shorten
+from tests.support.doc_short import shorten
 from tests.support.doc_usage import UsageError, check_usage
 
 _REAL_DATA = "needs photos or scans that are not in the repository"
@@ -100,10 +105,23 @@ def run_page(page: str, folder: Path) -> None:
                 exec(compile(item.text, f"{item.page}:{item.line}", "exec"), names)
 
 
+@contextmanager
+def ipython(folder: Path) -> Iterator[InteractiveShell]:
+    """A shell that runs the cells of a notebook as its kernel would."""
+    settings = Config()
+    settings.HistoryManager.enabled = False
+    shell = InteractiveShell(config=settings, ipython_dir=str(folder / "ipython"))
+    try:
+        yield shell
+    finally:
+        atexit.unregister(shell.atexit_operations)
+        shell.atexit_operations()
+
+
 @pytest.fixture(scope="module")
-def in_short() -> Iterator[None]:
+def in_short(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        shorten(patch)
+        shorten(patch, tmp_path_factory.mktemp("work"))
         yield
 
 
@@ -131,28 +149,18 @@ def test_the_commands_of_a_page_run(after_first: Path, tmp_path: Path, page: str
 
 @pytest.mark.slow
 @pytest.mark.parametrize("notebook", _NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(after_first: Path, tmp_path: Path, notebook: Path) -> None:
-    here = Path(shutil.copytree(after_first, tmp_path / "here"))
-    shutil.copy(notebook, here)
-    startup = tmp_path / "ipython" / "profile_default" / "startup"
-    startup.mkdir(parents=True)
-    (startup / "short.py").write_text(STARTUP)
-    programs = Path(sys.executable).parent
-    done = subprocess.run(
-        [programs / "jupyter-execute", "--timeout=600", notebook.name],
-        cwd=here,
-        env={
-            **os.environ,
-            "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}",
-            "PYTHONPATH": str(ROOT),
-            "IPYTHONDIR": str(tmp_path / "ipython"),
-        },
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=600,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_a_notebook_runs(
+    after_first: Path, tmp_path: Path, notebook: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In IPython in this process: a kernel of its own would import everything and register frames again."""
+    stored = nbformat.read(notebook, as_version=4)
+    nbformat.validate(stored)
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    with inside(Path(shutil.copytree(after_first, tmp_path / "here"))), ipython(tmp_path) as shell:
+        for cell in stored.cells:
+            if cell.cell_type == "code":
+                shell.run_cell(cell.source).raise_error()
+                assert shell.user_ns.get("_exit_code", 0) == 0, cell.source
 
 
 @pytest.mark.parametrize("notebook", _NOTEBOOKS, ids=lambda path: path.stem)

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,13 +58,13 @@ def foreign(tmp_path_factory: pytest.TempPathFactory, field_map: FeatureMap) -> 
         exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps_directory((place[0], place[1], place[2])))
         pixels = Image.fromarray(field.render(texture, image.cam_from_local, seed=k)).convert("RGB")
         pixels.save(photos / f"{k}.jpg", quality=95, exif=exif)
-    colmap_alone(folder, photos, field_map, "L1_ROOT")
+    colmap_alone(folder, photos, field_map)
     return folder
 
 
-def colmap_alone(folder: Path, photos: Path, feature_map: FeatureMap, normalisation: str) -> None:
+def colmap_alone(folder: Path, photos: Path, feature_map: FeatureMap) -> None:
     """COLMAP's SIFT, matches and triangulation at known poses, into `folder`."""
-    database = colmap_features(folder, photos, normalisation)
+    database = colmap_features(folder, photos)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = 1
@@ -81,13 +83,13 @@ def colmap_alone(folder: Path, photos: Path, feature_map: FeatureMap, normalisat
     made.write(str(folder / "sparse" / "0"))
 
 
-def colmap_features(folder: Path, photos: Path, normalisation: str) -> Path:
+def colmap_features(folder: Path, photos: Path) -> Path:
     """COLMAP's SIFT, into the database in `folder`."""
     database = folder / "database.db"
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
     extraction.num_threads = 1
-    extraction.sift.normalization = getattr(pycolmap.Normalization, normalisation)
+    extraction.sift.max_num_features = 2000
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "PINHOLE"
     reader.camera_params = "600,600,320,240"
@@ -99,6 +101,16 @@ def colmap_features(folder: Path, photos: Path, normalisation: str) -> Path:
         extraction_options=extraction,
     )
     return database
+
+
+def with_descriptors_of_length_one(database: Path) -> None:
+    """RootSIFT, the root of each part of the sum, to what COLMAP's `L2` writes of the same histograms."""
+    with closing(sqlite3.connect(database)) as opened, opened:
+        for image, data in opened.execute("SELECT image_id, data FROM descriptors").fetchall():
+            histograms = np.frombuffer(data, np.uint8).reshape(-1, 128).astype(np.float64) ** 2
+            parts = histograms / np.linalg.norm(histograms, axis=1, keepdims=True)
+            stored = np.clip(np.round(512.0 * parts), 0, 255).astype(np.uint8)
+            opened.execute("UPDATE descriptors SET data = ? WHERE image_id = ?", (stored.tobytes(), image))
 
 
 def localised(feature_map: FeatureMap) -> Rigid3:
@@ -258,8 +270,8 @@ class TestRefusals:
         self, tmp_path: Path, foreign: Path, field_map: FeatureMap
     ) -> None:
         # Where keypoints are, and so the model, is the same for every normalisation of their descriptors.
-        colmap_features(tmp_path, foreign / "photos", "L2")
-        shutil.copytree(foreign / "sparse", tmp_path / "sparse")
+        shutil.copytree(foreign, tmp_path, dirs_exist_ok=True)
+        with_descriptors_of_length_one(tmp_path / "database.db")
         options = ModelOptions(photos=foreign / "photos", stated=STATED)
         with pytest.raises(IngestError, match="expected RootSIFT"):
             map_of_model(tmp_path, options)

@@ -19,7 +19,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("after_s", [0.0, 0.1, 0.7])
+@pytest.mark.parametrize("after_s", [0.0, pytest.param(0.1, marks=pytest.mark.evaluation), 0.7])
 def test_a_stop_under_load_is_clean(database: Path, after_s: float) -> None:
     _, photo = cv2.imencode(".png", render(field_texture(1), view(4, -6, 40, 10, 33), seed=50))
     stopped = stopped_under_load(database, bytes(photo), after_s)

@@ -24,9 +24,15 @@ from tests.support.power_cut import Disk, State, write_state
 from tests.support.store_suite import NOTHING_KEPT
 
 
+@pytest.fixture(scope="module")
+def rich(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database to be copied."""
+    return Path(rich_database(tmp_path_factory.mktemp("rich") / "maps.db").url)
+
+
 @pytest.fixture
-def database(tmp_path: Path) -> Database:
-    return rich_database(tmp_path / "maps.db")
+def database(rich: Path, tmp_path: Path) -> Database:
+    return Database(str(shutil.copytree(rich, tmp_path / "maps.db")))
 
 
 @pytest.fixture

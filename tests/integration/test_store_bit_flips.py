@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow as pa
@@ -18,10 +19,22 @@ from tests.support.maps import random_map
 FLIPS = 15  # `python -m tests.support.bit_flips` makes as many as wanted
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _checkpoints_soon() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+        yield
+
+
+@pytest.fixture(scope="module")
+def rich(_checkpoints_soon: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database to be copied."""
+    return Path(rich_database(tmp_path_factory.mktemp("rich") / "maps.db").url)
+
+
 @pytest.fixture
-def database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Database:
-    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
-    return rich_database(tmp_path / "maps.db")
+def database(rich: Path, tmp_path: Path) -> Database:
+    return Database(str(shutil.copytree(rich, tmp_path / "maps.db")))
 
 
 @pytest.mark.slow

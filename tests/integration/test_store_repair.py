@@ -18,12 +18,18 @@ from featuredb.store.verify import verify
 from tests.support.maps import random_map
 
 
-@pytest.fixture
-def database(tmp_path: Path) -> Database:
-    database = Database.create(tmp_path / "maps.db")
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database of two maps, to be copied."""
+    database = Database.create(tmp_path_factory.mktemp("whole") / "maps.db")
     for seed in (1, 2):
         database.commit_map(random_map(seed, extent_m=10.0))
-    return database
+    return Path(database.url)
+
+
+@pytest.fixture
+def database(whole: Path, tmp_path: Path) -> Database:
+    return Database(str(shutil.copytree(whole, tmp_path / "maps.db")))
 
 
 def entry(database: Database, table: str, version: int) -> Path:

@@ -1,5 +1,6 @@
 """`verify` names each kind of damage."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,19 @@ from featuredb.store.verify import DatabaseProblem, VerifyReport, verify
 from tests.support.maps import random_map
 
 
-@pytest.fixture
-def database(tmp_path: Path) -> Database:
-    database = Database.create(tmp_path / "maps.db")
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database to be copied."""
+    database = Database.create(tmp_path_factory.mktemp("whole") / "maps.db")
     # One tile, so that there is one file for each child table to damage.
     database.commit_map(random_map(1, extent_m=10.0))
     assert verify(database).ok
-    return database
+    return Path(database.url)
+
+
+@pytest.fixture
+def database(whole: Path, tmp_path: Path) -> Database:
+    return Database(str(shutil.copytree(whole, tmp_path / "maps.db")))
 
 
 def data_file(database: Database, table: str) -> Path:

@@ -34,7 +34,9 @@ def database(store: FaultyStore, request: pytest.FixtureRequest) -> Database:
     return made
 
 
-@pytest.mark.parametrize("kind", REFUSED)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.evaluation) if kind == "500" else kind for kind in REFUSED]
+)
 def test_a_commit_whose_entry_is_refused_is_not_there(
     store: FaultyStore, database: Database, kind: str
 ) -> None:

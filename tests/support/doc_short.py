@@ -1,24 +1,28 @@
-"""The documentation in short: its commands, and notebooks, which begin with `STARTUP`."""
+"""The documentation in short."""
+
+from pathlib import Path
 
 import pytest
 
 from featuredb.features.extractor import ExtractorOptions
+from ingest import pipeline
 from ingest.cli import video
 from ingest.register.anchor import frames
 from ingest.register.anchor.anchor_map import AnchorOptions
 from tests.support.remembered import remembered
 
 FEATURES = 1500  # of a photo
-STARTUP = "import pytest\nfrom tests.support.doc_short import shorten\nshorten(pytest.MonkeyPatch())\n"
 
 
-def shorten(patch: pytest.MonkeyPatch) -> None:
+def shorten(patch: pytest.MonkeyPatch, work: Path) -> None:
     """Commands start no workers, which take long, and what the same photo gave before is not sought anew.
 
-    docs/anchoring.md and the tutorials register the same frames on the same scan, two that agree.
+    docs/anchoring.md and the tutorials register the same frames on the same scan, two that agree. Several
+    pages make a map of the same photos, each in a database of its own: they have one work folder, `work`.
     A map of few features is adjusted and compared sooner; how good it is, the demo says.
     """
     patch.setattr("os.cpu_count", lambda: 1)
+    patch.setattr(pipeline, "default_root", lambda database_url: work)
     patch.setitem(ExtractorOptions.__init__.__kwdefaults__, "max_features", FEATURES)
     patch.setattr(video, "_FEATURES", FEATURES)
     patch.setitem(AnchorOptions.__init__.__kwdefaults__, "frames", 2)
