@@ -6,7 +6,7 @@ import logging
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -114,24 +114,21 @@ class Verdict:
 
 
 def world_told(
-    doc: str | None, argv: Sequence[str] | None, seed: int, sizes: Mapping[str, Callable[..., W]]
+    doc: str | None, argv: Sequence[str] | None, seed: int, world: Callable[..., W]
 ) -> tuple[Path, W]:
     """The folder that a program of a made world is told, made, and the world.
 
     Args:
-        doc: of the program's module. seed: where none is told.
-        sizes: worlds by seed, by name; the first where none is told.
+        doc: of the program's module. seed: where none is told. world: by seed.
     """
-    usual = next(iter(sizes))
     parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="where all is kept: a folder for each world")
-    parser.add_argument("--size", choices=tuple(sizes), default=usual, help=f"of the world; default: {usual}")
     parser.add_argument("--seed", type=int, default=seed, help=f"of the world; default: {seed}")
     parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
     args = parser.parse_args(argv)
     log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
-    return args.out, sizes[args.size](seed=args.seed)
+    return args.out, world(seed=args.seed)
 
 
 def say(text: str) -> None:

@@ -1,11 +1,11 @@
 """Twelve people's photos of a town that a survey has mapped in part: how many register, and how well?
 
-    python -m tools.growth_community --out DIR [--size full|alike] [--seed N]
+    python -m tools.growth_community --out DIR [--seed N]
 
 The world is that of `tools.worlds.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
-most of the photos, as on photo sites; in the world of --size alike thirty sights have nearly as many each.
+most of the photos, as on photo sites.
 
 Prints what became of each kind of photo, by kind, owner and geotag; writes community.json.
 Everything is kept in DIR and goes on where it was. Exit code 0 if at least 70 % of the town's photos are in
@@ -44,11 +44,10 @@ from tools.worlds.community import CommunityOptions, community_album
 _OWN = ("street", "drone")
 _FOREIGN = ("other_town", "indoor", "portrait")
 _SHARE, _MEDIAN_M = 0.70, 0.30
-_SIZES = {"short": CommunityOptions, "full": CommunityOptions.full, "alike": CommunityOptions.alike}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = world_told(__doc__, argv, 1, _SIZES)
+    out, world = world_told(__doc__, argv, 1, CommunityOptions)
     album = made(community_album, out / "world", world)
     database = anchored(out / "db", album, "survey")
     everything = album.of(*_OWN, *_FOREIGN, "copy")

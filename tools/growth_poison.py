@@ -1,6 +1,6 @@
 """Poison: look-alike blocks, mirrors, liars and forgers send photos. Is anything wrong promoted?
 
-    python -m tools.growth_poison --out DIR [--size full] [--seed N]
+    python -m tools.growth_poison --out DIR [--seed N]
 
 The world is that of `tools.worlds.poison_world`. The survey is ingested, honest photos are grown, and
 held-out photos become canaries with their true poses. Then a copy of that database gets all kinds of poison
@@ -88,7 +88,7 @@ class PoisonOutcome:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = world_told(__doc__, argv, 4, {"short": PoisonOptions, "full": PoisonOptions.full})
+    out, world = world_told(__doc__, argv, 4, PoisonOptions)
     album = made(poison_album, out / "world", world)
     base = honest_base(out / "db", album)
     clean = max(off_shares(base, album, world).values(), default=0.0)

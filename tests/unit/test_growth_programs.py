@@ -20,14 +20,12 @@ from tools.worlds.walk_world import WalkOptions
 WALK = WalkOptions()
 
 
-def test_another_seed_and_the_full_size_are_other_worlds(tmp_path: Path) -> None:
+def test_another_seed_is_another_world(tmp_path: Path) -> None:
     def told(*words: str) -> CommunityOptions:
-        return world_told("", ["--out", str(tmp_path / "kept"), *words], 1, growth_community._SIZES)[1]
+        return world_told("", ["--out", str(tmp_path / "kept"), *words], 1, CommunityOptions)[1]
 
     assert told() == CommunityOptions(seed=1)
-    assert told("--seed", "7", "--size", "full") == CommunityOptions.full(7)
-    assert CommunityOptions.full(7).photos == 300
-    assert told("--size", "alike").zipf is None
+    assert told("--seed", "7") == CommunityOptions(seed=7)
     assert (tmp_path / "kept").is_dir()
 
 

@@ -6,17 +6,13 @@ other_town; copy (a re-upload by somebody else); indoor, portrait (belong nowher
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from typing import Self
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
-from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
 from tools.worlds.album import PlannedPhoto, Subject
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.edits import Edit
@@ -24,15 +20,8 @@ from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.geotags import GeotagOptions, geotag_at
 from tools.worlds.people import Person, community
 from tools.worlds.sights import find_sights
-from tools.worlds.surveyed import (
-    DAYS,
-    day_scene,
-    moment,
-    shot_seed,
-    survey_photos,
-)
+from tools.worlds.surveyed import DAYS, TownOptions, moment, shot_seed, survey_photos
 
-_OTHER_SEED = 1000
 _TAGGED_HERE, _TAGGED_THERE = (
     0.6,
     0.8,
@@ -40,20 +29,14 @@ _TAGGED_HERE, _TAGGED_THERE = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CommunityOptions:
-    """What to write. The same options give the same bytes.
+class CommunityOptions(TownOptions):
+    """What to write; the survey is of most of what people visit.
 
     Attributes:
-        seed: of everything. town_size_m: width and height of the town.
-        flight: the anchored survey, of most of what people visit.
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
         sights: places that people visit.
-        zipf: how much more they visit the first ones (`plan_visits`). Photo sites show a few landmarks: the
-            paper's 120,000 photos were of seven, and in every town one place leads. None: nearly alike.
-        width: of the widest camera, pixels.
         geotags: how wrong they are.
-        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
     """
 
     seed: int = 1
@@ -69,61 +52,7 @@ class CommunityOptions:
     indoor: int = 2
     portraits: int = 2
     sights: int = 6
-    zipf: float | None = 1.0
-    width: int = 1200
     geotags: GeotagOptions = field(default_factory=GeotagOptions)
-    texel_m: float = 0.06
-    pieces: int = 4
-
-    def __post_init__(self) -> None:
-        if min(self.photos, self.other_town, self.copies, self.indoor, self.portraits) < 0:
-            raise InvalidValueError(f"CommunityOptions: expected numbers >= 0, found {self}")
-        if not (self.sights > 0 and self.width >= 64):
-            raise InvalidValueError(f"CommunityOptions: value out of range in {self}")
-
-    @classmethod
-    def full(cls, seed: int) -> Self:
-        """A town with 300 photos of it."""
-        return cls(
-            seed=seed,
-            town_size_m=(440.0, 350.0),
-            flight=FlightOptions(
-                lines=9, per_line=13, height_m=100.0, oblique=14, gps_error="rtk", center_m=(-50.0, 15.0)
-            ),
-            photos=300,
-            other_town=100,
-            copies=40,
-            indoor=12,
-            portraits=12,
-            sights=12,
-            width=1600,
-            pieces=16,
-        )
-
-    @classmethod
-    def alike(cls, seed: int) -> Self:
-        """The full world, whose thirty sights are visited nearly alike."""
-        return replace(cls.full(seed), sights=30, zipf=None)
-
-    def scene(self, key: str) -> Scene:
-        """Scenes "home/light/week" and "away/light/week"."""
-        return day_scene(_base(self, key.split("/")[0]), key)
-
-
-@lru_cache(maxsize=4)
-def _base(options: CommunityOptions, town: str) -> Scene:
-    if town == "home":
-        return make_town(
-            options.seed, size_m=options.town_size_m, texel_m=options.texel_m, pieces=options.pieces
-        )
-    return make_town(
-        options.seed + _OTHER_SEED,
-        name="other town",
-        size_m=options.town_size_m,
-        place=OTHER_TOWN_PLACE,
-        texel_m=options.texel_m,
-        pieces=options.pieces,
-    )
 
 
 def community_album(options: CommunityOptions) -> list[PlannedPhoto]:
@@ -137,7 +66,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
     home, away = options.scene("home/0/000"), options.scene("away/0/000")
     people = community(options.width)
     places = find_sights(home, options.sights, options.seed, options.flight.center_m)
-    mine = plan_visits(home, people, places, options.photos, options.seed, "home", zipf=options.zipf)
+    mine = plan_visits(home, people, places, options.photos, options.seed, "home", by_rank=True)
     places = find_sights(away, options.sights, options.seed + 1)
     theirs = plan_visits(
         away,
@@ -148,7 +77,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
         "away",
         first_visit=10_000,
         kind="other_town",
-        zipf=options.zipf,
+        by_rank=True,
     )
     rng = np.random.default_rng((options.seed, 58))
     mine = tagged(home, mine, people, options.geotags, rng)
