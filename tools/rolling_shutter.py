@@ -10,12 +10,11 @@
 
 """
 
-import multiprocessing
 import subprocess
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +33,7 @@ from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from tools.figures import study_parser, write_figures
+from tools.worlds.film_frame import in_order
 from tools.worlds.film_world import FilmOptions, film_frame
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
@@ -91,12 +91,9 @@ def drawn(film: FilmOptions, folder: Path) -> list[Path]:
     """The film's frames as JPEG; what is there is taken as it is."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"{k:04d}.jpg" for k in range(film.frames)]
-    missing = [k for k, file in enumerate(files) if not file.is_file()]
-    if missing:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(mp_context=context) as pool:
-            for k, data in zip(missing, pool.map(_jpeg, [film] * len(missing), missing), strict=True):
-                files[k].write_bytes(data)
+    if not all(file.is_file() for file in files):
+        for file, data in zip(files, in_order(partial(_jpeg, film), film.frames), strict=True):
+            file.write_bytes(data)
     return files
 
 

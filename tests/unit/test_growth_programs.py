@@ -55,7 +55,6 @@ def placed(f: AlbumFact, error_m: float | None, status: str = "active", drift_m:
         status=status,
         generation=1,
         offset_m=None if error_m is None else np.array([0.0, error_m, 0.0]),
-        angle_deg=0.0,
         drift_m=drift_m,
         bound_m=2.0 * drift_m,
     )
@@ -88,23 +87,8 @@ def test_each_line_of_the_community_can_fail(line: str, change) -> None:  # type
 
 
 def steps(ratio: float = 0.5, stopped: int = 0, reach: float = 700.0, drift: float = 0.4) -> list[Step]:
-    probes = tuple(
-        Probe(name=str(i), step=0, away_m=float(i), error_m=0.1, normalised=2.0) for i in range(10)
-    )
-    return [
-        Step(
-            step=0,
-            reach_m=reach,
-            maps=1,
-            quarantined=0,
-            drift_m=drift,
-            true_m=ratio * drift,
-            ratio=ratio,
-            worst_m=ratio * drift,
-            stopped=stopped,
-            probes=probes,
-        )
-    ]
+    probes = tuple(Probe(error_m=0.1, normalised=2.0) for _ in range(10))
+    return [Step(step=0, reach_m=reach, drift_m=drift, ratio=ratio, stopped=stopped, failed=0, probes=probes)]
 
 
 def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
@@ -134,7 +118,7 @@ def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:
 
 
 def test_poison_that_gets_in_fails() -> None:
-    clean = PoisonOutcome(sent=10, active=0, quarantined=0, wrong={}, off_share=0.0)
+    clean = PoisonOutcome(sent=10, active=0, wrong={}, off_share=0.0)
     good = {"changed": True, "restored": True}
     assert all(holding(growth_poison.judge(clean, 0.01, good)).values())
     for bad in (replace(clean, wrong={"mirrored": 1}), replace(clean, off_share=0.03)):

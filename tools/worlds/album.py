@@ -1,21 +1,17 @@
 """Albums: photos of many people as planned, taken, edited, tagged, and written with a table and the truth.
 
 An album's photos lie in a folder per owner under names that give nothing away. Beside them stand
-`table.csv`, `table.jsonl` and `table.parquet` as a photo site's programming interface would give them,
-`truth.json` with every true pose, and `facts.jsonl` with what each photo really is.
+`table.jsonl` as a photo site's programming interface would give it, `truth.json` with every true pose, and
+`facts.jsonl` with what each photo really is.
 """
 
-import multiprocessing
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal, Protocol
 
-import cv2
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
@@ -27,8 +23,9 @@ from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.truth import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
-from tools.worlds.album_files import AlbumFact, Geotag, write_facts, write_tables
+from tools.worlds.album_files import AlbumFact, Geotag, write_facts, write_table
 from tools.worlds.edits import Edit, edited, edited_camera
+from tools.worlds.film_frame import in_order, process_count
 from tools.worlds.indoors import indoor_photo, portrait_photo
 
 Progress = Callable[[int, int], None]
@@ -84,7 +81,7 @@ def write_album(
     workers: int = 0,
     progress: Progress | None = None,
 ) -> Path:
-    """Write all photos, tables and truth into `folder`; files that are there already are kept.
+    """Write all photos, the table and the truth into `folder`; files that are there already are kept.
 
     Photos whose fact says `home` get a true pose in the frame of the scene "home/0/000".
 
@@ -109,11 +106,14 @@ def write_album(
     # The same scenes lie together: a process takes a part of the list, and paints few scenes.
     todo = sorted((p for p in photos if not (folder / p.shot.name).exists()), key=lambda p: p.scene)
     there = len(photos) - len(todo)
-    for done, _ in enumerate(_run(folder, world, todo, workers), start=there + 1):
+    # A row of its own for each process.
+    share = -(-len(todo) // max(process_count(workers, len(todo)), 1))
+    written = in_order(partial(_write, folder, world, todo), len(todo), workers, max(share, 1))
+    for done, _ in enumerate(written, start=there + 1):
         if progress is not None:
             progress(done, len(photos))
     truths = {p.shot.name: true for p in photos if (true := _truth(home, p)) is not None}
-    write_tables(folder, [(p.fact, p.geotag) for p in photos])
+    write_table(folder, [(p.fact, p.geotag) for p in photos])
     write_facts(folder, [p.fact for p in photos])
     write_truth(folder, Truth(seed=home.seed, epsg=home.epsg, frame=home.frame, images=truths))
     return folder
@@ -170,38 +170,15 @@ def _exif(photo: PlannedPhoto, image: Image8) -> Image.Exif | None:
     return exif
 
 
-def _run(folder: Path, world: SceneSource, todo: list[PlannedPhoto], workers: int) -> Iterator[str]:
-    """Write each photo, in a pool of processes (or here, for one worker); names as they are done."""
-    count = min(workers or os.cpu_count() or 1, len(todo))
-    if count <= 1:
-        for photo in todo:
-            yield _write(folder, world, photo)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ExitStack() as stack:
-        futures = []
-        for share in range(count):  # a row of its own for each process: few scenes are painted twice
-            pool = ProcessPoolExecutor(1, mp_context=context, initializer=_one_thread)
-            stack.enter_context(pool)
-            start, stop = (len(todo) * edge // count for edge in (share, share + 1))
-            futures += [pool.submit(_write, folder, world, photo) for photo in todo[start:stop]]
-        for future in as_completed(futures):
-            yield future.result()
-
-
-def _one_thread() -> None:
-    cv2.setNumThreads(1)
-
-
 @lru_cache(maxsize=4)
 def _scene(world: SceneSource, key: str) -> Scene:
     return world.scene(key)
 
 
-def _write(folder: Path, world: SceneSource, photo: PlannedPhoto) -> str:
+def _write(folder: Path, world: SceneSource, photos: Sequence[PlannedPhoto], number: int) -> None:
     """Write one file under its name by renaming, so that a file that is there is whole."""
+    photo = photos[number]
     target = folder / photo.shot.name
-    partial = target.with_suffix(f".{os.getpid()}.part")
-    partial.write_bytes(photo_file(_scene(world, photo.scene), photo))
-    partial.replace(target)
-    return photo.shot.name
+    part = target.with_suffix(f".{os.getpid()}.part")
+    part.write_bytes(photo_file(_scene(world, photo.scene), photo))
+    part.replace(target)

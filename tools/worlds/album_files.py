@@ -1,6 +1,5 @@
 """Files of an album: the table that a photo site gives, and the facts that only the simulation knows."""
 
-import csv
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -8,13 +7,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from featuredb.errors import InvalidValueError
 
 FACTS_FILE = "facts.jsonl"
-TABLE_FILES = ("table.csv", "table.jsonl", "table.parquet")
+TABLE_FILE = "table.jsonl"
 
 GeotagState = Literal["near", "far", "none"]
 
@@ -92,25 +88,13 @@ def read_facts(folder: Path) -> dict[str, AlbumFact]:
     return {fact.name: fact for fact in facts}
 
 
-def write_tables(folder: Path, rows: Sequence[tuple[AlbumFact, Geotag | None]]) -> None:
-    """Write table.csv, table.jsonl and table.parquet: the same rows, sorted by path.
-
-    Columns: path, id, lat, lon, accuracy, time, owner, licence, title. Missing values are empty, null,
-    and null. Photos of a survey are not part of a photo site.
-    """
+def write_table(folder: Path, rows: Sequence[tuple[AlbumFact, Geotag | None]]) -> None:
+    """Write table.jsonl, sorted by path; photos of a survey are not part of a photo site."""
     table = [
         _table_row(fact, tag) for fact, tag in sorted(rows, key=lambda r: r[0].name) if fact.kind != "survey"
     ]
-    columns = ("path", "id", "lat", "lon", "accuracy", "time", "owner", "licence", "title")
-    with (folder / TABLE_FILES[0]).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(table)
     lines = "".join(json.dumps(row) + "\n" for row in table)
-    (folder / TABLE_FILES[1]).write_text(lines, encoding="utf-8")
-    numbers = {"lat", "lon", "accuracy"}
-    schema = pa.schema([(name, pa.float64() if name in numbers else pa.string()) for name in columns])
-    pq.write_table(pa.Table.from_pylist(table, schema=schema), folder / TABLE_FILES[2])
+    (folder / TABLE_FILE).write_text(lines, encoding="utf-8")
 
 
 def _table_row(fact: AlbumFact, tag: Geotag | None) -> dict[str, Any]:

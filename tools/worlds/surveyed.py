@@ -9,7 +9,7 @@ import numpy as np
 from featuredb.simworld.flight import FlightOptions, survey
 from featuredb.simworld.town.days import DayOptions, another_day
 from featuredb.simworld.town.scene import Scene
-from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
 from tools.worlds.album import PlannedPhoto
 from tools.worlds.album_files import AlbumFact, Geotag
 
@@ -46,13 +46,12 @@ class TownOptions:
 @lru_cache(maxsize=4)
 def town_of(options: TownOptions, *, away: bool = False) -> Scene:
     """The town as it was built, or another one elsewhere on Earth."""
-    where = {"name": "other town", "place": OTHER_TOWN_PLACE} if away else {}
     return make_town(
         options.seed + (_OTHER_SEED if away else 0),
         size_m=options.town_size_m,
+        place=OTHER_TOWN_PLACE if away else TOWN_PLACE,
         texel_m=options.texel_m,
         pieces=options.pieces,
-        **where,
     )
 
 
