@@ -26,10 +26,8 @@ where the pose puts them and where the ortho image and the offset do.
 Refused must be: mirrored windows, windows whose prior lies elsewhere in the scan, photos of other places.
 """
 
-import argparse
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,7 +64,7 @@ _LIMIT_M, _WRONG_M = 1.5, 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindowOutcome:
-    """What became of one window."""
+    """What became of one window; `error_m` is None where no pose was tried."""
 
     kind: str
     column: int
@@ -74,16 +72,18 @@ class WindowOutcome:
     has_structure: bool
     accepted: bool
     error_m: float | None
-    message: str
-    matched_by: str
     log_nfa: float
-    elsewhere_log_nfa: float
-    seconds: float
-    pose: list[list[float]] | None
+    message: str
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__, "--seed")
+    parser.set_defaults(seed=0)
+    parser.add_argument("scan", type=Path)
+    parser.add_argument("ortho", type=Path)
+    parser.add_argument("--figure", type=Path, help="draw evidence against error")
+    parser.add_argument("--photos", type=Path, nargs="*", default=[], help="folders of other places")
+    args = parser.parse_args(argv)
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         database = Database.create(Path(folder) / "db")
@@ -102,10 +102,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         rng = np.random.default_rng([args.seed, _KINDS.index(kind), column, row])
         outcome = _one(place, cloud, kind, column, row, photo, offset, rng)
         outcomes.append(outcome)
-        print(_line(outcome), flush=True)
+        print(outcome, flush=True)
     if args.figure is not None:
         _draw(outcomes, args.figure)
-    _summary(outcomes, args.json)
+    write_figures(args.json, figures_of(outcomes))
     return 0
 
 
@@ -158,11 +158,8 @@ def _one(
 ) -> WindowOutcome:
     camera, truth = _nadir_camera(place, column, row)
     prior = _wrong_prior(truth, rng)
-    start = time.process_time()
     found = register_frame(photo, camera, prior, cloud)
-    seconds = time.process_time() - start
-    evidence = found.evidence
-    tried = evidence.get("pose_tried")
+    tried = found.evidence.get("pose_tried")
     error = None
     if tried is not None:
         error = _ground_error(place, camera, Rigid3.from_matrix(tried), column, row, offset)
@@ -173,12 +170,8 @@ def _one(
         has_structure=has_structure(place, column, row),
         accepted=found.accepted,
         error_m=error,
+        log_nfa=found.evidence.get("confirmation", {}).get("log_nfa", 0.0),
         message=f"{found.reason}: {found.message}" if found.reason else "",
-        matched_by=evidence.get("matched_by", ""),
-        log_nfa=evidence.get("confirmation", {}).get("log_nfa", 0.0),
-        elsewhere_log_nfa=evidence.get("elsewhere_log_nfa", 0.0),
-        seconds=seconds,
-        pose=tried,
     )
 
 
@@ -219,15 +212,6 @@ def _ground_error(
     return float(np.sqrt(((found[:, :2] - wanted) ** 2).sum(axis=1).mean()))
 
 
-def _line(o: WindowOutcome) -> str:
-    error = "-" if o.error_m is None else f"{o.error_m:.2f}"
-    return (
-        f"{o.kind:9} {o.column:4} {o.row:4} structure {o.has_structure!s:5} accepted {o.accepted!s:5} "
-        f"error {error:>6} m  log_nfa {o.log_nfa:5.1f} elsewhere {o.elsewhere_log_nfa:4.1f} "
-        f"{o.matched_by:8} {o.seconds:5.1f} s  {o.message}"
-    )
-
-
 def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
     """Evidence of the pictures against the error on the ground, with the verdict's two lines."""
     chart = Figure(figsize=(7.5, 3.6), dpi=110, facecolor="white", layout="constrained")
@@ -249,42 +233,23 @@ def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
     chart.savefig(path)
 
 
-def _summary(outcomes: Sequence[WindowOutcome], figures: Path | None) -> None:
+def figures_of(outcomes: Sequence[WindowOutcome]) -> dict[str, float]:
+    """How many windows are found, and how many of what has to be refused is accepted."""
     windows = [o for o in outcomes if o.kind == "window"]
     structured = [o for o in windows if o.has_structure]
     close = [o for o in structured if o.accepted and o.error_m is not None and o.error_m <= _LIMIT_M]
     wrong = [o for o in windows if o.accepted and (o.error_m is None or o.error_m > _WRONG_M)]
     foreign = [o for o in outcomes if o.kind != "window"]
-    taken = [o for o in foreign if o.accepted]
-    accepted = [o for o in windows if o.accepted]
-    errors = [o.error_m for o in accepted if o.error_m is not None]
-    write_figures(
-        figures,
-        {
-            "windows": len(windows),
-            "structured": len(structured),
-            "close": len(close),
-            "rate": len(close) / max(len(structured), 1),
-            "accepted": len(accepted),
-            "median_m": float(np.median(errors or [np.nan])),
-            "largest_m": max(errors, default=float("nan")),
-            "wrong": len(wrong),
-            "foreign": len(foreign),
-            "foreign_accepted": len(taken),
-        },
-    )
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("scan", type=Path)
-    parser.add_argument("ortho", type=Path)
-    parser.add_argument("--figure", type=Path, help="draw evidence against error")
-    parser.add_argument(
-        "--photos", type=Path, nargs="*", default=[], help="folders with photos of other places"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    return parser.parse_args(argv)
+    errors = [o.error_m for o in windows if o.accepted and o.error_m is not None]
+    return {
+        "structured": len(structured),
+        "close": len(close),
+        "rate": len(close) / max(len(structured), 1),
+        "largest_m": max(errors, default=float("nan")),
+        "wrong": len(wrong),
+        "foreign": len(foreign),
+        "foreign_accepted": sum(o.accepted for o in foreign),
+    }
 
 
 if __name__ == "__main__":

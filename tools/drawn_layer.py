@@ -5,7 +5,6 @@ frame each belongs where the true camera sees it; its mark is where the film was
 """
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,26 +26,14 @@ _CHANGED = 50  # grey levels; writing the film anew changes less
 _FEWEST_PIXELS = 8  # of a mark that is not hidden
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnMarks:
-    """Where marks were found.
-
-    Attributes:
-        frames: with a mark. marks: measured. stray: changed spots that no place explains.
-        median_px, largest_px: between a mark's centre and the pixel where its place belongs.
-    """
-
-    frames: int
-    marks: int
-    stray: int
-    median_px: float
-    largest_px: float
-
-
 def drawn_marks(
     folder: Path, film: Path, truth: FilmTruth, scene: Scene, track: Trajectory, database: Path
-) -> DrawnMarks:
-    """Draw a layer over a film that was tracked, and measure its marks; files go into `folder`."""
+) -> dict[str, float]:
+    """Draw a layer over a film that was tracked, and measure its marks; files go into `folder`.
+
+    Frames with a mark, marks that were measured, stray: changed spots that no place explains, and the
+    distances between a mark's centre and the pixel where its place belongs.
+    """
     places = _places(scene, truth)
     (folder / "layer.geojson").write_text(json.dumps(_layer(truth.frame.geodetic_from_enu(places))))
     write_trajectory(folder / "track.csv", track)
@@ -65,13 +52,13 @@ def drawn_marks(
             changed = np.abs(after.rgb().astype(np.int16) - before.rgb()).max(axis=2)
             found, strange = marks_of(changed.astype(np.float64), lens.project(pose.act(places)))
             off, frames, stray = [*off, *found], frames + bool(found), stray + strange
-    return DrawnMarks(
-        frames=frames,
-        marks=len(off),
-        stray=stray,
-        median_px=float(np.median(off)),
-        largest_px=max(off),
-    )
+    return {
+        "frames": frames,
+        "marks": len(off),
+        "stray": stray,
+        "median_px": float(np.median(off)),
+        "largest_px": max(off),
+    }
 
 
 def marks_of(changed: FloatArray, pixels: FloatArray) -> tuple[list[float], int]:

@@ -12,7 +12,6 @@ the map stores of it (root mean square of its parameters: 1 is right). Worst is 
 of a median to the baseline's, or to the reported radius.
 """
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -49,7 +48,9 @@ class Errors:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__)
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as scratch:
         figures = judged(read_laser_set(args.folder), Path(scratch) / args.folder.name)
     write_figures(args.json, figures)
@@ -60,7 +61,7 @@ def judged(truth: LaserSet, work: Path) -> dict[str, float]:
     """The figures of one set."""
     photos = with_exif(truth, truth.mapped, work / "photos", positions=True)
     asked = with_exif(truth, truth.asked, work / "asked", positions=False)
-    make(work / "db", "photos", photos, len(truth.mapped))
+    make(work / "db", "photos", photos)
     maps = [one for one in all_maps(work / "db") if isinstance(one, FeatureMap)]
     if not maps:
         raise SystemExit(f"{truth.photos}: no map was placed")
@@ -167,12 +168,6 @@ def pose_errors(
 
 def _median(values: Sequence[float]) -> float:
     return float(np.median(values)) if len(values) else float("nan")
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("folder", type=Path, metavar="FOLDER")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -148,13 +148,11 @@ class Heard:
     seconds: list[float] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     wrong: int = 0
-    localised: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def answered(self, seconds: float, reply: LocaliseReply, expected: LocaliseReply) -> None:
         with self._lock:
             self.seconds.append(seconds)
-            self.localised += reply.status == "localised"
             self.wrong += not same_place(reply, expected)
 
     def failed(self, code: str) -> None:
@@ -221,36 +219,31 @@ def honest_clients(
                 heard.failed(error.code)
 
     threads = [threading.Thread(target=run, args=(name, 3 * k)) for k, name in enumerate(HONEST)]
+    with beside(threads, stop):
+        yield heard
+
+
+@contextmanager
+def watched_memory(process: CommandProcess, every_s: float = 1.0) -> Iterator[list[float]]:
+    """Looks at a process's memory again and again within the block: what it sees (MiB), in order."""
+    seen, stop = [process.memory_mib()], threading.Event()
+
+    def run() -> None:
+        while not stop.wait(every_s):
+            seen.append(process.memory_mib())
+
+    with beside([threading.Thread(target=run)], stop):
+        yield seen
+
+
+@contextmanager
+def beside(threads: Sequence[threading.Thread], stop: threading.Event) -> Iterator[None]:
+    """Within the block these run, until they are told to stop."""
     for thread in threads:
         thread.start()
     try:
-        yield heard
+        yield
     finally:
         stop.set()
         for thread in threads:
             thread.join()
-
-
-class MemoryWatch:
-    """Looks at a process's memory again and again, within a `with` block.
-
-    Attributes:
-        mib: what it saw, in order.
-    """
-
-    def __init__(self, process: CommandProcess, every_s: float = 1.0) -> None:
-        self.mib = [process.memory_mib()]
-        self._process, self._every_s, self._stop = process, every_s, threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> "MemoryWatch":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._stop.wait(self._every_s):
-            self.mib.append(self._process.memory_mib())

@@ -78,7 +78,7 @@ def unplaced_map(photos: Path, work: Path) -> dict[str, object]:
     if not (work / _MADE).exists():
         without = copied(photos, names, work / "photos", strip=True)
         copied(photos, HELD_OUT, work / "asked", strip=True)
-        made = make(work / "db", "photos", without, len(names))
+        made = make(work / "db", "photos", without)
         write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
     told: dict[str, object] = json.loads((work / _MADE).read_text(encoding="utf-8"))
     return {"photos": len(names), **told}

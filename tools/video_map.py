@@ -7,7 +7,6 @@
 3. The map's cameras against the truth.
 """
 
-import argparse
 import shutil
 import sys
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from ingest.workspace import default_root
 from tools.anchor_simworld import featuredb
-from tools.figures import write_figures
+from tools.figures import study_parser, write_figures
 from tools.track_evaluation import film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from tools.worlds.scan_world import make_scan_world
@@ -30,7 +29,7 @@ _FRAMES = 1200
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    args = study_parser(__doc__, "--out").parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     world = make_scan_world(args.out)
     folder = write_film(args.out / "film-smooth", film_options("smooth", _FRAMES))
@@ -46,7 +45,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = ("anchor", str(database), made.map_id, "--photos", str(stills), "--out", str(out), "--auto")
     placed = featuredb(*words, "--quiet", may_refuse=True) == 0
     clock.lap("anchor")
-    made_s, anchored_s = clock.seconds["ingest"], clock.seconds["anchor"]
     snapshot = Database.open(database).snapshot()
     feature_map = snapshot.load_map(made.map_id)
     off = keyframe_errors(feature_map, read_film_truth(folder))
@@ -55,8 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "keyframes_m": float(np.median(off)),
         "keyframes_largest_m": float(off.max()),
         "placed": int(placed),
-        "made_s": made_s,
-        "anchored_s": anchored_s,
+        "made_s": clock.seconds["ingest"],
+        "anchored_s": clock.seconds["anchor"],
     }
     write_figures(args.out / "video_map.json", figures)
     return 0
@@ -71,12 +69,6 @@ def keyframe_errors(feature_map: FeatureMap, truth: FilmTruth) -> FloatArray:
         assert true is not None
         found.append(float(np.linalg.norm(here.act(image.cam_from_local.center) - true.center)))
     return np.array(found)
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("video-map"))
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":
