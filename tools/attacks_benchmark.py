@@ -26,11 +26,11 @@ from featuredb.store import Database
 from reloc.service.options import wire_name_of
 from tools.attacks import ATTACKS, Target, attack
 from tools.figures import write_figures
+from tools.serve_process import beside
 from tools.service_world import (
     ATTACKER,
     DEADLINE_S,
     Service,
-    beside,
     enlarged,
     first_answers,
     honest_clients,

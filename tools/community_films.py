@@ -27,7 +27,7 @@ from featuredb.simworld.laser.airborne import scan_town
 from featuredb.simworld.laser.scan_file import write_scan
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from reloc.tracking.trajectory.read import read_trajectory_csv
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps

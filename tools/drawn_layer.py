@@ -16,7 +16,7 @@ from featuredb.simworld.town.scene import Scene, texture_index
 from featuredb.video.frames import open_video
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.worlds.film_world import FILM_FILE, FilmTruth
 
 _SEED, _SHOWING, _PLACES = 3, 6, 8  # frames that give places, and places of each

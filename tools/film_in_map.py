@@ -17,7 +17,7 @@ import numpy as np
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 
 

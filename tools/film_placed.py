@@ -19,7 +19,7 @@ from featuredb.geo.utm import utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store import Database
 from featuredb.video.telemetry import telemetry_of_video
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 
 _WITHIN = float(chi2.ppf(0.95, 2))

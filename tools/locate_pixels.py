@@ -33,7 +33,8 @@ from reloc.pixels.locate import PixelPlace, locate
 from reloc.pixels.surfaces import RaySurface, scan_surface
 from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
-from tools.anchor_simworld import anchored, featuredb
+from tools.anchor_simworld import anchored
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 from tools.worlds.scan_world import make_scan_world
 

@@ -20,7 +20,7 @@ from PIL import Image
 from featuredb.features.jpeg_segments import EXIF_PREFIX, with_app1
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")

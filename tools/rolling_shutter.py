@@ -10,7 +10,6 @@
 
 """
 
-import subprocess
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -32,6 +31,7 @@ from featuredb.simworld.camera.sensor import jpeg_bytes
 from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
+from tools.commands import said
 from tools.figures import study_parser, write_figures
 from tools.worlds.film_frame import in_order
 from tools.worlds.film_world import FilmOptions, film_frame
@@ -56,7 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             for receiver in ("plain", "rtk"):
                 name = f"{style}-{seed}-{receiver}"
                 photos = tagged(film, pictures, receiver == "rtk", args.work / name)
-                said = ingested(args.work / f"{name}.db", photos)
+                words = ("ingest", "photos", str(args.work / f"{name}.db"), str(photos))
+                report = said(*words, "--max-features", "4000", "--quiet")
                 maps = Database.open(args.work / f"{name}.db").snapshot()
                 active = [m for m in maps.maps() if m.status == "active"]
                 squares = [normalised(film, maps.load_map(m.map_id)) for m in active]
@@ -64,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 figures["active"] += bool(active)
                 figures["outside"] += sum(max(one) > _OUTSIDE for one in squares)
                 figures["held_back"] += not active
-                figures["unnamed"] += "rolling shutter" not in said
+                figures["unnamed"] += "rolling shutter" not in report
                 worst = max([worst, *(max(one) for one in squares)])
                 words = ", ".join(f"position {a:.1f} and orientation {b:.1f}" for a, b in squares)
                 sys.stdout.write(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}\n")
@@ -135,15 +136,6 @@ def tagged(film: FilmOptions, pictures: Sequence[Path], rtk: bool, folder: Path)
         with Image.open(picture) as image:
             (folder / picture.name).write_bytes(jpeg_bytes(np.asarray(image), 92, exif))
     return folder
-
-
-def ingested(database: Path, photos: Path) -> str:
-    """What `featuredb ingest photos` says."""
-    words = ("ingest", "photos", str(database), str(photos), "--max-features", "4000", "--quiet")
-    command = [sys.executable, "-m", "featuredb.cli", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    sys.stdout.write(f"$ featuredb {' '.join(words)}\n{done.stdout}{done.stderr}")
-    return done.stdout
 
 
 def normalised(film: FilmOptions, feature_map: FeatureMap) -> tuple[float, float]:

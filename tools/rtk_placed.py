@@ -29,7 +29,8 @@ from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.truth import TrueImage, Truth
 from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database
-from tools.anchor_simworld import camera_errors, featuredb
+from tools.anchor_simworld import camera_errors
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 from tools.made_maps import copied
 

@@ -2,7 +2,6 @@
 
 import argparse
 import io
-import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -19,9 +18,10 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from reloc.authority.folder import Authority
 from reloc.client import Client, LocaliseReply
+from reloc.service.session import bind_free_port
 from tools.figures import study_parser
 from tools.proxy_process import proxied
-from tools.serve_process import CommandProcess, ServeProcess
+from tools.serve_process import CommandProcess, ServeProcess, beside
 
 HONEST, ATTACKER, WEB = ("alice", "bob", "carol"), "mallory", "web"
 _SAME_M = 0.5  # two answers to one photo
@@ -81,9 +81,7 @@ def photos_of(folder: Path, count: int) -> list[bytes]:
 
 def free_port() -> int:
     """One that nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    return int(bind_free_port("tcp/127.0.0.1:0").rpartition(":")[2])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,16 +232,3 @@ def watched_memory(process: CommandProcess, every_s: float = 1.0) -> Iterator[li
 
     with beside([threading.Thread(target=run)], stop):
         yield seen
-
-
-@contextmanager
-def beside(threads: Sequence[threading.Thread], stop: threading.Event) -> Iterator[None]:
-    """Within the block these run, until they are told to stop."""
-    for thread in threads:
-        thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()

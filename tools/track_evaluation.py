@@ -36,7 +36,8 @@ from reloc.tracking.ground import Finder
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from reloc.tracking.trajectory.values import Trajectory
-from tools.anchor_simworld import anchored, featuredb
+from tools.anchor_simworld import anchored
+from tools.commands import featuredb
 from tools.drawn_layer import drawn_marks
 from tools.figures import study_parser, write_figures
 from tools.growth_common import say

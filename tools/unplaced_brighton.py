@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
+from tools.commands import anchor, featuredb
 from tools.figures import write_figures
 from tools.made_maps import copied, make, photo_names
 from tools.picked import Scan, picks, read_scan, write_picks
@@ -88,10 +88,8 @@ def placed_by(
     database: Path, map_id: str, work: Path, truth: ScanTruth, *start: str
 ) -> dict[str, float] | None:
     """Place the map by `featuredb anchor` and its arguments: errors of the held-out photos; None: refused."""
-    words = ("anchor", str(database), map_id, "--photos", str(work / "photos"), *start)
     # 1: the map is not placed. 2: where it starts from is open, before anything is tried.
-    out = ("--out", str(database.parent / "anchor"), "--auto", "--quiet")
-    if featuredb(*words, *out, may_refuse=True, refusals=(1, 2)) != 0:
+    if not anchor(database, map_id, work / "photos", database.parent / "anchor", *start, refusals=(1, 2)):
         return None
     asked = ask_poses(Database.open(database), work / "asked", HELD_OUT, truth.frame, truth.poses)
     return error_figures(asked)

@@ -24,7 +24,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import write_figures
 from tools.made_maps import copied, photo_names
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth

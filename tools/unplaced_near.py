@@ -21,7 +21,7 @@ import numpy as np
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import write_figures
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 from tools.unplaced_brighton import placed_by, summed, unplaced_map

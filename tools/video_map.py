@@ -19,7 +19,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from ingest.workspace import default_root
-from tools.anchor_simworld import featuredb
+from tools.commands import anchor, featuredb
 from tools.figures import study_parser, write_figures
 from tools.track_evaluation import film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
@@ -41,9 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     clock.lap("ingest")
     (made,) = Database.open(database).snapshot().maps()
     (stills,) = (default_root(Database.open(database).url) / "films").iterdir()
-    out = args.out / "film-anchor"
-    words = ("anchor", str(database), made.map_id, "--photos", str(stills), "--out", str(out), "--auto")
-    placed = featuredb(*words, "--quiet", may_refuse=True) == 0
+    placed = anchor(database, made.map_id, stills, args.out / "film-anchor")
     clock.lap("anchor")
     snapshot = Database.open(database).snapshot()
     feature_map = snapshot.load_map(made.map_id)
