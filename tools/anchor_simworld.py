@@ -12,7 +12,6 @@
 Exit code 0 if the map was placed, and the other town's scan was refused.
 """
 
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +23,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.truth import Truth
 from featuredb.simworld.world import World
 from featuredb.store import Database
-from tools.commands import anchor, featuredb
+from tools.commands import anchor, featuredb, newest_copy
 from tools.figures import study_parser, write_figures
 from tools.real_photos import ask_poses, error_figures
 from tools.worlds.scan_world import ScanWorld, make_scan_world
@@ -49,9 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def anchored(work: Path, mapped: Path, world: ScanWorld, *, other: bool) -> tuple[Path, bool]:
     """A copy of the database with one of the scans, anchored; and whether the map was placed."""
-    database = work / f"anchored-{'other' if other else 'own'}-intensity"
-    shutil.rmtree(database, ignore_errors=True)
-    shutil.copytree(mapped, database)
+    database = newest_copy(mapped, work / f"anchored-{'other' if other else 'own'}-intensity")
     featuredb("lidar", "add", str(database), str(world.other_scan if other else world.scan))
     map_id = Database.open(database).snapshot().maps()[0].map_id
     report = work / f"{database.name}-report"

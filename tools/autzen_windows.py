@@ -17,9 +17,7 @@ window counts as having structure by these measures alone:
 scan:
   a gradient (sigma 2 pixels) whose 95th percentile in the part is above the picture's own 75th percentile.
 
-Ortho image and scan disagree by a few feet: 7 columns and 2 rows, says who described the data. That offset is
-checked here, from the whole picture and from its quarters, by the correlation of gradient magnitudes over
-shifts, with rasters made by counting points into cells: nothing of it is shared with the registration. A
+Ortho image and scan disagree by a few feet: 7 columns and 2 rows, says who described the data. A
 window's error is the root mean square, over 16 places of the window, of the distance on the ground between
 where the pose puts them and where the ortho image and the offset do.
 
@@ -51,7 +49,7 @@ from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import SURE_CONFIRMATION_LOG_NFA
 from ingest.register.frame_registration import FramePrior
 from tools.figures import study_parser, write_figures
-from tools.ortho_place import WINDOW_PX, Floats, OrthoOverScan, has_structure, measured_offset, place_of
+from tools.ortho_place import WINDOW_PX, Floats, OrthoOverScan, has_structure, place_of
 
 _STEPS = (225, 200)  # columns, rows between windows
 _HEIGHT_M = 1000.0
@@ -92,11 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         cloud = replace(load_cloud(database, frame), rgb=None)
     print(f"scan: {len(cloud):,} points, {added.scan.height_datum} heights, EPSG:{added.scan.epsg}")
     place = place_of(args.ortho, frame, added.scan.epsg, cloud)
-    measured = measured_offset(place)
     offset = place.on_ground(np.array([_OFFSET_PX]))[0] - place.on_ground(np.zeros((1, 2)))[0]
-    apart = float(np.hypot(*(offset - measured)))
-    taken = f"columns {_OFFSET_PX[0]:+g}, rows {_OFFSET_PX[1]:+g}"
-    print(f"offset taken: {taken}; the measured one is {apart:.2f} m from it")
     outcomes = []
     for kind, column, row, photo in _photos(place, args.photos):
         rng = np.random.default_rng([args.seed, _KINDS.index(kind), column, row])
@@ -192,13 +186,14 @@ def _wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
     shift, axis = rng.normal(size=3), rng.normal(size=3)
     center = truth.center + _PRIOR_M * shift / np.linalg.norm(shift)
     rotation = so3_exp(np.radians(_PRIOR_DEG) * axis / np.linalg.norm(axis)) @ truth.rotation
+    # 20 m in space and 5 degrees about any axis, by axis.
+    sigma_m, sigma_deg = _PRIOR_M / np.sqrt(3.0), _PRIOR_DEG / np.sqrt(3.0)
     return FramePrior(
         cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
-        # 20 m in space and 5 degrees about any axis, by axis.
-        sigma_horizontal_m=_PRIOR_M / np.sqrt(3.0),
-        sigma_vertical_m=_PRIOR_M / np.sqrt(3.0),
-        sigma_heading_deg=_PRIOR_DEG / np.sqrt(3.0),
-        sigma_tilt_deg=_PRIOR_DEG / np.sqrt(3.0),
+        sigma_horizontal_m=sigma_m,
+        sigma_vertical_m=sigma_m,
+        sigma_heading_deg=sigma_deg,
+        sigma_tilt_deg=sigma_deg,
     )
 
 

@@ -1,5 +1,6 @@
 """Commands of featuredb, each in a process of its own, as programs that measure something run them."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -40,6 +41,12 @@ def anchor(
     words = ("anchor", str(database), map_id, "--photos", str(photos), *start)
     last = ("--out", str(out), "--auto", "--quiet")
     return featuredb(*words, *last, may_refuse=True, refusals=refusals) == 0
+
+
+def newest_copy(source: Path, target: Path) -> Path:
+    """A copy of a database, made anew."""
+    shutil.rmtree(target, ignore_errors=True)
+    return Path(shutil.copytree(source, target))
 
 
 def _run(words: Sequence[str]) -> subprocess.CompletedProcess[str]:

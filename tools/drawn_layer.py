@@ -11,13 +11,13 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.camera.photograph import render_depth
-from featuredb.simworld.town.scene import Scene, texture_index
+from featuredb.simworld.town.scene import Scene
 from featuredb.video.frames import open_video
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb
 from tools.worlds.film_world import FILM_FILE, FilmTruth
+from tools.worlds.seen_places import SeenPlaces
 
 _SEED, _SHOWING, _PLACES = 3, 6, 8  # frames that give places, and places of each
 _REACH_PX = 10  # around a place: a mark is a ring of 4 px radius
@@ -103,18 +103,12 @@ def _ring_centre(mark: FloatArray) -> FloatArray:
 def _places(scene: Scene, truth: FilmTruth) -> FloatArray:
     """(n, 3) in the truth's frame, of what stands still."""
     rng = np.random.default_rng(_SEED)
-    cars = np.unique(scene.faces.object_id[scene.faces.texture == texture_index("car")])
-    camera, found = truth.camera, []
+    found = []
     for frame in np.linspace(0, len(truth.times_s) - 1, _SHOWING).astype(int):
         pose = truth.cam_from_local[frame]
-        if pose is None:
-            continue
-        drawn = render_depth(scene, camera, pose)
-        rows, columns = np.nonzero(np.isfinite(drawn.depth) & ~np.isin(drawn.object_id, cars))
-        chosen = rng.choice(len(rows), _PLACES, replace=False)
-        rows, columns = rows[chosen], columns[chosen]
-        rays = np.column_stack([camera.unproject(np.column_stack([columns, rows]) + 0.5), np.ones(len(rows))])
-        found.append(pose.inverse().act(rays * drawn.depth[rows, columns][:, None].astype(np.float64)))
+        if pose is not None:
+            seen = SeenPlaces(scene, truth.camera, pose)
+            found.append(seen.places(seen.pixels(rng, _PLACES)))
     return np.concatenate(found)
 
 

@@ -1,7 +1,6 @@
 """What the programs that measure growth share: an anchored database, contributions, errors."""
 
 import json
-import shutil
 import sys
 import time
 from collections import Counter
@@ -241,13 +240,6 @@ def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     data = photo.read_bytes()
     gray = decode_gray(data)
     return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray))
-
-
-def newest_copy(source: Path, target: Path) -> Database:
-    """A copy of a database, made anew."""
-    shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(source, target)
-    return Database.open(target)
 
 
 def conclude(out: Path, name: str, verdicts: Sequence[Verdict]) -> int:

@@ -37,6 +37,7 @@ from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
 from ingest.growth.trust.promotion import promote_by_hand
 from reloc.localiser import Localiser
+from tools.commands import newest_copy
 from tools.growth_common import (
     Album,
     Verdict,
@@ -46,7 +47,6 @@ from tools.growth_common import (
     give,
     grown,
     made,
-    newest_copy,
     none_failed,
     registered,
     world_told,
@@ -87,7 +87,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     base = honest_base(out / "db", album)
     clean = max(off_shares(base, album, world).values(), default=0.0)
     outcome = try_poison(out, base, album, world)
-    fabricated = force_and_retire(newest_copy(out / "db", out / "db-forced"), album, [], fabricate=True)
+    forced = Database.open(newest_copy(out / "db", out / "db-forced"))
+    fabricated = force_and_retire(forced, album, [], fabricate=True)
     return conclude(out, "poison", judge(outcome, clean, fabricated))
 
 
@@ -115,7 +116,7 @@ def honest_base(path: Path, album: Album) -> Database:
 
 def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) -> PoisonOutcome:
     """All poison on a copy of the honest database."""
-    database = newest_copy(Path(base.url), out / "db-poisoned")
+    database = Database.open(newest_copy(Path(base.url), out / "db-poisoned"))
     sent = album.of(*POISONS)
     failed = 0
     for arrived in (sent, album.of("late")):

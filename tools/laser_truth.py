@@ -5,7 +5,7 @@
 Of the folder (see `tools.laser_set`) all photos but every fifth from the third on are ingested into a new
 database, with exact positions and the EXIF of one camera whose focal length is rounded to a whole
 millimetre of 35 mm film. The other photos are asked of a server twice: with their true camera, and with EXIF
-alone. Prints, for the map's cameras and for both kinds of answers: the median and largest error of position
+alone. Prints, for the map's cameras and for both kinds of answers: the median error of position
 and orientation, the median of the 68 % radius that was reported, and the baseline's median
 (`tools.laser_baseline`); and how far the map's lens is from the true one, over the standard deviations that
 the map stores of it (root mean square of its parameters: 1 is right). Worst is the largest ratio
@@ -87,7 +87,7 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
     ratios = []
     for kind, errors in kinds.items():
         other = theirs["map" if kind == "map" else "asked"]
-        figures |= {f"{kind}_wanted": errors.wanted, f"{kind}_found": len(errors.metres)}
+        figures[f"{kind}_found"] = len(errors.metres)
         for unit in ("m", "deg"):
             mine = errors.metres if unit == "m" else errors.degrees
             reported = errors.told_m if unit == "m" else errors.told_deg
@@ -95,7 +95,6 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
             median = _median(mine)
             figures |= {
                 f"{kind}_{unit}": median,
-                f"{kind}_largest_{unit}": max(mine, default=float("nan")),
                 f"{kind}_reported_{unit}": _median(reported),
                 f"{kind}_colmap_{unit}": _median(baseline),
             }

@@ -11,7 +11,7 @@ which no other position is known). Exit code 0 if there is a map.
 import io
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -84,6 +84,14 @@ def all_maps(database: Path) -> list[AnyMap]:
 def photo_names(folder: Path) -> list[str]:
     """Names of the photos of a folder, sorted."""
     return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
+
+
+def position_table(folder: Path, rows: Iterable[tuple[object, ...]]) -> Path:
+    """A table beside photos: name, latitude, longitude (degrees), height, and both accuracies (m)."""
+    lines = ["path,lat,lon,height,accuracy,accuracy_height", *(",".join(map(str, row)) for row in rows)]
+    table = folder / "table.csv"
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return table
 
 
 def copied(folder: Path, names: Sequence[str], target: Path, *, strip: bool) -> Path:

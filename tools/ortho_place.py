@@ -1,4 +1,4 @@
-"""An ortho image over a scan: where its pixels lie, how far the two disagree, what shows structure.
+"""An ortho image over a scan: where its pixels lie, and what shows structure.
 
 Nothing here is shared with the registration that `tools/autzen_windows.py` measures.
 """
@@ -20,7 +20,6 @@ from featuredb.render.cloud import PointCloud
 Floats = NDArray[np.float64]
 WINDOW_PX = 400
 _HIGH_M = 3.0
-_REACH = 40  # pixels of shift searched for the offset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,45 +82,6 @@ def _gradients(picture: NDArray[Any], sigma: float) -> NDArray[np.float32]:
     )
     dy, dx = np.gradient(smooth)
     return np.asarray(np.hypot(dx, dy), dtype=np.float32)
-
-
-def measured_offset(place: OrthoOverScan) -> Floats:
-    """Where the scan has what the ortho image shows, less where the image does: (2,) metres east, north."""
-    ortho, scan = _gradients(place.gray.astype(np.float32), 1.0), _gradients(place.intensity, 1.5)
-    ok = ~place.high
-    h, w = ortho.shape
-    halves = [(slice(0, h // 2), "north"), (slice(h // 2, h), "south")]
-    sides = [(slice(0, w // 2), "west"), (slice(w // 2, w), "east")]
-    parts = [(f"{a} {b}", rows, columns) for rows, a in halves for columns, b in sides]
-    found = np.zeros(2)
-    for name, rows, columns in [*parts, ("whole", slice(0, h), slice(0, w))]:
-        found, height = _best_shift(ortho[rows, columns], scan[rows, columns], ok[rows, columns])
-        print(f"offset, {name}: columns {found[0]:+.1f}, rows {found[1]:+.1f}, correlation {height:.3f}")
-    offset: Floats = place.on_ground(found[None])[0] - place.on_ground(np.zeros((1, 2)))[0]
-    return offset
-
-
-def _best_shift(a: NDArray[Any], b: NDArray[Any], ok: NDArray[np.bool_]) -> tuple[Floats, float]:
-    """The shift (columns, rows) of b against a with the highest correlation, to a fraction of a pixel."""
-    inner = np.zeros(a.shape, bool)
-    inner[_REACH:-_REACH, _REACH:-_REACH] = True
-    rows, columns = np.nonzero(inner & ok)
-    values = a[rows, columns] - a[rows, columns].mean()
-    reach = 15
-    grid = np.empty((2 * reach + 1, 2 * reach + 1))
-    for i in range(-reach, reach + 1):
-        for j in range(-reach, reach + 1):
-            other = b[rows + i, columns + j]
-            other = other - other.mean()
-            grid[i + reach, j + reach] = values @ other / np.sqrt((values @ values) * (other @ other))
-    i, j = (int(np.clip(k, 1, 2 * reach - 1)) for k in divmod(int(grid.argmax()), 2 * reach + 1))
-
-    def top(low: float, middle: float, high: float) -> float:
-        return 0.5 * (high - low) / max(2 * middle - low - high, 1e-9)
-
-    x = j - reach + top(grid[i, j - 1], grid[i, j], grid[i, j + 1])
-    y = i - reach + top(grid[i - 1, j], grid[i, j], grid[i + 1, j])
-    return np.asarray([x, y], dtype=np.float64), float(grid.max())
 
 
 def has_structure(place: OrthoOverScan, column: int, row: int) -> bool:

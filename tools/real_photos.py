@@ -58,8 +58,6 @@ class HeldOutRow:
     name: str
     reason: str
     error: PoseError | None
-    inliers: int
-    camera: str
     position_68_m: float
     orientation_68_deg: float
 
@@ -162,8 +160,6 @@ def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3) -> He
         name=name,
         reason=reply.reason or "",
         error=error,
-        inliers=reply.inliers,
-        camera=reply.camera.source if reply.camera else "",
         position_68_m=nan if reply.covariance is None else error_radius(np.array(reply.covariance)[3:, 3:]),
         orientation_68_deg=reply.accuracy.orientation_68_deg if reply.accuracy else nan,
     )

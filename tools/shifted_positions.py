@@ -24,7 +24,7 @@ from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution
 from tools.commands import featuredb, said
 from tools.figures import study_parser, write_figures
-from tools.made_maps import copied, photo_names
+from tools.made_maps import copied, photo_names, position_table
 
 _SHIFT_M = 50_000.0
 
@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     database, grown = args.work / "db", args.work / "grown.db"
     for one in (database, grown):
         featuredb("ingest", "photos", str(one), str(right), "--quiet")
-    table = write_table(shifted, names[1::2])
+    table = position_table(shifted, (_table_row(shifted / name) for name in names[1::2]))
     ingest_km = told_km("ingest", "photos", str(database), str(table), "--trust-geotags", "--quiet")
     _, second = sorted(Database.open(database).snapshot().maps(), key=lambda m: m.created_at)
     featuredb("lidar", "add", str(database), str(args.scan))
@@ -66,16 +66,9 @@ def shifted_position(photo: Path) -> tuple[ExifInfo, float, float]:
     return exif, float(latitude), float(longitude)
 
 
-def write_table(folder: Path, names: Sequence[str]) -> Path:
-    """A table of the shifted positions beside the photos."""
-    lines = ["path,lat,lon,height,accuracy,accuracy_height"]
-    for name in names:
-        exif, latitude, longitude = shifted_position(folder / name)
-        sigmas = f"{exif.sigma_horizontal_m},{exif.sigma_vertical_m}"
-        lines.append(f"{name},{latitude:.8f},{longitude:.8f},{exif.altitude_m},{sigmas}")
-    table = folder / "table.csv"
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return table
+def _table_row(photo: Path) -> tuple[object, ...]:
+    exif, latitude, longitude = shifted_position(photo)
+    return photo.name, latitude, longitude, exif.altitude_m, exif.sigma_horizontal_m, exif.sigma_vertical_m
 
 
 def contribution(photo: Path) -> Contribution:

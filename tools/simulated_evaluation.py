@@ -10,9 +10,7 @@ for every held-out photo and every negative, and compares with the truth:
 - shares of errors within the reported 68 % radii, over placements (tools/calibration.py).
 """
 
-import argparse
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,9 +48,14 @@ class Asked:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__, "--seed")
+    parser.add_argument("--out", type=Path, default=Path("simulated-evaluation"))
+    args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    world, database = prepare(args)
+    world = make_world(args.out / "world", size="full", seed=args.seed, exact_gps=True)
+    database = Database.create(args.out / "db")
+    if not database.snapshot().maps():
+        ingest_world(world, database, args.out / "report", exact_gps=True)
     localiser = Localiser.open(database)
     asked = ask_world(world, localiser)
     drone = [a for a in asked if a.group == "drone"]
@@ -60,18 +63,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     inside = inside_over_placements(answers, localiser.areas[0].area, world, _DRAWS, args.seed)
     write_figures(args.json, inside | flat_figures(asked))
     return 0
-
-
-def prepare(args: argparse.Namespace) -> tuple[World, Database]:
-    """The world and the database of its drone photos, made unless they are there."""
-    start = time.monotonic()
-    world = make_world(args.out / "world", size="full", seed=args.seed, exact_gps=True)
-    database = Database.create(args.out / "db")
-    if not database.snapshot().maps():
-        ingest_world(world, database, args.out / "report", exact_gps=True)
-    sys.stdout.write(f"world and map: {time.monotonic() - start:.0f} s\n")
-    sys.stdout.flush()
-    return world, database
 
 
 def ask_world(world: World, localiser: Localiser) -> list[Asked]:
@@ -114,13 +105,6 @@ def flat_figures(asked: Sequence[Asked]) -> dict[str, float]:
         "street": len(street),
         "street_answered": sum(a.pose is not None for a in street),
     }
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--out", type=Path, default=Path("simulated-evaluation"))
-    parser.add_argument("--seed", type=int, default=1)
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

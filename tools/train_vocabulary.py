@@ -28,7 +28,7 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.index.descriptor_index import use_threads
 from featuredb.index.vocabulary import Vocabulary
-from ingest.executor import InProcessExecutor, PoolExecutor
+from ingest.executor import InProcessExecutor
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.sfm.extract import extract_photos, features_key
 from ingest.workspace import Workspace, read_array
@@ -40,10 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="of each folder's photos, each Nth")
-    parser.add_argument("--words", type=int, default=128)
-    parser.add_argument("--dimensions", type=int, default=32)
     parser.add_argument("--lists", type=int, default=None, metavar="K", help="centres of K inverted lists")
-    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args(argv)
     use_threads(1)
@@ -51,11 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = ExtractorOptions(max_features=_FEATURES)
     with tempfile.TemporaryDirectory() as scratch:
         workspace = Workspace(root=Path(scratch))
-        if args.workers == 1:
-            extract_photos(photos, workspace, options, InProcessExecutor())
-        else:
-            with PoolExecutor(args.workers) as pool:
-                extract_photos(photos, workspace, options, pool)
+        extract_photos(photos, workspace, options, InProcessExecutor())
         key = features_key(options)
         descriptors = [read_array(workspace.features(key, p.sha256), "descriptors") for p in photos]
     args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -63,12 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         np.savez_compressed(args.out, centers=train_lists(descriptors, args.lists))
         sys.stdout.write(f"{args.out}: {args.lists} lists from {len(photos)} photos\n")
         return 0
-    vocabulary = train_vocabulary(descriptors, words=args.words, dimensions=args.dimensions)
+    vocabulary = train_vocabulary(descriptors)
     args.out.write_bytes(vocabulary.to_bytes())
-    sys.stdout.write(
-        f"{args.out}: {args.words} words of {args.dimensions} dimensions from {len(photos)} photos, "
-        f"digest {vocabulary.digest}\n"
-    )
+    sys.stdout.write(f"{args.out}: {len(photos)} photos, digest {vocabulary.digest}\n")
     return 0
 
 
