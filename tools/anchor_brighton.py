@@ -14,7 +14,6 @@
 
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,7 +30,7 @@ from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = arguments(__doc__, argv)
+    args = scan_parser(__doc__, "--work", "--held-out").parse_args(argv)
     truth = scan_truth(args)
     work: Path = args.work
     database = work / "anchored"
@@ -88,13 +87,6 @@ def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
         "gps_focal_off": abs(focal_px / scan_px - 1.0) / max(uncertainty.focal_rel, 0.01),
         "gps_shape_m": float(np.median(np.linalg.norm(rest, axis=1))),
     }
-
-
-def arguments(doc: str | None, argv: Sequence[str] | None) -> argparse.Namespace:
-    """What studies of photos held out of a set with a scan are told; `doc`: of the program's module."""
-    parser = scan_parser(doc, "--work")
-    parser.add_argument("--held-out", nargs="+", required=True, metavar="NAME")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,17 @@
-"""What programs that measure something share: arguments, and figures for the scoreboard."""
+"""What programs that measure something share: arguments, errors, and figures for the scoreboard."""
 
 import argparse
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_log
 from featuredb.plain_json import plain
 
 _SHARED: dict[str, dict[str, Any]] = {
@@ -16,6 +21,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     "--scan": {"metavar": "LAZ", "required": True},
     "--work": {"metavar": "FOLDER", "required": True, "help": "what is made is kept there"},
     "--inputs": {"metavar": "FOLDER", "help": "keep worlds and films there"},
+    "--held-out": {"type": str, "nargs": "+", "required": True, "metavar": "NAME"},
     "--seed": {"type": int, "default": 1, "help": "of what is drawn; default: 1"},
 }
 
@@ -29,6 +35,21 @@ def study_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
     for name in shared if "--out" in shared else ("--json", *shared):
         parser.add_argument(name, **{"type": Path, **_SHARED[name]})
     return parser
+
+
+def pose_offset(pose: Rigid3, true: Rigid3) -> FloatArray:
+    """(6,) rotation (rad) before displacement of the camera (m), from a cam_from_local to the true one."""
+    turn = so3_log(true.rotation.T @ pose.rotation)
+    return np.concatenate([turn, true.center - pose.center])
+
+
+def spread(metres: Sequence[float], degrees: Sequence[float]) -> dict[str, float]:
+    """Medians and largest of errors of positions and orientations; NaN where there are none."""
+    return {
+        f"{name}_{unit}": float(of(errors)) if len(errors) else float("nan")
+        for unit, errors in (("m", metres), ("deg", degrees))
+        for name, of in (("median", np.median), ("largest", np.max))
+    }
 
 
 def write_figures(path: Path | None, figures: Mapping[str, Any]) -> None:

@@ -7,7 +7,6 @@ track at the keyframes with the poses that the map itself has of them: the dista
 median distance from the map's cameras to their points, and the angle. Exit code 0 if a frame was followed.
 """
 
-import csv
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
 from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
+from tools.film_placed import keyframe_count, tracked_by
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,18 +33,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 def film_in_map(film: Path, work: Path) -> dict[str, float]:
     """Ingest and track a film in a folder: keyframes and frames that are in the map, and against the map's
     own cameras at keyframes the medians of distance, relative, and angle."""
-    database, track = work / "db", work / "track.csv"
+    database = work / "db"
     featuredb("ingest", "video", str(database), str(film), "--no-telemetry", "--quiet", may_refuse=True)
     snapshot = Database.open(database).snapshot()
     largest = max(snapshot.unplaced_maps(), key=lambda m: m.images).map_id
-    featuredb("track", str(database), str(film), "--map", largest, "--out", str(track), may_refuse=True)
-    with track.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = tracked_by(database, largest, film, work)
     unplaced = snapshot.load_unplaced(largest)
     assert isinstance(unplaced, UnplacedMap)
     found = {int(row["frame"]): row for row in rows if row["own_x"]}
     center_rel, angle_deg = _against_keyframes(unplaced, found)
-    keyframes = len(list((database / "_work" / "films").rglob("*.jpg")))
+    keyframes = keyframe_count(database)
     return {
         "keyframes": keyframes,
         "mapped": len(unplaced.images),

@@ -36,18 +36,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 def film_placed(film: Path, work: Path) -> dict[str, float]:
     """Ingest and track a film in a folder: keyframes in the map, frames with a pose, those compared, and the
     horizontal distances."""
-    database, track = work / "db", work / "track.csv"
+    database = work / "db"
     featuredb("ingest", "video", str(database), str(film), "--quiet")
     (placed,) = Database.open(database).snapshot().maps()
-    featuredb("track", str(database), str(film), "--map", placed.map_id, "--out", str(track))
-    with track.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["easting"]]
+    rows = [row for row in tracked_by(database, placed.map_id, film, work) if row["easting"]]
     off, covariances = _off_telemetry(film, rows)
     squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances), off)
     metres = np.linalg.norm(off, axis=1)
     radii = np.sqrt(_WITHIN * np.linalg.eigvalsh(covariances)[:, -1])
     return {
-        "keyframes": len(list((database / "_work" / "films").rglob("*.jpg"))),
+        "keyframes": keyframe_count(database),
         "mapped": placed.images,
         "active": int(placed.status == "active"),
         "tracked": len(rows),
@@ -57,6 +55,19 @@ def film_placed(film: Path, work: Path) -> dict[str, float]:
         "largest_m": float(metres.max()),
         "inside": float((squares <= _WITHIN).mean()),
     }
+
+
+def tracked_by(database: Path, map_id: str, film: Path, work: Path) -> list[dict[str, str]]:
+    """The rows of a film's track by a map."""
+    track = work / "track.csv"
+    featuredb("track", str(database), str(film), "--map", map_id, "--out", str(track), may_refuse=True)
+    with track.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def keyframe_count(database: Path) -> int:
+    """Of the films that an ingest into a database has kept."""
+    return len(list((database / "_work" / "films").rglob("*.jpg")))
 
 
 def _off_telemetry(film: Path, rows: Sequence[dict[str, str]]) -> tuple[FloatArray, FloatArray]:

@@ -31,8 +31,7 @@ from reloc.service.handler import localise_request
 from reloc.wire.query import LocaliseWireRequest
 from tools.figures import study_parser, write_figures
 from tools.growth_gates import WRONG_M, recorded
-from tools.worlds.album import PlannedPhoto, write_album
-from tools.worlds.album_files import TABLE_FILE, AlbumFact, read_facts
+from tools.worlds.album import TABLE_FILE, AlbumFact, PlannedPhoto, read_facts, write_album
 
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
 _SURVEY_SIGMA_M = (0.02, 0.03)

@@ -40,7 +40,7 @@ from tools.growth_common import (
     say,
     world_told,
 )
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact
 from tools.worlds.walk_world import WalkOptions, plan_walk
 
 _SURVEYS_M = 150.0  # of the way, which needs no coverage by others

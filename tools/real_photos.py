@@ -30,7 +30,7 @@ from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
 from tools.commands import featuredb
-from tools.figures import study_parser, write_figures
+from tools.figures import spread, study_parser, write_figures
 from tools.made_maps import photo_names
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
@@ -168,16 +168,8 @@ def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3) -> He
 def error_figures(rows: Sequence[HeldOutRow]) -> dict[str, float]:
     """How many photos were answered, and the errors of the answers."""
     errors = [row.error for row in rows if row.error is not None]
-    metres = [e.position_m for e in errors] or [float("nan")]
-    degrees = [e.angle_deg for e in errors] or [float("nan")]
-    return {
-        "asked": len(rows),
-        "answered": len(errors),
-        "median_m": float(np.median(metres)),
-        "largest_m": max(metres),
-        "median_deg": float(np.median(degrees)),
-        "largest_deg": max(degrees),
-    }
+    counts = {"asked": len(rows), "answered": len(errors)}
+    return counts | spread([e.position_m for e in errors], [e.angle_deg for e in errors])
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from featuredb.video.folder import natural_key
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
-from tools.figures import study_parser, write_figures
+from tools.figures import spread, study_parser, write_figures
 from tools.made_maps import photo_names
 from tools.real_photos import ingest, reference
 
@@ -43,20 +43,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     frames = film_of(args.photos, names, work / "frames")
     tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
     poses = {name: p.pose for name, p in zip(names, tracked.trajectory.points, strict=True) if p.pose}
-    metres = []
+    off = []
     for name, pose in poses.items():
         if name in moved:
-            off = pose_difference(part.frame, moved[name], pose.epsg, pose.utm, pose.cam_from_utm_xyzw)
-            metres.append(off.position_m)
-            sys.stdout.write(f"{name}: {off.position_m:.3f} m, {off.angle_deg:.3f} degrees\n")
+            off.append(pose_difference(part.frame, moved[name], pose.epsg, pose.utm, pose.cam_from_utm_xyzw))
+            sys.stdout.write(f"{name}: {off[-1]}\n")
     figures = {
         "frames": len(names),
         "lost": len(names) - len(poses),
-        "median_m": float(np.median(metres or [np.nan])),
-        "largest_m": max(metres, default=float("nan")),
         "unknown": len(poses.keys() - moved.keys()),
     }
-    write_figures(args.json, figures)
+    write_figures(args.json, figures | spread([e.position_m for e in off], [e.angle_deg for e in off]))
     return 0
 
 

@@ -33,7 +33,7 @@ from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from tools.commands import said
 from tools.figures import study_parser, write_figures
-from tools.worlds.film_frame import in_order
+from tools.worlds.film_frame import Exposure, in_order
 from tools.worlds.film_world import FilmOptions, film_frame
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
@@ -83,8 +83,7 @@ def film_options(style: FlightStyle, seed: int) -> FilmOptions:
         rate_hz=1.0,
         width=960,
         height=540,
-        samples=2,
-        readout_s=_READOUT_S,
+        exposure=Exposure(samples=2, readout_s=_READOUT_S),
     )
 
 

@@ -139,24 +139,21 @@ class Heard:
 
     Attributes:
         seconds: of each question, failed ones as long as they may take. failures: codes.
-        wrong: answers that are another place than the first one to the same question, or none where that had
-            a place.
+        same: of each answer, whether it is the place of the first one to the same question, or none where
+            that had none.
     """
 
     seconds: list[float] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
-    wrong: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    same: list[bool] = field(default_factory=list)
 
-    def answered(self, seconds: float, reply: LocaliseReply, expected: LocaliseReply) -> None:
-        with self._lock:
-            self.seconds.append(seconds)
-            self.wrong += not same_place(reply, expected)
+    @property
+    def wrong(self) -> int:
+        return self.same.count(False)
 
     def failed(self, code: str) -> None:
-        with self._lock:
-            self.seconds.append(DEADLINE_S)
-            self.failures.append(code)
+        self.seconds.append(DEADLINE_S)
+        self.failures.append(code)
 
     def p99_s(self) -> float:
         return float(np.percentile(self.seconds, 99)) if self.seconds else float("nan")
@@ -200,7 +197,8 @@ def honest_clients(
         except ServiceError as error:
             heard.failed(error.code)
         else:
-            heard.answered(time.monotonic() - start, reply, expected[which])
+            heard.seconds.append(time.monotonic() - start)
+            heard.same.append(same_place(reply, expected[which]))
 
     def run(name: str, number: int) -> None:
         path, again = service.config(name), name == HONEST[-1]

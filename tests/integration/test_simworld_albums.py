@@ -15,8 +15,7 @@ from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.truth import read_truth
 from ingest.photos.table import read_table
-from tools.worlds.album import write_album
-from tools.worlds.album_files import TABLE_FILE, read_facts
+from tools.worlds.album import TABLE_FILE, read_facts, write_album
 from tools.worlds.community import CommunityOptions, community_album
 from tools.worlds.poison_world import POISONS, PoisonOptions, plan_poison, poison_places
 from tools.worlds.walk_world import WalkOptions, plan_walk

@@ -13,7 +13,7 @@ from tools import growth_community, growth_poison, growth_walk
 from tools.growth_common import Album, Registered, Verdict, world_told
 from tools.growth_poison import PoisonOutcome
 from tools.growth_walk import Probe, Step, worst_map
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact
 from tools.worlds.community import CommunityOptions
 from tools.worlds.walk_world import WalkOptions
 

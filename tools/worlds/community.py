@@ -13,8 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import PlannedPhoto, Subject
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact, PlannedPhoto, Subject
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.geotags import GeotagOptions, geotag_at

@@ -9,8 +9,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import PlannedPhoto
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact, PlannedPhoto
 from tools.worlds.edits import Edit
 from tools.worlds.geotags import GeotagOptions, Tagging, give_geotags
 from tools.worlds.people import Person

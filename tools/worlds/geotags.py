@@ -8,7 +8,7 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album_files import Geotag, GeotagState
+from tools.worlds.album import Geotag, GeotagState
 
 _FAR_M = (1_000.0, 12_000.0)
 

@@ -24,8 +24,7 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import PlannedPhoto
-from tools.worlds.album_files import Geotag
+from tools.worlds.album import Geotag, PlannedPhoto
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.geotags import GeotagOptions, geotag_at

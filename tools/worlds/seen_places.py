@@ -27,7 +27,7 @@ class SeenPlaces:
         """Centres (count, 2) of pixels that show what stands still."""
         rows, columns = np.nonzero(self.still)
         chosen = rng.choice(len(rows), count, replace=False)
-        return np.column_stack([columns[chosen], rows[chosen]]) + 0.5
+        return np.column_stack([columns[chosen], rows[chosen]]).astype(np.float64) + 0.5
 
     def places(self, pixels: FloatArray) -> FloatArray:
         """(n, 3) of pixels (n, 2)."""

@@ -10,8 +10,7 @@ from featuredb.simworld.flight import FlightOptions, survey
 from featuredb.simworld.town.days import DayOptions, another_day
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto
-from tools.worlds.album_files import AlbumFact, Geotag
+from tools.worlds.album import AlbumFact, Geotag, PlannedPhoto
 
 # Suns by the hour, town axes; index 0 is the scene's own.
 _SUNS = (None, (0.62, -0.42, 0.62), (0.10, -0.55, 0.83), (-0.66, -0.30, 0.55))

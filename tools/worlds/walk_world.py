@@ -14,8 +14,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import PlannedPhoto
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact, PlannedPhoto
 from tools.worlds.geotags import geotag_at
 from tools.worlds.people import Person, community
 from tools.worlds.sights import Surroundings, look_at
