@@ -36,7 +36,6 @@ def fact(i: int, kind: str = "drone") -> AlbumFact:
         kind=kind,
         owner="anna",
         licence="CC0-1.0",
-        title="",
         time=datetime(2025, 1, 1, tzinfo=UTC),
         home=kind == "drone",
     )

@@ -32,7 +32,6 @@ from tools.worlds.indoors import indoor_photo, portrait_photo
 FACTS_FILE = "facts.jsonl"
 TABLE_FILE = "table.jsonl"
 
-GeotagState = Literal["near", "far", "none"]
 Progress = Callable[[int, int], None]
 Subject = Literal["town", "indoor", "portrait"]
 ExifPolicy = Literal["full", "no_gps", "none"]
@@ -60,14 +59,12 @@ class AlbumFact:
     Attributes:
         name: path within the album. photo_id: the site's number.
         kind: survey, street, drone, other_town, copy, indoor, portrait, ...; the worlds' modules list theirs.
-        owner, licence, title: as in the table.
+        owner, licence: as in the table.
         time: of capture as claimed, timezone-aware.
         home: it shows the town whose frame the truth is in, so that it has a true pose.
         copy_of: the original, "" where this is one.
-        geotag: near (within the error of the world), far (wrong on purpose or by mistake), or none.
         visit: photos of one visit by one person share it; -1 for those of none.
         batch: when it arrives, for worlds that arrive in steps.
-        place: name of the sight or place, for people.
     """
 
     name: str
@@ -75,14 +72,11 @@ class AlbumFact:
     kind: str
     owner: str
     licence: str
-    title: str
     time: datetime
     home: bool = True
     copy_of: str = ""
-    geotag: GeotagState = "near"
     visit: int = -1
     batch: int = 0
-    place: str = ""
 
 
 class SceneSource(Protocol):
@@ -281,5 +275,4 @@ def _table_row(fact: AlbumFact, tag: Geotag | None) -> dict[str, Any]:
         "time": fact.time.isoformat(),
         "owner": fact.owner,
         "licence": fact.licence,
-        "title": fact.title,
     }

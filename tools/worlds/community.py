@@ -100,12 +100,12 @@ def _other_tags(
         jitter = np.array([*rng.normal(0, 0.5 * options.sigma_m, 2), 0.0])
         if fate < _TAGGED_HERE:
             tag = geotag_at(home, home.enu_from_town @ spot + jitter, 0.0, accuracy)
-            result.append(replace(p, geotag=tag, fact=replace(p.fact, geotag="far")))
+            result.append(replace(p, geotag=tag))
         elif fate < _TAGGED_THERE:
             tag = geotag_at(away, p.shot.cam_from_local.center + jitter, 0.0, accuracy)
             result.append(replace(p, geotag=tag))
         else:
-            result.append(replace(p, fact=replace(p.fact, geotag="none")))
+            result.append(p)
     return result
 
 
@@ -146,8 +146,6 @@ def plan_copies(
                     owner=owner.name,
                     licence=owner.licence,
                     copy_of=original.shot.name,
-                    geotag=original.fact.geotag if keeps_tag else "none",
-                    title="found this",
                 ),
             )
         )
@@ -179,10 +177,8 @@ def _plan_nowhere(options: CommunityOptions, people: tuple[Person, ...], home: S
             kind=subject,
             owner=person.name,
             licence=person.licence,
-            title="at home" if subject == "indoor" else "me",
             time=shot.time,
             home=False,
-            geotag="near" if has_tag else "none",
         )
         photos.append(
             PlannedPhoto(

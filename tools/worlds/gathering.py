@@ -108,11 +108,9 @@ def _visit(
             kind=kind or ("drone" if by_drone else "street"),
             owner=person.name,
             licence=person.licence,
-            title=f"{sight.name.split()[0]}, {shot.time:%B %Y}",
             time=shot.time,
             home=town == "home",
             visit=visit,
-            place=f"{sight.name}, {view.mode}",
         )
         photos.append(
             PlannedPhoto(
@@ -148,10 +146,7 @@ def tagged(
         for p in photos
     ]
     given = give_geotags(scene, asked, options, rng)
-    return [
-        replace(p, geotag=tag, fact=replace(p.fact, geotag=state))
-        for p, (tag, state) in zip(photos, given, strict=True)
-    ]
+    return [replace(p, geotag=tag) for p, (tag, _) in zip(photos, given, strict=True)]
 
 
 def named(photos: list[PlannedPhoto], seed: int) -> list[PlannedPhoto]:

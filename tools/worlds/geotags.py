@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import Geotag, GeotagState
+from tools.worlds.album import Geotag
 
+GeotagState = Literal["near", "far", "none"]
 _FAR_M = (1_000.0, 12_000.0)
 
 

@@ -224,4 +224,4 @@ def _poisoned(photo: PlannedPhoto, home: Scene, places: Places, rng: np.random.G
 
 
 def _claiming(photo: PlannedPhoto, tag: Geotag) -> PlannedPhoto:
-    return replace(photo, geotag=tag, exif="full", fact=replace(photo.fact, geotag="far"))
+    return replace(photo, geotag=tag, exif="full")

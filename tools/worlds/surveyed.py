@@ -93,7 +93,6 @@ def survey_photos(
             kind="survey",
             owner="survey office",
             licence="CC-BY-4.0",
-            title=f"survey photo {i + 1}",
             time=shot.time,
         )
         tag = Geotag(latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=float(height))

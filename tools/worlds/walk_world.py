@@ -187,12 +187,9 @@ def _photos(
             kind=kind,
             owner=owner,
             licence=person.licence,
-            title=f"step {step + 1}",
             time=shot.time,
-            geotag="near" if tag else "none",
             visit=10 * step + who,
             batch=step,
-            place=f"step {step + 1}",
         )
         photos.append(
             PlannedPhoto(
