@@ -66,8 +66,7 @@ class PoisonOutcome:
         sent: photos. active: of them, in such maps. wrong: photos registered wrongly in active
             maps by their kind, the poison's and honest ones alike.
         off_share: largest share of points off the true surface among active grown maps with poison.
-        forced: maps that were forced in. restored: whether all answers came back; changed: whether any had
-            changed meanwhile.
+        forced: maps that were forced in. restored: whether all answers came back.
         failed: photos lost by an exception.
     """
 
@@ -76,7 +75,6 @@ class PoisonOutcome:
     wrong: dict[str, int]
     off_share: float
     forced: int = 0
-    changed: bool = False
     restored: bool = True
     failed: int = 0
 
@@ -136,7 +134,6 @@ def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) ->
         wrong=dict(Counter(r.fact.kind for r in active if r.wrong)),
         off_share=max((shares[m] for m in poisoned if m in shares), default=0.0),
         forced=forced["forced"],
-        changed=forced["changed"],
         restored=forced["restored"],
         failed=failed,
     )

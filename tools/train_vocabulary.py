@@ -34,6 +34,7 @@ from ingest.sfm.extract import extract_photos, features_key
 from ingest.workspace import Workspace, read_array
 
 _FEATURES = 3000  # the strongest of a photo, those that PairOptions aggregates
+_PER_PHOTO = 1500  # of these, what the centres are trained on
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,19 +68,17 @@ def train_vocabulary(
     *,
     words: int = 128,
     dimensions: int = 32,
-    per_photo: int = 1500,
     seed: int = 0,
 ) -> Vocabulary:
     """Principal components and k-means of some descriptors of each photo, with fixed random choices.
 
     Args:
         descriptors: (n, 128) of each photo.
-        per_photo: descriptors taken of each.
 
     Raises:
         InvalidValueError: fewer descriptors than 40 a word, which k-means wants at least.
     """
-    samples = _samples(descriptors, per_photo, words, seed)
+    samples = _samples(descriptors, words, seed)
     mean = samples.mean(axis=0, dtype=np.float64)
     _, vectors = np.linalg.eigh(np.cov((samples - mean).T))
     projection = vectors[:, ::-1][:, :dimensions]
@@ -92,21 +91,17 @@ def train_vocabulary(
     )
 
 
-def train_lists(
-    descriptors: Sequence[NDArray[np.uint8]], lists: int, per_photo: int = 1500, seed: int = 0
-) -> NDArray[np.uint8]:
+def train_lists(descriptors: Sequence[NDArray[np.uint8]], lists: int) -> NDArray[np.uint8]:
     """Centres (lists, 128) of inverted lists, rounded as descriptors are; arguments as there."""
-    centers = _kmeans(_samples(descriptors, per_photo, lists, seed), lists, seed, iterations=10)
+    centers = _kmeans(_samples(descriptors, lists, 0), lists, 0, iterations=10)
     return np.asarray(np.clip(np.rint(centers), 0, 255), dtype=np.uint8)
 
 
-def _samples(
-    descriptors: Sequence[NDArray[np.uint8]], per_photo: int, clusters: int, seed: int
-) -> NDArray[np.float32]:
+def _samples(descriptors: Sequence[NDArray[np.uint8]], clusters: int, seed: int) -> NDArray[np.float32]:
     generator = np.random.default_rng(seed)
     parts = []
     for photo in descriptors:
-        rows = generator.choice(len(photo), min(per_photo, len(photo)), replace=False)
+        rows = generator.choice(len(photo), min(_PER_PHOTO, len(photo)), replace=False)
         parts.append(photo[np.sort(rows)].astype(np.float32))
     samples = np.concatenate(parts) if parts else np.zeros((0, DESCRIPTOR_SIZE), np.float32)
     if len(samples) < 40 * clusters:

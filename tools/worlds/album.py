@@ -17,7 +17,6 @@ from typing import Any, Literal, Protocol
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.exif import exif_of
 from featuredb.simworld.camera.photograph import take_photo
 from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
@@ -104,7 +103,6 @@ class PlannedPhoto:
         quality: of the JPEG.
         sensor: of its camera, as this person uses it.
         orientation: EXIF orientation, 6 or 8 for a phone held upright that stores landscape pictures.
-        scene_from_home: where the scene has a local frame of its own, that frame from the truth's.
     """
 
     shot: Shot
@@ -117,7 +115,6 @@ class PlannedPhoto:
     quality: int = 90
     sensor: SensorOptions = field(default_factory=SensorOptions)
     orientation: int = 1
-    scene_from_home: Rigid3 | None = None
 
 
 def write_album(
@@ -177,12 +174,8 @@ def _truth(home: Scene, photo: PlannedPhoto) -> TrueImage | None:
     camera = edited_camera(photo.shot.device.camera, photo.edits, photo.shot.seed)
     if camera is None:
         return None
-    pose = photo.shot.cam_from_local
-    if photo.scene_from_home is not None:
-        pose = pose @ photo.scene_from_home
     device = replace(photo.shot.device, camera=camera)
-    shot = replace(photo.shot, device=device, cam_from_local=pose, gps_enu=None)
-    return true_image(home, shot)
+    return true_image(home, replace(photo.shot, device=device, gps_enu=None))
 
 
 def _picture(scene: Scene, photo: PlannedPhoto) -> Image8:

@@ -16,7 +16,7 @@ from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import AlbumFact, PlannedPhoto, Subject
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
-from tools.worlds.geotags import GeotagOptions, geotag_at
+from tools.worlds.geotags import ACCURACY_SHARE, GeotagOptions, geotag_at
 from tools.worlds.people import Person, community
 from tools.worlds.sights import find_sights
 from tools.worlds.surveyed import DAYS, TownOptions, moment, shot_seed, survey_photos
@@ -35,7 +35,6 @@ class CommunityOptions(TownOptions):
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
         sights: places that people visit.
-        geotags: how wrong they are.
     """
 
     seed: int = 1
@@ -51,7 +50,6 @@ class CommunityOptions(TownOptions):
     indoor: int = 2
     portraits: int = 2
     sights: int = 6
-    geotags: GeotagOptions = field(default_factory=GeotagOptions)
 
 
 def community_album(options: CommunityOptions) -> list[PlannedPhoto]:
@@ -79,8 +77,8 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
         by_rank=True,
     )
     rng = np.random.default_rng((options.seed, 58))
-    mine = tagged(home, mine, people, options.geotags, rng)
-    theirs = _other_tags(home, away, theirs, options.geotags, rng)
+    mine = tagged(home, mine, people, GeotagOptions(), rng)
+    theirs = _other_tags(home, away, theirs, GeotagOptions(), rng)
     copies = plan_copies(mine, people, options.copies, options.seed)
     nowhere = _plan_nowhere(options, people, home)
     return named([*mine, *theirs, *copies, *nowhere], options.seed)
@@ -96,7 +94,7 @@ def _other_tags(
         half = 0.4 * np.asarray(home.plan.size)
         drawn = float(rng.random()), np.array([*rng.uniform(-half, half), 2.0])
         fate, spot = place_of.setdefault(p.fact.visit, drawn)
-        accuracy = float(np.round(options.sigma_m)) if rng.random() < options.accuracy_share else None
+        accuracy = float(np.round(options.sigma_m)) if rng.random() < ACCURACY_SHARE else None
         jitter = np.array([*rng.normal(0, 0.5 * options.sigma_m, 2), 0.0])
         if fate < _TAGGED_HERE:
             tag = geotag_at(home, home.enu_from_town @ spot + jitter, 0.0, accuracy)

@@ -35,6 +35,7 @@ from tools.worlds.surveyed import TownOptions, day_scene, survey_photos, town_of
 
 POISONS = ("lookalike", "mirrored", "mirror_block", "liar", "liar_other", "altered", "forged")
 _LIE_M = (130.0, 75.0)  # shift of the liar's positions, east and north: another block
+_TAGS = GeotagOptions(sigma_m=15.0, far_share=0.0)  # of those who do not lie
 _EDITS = (
     Edit(kind="pasted", amount=0.3),
     Edit(kind="moved", amount=0.25),
@@ -50,7 +51,7 @@ class PoisonOptions(TownOptions):
     Attributes:
         honest, late: photos of honest people before and after the poison. canaries: held-out photos.
         per_poison: photos of each of POISONS.
-        sights: places that honest people visit. geotags: of those who do not lie.
+        sights: places that honest people visit.
     """
 
     seed: int = 4
@@ -65,7 +66,6 @@ class PoisonOptions(TownOptions):
     canaries: int = 6
     per_poison: int = 10
     sights: int = 6
-    geotags: GeotagOptions = field(default_factory=lambda: GeotagOptions(sigma_m=15.0, far_share=0.0))
 
     def scene(self, key: str) -> Scene:
         """Scenes "home/...", "forged/..." and "away/light/week"."""
@@ -167,7 +167,7 @@ def plan_poison(options: PoisonOptions) -> list[PlannedPhoto]:
         seed = options.seed + 10 * i
         taken = plan_visits(scene, owners, towns[sights], count, seed, town, first_visit=1000 * i, kind=kind)
         rng = np.random.default_rng((seed, 58))
-        taken = tagged(scene, taken, owners, options.geotags, rng)
+        taken = tagged(scene, taken, owners, _TAGS, rng)
         taken = [_poisoned(p, home, places, rng) for p in taken]
         photos += [_renamed(p, kind, batch) for p in taken]
     return named(photos, options.seed)
