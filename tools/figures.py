@@ -12,6 +12,8 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
+from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.plain_json import plain
 
 _SHARED: dict[str, dict[str, Any]] = {
@@ -41,6 +43,14 @@ def pose_offset(pose: Rigid3, true: Rigid3) -> FloatArray:
     """(6,) rotation (rad) before displacement of the camera (m), from a cam_from_local to the true one."""
     turn = so3_log(true.rotation.T @ pose.rotation)
     return np.concatenate([turn, true.center - pose.center])
+
+
+def laid_on(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) -> Sim3 | None:
+    """The similarity that takes places (3,) onto those of the same names; None where these are too few."""
+    both = sorted(mine.keys() & theirs.keys())
+    if len(both) < 3:
+        return None
+    return similarity_closed_form(*(np.array([of[name] for name in both]) for of in (mine, theirs)))
 
 
 def spread(metres: Sequence[float], degrees: Sequence[float]) -> dict[str, float]:

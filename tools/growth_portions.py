@@ -26,7 +26,6 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
 from ingest.executor import InProcessExecutor
@@ -41,7 +40,7 @@ from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from tools.figures import study_parser, write_figures
+from tools.figures import laid_on, study_parser, write_figures
 from tools.growth_gates import recorded
 
 _PORTIONS = 3
@@ -166,18 +165,9 @@ def _viewing_distance(component: Component) -> float:
     return float(np.median(np.linalg.norm(offsets, axis=1)))
 
 
-def _extent(centers: FloatArray) -> float:
-    """Diagonal of the box of camera centres (n, 3)."""
-    return float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0)))
-
-
 def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
     """The joint reconstruction's places, carried to the first map's frame by the photos that are in both."""
-    both = sorted(state.joint.keys() & state.centers.keys())
-    ours, theirs = (
-        np.array([of[name] for name in both]).reshape(-1, 3) for of in (state.centers, state.joint)
-    )
-    carried = similarity_closed_form(theirs, ours) if len(both) >= 3 else None
+    carried = laid_on(state.joint, state.centers)
     if carried is None or state.frame is None:
         return nullcontext()
 
@@ -226,14 +216,14 @@ def _judged(state: State, joint: Component) -> dict[str, float]:
     """Where growth has the photos against the joint reconstruction."""
     metric = joint.placement.local_from_sfm is not None and joint.placement.reason is None
     sim = joint.placement.local_from_sfm if metric else None
-    scale = _EXTENT_M / _extent(joint.model.centers())
+    scale = _EXTENT_M / float(np.linalg.norm(np.ptp(joint.model.centers(), axis=0)))
     sim = sim or Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3))
-    reference = {p.name: sim.act(c) for p, c in zip(joint.photos, joint.model.centers(), strict=True)}
+    reference = {name: sim.act(center) for name, center in state.joint.items()}
     both = sorted(reference.keys() & state.centers.keys())
-    ours = np.array([state.centers[name] for name in both]).reshape(-1, 3)
-    theirs = np.array([reference[name] for name in both]).reshape(-1, 3)
-    aligned = similarity_closed_form(ours, theirs) if len(both) >= 3 else None
-    apart = np.linalg.norm(aligned.act(ours) - theirs, axis=1) if aligned else np.full(len(both), np.nan)
+    aligned = laid_on(state.centers, reference)
+    apart = np.full(len(both), np.nan)
+    if aligned is not None:
+        apart = np.array([np.linalg.norm(aligned.act(state.centers[n]) - reference[n]) for n in both])
     return {
         "joint": len(reference),
         "grown": len(both),

@@ -15,10 +15,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import pose_difference
 from featuredb.store import Database
@@ -26,7 +23,7 @@ from featuredb.video.folder import natural_key
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
-from tools.figures import spread, study_parser, write_figures
+from tools.figures import laid_on, spread, study_parser, write_figures
 from tools.made_maps import photo_names
 from tools.real_photos import ingest, reference
 
@@ -39,7 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not (work / name).exists():
             ingest(work / name, args.photos, left_out, work / "cache")
     part, whole = reference(work / "part"), reference(work / "whole")
-    moved = laid_on(whole, part)
+    sim = laid_on(centers(whole), centers(part))
+    assert sim is not None
+    moved = {image.name: sim.act_on_pose(image.cam_from_local) for image in whole.images}
     frames = film_of(args.photos, names, work / "frames")
     tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
     poses = {name: p.pose for name, p in zip(names, tracked.trajectory.points, strict=True) if p.pose}
@@ -57,15 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def laid_on(whole: FeatureMap, part: FeatureMap) -> dict[str, Rigid3]:
-    """Poses of the whole's images in the part's frame, by name."""
-    there = {image.name: image.cam_from_local for image in part.images}
-    both = [image for image in whole.images if image.name in there]
-    here = np.array([image.cam_from_local.center for image in both])
-    wanted = np.array([there[image.name].center for image in both])
-    sim = similarity_closed_form(here, wanted)
-    assert sim is not None
-    return {image.name: sim.act_on_pose(image.cam_from_local) for image in whole.images}
+def centers(feature_map: FeatureMap) -> dict[str, FloatArray]:
+    """Of a map's cameras, by the names of its images."""
+    return {image.name: image.cam_from_local.center for image in feature_map.images}
 
 
 def film_of(photos: Path, names: Sequence[str], folder: Path) -> Path:
