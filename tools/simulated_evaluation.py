@@ -49,13 +49,11 @@ class Asked:
     """One query.
 
     Attributes:
-        group: drone, street, or the kind of negative.
         pose: the answer; None where not localised.
         error: against the truth; None likewise, or where there is none.
         true_in_area: true cam_from_local in the frame of the answer; None likewise.
     """
 
-    group: str
     pose: LocalisedPose | None
     error: PoseError | None
     true_in_area: Rigid3 | None
@@ -72,52 +70,48 @@ def main(argv: Sequence[str] | None = None) -> int:
         ingest_world(world, database, args.out / "report", exact_gps=True)
     localiser = Localiser.open(database)
     asked = ask_world(world, localiser)
-    drone = [a for a in asked if a.group == "drone"]
-    answers = [(a.pose, a.true_in_area) for a in drone if a.pose and a.true_in_area]
+    answers = [(a.pose, a.true_in_area) for a in asked["drone"] if a.pose and a.true_in_area]
     inside = inside_over_placements(answers, localiser.areas[0].area, world, _DRAWS, args.seed)
     write_figures(args.json, inside | flat_figures(asked))
     return 0
 
 
-def ask_world(world: World, localiser: Localiser) -> list[Asked]:
-    """Ask for every photo that is not in the map."""
-    asked = [_ask(world, localiser, "drone", p) for p in world.images("queries")]
-    asked += [_ask(world, localiser, "street", p) for p in world.images("street")]
-    for kind in NEGATIVE_KINDS:
-        asked += [_ask(world, localiser, kind, p) for p in world.negatives(kind)]
-    return asked
+def ask_world(world: World, localiser: Localiser) -> dict[str, list[Asked]]:
+    """Ask for every photo that is not in the map: by drone, from the street, and each kind of negative."""
+    photos = {"drone": world.images("queries"), "street": world.images("street")}
+    photos |= {kind: world.negatives(kind) for kind in NEGATIVE_KINDS}
+    return {group: [_ask(world, localiser, path) for path in paths] for group, paths in photos.items()}
 
 
-def _ask(world: World, localiser: Localiser, group: str, path: Path) -> Asked:
+def _ask(world: World, localiser: Localiser, path: Path) -> Asked:
     pose = answer_of(localiser, path).pose
     name = path.relative_to(world.folder).as_posix()
     true, frame = world.truth.images.get(name), world.truth.frame
     if pose is None or true is None:
-        return Asked(group=group, pose=pose, error=None, true_in_area=None)
+        return Asked(pose=pose, error=None, true_in_area=None)
     return Asked(
-        group=group,
         pose=pose,
         error=pose_difference(frame, true.cam_from_local, pose.epsg, pose.utm, pose.cam_from_utm_xyzw),
         true_in_area=true.cam_from_local @ frame.enu_from(pose.frame),
     )
 
 
-def flat_figures(asked: Sequence[Asked]) -> dict[str, float]:
+def flat_figures(asked: dict[str, list[Asked]]) -> dict[str, float]:
     """Answers to held-out drone photos with their errors; answers where there should be none."""
-    drone = summarise([a.error for a in asked if a.group == "drone"])
-    negatives = [a for a in asked if a.group in NEGATIVE_KINDS]
-    street = [a for a in asked if a.group == "street"]
+    drone = summarise([a.error for a in asked["drone"]])
+    negatives = [a for kind in NEGATIVE_KINDS for a in asked[kind]]
+    everything = [a for those in asked.values() for a in those]
     return {
         "asked": drone.queries,
-        "answered": sum(a.pose is not None for a in asked if a.group == "drone"),
+        "answered": sum(a.pose is not None for a in asked["drone"]),
         "within": drone.within,
         "median_m": drone.position_m[0],
         "median_deg": drone.angle_deg[0],
-        "wrong": sum(a.error is not None and a.error.position_m > 5.0 for a in asked),
+        "wrong": sum(a.error is not None and a.error.position_m > 5.0 for a in everything),
         "negatives": len(negatives),
         "negatives_answered": sum(a.pose is not None for a in negatives),
-        "street": len(street),
-        "street_answered": sum(a.pose is not None for a in street),
+        "street": len(asked["street"]),
+        "street_answered": sum(a.pose is not None for a in asked["street"]),
     }
 
 
