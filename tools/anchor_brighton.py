@@ -14,7 +14,6 @@
 
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,26 +23,22 @@ import numpy as np
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
+from tools.commands import anchor, featuredb
 from tools.figures import write_figures
 from tools.real_photos import HeldOutRow, ask_poses, error_figures, ingest
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = arguments(__doc__, argv)
+    args = scan_parser(__doc__, "--work", "--held-out").parse_args(argv)
     truth = scan_truth(args)
     work: Path = args.work
     database = work / "anchored"
     ingest(database, args.photos, args.held_out)
     shape = by_gps(Database.open(database), truth)
-    sys.stdout.write("before, placed by GPS\n")
     before = ask_poses(Database.open(database), args.photos, args.held_out, truth.frame, truth.poses)
-    sys.stdout.write("".join(f"{row}\n" for row in before))
     anchored = anchored_on(database, args.scan, args.photos, work / "anchor")
-    sys.stdout.write("after, anchored on the scan\n")
     after = ask_poses(anchored, args.photos, args.held_out, truth.frame, truth.poses)
-    sys.stdout.write("".join(f"{row}\n" for row in after))
     figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
     write_figures(args.json, figures | stated(after) | shape)
     return 0
@@ -54,22 +49,21 @@ def stated(rows: Sequence[HeldOutRow]) -> dict[str, float]:
     answered = [(row, row.error) for row in rows if row.error is not None]
     if not answered:
         return {}
-    return {
-        "stated_m": float(np.median([row.position_68_m for row, _ in answered])),
-        "stated_deg": float(np.median([row.orientation_68_deg for row, _ in answered])),
-        "stated_over_m": float(np.median([row.position_68_m / error.position_m for row, error in answered])),
-        "stated_over_deg": float(
-            np.median([row.orientation_68_deg / error.angle_deg for row, error in answered])
-        ),
+    figures = {
+        "stated_m": [row.position_68_m for row, _ in answered],
+        "stated_deg": [row.orientation_68_deg for row, _ in answered],
+        "stated_over_m": [row.position_68_m / error.position_m for row, error in answered],
+        "stated_over_deg": [row.orientation_68_deg / error.angle_deg for row, error in answered],
     }
+    return {name: float(np.median(values)) for name, values in figures.items()}
 
 
 def anchored_on(database: Path, scan: Path, photos: Path, out: Path) -> Database:
     """The database, after its oldest map is placed on the scan, which is added to it; `out`: the report."""
     featuredb("lidar", "add", str(database), str(scan))
     map_id = Database.open(database).snapshot().maps()[0].map_id
-    words = ("anchor", str(database), map_id, "--photos", str(photos), "--out", str(out), "--auto", "--quiet")
-    featuredb(*words)
+    if not anchor(database, map_id, photos, out):
+        raise SystemExit(f"the map was not placed on its scan; its report is in {out}")
     return Database.open(database)
 
 
@@ -93,13 +87,6 @@ def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
         "gps_focal_off": abs(focal_px / scan_px - 1.0) / max(uncertainty.focal_rel, 0.01),
         "gps_shape_m": float(np.median(np.linalg.norm(rest, axis=1))),
     }
-
-
-def arguments(doc: str | None, argv: Sequence[str] | None) -> argparse.Namespace:
-    """What studies of photos held out of a set with a scan are told; `doc`: of the program's module."""
-    parser = scan_parser(doc, "--work")
-    parser.add_argument("--held-out", nargs="+", required=True, metavar="NAME")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

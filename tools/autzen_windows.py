@@ -17,30 +17,31 @@ window counts as having structure by these measures alone:
 scan:
   a gradient (sigma 2 pixels) whose 95th percentile in the part is above the picture's own 75th percentile.
 
-Ortho image and scan disagree by a few feet: 7 columns and 2 rows, says who described the data. That offset is
-checked here, from the whole picture and from its quarters, by the correlation of gradient magnitudes over
-shifts, with rasters made by counting points into cells: nothing of it is shared with the registration. A
+Ortho image and scan disagree by a few feet: 7 columns and 2 rows, says who described the data. A
 window's error is the root mean square, over 16 places of the window, of the distance on the ground between
 where the pose puts them and where the ortho image and the offset do.
 
 Refused must be: mirrored windows, windows whose prior lies elsewhere in the scan, photos of other places.
 """
 
-import argparse
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import rasterio
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from featuredb.features.decode import decode_gray
+from featuredb.geo.crs.scan import scan_crs
+from featuredb.geo.crs.utm_transform import utm_transform
+from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
@@ -53,8 +54,10 @@ from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import SURE_CONFIRMATION_LOG_NFA
 from ingest.register.frame_registration import FramePrior
 from tools.figures import study_parser, write_figures
-from tools.ortho_place import WINDOW_PX, Floats, OrthoOverScan, has_structure, measured_offset, place_of
 
+Floats = NDArray[np.float64]
+WINDOW_PX = 400
+_HIGH_M = 3.0
 _STEPS = (225, 200)  # columns, rows between windows
 _HEIGHT_M = 1000.0
 _OFFSET_PX = (-7.0, -2.0)  # columns, rows
@@ -65,8 +68,26 @@ _LIMIT_M, _WRONG_M = 1.5, 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OrthoOverScan:
+    """The ortho image over the scan: grey values, the pixel grid on the ground, rasters of the scan."""
+
+    gray: NDArray[np.uint8]
+    east: Floats  # (h + 1, w + 1) would be exact; a plane fitted to the corners is, to a millimetre
+    north: Floats
+    ground_m: float
+    intensity: NDArray[np.float32]  # (h, w), NaN where no point fell
+    high: NDArray[np.bool_]
+
+    def on_ground(self, pixels: Floats) -> Floats:
+        """East and north (n, 2) of ortho pixels (n, 2), metres."""
+        full = np.column_stack([pixels, np.ones(len(pixels))])
+        found: Floats = np.column_stack([full @ self.east, full @ self.north])
+        return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WindowOutcome:
-    """What became of one window."""
+    """What became of one window; `error_m` is None where no pose was tried."""
 
     kind: str
     column: int
@@ -74,16 +95,18 @@ class WindowOutcome:
     has_structure: bool
     accepted: bool
     error_m: float | None
-    message: str
-    matched_by: str
     log_nfa: float
-    elsewhere_log_nfa: float
-    seconds: float
-    pose: list[list[float]] | None
+    message: str
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__, "--seed")
+    parser.set_defaults(seed=0)
+    parser.add_argument("scan", type=Path)
+    parser.add_argument("ortho", type=Path)
+    parser.add_argument("--figure", type=Path, help="draw evidence against error")
+    parser.add_argument("--photos", type=Path, nargs="*", default=[], help="folders of other places")
+    args = parser.parse_args(argv)
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         database = Database.create(Path(folder) / "db")
@@ -92,21 +115,79 @@ def main(argv: Sequence[str] | None = None) -> int:
         cloud = replace(load_cloud(database, frame), rgb=None)
     print(f"scan: {len(cloud):,} points, {added.scan.height_datum} heights, EPSG:{added.scan.epsg}")
     place = place_of(args.ortho, frame, added.scan.epsg, cloud)
-    measured = measured_offset(place)
     offset = place.on_ground(np.array([_OFFSET_PX]))[0] - place.on_ground(np.zeros((1, 2)))[0]
-    apart = float(np.hypot(*(offset - measured)))
-    taken = f"columns {_OFFSET_PX[0]:+g}, rows {_OFFSET_PX[1]:+g}"
-    print(f"offset taken: {taken}; the measured one is {apart:.2f} m from it")
     outcomes = []
     for kind, column, row, photo in _photos(place, args.photos):
         rng = np.random.default_rng([args.seed, _KINDS.index(kind), column, row])
         outcome = _one(place, cloud, kind, column, row, photo, offset, rng)
         outcomes.append(outcome)
-        print(_line(outcome), flush=True)
+        print(outcome, flush=True)
     if args.figure is not None:
         _draw(outcomes, args.figure)
-    _summary(outcomes, args.json)
+    write_figures(args.json, figures_of(outcomes))
     return 0
+
+
+def place_of(path: Path, frame: LocalFrame, epsg: int, cloud: PointCloud) -> OrthoOverScan:
+    """The ortho image at `path` in the frame of a cloud; prints how its pixels lie."""
+    with rasterio.open(path) as image:
+        bands, affine, wkt = image.read(), image.transform, image.crs.to_wkt()
+    gray = np.asarray(cv2.cvtColor(np.moveaxis(bands, 0, -1), cv2.COLOR_RGB2GRAY))
+    h, w = gray.shape
+    corners = np.array([(x, y) for x in (0.0, w / 2, w) for y in (0.0, h / 2, h)])
+    a, b, c, d, e, f = tuple(affine)[:6]
+    xy = corners @ np.array([[a, d], [b, e]]) + (c, f)
+    xyz = np.column_stack([xy, np.full(len(xy), 0.0)])
+    utm = utm_transform(scan_crs(wkt=wkt), xyz.min(0), xyz.max(0), epsg).apply(xyz)
+    ground = float(np.percentile(cloud.xyz[:, 2], 20))
+    utm[:, 2] = frame.utm_from_enu(np.array([0.0, 0.0, ground]), epsg)[2]
+    enu = frame.enu_from_utm(utm, epsg)
+    full = np.column_stack([corners, np.ones(len(corners))])
+    (east, left), (north, right) = (np.linalg.lstsq(full, enu[:, i], rcond=None)[:2] for i in (0, 1))
+    worst = float(np.sqrt(max(left.max(initial=0), right.max(initial=0)) / len(corners)))
+    print(f"ortho: {w} x {h} pixels of {np.hypot(east[0], north[0]):.4f} m; flat to {1000 * worst:.1f} mm")
+    turn = np.array([[east[0], north[0]], [east[1], north[1]]])
+    pixel = np.floor((cloud.xyz[:, :2] - (east[2], north[2])) @ np.linalg.inv(turn)).astype(int)
+    inside = ((pixel >= 0) & (pixel < (w, h))).all(axis=1)
+    cell = pixel[inside] @ (1, w)
+    count = np.bincount(cell, minlength=w * h)
+    assert cloud.intensity is not None
+    total = np.bincount(cell, cloud.intensity[inside].astype(float), minlength=w * h)
+    top = np.full(w * h, -np.inf)
+    np.maximum.at(top, cell, cloud.xyz[inside, 2].astype(np.float64))
+    intensity = np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(h, w)
+    high = cv2.dilate((top.reshape(h, w) > ground + _HIGH_M).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return OrthoOverScan(
+        gray=gray, east=east, north=north, ground_m=ground, intensity=intensity.astype(np.float32), high=high
+    )
+
+
+def _gradients(picture: NDArray[Any], sigma: float) -> NDArray[np.float32]:
+    known = np.isfinite(picture).astype(np.float32)
+    filled = np.where(known > 0, picture, 0).astype(np.float32)
+    smooth = cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(
+        cv2.GaussianBlur(known, (0, 0), sigma), 1e-3
+    )
+    dy, dx = np.gradient(smooth)
+    return np.asarray(np.hypot(dx, dy), dtype=np.float32)
+
+
+def has_structure(place: OrthoOverScan, column: int, row: int) -> bool:
+    """Whether a window counts as having structure; the program's help says what that is."""
+    window = (slice(row, row + WINDOW_PX), slice(column, column + WINDOW_PX))
+    if place.high[window].mean() > 0.5:
+        return False
+    part, good, parts = 25, 0, 0
+    pictures = [_gradients(p.astype(np.float32), 2.0) for p in (place.gray, place.intensity)]
+    limits = [float(np.percentile(p, 75)) for p in pictures]
+    for r in range(row, row + WINDOW_PX, part):
+        for c in range(column, column + WINDOW_PX, part):
+            here = (slice(r, r + part), slice(c, c + part))
+            if place.high[here].mean() > 0.5:
+                continue
+            parts += 1
+            good += all(np.percentile(p[here], 95) > limit for p, limit in zip(pictures, limits, strict=True))
+    return good >= 0.25 * parts
 
 
 def _photos(
@@ -158,11 +239,8 @@ def _one(
 ) -> WindowOutcome:
     camera, truth = _nadir_camera(place, column, row)
     prior = _wrong_prior(truth, rng)
-    start = time.process_time()
     found = register_frame(photo, camera, prior, cloud)
-    seconds = time.process_time() - start
-    evidence = found.evidence
-    tried = evidence.get("pose_tried")
+    tried = found.evidence.get("pose_tried")
     error = None
     if tried is not None:
         error = _ground_error(place, camera, Rigid3.from_matrix(tried), column, row, offset)
@@ -173,12 +251,8 @@ def _one(
         has_structure=has_structure(place, column, row),
         accepted=found.accepted,
         error_m=error,
+        log_nfa=found.evidence.get("confirmation", {}).get("log_nfa", 0.0),
         message=f"{found.reason}: {found.message}" if found.reason else "",
-        matched_by=evidence.get("matched_by", ""),
-        log_nfa=evidence.get("confirmation", {}).get("log_nfa", 0.0),
-        elsewhere_log_nfa=evidence.get("elsewhere_log_nfa", 0.0),
-        seconds=seconds,
-        pose=tried,
     )
 
 
@@ -199,13 +273,14 @@ def _wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
     shift, axis = rng.normal(size=3), rng.normal(size=3)
     center = truth.center + _PRIOR_M * shift / np.linalg.norm(shift)
     rotation = so3_exp(np.radians(_PRIOR_DEG) * axis / np.linalg.norm(axis)) @ truth.rotation
+    # 20 m in space and 5 degrees about any axis, by axis.
+    sigma_m, sigma_deg = _PRIOR_M / np.sqrt(3.0), _PRIOR_DEG / np.sqrt(3.0)
     return FramePrior(
         cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
-        # 20 m in space and 5 degrees about any axis, by axis.
-        sigma_horizontal_m=_PRIOR_M / np.sqrt(3.0),
-        sigma_vertical_m=_PRIOR_M / np.sqrt(3.0),
-        sigma_heading_deg=_PRIOR_DEG / np.sqrt(3.0),
-        sigma_tilt_deg=_PRIOR_DEG / np.sqrt(3.0),
+        sigma_horizontal_m=sigma_m,
+        sigma_vertical_m=sigma_m,
+        sigma_heading_deg=sigma_deg,
+        sigma_tilt_deg=sigma_deg,
     )
 
 
@@ -217,15 +292,6 @@ def _ground_error(
     found = pose.center + rays * ((place.ground_m - pose.center[2]) / rays[:, 2:])
     wanted = place.on_ground(spots + np.array([column, row])) + offset
     return float(np.sqrt(((found[:, :2] - wanted) ** 2).sum(axis=1).mean()))
-
-
-def _line(o: WindowOutcome) -> str:
-    error = "-" if o.error_m is None else f"{o.error_m:.2f}"
-    return (
-        f"{o.kind:9} {o.column:4} {o.row:4} structure {o.has_structure!s:5} accepted {o.accepted!s:5} "
-        f"error {error:>6} m  log_nfa {o.log_nfa:5.1f} elsewhere {o.elsewhere_log_nfa:4.1f} "
-        f"{o.matched_by:8} {o.seconds:5.1f} s  {o.message}"
-    )
 
 
 def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
@@ -249,42 +315,23 @@ def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
     chart.savefig(path)
 
 
-def _summary(outcomes: Sequence[WindowOutcome], figures: Path | None) -> None:
+def figures_of(outcomes: Sequence[WindowOutcome]) -> dict[str, float]:
+    """How many windows are found, and how many of what has to be refused is accepted."""
     windows = [o for o in outcomes if o.kind == "window"]
     structured = [o for o in windows if o.has_structure]
     close = [o for o in structured if o.accepted and o.error_m is not None and o.error_m <= _LIMIT_M]
     wrong = [o for o in windows if o.accepted and (o.error_m is None or o.error_m > _WRONG_M)]
     foreign = [o for o in outcomes if o.kind != "window"]
-    taken = [o for o in foreign if o.accepted]
-    accepted = [o for o in windows if o.accepted]
-    errors = [o.error_m for o in accepted if o.error_m is not None]
-    write_figures(
-        figures,
-        {
-            "windows": len(windows),
-            "structured": len(structured),
-            "close": len(close),
-            "rate": len(close) / max(len(structured), 1),
-            "accepted": len(accepted),
-            "median_m": float(np.median(errors or [np.nan])),
-            "largest_m": max(errors, default=float("nan")),
-            "wrong": len(wrong),
-            "foreign": len(foreign),
-            "foreign_accepted": len(taken),
-        },
-    )
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("scan", type=Path)
-    parser.add_argument("ortho", type=Path)
-    parser.add_argument("--figure", type=Path, help="draw evidence against error")
-    parser.add_argument(
-        "--photos", type=Path, nargs="*", default=[], help="folders with photos of other places"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    return parser.parse_args(argv)
+    errors = [o.error_m for o in windows if o.accepted and o.error_m is not None]
+    return {
+        "structured": len(structured),
+        "close": len(close),
+        "rate": len(close) / max(len(structured), 1),
+        "largest_m": max(errors, default=float("nan")),
+        "wrong": len(wrong),
+        "foreign": len(foreign),
+        "foreign_accepted": sum(o.accepted for o in foreign),
+    }
 
 
 if __name__ == "__main__":

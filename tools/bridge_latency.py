@@ -14,7 +14,6 @@ than the robot's. Here it has a core of its own, so that its work on the next fr
 bridge; `live`, the bridge and this process share the others. Figures say how busy the machine was (load).
 """
 
-import argparse
 import json
 import os
 import select
@@ -73,7 +72,10 @@ class Moments:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__)
+    parser.add_argument("db", type=Path)
+    parser.add_argument("photo", type=Path, help="that the database localises")
+    args = parser.parse_args(argv)
     figures: dict[str, float] = {"load": os.getloadavg()[0]}
     with tempfile.TemporaryDirectory() as scratch:
         film = _film(Path(scratch) / "still.mp4", args.photo)
@@ -191,13 +193,6 @@ def _figures(name: str, moments: Moments) -> dict[str, float]:
         f"{name}_median_ms": float(np.median(late)),
         f"{name}_99_ms": float(np.quantile(late, 0.99)),
     }
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("db", type=Path)
-    parser.add_argument("photo", type=Path, help="that the database localises")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

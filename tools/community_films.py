@@ -27,7 +27,7 @@ from featuredb.simworld.laser.airborne import scan_town
 from featuredb.simworld.laser.scan_file import write_scan
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from reloc.tracking.trajectory.read import read_trajectory_csv
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb, newest_copy
 from tools.figures import study_parser, write_figures
 from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
@@ -52,9 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     say(found.as_text())
     figures: dict[str, Any] = found.figures(scripts) | {"ingest_s": seconds, "placed": 0}
     if found.of_place:
-        database = work / "placed"
-        shutil.rmtree(database, ignore_errors=True)
-        shutil.copytree(made, database)
+        database = newest_copy(made, work / "placed")
         placed = _placed(database, found, truth, _scan(inputs, args.seed), work, args.seed)
         figures["placed"] = int(placed)
         tracks = _tracked(database, inputs / "films", work, truth) if placed else []

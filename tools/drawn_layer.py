@@ -5,20 +5,19 @@ frame each belongs where the true camera sees it; its mark is where the film was
 """
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.camera.photograph import render_depth
-from featuredb.simworld.town.scene import Scene, texture_index
+from featuredb.simworld.town.scene import Scene
 from featuredb.video.frames import open_video
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.worlds.film_world import FILM_FILE, FilmTruth
+from tools.worlds.seen_places import SeenPlaces
 
 _SEED, _SHOWING, _PLACES = 3, 6, 8  # frames that give places, and places of each
 _REACH_PX = 10  # around a place: a mark is a ring of 4 px radius
@@ -27,26 +26,14 @@ _CHANGED = 50  # grey levels; writing the film anew changes less
 _FEWEST_PIXELS = 8  # of a mark that is not hidden
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnMarks:
-    """Where marks were found.
-
-    Attributes:
-        frames: with a mark. marks: measured. stray: changed spots that no place explains.
-        median_px, largest_px: between a mark's centre and the pixel where its place belongs.
-    """
-
-    frames: int
-    marks: int
-    stray: int
-    median_px: float
-    largest_px: float
-
-
 def drawn_marks(
     folder: Path, film: Path, truth: FilmTruth, scene: Scene, track: Trajectory, database: Path
-) -> DrawnMarks:
-    """Draw a layer over a film that was tracked, and measure its marks; files go into `folder`."""
+) -> dict[str, float]:
+    """Draw a layer over a film that was tracked, and measure its marks; files go into `folder`.
+
+    Frames with a mark, marks that were measured, stray: changed spots that no place explains, and the
+    distances between a mark's centre and the pixel where its place belongs.
+    """
     places = _places(scene, truth)
     (folder / "layer.geojson").write_text(json.dumps(_layer(truth.frame.geodetic_from_enu(places))))
     write_trajectory(folder / "track.csv", track)
@@ -65,13 +52,13 @@ def drawn_marks(
             changed = np.abs(after.rgb().astype(np.int16) - before.rgb()).max(axis=2)
             found, strange = marks_of(changed.astype(np.float64), lens.project(pose.act(places)))
             off, frames, stray = [*off, *found], frames + bool(found), stray + strange
-    return DrawnMarks(
-        frames=frames,
-        marks=len(off),
-        stray=stray,
-        median_px=float(np.median(off)),
-        largest_px=max(off),
-    )
+    return {
+        "frames": frames,
+        "marks": len(off),
+        "stray": stray,
+        "median_px": float(np.median(off)),
+        "largest_px": max(off),
+    }
 
 
 def marks_of(changed: FloatArray, pixels: FloatArray) -> tuple[list[float], int]:
@@ -116,18 +103,12 @@ def _ring_centre(mark: FloatArray) -> FloatArray:
 def _places(scene: Scene, truth: FilmTruth) -> FloatArray:
     """(n, 3) in the truth's frame, of what stands still."""
     rng = np.random.default_rng(_SEED)
-    cars = np.unique(scene.faces.object_id[scene.faces.texture == texture_index("car")])
-    camera, found = truth.camera, []
+    found = []
     for frame in np.linspace(0, len(truth.times_s) - 1, _SHOWING).astype(int):
         pose = truth.cam_from_local[frame]
-        if pose is None:
-            continue
-        drawn = render_depth(scene, camera, pose)
-        rows, columns = np.nonzero(np.isfinite(drawn.depth) & ~np.isin(drawn.object_id, cars))
-        chosen = rng.choice(len(rows), _PLACES, replace=False)
-        rows, columns = rows[chosen], columns[chosen]
-        rays = np.column_stack([camera.unproject(np.column_stack([columns, rows]) + 0.5), np.ones(len(rows))])
-        found.append(pose.inverse().act(rays * drawn.depth[rows, columns][:, None].astype(np.float64)))
+        if pose is not None:
+            seen = SeenPlaces(scene, truth.camera, pose)
+            found.append(seen.places(seen.pixels(rng, _PLACES)))
     return np.concatenate(found)
 
 

@@ -7,10 +7,8 @@ track at the keyframes with the poses that the map itself has of them: the dista
 median distance from the map's cameras to their points, and the angle. Exit code 0 if a frame was followed.
 """
 
-import csv
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,70 +16,43 @@ import numpy as np
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FilmInMap:
-    """What came of a film.
-
-    Attributes:
-        keyframes: of the film; mapped: of them, in the largest map.
-        frames: of the film; tracked: of them, with a pose in the map's frame.
-        center_rel: median distance of the track from the map's own cameras at keyframes, over the median
-            distance from the cameras to the points. angle_deg: median angle between the two.
-    """
-
-    keyframes: int
-    mapped: int
-    frames: int
-    tracked: int
-    center_rel: float
-    angle_deg: float
-
-    @property
-    def mapped_share(self) -> float:
-        """Of the keyframes."""
-        return self.mapped / self.keyframes
-
-    @property
-    def tracked_share(self) -> float:
-        """Of the frames."""
-        return self.tracked / self.frames
+from tools.film_placed import keyframe_count, tracked_by
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("film", type=Path)
     args = parser.parse_args(argv)
-    made = film_in_map(args.film, args.work)
-    shares = {"mapped_share": made.mapped_share, "tracked_share": made.tracked_share}
-    write_figures(args.json, asdict(made) | shares)
-    return 0 if made.tracked else 1
+    figures = film_in_map(args.film, args.work)
+    write_figures(args.json, figures)
+    return 0 if figures["tracked"] else 1
 
 
-def film_in_map(film: Path, work: Path) -> FilmInMap:
-    """Ingest and track a film in a folder."""
-    database, track = work / "db", work / "track.csv"
+def film_in_map(film: Path, work: Path) -> dict[str, float]:
+    """Ingest and track a film in a folder: keyframes and frames that are in the map, and against the map's
+    own cameras at keyframes the medians of distance, relative, and angle."""
+    database = work / "db"
     featuredb("ingest", "video", str(database), str(film), "--no-telemetry", "--quiet", may_refuse=True)
     snapshot = Database.open(database).snapshot()
     largest = max(snapshot.unplaced_maps(), key=lambda m: m.images).map_id
-    featuredb("track", str(database), str(film), "--map", largest, "--out", str(track), may_refuse=True)
-    with track.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = tracked_by(database, largest, film, work)
     unplaced = snapshot.load_unplaced(largest)
     assert isinstance(unplaced, UnplacedMap)
     found = {int(row["frame"]): row for row in rows if row["own_x"]}
     center_rel, angle_deg = _against_keyframes(unplaced, found)
-    return FilmInMap(
-        keyframes=len(list((database / "_work" / "films").rglob("*.jpg"))),
-        mapped=len(unplaced.images),
-        frames=len(rows),
-        tracked=len(found),
-        center_rel=center_rel,
-        angle_deg=angle_deg,
-    )
+    keyframes = keyframe_count(database)
+    return {
+        "keyframes": keyframes,
+        "mapped": len(unplaced.images),
+        "mapped_share": len(unplaced.images) / keyframes,
+        "frames": len(rows),
+        "tracked": len(found),
+        "tracked_share": len(found) / len(rows),
+        "center_rel": center_rel,
+        "angle_deg": angle_deg,
+    }
 
 
 def _against_keyframes(unplaced: UnplacedMap, found: dict[int, dict[str, str]]) -> tuple[float, float]:

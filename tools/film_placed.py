@@ -10,7 +10,6 @@ distances between track and telemetry, the radius is that of the track: of the h
 import csv
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,66 +19,55 @@ from featuredb.geo.utm import utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store import Database
 from featuredb.video.telemetry import telemetry_of_video
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 
 _WITHIN = float(chi2.ppf(0.95, 2))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FilmPlaced:
-    """What came of a film.
-
-    Attributes:
-        keyframes: of the film; mapped: of them, in the placed map. active: whether the map answers.
-        tracked: frames with a pose; compared: of them, with a position by the telemetry.
-        radius_m: horizontal, 95 %. rms_m, largest_m: horizontal distance from track to telemetry.
-        inside: share of `compared` within 95 % of the track's covariance.
-    """
-
-    keyframes: int
-    mapped: int
-    active: int
-    tracked: int
-    compared: int
-    radius_m: float
-    rms_m: float
-    largest_m: float
-    inside: float
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("film", type=Path)
     args = parser.parse_args(argv)
-    made = film_placed(args.film, args.work)
-    write_figures(args.json, asdict(made))
+    write_figures(args.json, film_placed(args.film, args.work))
     return 0
 
 
-def film_placed(film: Path, work: Path) -> FilmPlaced:
-    """Ingest and track a film in a folder."""
-    database, track = work / "db", work / "track.csv"
+def film_placed(film: Path, work: Path) -> dict[str, float]:
+    """Ingest and track a film in a folder: keyframes in the map, frames with a pose, those compared, and the
+    horizontal distances."""
+    database = work / "db"
     featuredb("ingest", "video", str(database), str(film), "--quiet")
     (placed,) = Database.open(database).snapshot().maps()
-    featuredb("track", str(database), str(film), "--map", placed.map_id, "--out", str(track))
-    with track.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["easting"]]
+    rows = [row for row in tracked_by(database, placed.map_id, film, work) if row["easting"]]
     off, covariances = _off_telemetry(film, rows)
     squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances), off)
     metres = np.linalg.norm(off, axis=1)
     radii = np.sqrt(_WITHIN * np.linalg.eigvalsh(covariances)[:, -1])
-    return FilmPlaced(
-        keyframes=len(list((database / "_work" / "films").rglob("*.jpg"))),
-        mapped=placed.images,
-        active=int(placed.status == "active"),
-        tracked=len(rows),
-        compared=len(off),
-        radius_m=float(np.median(radii)),
-        rms_m=float(np.sqrt((metres**2).mean())),
-        largest_m=float(metres.max()),
-        inside=float((squares <= _WITHIN).mean()),
-    )
+    return {
+        "keyframes": keyframe_count(database),
+        "mapped": placed.images,
+        "active": int(placed.status == "active"),
+        "tracked": len(rows),
+        "compared": len(off),
+        "radius_m": float(np.median(radii)),
+        "rms_m": float(np.sqrt((metres**2).mean())),
+        "largest_m": float(metres.max()),
+        "inside": float((squares <= _WITHIN).mean()),
+    }
+
+
+def tracked_by(database: Path, map_id: str, film: Path, work: Path) -> list[dict[str, str]]:
+    """The rows of a film's track by a map."""
+    track = work / "track.csv"
+    featuredb("track", str(database), str(film), "--map", map_id, "--out", str(track), may_refuse=True)
+    with track.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def keyframe_count(database: Path) -> int:
+    """Of the films that an ingest into a database has kept."""
+    return len(list((database / "_work" / "films").rglob("*.jpg")))
 
 
 def _off_telemetry(film: Path, rows: Sequence[dict[str, str]]) -> tuple[FloatArray, FloatArray]:

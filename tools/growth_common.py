@@ -1,13 +1,10 @@
 """What the programs that measure growth share: an anchored database, contributions, errors."""
 
-import argparse
 import json
-import logging
-import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -19,14 +16,11 @@ import numpy as np
 from featuredb.features.decode import decode_gray
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import rotation_angle
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.truth import Truth, read_truth
 from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution, candidate_id_of
-from ingest.growing import GrowingOptions
-from ingest.growth.growth_report import GrowthReport
+from ingest.growing import GrowingOptions, grow_candidates
 from ingest.growth.map_places import drift_m, places_of
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
@@ -35,10 +29,9 @@ from reloc.localise.result import LocaliseResult
 from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
 from reloc.wire.query import LocaliseWireRequest
-from tools.figures import write_figures
+from tools.figures import study_parser, write_figures
 from tools.growth_gates import WRONG_M, recorded
-from tools.worlds.album import PlannedPhoto, write_album
-from tools.worlds.album_files import TABLE_FILES, AlbumFact, read_facts
+from tools.worlds.album import TABLE_FILE, AlbumFact, PlannedPhoto, read_facts, write_album
 
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
 _SURVEY_SIGMA_M = (0.02, 0.03)
@@ -80,7 +73,6 @@ class Registered:
     Attributes:
         fact: what it is. map_id, status, generation: of its map.
         offset_m: (3,) east, north, up, registered minus true; None for photos without a true place here.
-        angle_deg: between the orientations.
         drift_m: 95 % bound that its map claims against its anchors; None for anchors.
         bound_m: 95 % bound that its map claims on Earth, the anchors' own uncertainty included.
     """
@@ -90,7 +82,6 @@ class Registered:
     status: str
     generation: int
     offset_m: FloatArray | None
-    angle_deg: float
     drift_m: float | None
     bound_m: float
 
@@ -114,35 +105,23 @@ class Verdict:
 
 
 def world_told(
-    doc: str | None, argv: Sequence[str] | None, seed: int, sizes: Mapping[str, Callable[..., W]]
+    doc: str | None, argv: Sequence[str] | None, seed: int, world: Callable[..., W]
 ) -> tuple[Path, W]:
     """The folder that a program of a made world is told, made, and the world.
 
     Args:
-        doc: of the program's module. seed: where none is told.
-        sizes: worlds by seed, by name; the first where none is told.
+        doc: of the program's module. seed: where none is told. world: by seed.
     """
-    usual = next(iter(sizes))
-    parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="where all is kept: a folder for each world")
-    parser.add_argument("--size", choices=tuple(sizes), default=usual, help=f"of the world; default: {usual}")
-    parser.add_argument("--seed", type=int, default=seed, help=f"of the world; default: {seed}")
-    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
+    parser = study_parser(doc, "--out", "--seed")
+    parser.set_defaults(seed=seed)
     args = parser.parse_args(argv)
-    log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
-    return args.out, sizes[args.size](seed=args.seed)
+    return args.out, world(seed=args.seed)
 
 
 def say(text: str) -> None:
     sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
     sys.stdout.flush()
-
-
-def log_to_stderr(verbose: bool) -> None:
-    """What growth logs goes to stderr: everything, or warnings and failures alone."""
-    logging.basicConfig(format="%(message)s", level=logging.INFO if verbose else logging.WARNING)
-    logging.getLogger("faiss").setLevel(logging.WARNING)
 
 
 def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) -> "Album":
@@ -157,7 +136,7 @@ def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) 
 
 
 def open_album(folder: Path) -> Album:
-    lines = (folder / TABLE_FILES[1]).read_text(encoding="utf-8").splitlines()
+    lines = (folder / TABLE_FILE).read_text(encoding="utf-8").splitlines()
     rows = {row["path"]: row for row in map(json.loads, lines)}
     return Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
 
@@ -227,14 +206,11 @@ def registered(database: Database, album: Album) -> list[Registered]:
         here = album.truth.frame.enu_from(feature_map.frame)
         bound_m = drift_m(feature_map.placement.covariance, places_of(feature_map))
         for image in feature_map.images:
-            fact = _fact_of(album, feature_map, image.name)
+            fact = album.facts[_album_name(album, image.name, feature_map.name)]
             true = album.truth.images.get(fact.name)
-            offset, angle = None, float("nan")
+            offset = None
             if true is not None:
-                center = here.act(image.cam_from_local.center[None])[0]
-                offset = center - true.cam_from_local.center
-                turned = image.cam_from_local.rotation @ here.rotation.T
-                angle = float(np.degrees(rotation_angle(turned @ true.cam_from_local.rotation.T)))
+                offset = here.act(image.cam_from_local.center) - true.cam_from_local.center
             found.append(
                 Registered(
                     fact=fact,
@@ -242,17 +218,11 @@ def registered(database: Database, album: Album) -> list[Registered]:
                     status=summary.status,
                     generation=summary.generation,
                     offset_m=offset,
-                    angle_deg=angle,
                     drift_m=summary.drift_m,
                     bound_m=bound_m,
                 )
             )
     return found
-
-
-def _fact_of(album: Album, feature_map: FeatureMap, name: str) -> AlbumFact:
-    """A map's image as a photo of the album."""
-    return album.facts[_album_name(album, name, feature_map.name)]
 
 
 def _album_name(album: Album, name: str, folder: str = "") -> str:
@@ -264,16 +234,6 @@ def _album_name(album: Album, name: str, folder: str = "") -> str:
     raise SystemExit(f"photo {name} is not one of {album.folder}")
 
 
-def recording(out: Path, album: Album, name: str = "gates") -> AbstractContextManager[None]:
-    """What the gates of growth say of photos of the album goes to `<name>.jsonl` (`tools.growth_gates`)."""
-
-    def true_place(name: str) -> FloatArray | None:
-        image = album.truth.images.get(_album_name(album, name))
-        return None if image is None else image.cam_from_local.center
-
-    return recorded(out / f"{name}.jsonl", album.truth.frame, true_place)
-
-
 def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     """The answer to a photo, asked as a client does that knows nothing but the file."""
     data = photo.read_bytes()
@@ -281,29 +241,10 @@ def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray))
 
 
-def newest_copy(source: Path, target: Path) -> Database:
-    """A copy of a database, made anew."""
-    shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(source, target)
-    return Database.open(target)
-
-
-def table(rows: Sequence[Sequence[object]], head: Sequence[str]) -> str:
-    """Columns of text under a head."""
-    cells = [list(head), *([_cell(v) for v in row] for row in rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return "\n".join("  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)) for row in cells)
-
-
-def _cell(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
-
-
-def conclude(out: Path, name: str, verdicts: Sequence[Verdict], figures: dict[str, Any]) -> int:
+def conclude(out: Path, name: str, verdicts: Sequence[Verdict]) -> int:
     """Print what holds, write `<name>.json`; 0 if everything holds."""
     document = {
         "lines": {v.name: {"figure": v.text, "holds": v.holds} for v in verdicts},
-        "figures": figures,
         "failed": sum(not v.holds for v in verdicts),
         "summary": "; ".join(f"{v.name}: {v.text}" for v in verdicts),
     }
@@ -311,16 +252,20 @@ def conclude(out: Path, name: str, verdicts: Sequence[Verdict], figures: dict[st
     return 0 if all(v.holds for v in verdicts) else 1
 
 
-def tell(report: GrowthReport) -> None:
-    """The report of a run, without a line per gate."""
+def grown(database: Database, out: Path, album: Album, gates: str = "gates") -> Counter[str]:
+    """Grow once, with what the gates say recorded (`tools.growth_gates`): how many photos wait, by reason."""
+
+    def true_place(name: str) -> FloatArray | None:
+        image = album.truth.images.get(_album_name(album, name))
+        return None if image is None else image.cam_from_local.center
+
+    with recorded(out / f"{gates}.jsonl", album.truth.frame, true_place):
+        report = grow_candidates(database, GROWING)
     for line in report.as_text().splitlines():
         say(line[:300])
-
-
-def failures(report: GrowthReport) -> int:
-    """Photos that a step lost by an exception that it did not foresee, not by a reason."""
-    return sum(p.reason_code == "FAILED" for p in report.photos)
+    return Counter(p.reason_code for p in report.photos if p.reason_code)
 
 
 def none_failed(count: int) -> Verdict:
+    """Of photos that a step lost by an exception that it did not foresee, not by a reason."""
     return Verdict(name="no step failed", text=f"{count} photos lost by an exception", holds=count == 0)

@@ -1,68 +1,50 @@
 """Twelve people's photos of a town that a survey has mapped in part: how many register, and how well?
 
-    python -m tools.growth_community --out DIR [--size full|alike] [--seed N]
+    python -m tools.growth_community --out DIR [--seed N]
 
 The world is that of `tools.worlds.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
-most of the photos, as on photo sites; in the world of --size alike thirty sights have nearly as many each.
+most of the photos, as on photo sites.
 
-Prints what became of each kind of photo, by kind, owner and geotag; writes community.json.
-Everything is kept in DIR and goes on where it was. Exit code 0 if at least 70 % of the town's photos are in
+Writes community.json. Exit code 0 if at least 70 % of the town's photos are in
 active maps with a median error of at most 0.30 m, none of another town or of nowhere, and none is wrong by
 more than 2 m.
 """
 
 import sys
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from ingest.growing import grow_candidates
 from tools.growth_common import (
-    GROWING,
     Album,
     Registered,
     Verdict,
     anchored,
     conclude,
-    failures,
     give,
+    grown,
     made,
     none_failed,
-    recording,
     registered,
-    say,
-    table,
-    tell,
     world_told,
 )
-from tools.worlds.album_files import AlbumFact
 from tools.worlds.community import CommunityOptions, community_album
 
 _OWN = ("street", "drone")
 _FOREIGN = ("other_town", "indoor", "portrait")
 _SHARE, _MEDIAN_M = 0.70, 0.30
-_SIZES = {"short": CommunityOptions, "full": CommunityOptions.full, "alike": CommunityOptions.alike}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = world_told(__doc__, argv, 1, _SIZES)
+    out, world = world_told(__doc__, argv, 1, CommunityOptions)
     album = made(community_album, out / "world", world)
     database = anchored(out / "db", album, "survey")
-    everything = album.of(*_OWN, *_FOREIGN, "copy")
-    give(database, album, everything)
-    say(f"{len(everything)} photos contributed")
-    with recording(out, album):
-        report = grow_candidates(database, GROWING)
-    tell(report)
-    found = registered(database, album)
-    codes = Counter(p.reason_code for p in report.photos if p.reason_code)
-    sys.stdout.write(breakdown(album, found))
-    verdicts = [*judge(album, found), none_failed(failures(report))]
-    figures = {"reasons": dict(codes), "seconds": report.seconds, "rounds": report.rounds}
-    return conclude(out, "community", verdicts, figures)
+    give(database, album, album.of(*_OWN, *_FOREIGN, "copy"))
+    waiting = grown(database, out, album)
+    verdicts = [*judge(album, registered(database, album)), none_failed(waiting["FAILED"])]
+    return conclude(out, "community", verdicts)
 
 
 def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
@@ -96,41 +78,6 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
         ),
         Verdict(name="wrong by more than 2 m", text=f"{len(wrong)}, none wanted", holds=not wrong),
     ]
-
-
-def breakdown(album: Album, found: Sequence[Registered]) -> str:
-    """Counts and errors by kind, owner, geotag and mode of flight."""
-    by_name = {r.fact.name: r for r in sorted(found, key=lambda r: r.status == "active")}
-    keys: dict[str, Callable[[AlbumFact], str]] = {
-        "kind": lambda f: f.kind,
-        "owner": lambda f: f.owner if f.kind in _OWN else "",
-        "geotag": lambda f: f.geotag if f.kind in _OWN else "",
-        "taken": lambda f: f.place.split(", ")[-1] if f.kind in _OWN else "",
-    }
-    rows = []
-    for name, key in keys.items():
-        groups: dict[str, list[AlbumFact]] = {}
-        for fact in album.facts.values():
-            if fact.kind != "survey" and key(fact):
-                groups.setdefault(key(fact), []).append(fact)
-        for group, facts in sorted(groups.items()):
-            here = [by_name[f.name] for f in facts if f.name in by_name]
-            active = [r for r in here if r.status == "active"]
-            errors = [r.error_m for r in active if np.isfinite(r.error_m)]
-            median = float(np.median(errors)) if errors else float("nan")
-            rows.append(
-                (
-                    f"{name} {group}",
-                    len(facts),
-                    len(active),
-                    len(here) - len(active),
-                    median,
-                    max(errors, default=float("nan")),
-                    sum(r.wrong for r in active),
-                )
-            )
-    head = ("photos", "all", "active", "quarantined", "median m", "worst m", "wrong")
-    return table(rows, head) + "\n"
 
 
 if __name__ == "__main__":

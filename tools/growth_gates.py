@@ -196,13 +196,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("files", type=Path, nargs="+", metavar="gates.jsonl")
     args = parser.parse_args(argv)
     judgements = read_judgements(args.files)
-    sys.stdout.write("step    gate                      asked refused  alone  right  wrong\n")
-    for step, gate, *figures in gate_rows(judgements):
-        sys.stdout.write(f"{step:7} {gate:24}" + "".join(f"{figure:7d}" for figure in figures) + "\n")
     rows = gate_rows(judgements)
+    sys.stdout.write("step    gate                      asked refused  alone  right  wrong\n")
+    for step, gate, *counts in rows:
+        sys.stdout.write(f"{step:7} {gate:24}" + "".join(f"{count:7d}" for count in counts) + "\n")
     figures = {
         "judged": sum(j.step == "place" for j in judgements),
-        "gates": len(rows),
         "alone_right": sum(right for *_, right, _ in rows),
         "alone_wrong": sum(wrong for *_, wrong in rows),
     }

@@ -1,6 +1,6 @@
 """Poison: look-alike blocks, mirrors, liars and forgers send photos. Is anything wrong promoted?
 
-    python -m tools.growth_poison --out DIR [--size full] [--seed N]
+    python -m tools.growth_poison --out DIR [--seed N]
 
 The world is that of `tools.worlds.poison_world`. The survey is ingested, honest photos are grown, and
 held-out photos become canaries with their true poses. Then a copy of that database gets all kinds of poison
@@ -22,7 +22,7 @@ Writes poison.json. Exit code 0 if nothing wrong was promoted and every answer c
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +35,20 @@ from featuredb.maps.move import move_map
 from featuredb.simworld.camera.photograph import render_depth
 from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
-from ingest.growing import grow_candidates
 from ingest.growth.trust.promotion import promote_by_hand
 from reloc.localiser import Localiser
+from tools.commands import newest_copy
 from tools.growth_common import (
-    GROWING,
     Album,
     Verdict,
     anchored,
     answer_of,
     conclude,
-    failures,
     give,
+    grown,
     made,
-    newest_copy,
     none_failed,
-    recording,
     registered,
-    say,
-    tell,
     world_told,
 )
 from tools.worlds.poison_world import POISONS, PoisonOptions, poison_album
@@ -68,35 +63,31 @@ class PoisonOutcome:
     """What the poison did.
 
     Attributes:
-        sent: photos. active, quarantined: of them, in such maps. wrong: photos registered wrongly in active
+        sent: photos. active: of them, in such maps. wrong: photos registered wrongly in active
             maps by their kind, the poison's and honest ones alike.
         off_share: largest share of points off the true surface among active grown maps with poison.
-        forced: maps that were forced in. restored: whether all answers came back; changed: whether any had
-            changed meanwhile.
+        forced: maps that were forced in. restored: whether all answers came back.
         failed: photos lost by an exception.
     """
 
     sent: int
     active: int
-    quarantined: int
     wrong: dict[str, int]
     off_share: float
     forced: int = 0
-    changed: bool = False
     restored: bool = True
     failed: int = 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = world_told(__doc__, argv, 4, {"short": PoisonOptions, "full": PoisonOptions.full})
+    out, world = world_told(__doc__, argv, 4, PoisonOptions)
     album = made(poison_album, out / "world", world)
     base = honest_base(out / "db", album)
     clean = max(off_shares(base, album, world).values(), default=0.0)
-    say(f"honest maps: at most {clean:.2%} of the points {_OFF_M} m off the true surface")
     outcome = try_poison(out, base, album, world)
-    fabricated = force_and_retire(newest_copy(out / "db", out / "db-forced"), album, [], fabricate=True)
-    figures = {"outcome": asdict(outcome), "clean_off_share": clean, "fabricated": fabricated}
-    return conclude(out, "poison", judge(outcome, clean, fabricated), figures)
+    forced = Database.open(newest_copy(out / "db", out / "db-forced"))
+    fabricated = force_and_retire(forced, album, [], fabricate=True)
+    return conclude(out, "poison", judge(outcome, clean, fabricated))
 
 
 def honest_base(path: Path, album: Album) -> Database:
@@ -117,22 +108,18 @@ def honest_base(path: Path, album: Album) -> Database:
         )
         add_canary(database, fact.photo_id, (album.folder / fact.name).read_bytes(), pose, origin="person")
     give(database, album, album.of("honest"))
-    with recording(path.parent, album):
-        tell(grow_candidates(database, GROWING))
+    grown(database, path.parent, album)
     return database
 
 
 def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) -> PoisonOutcome:
     """All poison on a copy of the honest database."""
-    database = newest_copy(Path(base.url), out / "db-poisoned")
+    database = Database.open(newest_copy(Path(base.url), out / "db-poisoned"))
     sent = album.of(*POISONS)
     failed = 0
     for arrived in (sent, album.of("late")):
         give(database, album, arrived)
-        with recording(out, album, "gates-poisoned"):
-            report = grow_candidates(database, GROWING)
-        tell(report)
-        failed += failures(report)
+        failed += grown(database, out, album, "gates-poisoned")["FAILED"]
     found = registered(database, album)
     active = [r for r in found if r.status == "active" and r.generation > 0]
     poisoned = {r.map_id for r in active if r.fact.kind in POISONS}
@@ -144,11 +131,9 @@ def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) ->
     return PoisonOutcome(
         sent=len(sent),
         active=sum(r.fact.kind in POISONS for r in active),
-        quarantined=sum(r.fact.kind in POISONS and r.status == "quarantined" for r in found),
         wrong=dict(Counter(r.fact.kind for r in active if r.wrong)),
         off_share=max((shares[m] for m in poisoned if m in shares), default=0.0),
         forced=forced["forced"],
-        changed=forced["changed"],
         restored=forced["restored"],
         failed=failed,
     )
@@ -160,18 +145,13 @@ def off_shares(database: Database, album: Album, world: PoisonOptions) -> dict[s
     The depth that the true camera sees at an observation's pixel against that of the map's point; edges of
     things, where a pixel decides, are left out.
     """
-    shares = {}
+    shares, found = {}, registered(database, album)
     for summary in database.snapshot().maps():
         if summary.status == "active" and summary.method == "map":
+            names = [r.fact.name for r in found if r.map_id == summary.map_id]
             feature_map = database.snapshot().load_map(summary.map_id)
-            found = registered_names(database, album, feature_map.map_id)
-            shares[summary.map_id] = _off_share(feature_map, album, world, found)
+            shares[summary.map_id] = _off_share(feature_map, album, world, names)
     return shares
-
-
-def registered_names(database: Database, album: Album, map_id: str) -> list[str]:
-    """Names in the album of a map's images, in their order."""
-    return [r.fact.name for r in registered(database, album) if r.map_id == map_id]
 
 
 def _off_share(feature_map: FeatureMap, album: Album, world: PoisonOptions, names: Sequence[str]) -> float:
@@ -203,13 +183,12 @@ def force_and_retire(
 ) -> dict[str, Any]:
     """Force maps in by hand and take them out again; whether answers changed, and whether they came back."""
     before = answers(database, album)
-    forced = list(held)
-    if fabricate:
-        forced.append(_moved_copy(database))
-    done = []
-    for map_id in forced:
-        if promote_by_hand(database, map_id, "forced for the test", force=True).promoted:
-            done.append(map_id)
+    forced = [*held, _moved_copy(database)] if fabricate else held
+    done = [
+        map_id
+        for map_id in forced
+        if promote_by_hand(database, map_id, "forced for the test", force=True).promoted
+    ]
     during = answers(database, album) if done else before
     for map_id in done:
         if database.snapshot().get(map_id).status != "retired":

@@ -12,15 +12,10 @@
 3. Camera centres of both are compared after a similarity, in metres for photos with GPS. Without GPS a
    metre is a hundredth of the extent of the camera centres (diagonal of their box), and the drift budget,
    which is in metres, is left out.
-
-Prints one line a photo with -v.
 """
 
-import argparse
-import logging
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -31,13 +26,11 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
 from ingest.executor import InProcessExecutor
 from ingest.fingerprint import digest
 from ingest.growing import reconstructed_photos
-from ingest.growth.growth_report import GrowthReport
 from ingest.growth.run import grow
 from ingest.growth.values import GrowthOptions
 from ingest.map_builder import MapIdentity, build_map
@@ -47,8 +40,7 @@ from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from tools.figures import study_parser, write_figures
-from tools.growth_common import log_to_stderr
+from tools.figures import laid_on, study_parser, write_figures
 from tools.growth_gates import recorded
 
 _PORTIONS = 3
@@ -86,14 +78,14 @@ class State:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
-    log_to_stderr(args.verbose)
+    parser = study_parser(__doc__, "--photos", "--work")
+    parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
+    parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
+    args = parser.parse_args(argv)
     found = require_usable(scan_folder(args.photos, ScanOptions()), args.photos, least=2)
     photos = [replace(photo, owner=_OWNER) for photo in found]
     making = MapMakingOptions()
-    started = time.process_time()
     joint = _reconstruct(photos, list(range(len(photos))), making, args.work)[0]
-    joint_s = time.process_time() - started
     with tempfile.TemporaryDirectory() as scratch:
         state = State(
             photos=photos,
@@ -103,13 +95,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             joint={p.name: c for p, c in zip(joint.photos, joint.model.centers(), strict=True)},
             gates=args.gates,
         )
-        started = time.process_time()
-        cut = portions(len(photos), args.cut)
-        for number, rows in enumerate([*cut, []], start=1):
+        for rows in [*portions(len(photos), args.cut), []]:
             state.waiting = sorted([*state.waiting, *rows])
-            _take_in(state, f"portion {number}" if rows else "end")
-        grown_s = time.process_time() - started
-    return _judge(state, joint, args, joint_s, grown_s)
+            _take_in(state)
+    write_figures(args.json, _judged(state, joint))
+    return 0
 
 
 def portions(count: int, cut: str) -> list[list[int]]:
@@ -121,23 +111,20 @@ def portions(count: int, cut: str) -> list[list[int]]:
     return [part.tolist() for part in parts]
 
 
-def _take_in(state: State, what: str) -> None:
+def _take_in(state: State) -> None:
     """Make the first map, or grow."""
     if state.frame is None:
-        _first_map(state, what)
+        _first_map(state)
     if state.frame is None or not state.waiting:
         return
-    report = _grow(state)
+    made = _reconstructed(state.photos, state.waiting, state.making, state.work)
+    with nullcontext() if state.gates is None else _recording(state, state.gates):
+        report = grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
+    sys.stdout.write(f"{report.as_text()}\n")
     _find_centers(state)
-    for entry in report.maps:
-        said = f"{entry.reason_code}: {entry.reason}" if entry.reason_code else _summary(state, entry.map_id)
-        print(f"  {what}: {len(entry.photos)} photos {entry.status}, {said}")
-    for photo in report.photos:
-        if photo.outcome != "promoted":
-            logging.info("  %s: %s waits, %s: %s", what, photo.name, photo.reason_code, photo.reason)
 
 
-def _first_map(state: State, what: str) -> None:
+def _first_map(state: State) -> None:
     for component in _reconstruct(state.photos, state.waiting, state.making, state.work):
         if len(component.photos) < _LEAST_FIRST:
             break
@@ -147,9 +134,7 @@ def _first_map(state: State, what: str) -> None:
                 state.growth = GrowthOptions(drift_budget_m=_NO_BUDGET_M)
             state.database.commit_maps([first])
             _find_centers(state)
-            print(f"  {what}: first map of {len(first.images)} photos, placed by {first.placement.method}")
             return
-    print(f"  {what}: no first map, {len(state.waiting)} photos wait")
 
 
 def _made_up(state: State, component: Component) -> FeatureMap | None:
@@ -180,25 +165,9 @@ def _viewing_distance(component: Component) -> float:
     return float(np.median(np.linalg.norm(offsets, axis=1)))
 
 
-def _extent(centers: FloatArray) -> float:
-    """Diagonal of the box of camera centres (n, 3)."""
-    return float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0)))
-
-
-def _grow(state: State) -> GrowthReport:
-    """One run over all waiting photos."""
-    made = _reconstructed(state.photos, state.waiting, state.making, state.work)
-    with nullcontext() if state.gates is None else _recording(state, state.gates):
-        return grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
-
-
 def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
     """The joint reconstruction's places, carried to the first map's frame by the photos that are in both."""
-    both = sorted(state.joint.keys() & state.centers.keys())
-    ours, theirs = (
-        np.array([of[name] for name in both]).reshape(-1, 3) for of in (state.centers, state.joint)
-    )
-    carried = similarity_closed_form(theirs, ours) if len(both) >= 3 else None
+    carried = laid_on(state.joint, state.centers)
     if carried is None or state.frame is None:
         return nullcontext()
 
@@ -243,51 +212,25 @@ def _identity(rows: Sequence[int]) -> MapIdentity:
     return MapIdentity(map_id=name, name=name, source="photos", licence="", provenance={})
 
 
-def _summary(state: State, map_id: str) -> str:
-    feature_map = state.database.snapshot().load_map(map_id)
-    growth = feature_map.placement.evidence["growth"]
-    figures = ", ".join(f"{name} {gate['figure']:.3g}" for name, gate in growth["gates"].items())
-    return f"by {len(feature_map.parents)} maps, drift {growth['drift_m']:.2f} m; {figures}"
-
-
-def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: float, grown_s: float) -> int:
+def _judged(state: State, joint: Component) -> dict[str, float]:
+    """Where growth has the photos against the joint reconstruction."""
     metric = joint.placement.local_from_sfm is not None and joint.placement.reason is None
     sim = joint.placement.local_from_sfm if metric else None
-    scale = _EXTENT_M / _extent(joint.model.centers())
+    scale = _EXTENT_M / float(np.linalg.norm(np.ptp(joint.model.centers(), axis=0)))
     sim = sim or Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3))
-    reference = {p.name: sim.act(c) for p, c in zip(joint.photos, joint.model.centers(), strict=True)}
+    reference = {name: sim.act(center) for name, center in state.joint.items()}
     both = sorted(reference.keys() & state.centers.keys())
-    ours = np.array([state.centers[name] for name in both]).reshape(-1, 3)
-    theirs = np.array([reference[name] for name in both]).reshape(-1, 3)
-    aligned = similarity_closed_form(ours, theirs) if len(both) >= 3 else None
-    apart = np.linalg.norm(aligned.act(ours) - theirs, axis=1) if aligned else np.full(len(both), np.nan)
-    if args.verbose:
-        for name, distance in zip(both, apart, strict=True):
-            print(f"    {name:<28} {distance:.3f} m")
-    missing = sorted(reference.keys() - state.centers.keys())
-    median = float(np.median(apart)) if len(both) else float("nan")
-    largest_m = float(apart.max(initial=0))
-    figures = {
-        "photos": len(state.photos),
+    aligned = laid_on(state.centers, reference)
+    apart = np.full(len(both), np.nan)
+    if aligned is not None:
+        apart = np.array([np.linalg.norm(aligned.act(state.centers[n]) - reference[n]) for n in both])
+    return {
         "joint": len(reference),
         "grown": len(both),
-        "missing": len(missing),
-        "missing_photos": missing,
-        "median_m": median,
-        "largest_m": largest_m,
-        "joint_cpu_s": joint_s,
-        "grown_cpu_s": grown_s,
+        "missing": len(reference.keys() - state.centers.keys()),
+        "median_m": float(np.median(apart)) if len(both) else float("nan"),
+        "largest_m": float(apart.max(initial=0)),
     }
-    write_figures(args.json, figures)
-    return 0
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__, "--photos", "--work")
-    parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
-    parser.add_argument("-v", "--verbose", action="store_true", help="one line a photo")
-    parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

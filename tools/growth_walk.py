@@ -1,40 +1,30 @@
 """A walk away from the anchor, from contributed queries alone: does coverage follow, and is the bound true?
 
-    python -m tools.growth_walk --out DIR [--size full] [--seed N]
+    python -m tools.growth_walk --out DIR [--seed N]
 
 The world is that of `tools.worlds.walk_world`. Step by step the photos of three people are contributed
 and `featuredb grow` runs once. After each step photos that nobody contributes (probes) of all steps so far
 ask where they were taken, and the new maps are compared with the truth. When everything has arrived, the
 survey at the far end is ingested and growth runs again.
 
-walk.json has for each step: active maps, how far coverage reaches, the drift that the maps claim (95 %,
-against the anchor), the bound on Earth (95 %, with what the anchor is uncertain by) beside the true error
-(length of the median error of a map's photos) of the map where the two are closest, the photo that is worst,
-probes answered, their errors and how many sigmas these are. Everything is kept in DIR, and a run that was
-interrupted goes on.
-
-Exit code 0 if: coverage follows for at least 600 m, or the way between the surveys; the true drift of every
+Writes walk.json. Exit code 0 if: coverage follows for the way between the surveys; the true drift of every
 map stays inside its bound at every step; growth stopped by itself and no active map exceeds the budget; after
 the second anchor every probe that is answered is within 0.3 m, and the maps that were there moved in one
 commit. At no step may a probe be answered more than 2 m off: one that shows land beyond the maps, too.
 """
 
-import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from featuredb.store import Database
-from ingest.growing import grow_candidates
 from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localiser import Localiser
 from tools.growth_common import (
-    GROWING,
     WRONG_M,
     Album,
     Registered,
@@ -42,20 +32,18 @@ from tools.growth_common import (
     anchored,
     answer_of,
     conclude,
-    failures,
     give,
+    grown,
     made,
     none_failed,
-    recording,
     registered,
     say,
-    tell,
     world_told,
 )
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact
 from tools.worlds.walk_world import WalkOptions, plan_walk
 
-_WALK_M, _SURVEYS_M = 600.0, 150.0  # coverage that is wanted, or what the surveys leave of the way
+_SURVEYS_M = 150.0  # of the way, which needs no coverage by others
 _AFTER_M = 0.3
 _INSIDE = float(chi2.ppf(0.95, 3))
 _PROBE_SHARE = 0.90  # of the probes inside their 95 %: of a few dozen, more may miss by chance
@@ -63,11 +51,8 @@ _PROBE_SHARE = 0.90  # of the probes inside their 95 %: of a few dozen, more may
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Probe:
-    """One held-out photo asked: its step, distance from the anchor, error and squared normalised error."""
+    """One held-out photo asked: error and squared normalised error of the answer."""
 
-    name: str
-    step: int
-    away_m: float
     error_m: float | None
     normalised: float | None
 
@@ -78,76 +63,46 @@ class Step:
 
     Attributes:
         reach_m: distance from the anchor's edge to the furthest photo in an active map.
-        maps, quarantined: numbers of grown maps.
-        drift_m: largest claimed of active maps. true_m: length of the median error of the map that is worst
-            against its bound on Earth; ratio: that over the bound. worst_m: largest error of a photo.
+        drift_m: largest claimed of active maps. ratio: of the length of the median error of the map that is
+            worst against its bound on Earth, over that bound.
         stopped: photos that wait for the drift budget. failed: photos lost by an exception.
     """
 
     step: int
     reach_m: float
-    maps: int
-    quarantined: int
     drift_m: float
-    true_m: float
     ratio: float
-    worst_m: float
     stopped: int
+    failed: int
     probes: tuple[Probe, ...]
-    failed: int = 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = world_told(__doc__, argv, 2, {"short": WalkOptions, "full": WalkOptions.full})
+    out, world = world_told(__doc__, argv, 2, WalkOptions)
     album = made(plan_walk, out / "world", world)
     database = anchored(out / "db", album, "survey")
-    log = out / "steps.json"
-    steps = _read_steps(log)
-    batches = sorted({f.batch for f in album.of("walk")})
-    for batch in batches[len(steps) :]:
-        steps.append(take_step(database, album, batch))
-        log.write_text(json.dumps([asdict(s) for s in steps]) + "\n", encoding="utf-8")
+    steps = []
+    for batch in sorted({f.batch for f in album.of("walk")}):
+        give(database, album, album.of("walk", batch=batch))
+        steps.append(measure(database, album, batch))
+        say(f"{steps[-1]}")
     end, commits = second_anchor(database, album)
-    figures: dict[str, Any] = {"steps": [asdict(s) for s in steps], "after": asdict(end), "commits": commits}
-    return conclude(out, "walk", judge(steps, end, commits, world), figures)
+    return conclude(out, "walk", judge(steps, end, commits, world))
 
 
-def take_step(database: Database, album: Album, batch: int) -> Step:
-    """Contribute one step's photos, grow once, measure."""
-    give(database, album, album.of("walk", batch=batch))
-    with recording(Path(database.url).parent, album):
-        report = grow_candidates(database, GROWING)
-    tell(report)
-    stopped = sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
-    step = replace(measure(database, album, batch, stopped), failed=failures(report))
-    answered = [p for p in step.probes if p.error_m is not None]
-    worst = max((p.error_m or 0.0 for p in answered), default=float("nan"))
-    say(
-        f"step {batch + 1}: reach {step.reach_m:.0f} m, drift claimed {step.drift_m:.2f} m, "
-        f"true {step.true_m:.2f} m ({step.ratio:.0%} of its bound), worst photo {step.worst_m:.2f} m, "
-        f"probes {len(answered)}/{len(step.probes)}, worst {worst:.2f} m"
-    )
-    return step
-
-
-def measure(database: Database, album: Album, batch: int, stopped: int) -> Step:
-    """Maps and probes of all steps up to this one against the truth."""
-    found = registered(database, album)
+def measure(database: Database, album: Album, batch: int) -> Step:
+    """Grow once: maps and probes of all steps up to this one against the truth."""
+    waiting = grown(database, Path(database.url).parent, album)
     edge = max(_along(album, f) for f in album.of("survey"))
-    grown = [r for r in found if r.generation > 0]
-    active = [r for r in grown if r.status == "active"]
-    true, ratio = worst_map(active)
+    active = [r for r in registered(database, album) if r.generation > 0 and r.status == "active"]
     return Step(
         step=batch,
         reach_m=max((_along(album, r.fact) - edge for r in active), default=0.0),
-        maps=len({r.map_id for r in active}),
-        quarantined=len({r.map_id for r in grown} - {r.map_id for r in active}),
         drift_m=max((r.drift_m or 0.0 for r in active), default=0.0),
-        true_m=true,
-        ratio=ratio,
-        worst_m=max((r.error_m for r in active), default=0.0),
-        stopped=stopped,
-        probes=tuple(ask_probes(database, album, batch, edge)),
+        ratio=worst_map(active)[1],
+        stopped=waiting["DRIFT_BUDGET"],
+        failed=waiting["FAILED"],
+        probes=tuple(ask_probes(database, album, batch)),
     )
 
 
@@ -162,7 +117,7 @@ def worst_map(found: Sequence[Registered]) -> tuple[float, float]:
     return worst
 
 
-def ask_probes(database: Database, album: Album, upto: int, edge: float) -> list[Probe]:
+def ask_probes(database: Database, album: Album, upto: int) -> list[Probe]:
     """Ask for every probe of the steps so far."""
     localiser = Localiser.open(database)
     probes = []
@@ -173,19 +128,11 @@ def ask_probes(database: Database, album: Album, upto: int, edge: float) -> list
         error, normalised = None, None
         if pose is not None:
             true = album.truth.images[fact.name].cam_from_local.center
-            center = album.truth.frame.enu_from(pose.frame).act(pose.cam_from_local.center[None])[0]
+            center = album.truth.frame.enu_from(pose.frame).act(pose.cam_from_local.center)
             offset = center - true
             error = float(np.linalg.norm(offset))
             normalised = float(offset @ np.linalg.solve(pose.covariance[3:, 3:], offset))
-        probes.append(
-            Probe(
-                name=fact.name,
-                step=fact.batch,
-                away_m=_along(album, fact) - edge,
-                error_m=error,
-                normalised=normalised,
-            )
-        )
+        probes.append(Probe(error_m=error, normalised=normalised))
     return probes
 
 
@@ -193,25 +140,20 @@ def second_anchor(database: Database, album: Album) -> tuple[Step, int]:
     """Ingest the far survey, grow, measure; also in how many commits the maps that were there moved."""
     placed = {m.map_id: m.write_id for m in database.snapshot().maps()}
     version = database.poll_version()
-    path = Path(database.url)
-    anchored(path, album, "survey_far")
-    with recording(Path(database.url).parent, album):
-        report = grow_candidates(database, GROWING)
-    tell(report)
+    anchored(Path(database.url), album, "survey_far")
+    end = measure(database, album, max(f.batch for f in album.of("walk")))
     history = [database.snapshot(v) for v in range(version, database.poll_version() + 1)]
     commits, known = 0, placed
     for snapshot in history:
         now = {m.map_id: m.write_id for m in snapshot.maps()}
         commits += any(now[i] != known[i] for i in now.keys() & placed.keys())
         known = {**known, **now}
-    last = max(f.batch for f in album.of("walk"))
-    stopped = sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
-    return replace(measure(database, album, last, stopped), failed=failures(report)), commits
+    return end, commits
 
 
 def judge(steps: Sequence[Step], end: Step, commits: int, world: WalkOptions) -> list[Verdict]:
     """The contract's lines."""
-    wanted = min(_WALK_M, world.end_m - world.start_m - _SURVEYS_M)
+    wanted = world.end_m - world.start_m - _SURVEYS_M
     reach = max((s.reach_m for s in steps), default=0.0)
     stopped = next((s for s in steps if s.stopped), None)
     ratio = max((s.ratio for s in steps), default=0.0)
@@ -268,13 +210,6 @@ def _along(album: Album, fact: AlbumFact) -> float:
     ]
     way = ends[1] - ends[0]
     return float((center[:2] - ends[0]) @ way / np.linalg.norm(way))
-
-
-def _read_steps(log: Path) -> list[Step]:
-    if not log.exists():
-        return []
-    rows = json.loads(log.read_text(encoding="utf-8"))
-    return [Step(**{**row, "probes": tuple(Probe(**p) for p in row["probes"])}) for row in rows]
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ pairs where they have none, incremental mapping. Ours is `featuredb ingest photo
 commit. Each is a process of its own, the one after the other.
 """
 
-import argparse
 import json
 import resource
 import subprocess
@@ -20,7 +19,7 @@ from typing import Any
 
 from featuredb.maps.feature_map import FeatureMap
 from tools.figures import study_parser, write_figures
-from tools.made_maps import all_maps, photo_names
+from tools.made_maps import all_maps
 
 _NEIGHBOURS = 15
 _SIDE_PX = 1600
@@ -51,7 +50,6 @@ print(json.dumps(max(([m.image(i).name for i in m.reg_image_ids()] for m in mode
 class Cost:
     """Of one set: processor seconds, photos in the largest model or map and in both, maps with a place."""
 
-    photos: int
     colmap_s: float
     colmap_photos: int
     ours_s: float
@@ -65,7 +63,9 @@ class Cost:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
+    args = parser.parse_args(argv)
     costs = {folder.parent.name: measured(folder) for folder in args.folders}
     figures: dict[str, Any] = {
         name: asdict(cost) | {"ratio": cost.ratio, "share": cost.both / max(1, cost.colmap_photos)}
@@ -89,7 +89,6 @@ def measured(folder: Path) -> Cost:
     theirs = set(json.loads(told.splitlines()[-1]))
     ours = {image.name for image in max(maps, key=lambda one: len(one.images)).images}
     return Cost(
-        photos=len(photo_names(folder)),
         colmap_s=colmap_s,
         colmap_photos=len(theirs),
         ours_s=ours_s,
@@ -107,12 +106,6 @@ def _processor_s(*argv: str) -> tuple[float, str]:
     if done.returncode:
         raise SystemExit(f"exit code {done.returncode}: {' '.join(argv[:4])}")
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done.stdout
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from featuredb.features.exif.write import gps_directory
+from featuredb.features.jpeg_segments import EXIF_PREFIX, with_app1
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -94,11 +95,8 @@ def with_exif(truth: LaserSet, names: Sequence[str], folder: Path, *, positions:
             gps = gps_directory((float(lat), float(lon), float(height)))
             exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
             exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSHPositioningError] = SIGMA_M
-        data, content = (truth.photos / name).read_bytes(), exif.tobytes()
-        if data[:2] != b"\xff\xd8":
-            raise SystemExit(f"{truth.photos / name}: expected a JPEG file")
-        segment = b"\xff\xe1" + (len(content) + 2).to_bytes(2, "big") + content
-        (folder / name).write_bytes(data[:2] + segment + data[2:])
+        content = exif.tobytes().removeprefix(EXIF_PREFIX)
+        (folder / name).write_bytes(with_app1((truth.photos / name).read_bytes(), content, b""))
     return folder
 
 

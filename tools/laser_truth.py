@@ -5,14 +5,13 @@
 Of the folder (see `tools.laser_set`) all photos but every fifth from the third on are ingested into a new
 database, with exact positions and the EXIF of one camera whose focal length is rounded to a whole
 millimetre of 35 mm film. The other photos are asked of a server twice: with their true camera, and with EXIF
-alone. Prints, for the map's cameras and for both kinds of answers: the median and largest error of position
+alone. Prints, for the map's cameras and for both kinds of answers: the median error of position
 and orientation, the median of the 68 % radius that was reported, and the baseline's median
 (`tools.laser_baseline`); and how far the map's lens is from the true one, over the standard deviations that
 the map stores of it (root mean square of its parameters: 1 is right). Worst is the largest ratio
 of a median to the baseline's, or to the reported radius.
 """
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -49,7 +48,9 @@ class Errors:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__)
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as scratch:
         figures = judged(read_laser_set(args.folder), Path(scratch) / args.folder.name)
     write_figures(args.json, figures)
@@ -60,7 +61,7 @@ def judged(truth: LaserSet, work: Path) -> dict[str, float]:
     """The figures of one set."""
     photos = with_exif(truth, truth.mapped, work / "photos", positions=True)
     asked = with_exif(truth, truth.asked, work / "asked", positions=False)
-    make(work / "db", "photos", photos, len(truth.mapped))
+    make(work / "db", "photos", photos)
     maps = [one for one in all_maps(work / "db") if isinstance(one, FeatureMap)]
     if not maps:
         raise SystemExit(f"{truth.photos}: no map was placed")
@@ -86,7 +87,7 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
     ratios = []
     for kind, errors in kinds.items():
         other = theirs["map" if kind == "map" else "asked"]
-        figures |= {f"{kind}_wanted": errors.wanted, f"{kind}_found": len(errors.metres)}
+        figures[f"{kind}_found"] = len(errors.metres)
         for unit in ("m", "deg"):
             mine = errors.metres if unit == "m" else errors.degrees
             reported = errors.told_m if unit == "m" else errors.told_deg
@@ -94,7 +95,6 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
             median = _median(mine)
             figures |= {
                 f"{kind}_{unit}": median,
-                f"{kind}_largest_{unit}": max(mine, default=float("nan")),
                 f"{kind}_reported_{unit}": _median(reported),
                 f"{kind}_colmap_{unit}": _median(baseline),
             }
@@ -167,12 +167,6 @@ def pose_errors(
 
 def _median(values: Sequence[float]) -> float:
     return float(np.median(values)) if len(values) else float("nan")
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("folder", type=Path, metavar="FOLDER")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

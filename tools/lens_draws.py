@@ -54,8 +54,7 @@ from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
-from tools.calibration import pose_offset
-from tools.figures import study_parser, write_figures
+from tools.figures import pose_offset, study_parser, write_figures
 
 _WIDTH, _HEIGHT, _FOCAL_PX = 1200, 900, 1000.0
 _SIGMAS_M = (0.02, 0.5, 3.0)  # of positions

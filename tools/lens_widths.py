@@ -13,7 +13,6 @@ disagree about its lens (`featuredb.adjust.lens_agreement`), and by how much sin
 (`ingest.colmap.picture_shear`).
 """
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
@@ -37,7 +36,7 @@ from ingest.photos.photo import Photo
 from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
 from tools.figures import study_parser, write_figures
-from tools.made_maps import all_maps, make, photo_names
+from tools.made_maps import all_maps, make
 
 WIDTHS = tuple(field.name for field in fields(LensWidths))
 _DROP = float(chi2.ppf(0.95, 1)) / 2.0
@@ -67,7 +66,9 @@ class Told:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__, "--work")
+    parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
+    args = parser.parse_args(argv)
     options = AdjustOptions()
     told: list[Told] = []
     disagreement: list[float] = []
@@ -214,14 +215,8 @@ def _database(folder: Path, work: Path) -> Path:
     if not database.exists():
         control = folder.parent / "gcp_list.txt"
         more = ("--gcp", str(control)) if control.exists() else ()
-        make(database, "photos", folder, len(photo_names(folder)), more)
+        make(database, "photos", folder, more)
     return database
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__, "--work")
-    parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

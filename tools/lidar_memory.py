@@ -4,8 +4,7 @@
 
 The scan is an airborne one of a rolling land with houses and trees, written strip by strip as LAS 1.4, so
 that making it needs little memory, too. The command runs in a process of its own; the memory of that process
-and all its children (resident set) is sampled ten times a second, and the largest the kernel has seen of the
-process is asked for in the end.
+and all its children (resident set) is sampled ten times a second.
 """
 
 import os
@@ -13,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
+from contextlib import suppress
 from pathlib import Path
 
 import laspy
@@ -22,6 +21,7 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 from pyproj import CRS
 
 from tools.figures import study_parser, write_figures
+from tools.serve_process import beside, children
 
 CHUNK = 500_000
 EPSG = 32632
@@ -74,28 +74,18 @@ def _surface(
 
 def tree_rss_bytes(root: int) -> int:
     """Resident memory of a process and all its descendants."""
-    children: dict[int, list[int]] = {}
-    resident: dict[int, int] = {}
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        try:
-            fields = (entry / "stat").read_text().rsplit(")", 1)[1].split()
-        except OSError:
-            continue  # it has ended meanwhile
-        children.setdefault(int(fields[1]), []).append(int(entry.name))
-        resident[int(entry.name)] = int(fields[21]) * os.sysconf("SC_PAGE_SIZE")
-    total, todo = 0, [root]
-    while todo:
-        process = todo.pop()
-        total += resident.get(process, 0)
-        todo += children.get(process, [])
-    return total
+    total, tree = 0, [root]
+    while tree:
+        process = tree.pop()
+        tree += children(process)
+        with suppress(OSError):  # it has ended meanwhile
+            total += int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    return total * os.sysconf("SC_PAGE_SIZE")
 
 
 def measure(command: list[str]) -> dict[str, float]:
-    """Run a command; wall and CPU seconds, peak memory of the tree and of the process."""
-    started, peak = time.perf_counter(), 0
+    """Run a command; CPU seconds, and peak memory of its processes."""
+    peak = 0
     process = subprocess.Popen(command, stdout=sys.stderr)
     done = threading.Event()
 
@@ -104,19 +94,11 @@ def measure(command: list[str]) -> dict[str, float]:
         while not done.wait(SAMPLE_S):
             peak = max(peak, tree_rss_bytes(process.pid))
 
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    _, status, usage = os.wait4(process.pid, 0)
-    done.set()
-    watcher.join()
+    with beside([threading.Thread(target=watch)], done):
+        _, status, usage = os.wait4(process.pid, 0)
     if os.waitstatus_to_exitcode(status) != 0:
         raise SystemExit(f"{' '.join(command)} failed with status {os.waitstatus_to_exitcode(status)}")
-    return {
-        "seconds": time.perf_counter() - started,
-        "cpu_seconds": usage.ru_utime + usage.ru_stime,
-        "peak_tree_mib": peak / 2**20,
-        "peak_process_mib": usage.ru_maxrss / 2**10,
-    }
+    return {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_tree_mib": peak / 2**20}
 
 
 def main() -> int:
@@ -134,12 +116,9 @@ def main() -> int:
     database = args.folder / "scans.db"
     shutil.rmtree(database, ignore_errors=True)
     run = [sys.executable, "-m", "featuredb.cli", "lidar", "add", str(database), str(scan), "--quiet"]
-    figures = {"points": args.points, "scan_bytes": scan.stat().st_size, **measure(run)}
-    figures["points_per_second"] = args.points / figures["seconds"]
+    figures = measure(run)
     figures["points_per_cpu_second"] = args.points / figures["cpu_seconds"]
-    figures["database_bytes"] = sum(f.stat().st_size for f in database.rglob("*") if f.is_file())
-    figures = {k: round(v, 1) for k, v in figures.items()}
-    write_figures(args.json, figures)
+    write_figures(args.json, {k: round(v, 1) for k, v in figures.items()})
     return 0
 
 

@@ -26,12 +26,12 @@ from reloc.localiser import Localiser
 from reloc.overlay import map_points_in_view
 from reloc.pixels.locate import locate
 from reloc.pixels.surfaces import MapSurface, RaySurface, scan_surface
-from tools.anchor_brighton import anchored_on, arguments
+from tools.anchor_brighton import anchored_on
 from tools.figures import write_figures
 from tools.locate_pixels import Miss, miss_figures, misses, view_of
 from tools.picked import Scan, read_scan, visible
 from tools.real_photos import ingest
-from tools.scan_truth import scan_truth
+from tools.scan_truth import scan_parser, scan_truth
 
 _SEED, _PIXELS = 1, 300  # of each photo
 _NEAR, _REACH_PX = 12, 12.0  # points of the scan around a pixel, and how far they may be
@@ -39,7 +39,7 @@ _ONE_SURFACE_M = 0.3  # between the depths of nine tenths of them
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = arguments(__doc__, argv)
+    args = scan_parser(__doc__, "--work", "--held-out").parse_args(argv)
     truth = scan_truth(args)
     scan = read_scan(args.scan, truth.frame, truth.epsg)
     rng = np.random.default_rng(_SEED)

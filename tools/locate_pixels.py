@@ -21,9 +21,8 @@ from featuredb.adjust.block import whole_camera
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
-from featuredb.simworld.town.scene import Scene, texture_index
+from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.truth import TrueImage, Truth
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
@@ -33,9 +32,11 @@ from reloc.pixels.locate import PixelPlace, locate
 from reloc.pixels.surfaces import RaySurface, scan_surface
 from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
-from tools.anchor_simworld import anchored, featuredb
+from tools.anchor_simworld import anchored
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 from tools.worlds.scan_world import make_scan_world
+from tools.worlds.seen_places import SeenPlaces
 
 _SEED = 1
 _PIXELS, _DRAWS = 60, 16  # of each photo: pixels, and draws of a pose and a lens
@@ -74,15 +75,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         assert surface is not None
         surface.common_m = _STRIPS_M
         target = _Target(scene, truth, photo, view)
-        pixels = target.pixels(rng, _PIXELS)
-        found = misses(view, target.places(pixels), locate(view, surface, pixels))
+        found = target.looked_at(rng, surface, _PIXELS)
         answered += found
-        refused += len(pixels) - len(found)
+        refused += _PIXELS - len(found)
         for _ in range(_DRAWS):
             drawn += target.drawn(rng, surface, _PIXELS // 5)
     figures = miss_figures("answered", answered) | miss_figures("drawn", drawn)
-    figures |= {"refused": refused, "located": len(answered), "draws": len(drawn)}
-    write_figures(args.json, figures)
+    write_figures(args.json, figures | {"refused": refused, "located": len(answered)})
     return 0
 
 
@@ -90,38 +89,29 @@ class _Target:
     """A photo whose every pixel has a true place, in the frame of its answer."""
 
     def __init__(self, scene: Scene, truth: Truth, photo: TrueImage, view: AnsweredView) -> None:
-        self.camera = photo.camera
-        self.cam_from_local = photo.cam_from_local @ truth.frame.enu_from(view.frame)
-        self.view = view
-        rendered = render_depth(scene, photo.camera, photo.cam_from_local)
-        self.depth = rendered.depth
-        cars = scene.faces.object_id[scene.faces.texture == texture_index("car")]
-        self.still = np.isfinite(self.depth) & ~np.isin(rendered.object_id, np.unique(cars))
+        self._here = view.frame.enu_from(truth.frame)
+        self._photo, self._view = photo, view
+        self._seen = SeenPlaces(scene, photo.camera, photo.cam_from_local)
 
-    def pixels(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Centres (count, 2) of pixels that show what stands in both, photo and scan."""
-        rows, columns = np.nonzero(self.still)
-        chosen = rng.choice(len(rows), count, replace=False)
-        return np.column_stack([columns[chosen], rows[chosen]]) + 0.5
-
-    def places(self, pixels: FloatArray) -> FloatArray:
-        """(n, 3) true places."""
-        depth = self.depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)].astype(np.float64)
-        rays = np.column_stack([self.camera.unproject(pixels), np.ones(len(pixels))])
-        return self.cam_from_local.inverse().act(rays * depth[:, None])
+    def looked_at(
+        self, rng: np.random.Generator, surface: RaySurface, count: int, view: AnsweredView | None = None
+    ) -> list[Miss]:
+        """Misses of pixels at random, of what stands in both, photo and scan; `view`: or the answer's."""
+        pixels = self._seen.pixels(rng, count)
+        found = locate(view or self._view, surface, pixels)
+        return misses(self._view, self._here.act(self._seen.places(pixels)), found)
 
     def drawn(self, rng: np.random.Generator, surface: RaySurface, count: int) -> list[Miss]:
         """Misses from a pose and a lens that are off as the answer's covariance says."""
-        error = rng.multivariate_normal(np.zeros(len(self.view.covariance)), self.view.covariance)
-        local_from_cam = self.cam_from_local.inverse()
+        error = rng.multivariate_normal(np.zeros(len(self._view.covariance)), self._view.covariance)
+        local_from_cam = (self._photo.cam_from_local @ self._here.inverse()).inverse()
         turned = so3_exp(error[:3]).T @ local_from_cam.rotation
         pose = Rigid3(rotation=turned, translation=local_from_cam.translation - error[3:6]).inverse()
-        camera = whole_camera(self.camera) if len(error) > 6 else self.view.camera
+        camera = self._view.camera
         if len(error) > 6:
+            camera = whole_camera(self._photo.camera)
             camera = replace(camera, params=tuple(np.array(camera.params) - error[6:]))
-        view = replace(self.view, camera=camera, cam_from_local=pose)
-        pixels = self.pixels(rng, count)
-        return misses(view, self.places(pixels), locate(view, surface, pixels))
+        return self.looked_at(rng, surface, count, replace(self._view, camera=camera, cam_from_local=pose))
 
 
 def misses(view: AnsweredView, places: FloatArray, found: Sequence[PixelPlace]) -> list[Miss]:

@@ -8,12 +8,10 @@ what the placement of the first leaves between positions and the map (of --gcp: 
 which no other position is known). Exit code 0 if there is a map.
 """
 
-import argparse
 import io
-import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -22,7 +20,7 @@ from PIL import Image
 from featuredb.features.jpeg_segments import EXIF_PREFIX, with_app1
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -34,12 +32,11 @@ class Made:
     """What an ingest came to.
 
     Attributes:
-        photos: given; 0 for a film (`make`). largest, mapped: photos in the largest map, and in any.
+        largest, mapped: photos in the largest map, and in any.
         maps: with a place and without. seconds: of the command.
         residual_m: root mean square of the first placed map's; NaN without one.
     """
 
-    photos: int
     largest: int
     mapped: int
     maps: int
@@ -49,14 +46,16 @@ class Made:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__, "--photos", "--work")
+    parser.add_argument("--gcp", type=Path, default=None, metavar="FILE", help="control points of the photos")
+    args = parser.parse_args(argv)
     control = () if args.gcp is None else ("--gcp", str(args.gcp))
-    made = make(args.work / "db", "photos", args.photos, len(photo_names(args.photos)), control)
-    write_figures(args.json, asdict(made))
+    made = make(args.work / "db", "photos", args.photos, control)
+    write_figures(args.json, asdict(made) | {"photos": len(photo_names(args.photos))})
     return 0 if made.maps else 1
 
 
-def make(database: Path, kind: str, source: Path, photos: int, more: Sequence[str] = ()) -> Made:
+def make(database: Path, kind: str, source: Path, more: Sequence[str] = ()) -> Made:
     """Ingest photos or a film, with more arguments, and count what is in maps."""
     start = time.monotonic()
     featuredb("ingest", kind, str(database), str(source), "--quiet", *more, may_refuse=True)
@@ -66,7 +65,6 @@ def make(database: Path, kind: str, source: Path, photos: int, more: Sequence[st
     sizes = [*(m.images for m in placed), *(m.images for m in snapshot.unplaced_maps())]
     residual_m = [snapshot.load_map(m.map_id).placement.residual_rms_m for m in placed[:1]]
     return Made(
-        photos=photos,
         largest=max(sizes, default=0),
         mapped=sum(sizes),
         maps=len(sizes),
@@ -88,10 +86,12 @@ def photo_names(folder: Path) -> list[str]:
     return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
 
 
-def bare_film(film: Path, folder: Path) -> Path:
-    """A copy of a film with nothing beside it."""
-    folder.mkdir(parents=True)
-    return Path(shutil.copy(film, folder))
+def position_table(folder: Path, rows: Iterable[tuple[object, ...]]) -> Path:
+    """A table beside photos: name, latitude, longitude (degrees), height, and both accuracies (m)."""
+    lines = ["path,lat,lon,height,accuracy,accuracy_height", *(",".join(map(str, row)) for row in rows)]
+    table = folder / "table.csv"
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return table
 
 
 def copied(folder: Path, names: Sequence[str], target: Path, *, strip: bool) -> Path:
@@ -109,12 +109,6 @@ def without_position(jpeg: bytes) -> bytes:
         exif = image.getexif()
     exif.pop(_GPS_IFD, None)
     return with_app1(jpeg, exif.tobytes().removeprefix(EXIF_PREFIX), b"")
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__, "--photos", "--work")
-    parser.add_argument("--gcp", type=Path, default=None, metavar="FILE", help="control points of the photos")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

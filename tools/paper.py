@@ -25,9 +25,9 @@ from ingest.workspace import default_root
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
-from tools.anchor_simworld import featuredb
-from tools.figures import write_figures
-from tools.made_maps import bare_film, make
+from tools.commands import featuredb
+from tools.figures import study_parser, write_figures
+from tools.made_maps import make
 from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import axis_errors, film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
@@ -38,7 +38,7 @@ _PLACED = "placed.json"  # what came of the film; who starts again goes on from 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    args = study_parser(__doc__, "--out", "--inputs", "--seed").parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     write_figures(args.out / "paper.json", film(args))
     return 0
@@ -75,8 +75,9 @@ def film(args: argparse.Namespace) -> dict[str, Any]:
 def placed_film(film_file: Path, scan: Path, truth: FilmTruth, work: Path, seed: int) -> dict[str, Any]:
     """The film's map in `work`/db, placed by picks in one frame: its id, keyframes, seconds; or why not."""
     shutil.rmtree(work, ignore_errors=True)
-    bare, database = bare_film(film_file, work), work / "db"
-    made = make(database, "video", bare, 0)
+    work.mkdir(parents=True)
+    bare, database = Path(shutil.copy(film_file, work)), work / "db"  # with nothing beside it
+    made = make(database, "video", bare)
     featuredb("lidar", "add", str(database), str(scan), "--quiet")
     unplaced = Database.open(database).snapshot().unplaced_maps()
     if not unplaced:
@@ -133,14 +134,6 @@ def seen_in_the_middle(database: Path, map_id: str, truth: FilmTruth) -> Seen:
 def frame_of(image: str) -> int:
     """The number of the film's frame that a keyframe is, by its name."""
     return int("".join(c for c in Path(image).stem if c.isdigit()))
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--inputs", type=Path, default=None, help="keep world and film there, not in --out")
-    parser.add_argument("--seed", type=int, default=1, help="of the picks")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from tools.anchor_simworld import featuredb
+from tools.commands import anchor
 
 # A point hides others of its cell that are farther by more than this share of the distance.
 _CELL_PX, _HIDDEN_REL = 12.0, 0.01
@@ -86,9 +86,7 @@ def place_by_picks(
     """Place a map on its scan by six picks with 3 px of error in one image; whether it was placed."""
     drawn = picks(scan, seen.camera, seen.cam_from_local, np.random.default_rng(seed), _SIGMA_PX)
     file = write_picks(work / "picks.csv", seen.image, *drawn)
-    words = ("anchor", str(database), map_id, "--photos", str(photos), "--picks", str(file))
-    out = ("--image", seen.image, "--out", str(work / "anchor"), "--auto", "--quiet")
-    return featuredb(*words, *out, may_refuse=True) == 0
+    return anchor(database, map_id, photos, work / "anchor", "--picks", str(file), "--image", seen.image)
 
 
 def write_picks(path: Path, image: str, pixels: FloatArray, utm: FloatArray) -> Path:

@@ -30,7 +30,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.own_frame import held_of
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from tools.figures import study_parser, write_figures
-from tools.made_maps import all_maps, make, photo_names
+from tools.made_maps import all_maps, make
 
 SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
@@ -232,7 +232,7 @@ def real_flight(folder: Path, work: Path) -> Flight:
     """The cameras of the largest map of a folder of photos, by its own positions."""
     database = work / folder.parent.name
     if not database.exists():
-        make(database, "photos", folder, len(photo_names(folder)))
+        make(database, "photos", folder)
     largest = max(all_maps(database), key=lambda one: len(one.images))
     images = sorted(
         largest.images, key=lambda image: (image.capture_time is None, image.capture_time, image.name)

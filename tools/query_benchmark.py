@@ -8,11 +8,11 @@ Beside it, between the same queries: OpenCV's SIFT alone (3,000 features of the 
 decoding in grey. A query without its decoding is compared with the one, its decoding with the other.
 """
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -39,43 +39,33 @@ _WITH_PRIOR = LocaliseWireRequest(options=RequestOptions(exif_prior=True))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timed:
-    """One query: its time measured from outside, and as the answer says it."""
+    """One query: its time measured from outside, and of OpenCV."""
 
     reply: LocaliseReply
     wall_ms: float
-    total_ms: float
     opencv_ms: dict[str, float]  # "decode" and "sift" of the same photo, right after it
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__)
+    parser.add_argument("db")
+    parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE")
+    args = parser.parse_args(argv)
     database = Database.open(args.db)
     with capped_process(_THREADS):
         localiser = Localiser.open(database)
-        direct = run_direct(localiser, args.images)
-        served = run_served(database, args.images)
+        direct = timed(lambda data: answer_query(_WITH_PRIOR, data, localiser), args.images)
+        options = ServeOptions(listen=("tcp/127.0.0.1:0",), threads_per_worker=_THREADS)
+        with start_server(database, options) as server, Client(server.endpoints[0]) as client:
+            ask = partial(client.localise, exif_prior=True, timeout_s=60.0)
+            served = timed(ask, args.images)
     write_figures(args.json, figures(direct, served))
     return 0
 
 
-def run_direct(localiser: Localiser, images: Sequence[Path]) -> list[Timed]:
-    """Each image five times in this process, after one round that is not counted."""
-
-    def ask(data: bytes) -> LocaliseReply:
-        return answer_query(_WITH_PRIOR, data, localiser)
-
-    return _rounds(ask, images)
-
-
-def run_served(database: Database, images: Sequence[Path]) -> list[Timed]:
-    """The same over Zenoh."""
-    options = ServeOptions(listen=("tcp/127.0.0.1:0",), threads_per_worker=_THREADS)
-    with start_server(database, options) as server, Client(server.endpoints[0]) as client:
-        return _rounds(lambda data: client.localise(data, exif_prior=True, timeout_s=60.0), images)
-
-
-def _rounds(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list[Timed]:
-    timed = []
+def timed(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list[Timed]:
+    """Each image five times, after one round that is not counted."""
+    found = []
     contents = [path.read_bytes() for path in images]
     for number in range(_REPEAT + 1):
         for data in contents:
@@ -83,11 +73,8 @@ def _rounds(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> li
             reply = ask(data)
             wall_ms = 1e3 * (time.perf_counter() - start)
             if number:
-                total_ms = reply.timings_ms["total"]
-                timed.append(
-                    Timed(reply=reply, wall_ms=wall_ms, total_ms=total_ms, opencv_ms=opencv_ms(data))
-                )
-    return timed
+                found.append(Timed(reply=reply, wall_ms=wall_ms, opencv_ms=opencv_ms(data)))
+    return found
 
 
 def opencv_ms(data: bytes) -> dict[str, float]:
@@ -109,7 +96,7 @@ def figures(direct: Sequence[Timed], served: Sequence[Timed]) -> dict[str, float
     return {
         "wall_ms": median(one.wall_ms for one in served),
         "in_process_ms": median(one.wall_ms for one in direct),
-        "transport_ms": median(one.wall_ms - one.total_ms for one in served),
+        "transport_ms": median(one.wall_ms - one.reply.timings_ms["total"] for one in served),
         "sift_ms": median(one.opencv_ms["sift"] for one in served),
         "over_sift": median(
             (one.wall_ms - one.reply.timings_ms["decode"]) / one.opencv_ms["sift"] for one in served
@@ -118,13 +105,6 @@ def figures(direct: Sequence[Timed], served: Sequence[Timed]) -> dict[str, float
         "asked": len(served),
         "localised": sum(one.reply.status == "localised" for one in served),
     }
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("db")
-    parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

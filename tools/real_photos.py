@@ -10,10 +10,7 @@
 
 """
 
-import argparse
 import json
-import resource
-import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -32,10 +29,10 @@ from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
-from tools.figures import study_parser, write_figures
+from tools.commands import featuredb
+from tools.figures import spread, study_parser, write_figures
 from tools.made_maps import photo_names
 
-_ROOT = Path(__file__).resolve().parent.parent
 _EVERY = 5  # without --held-out, one photo in so many is held out
 
 
@@ -46,16 +43,12 @@ class Ingest:
     Attributes:
         usable, registered: photos that were taken from the folder, and those that are in a map.
         wall_s: of the whole command, from the start of its process on an empty database.
-        cpu_s: of all its processes; on an idle machine of two cores the wall time is at least half of it.
-        stages_s: wall time by stage.
     """
 
     database: str
     usable: int
     registered: int
     wall_s: float
-    cpu_s: float
-    stages_s: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,32 +58,22 @@ class HeldOutRow:
     name: str
     reason: str
     error: PoseError | None
-    inliers: int
-    camera: str
     position_68_m: float
     orientation_68_deg: float
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
-    held_out = tuple(args.held_out) or every_nth(args.photos)
+    parser = study_parser(__doc__, "--photos", "--work")
+    parser.add_argument("--held-out", nargs="+", metavar="NAME", help=f"default: every {_EVERY}th photo")
+    args = parser.parse_args(argv)
+    held_out = args.held_out or photo_names(args.photos)[_EVERY // 2 :: _EVERY]
     work: Path = args.work
     part = ingest(work / "part", args.photos, held_out)
-    sys.stdout.write(f"{part}\n")
-    whole = ingest(work / "whole", args.photos, ())
-    sys.stdout.write(f"{whole}\n")
+    ingest(work / "whole", args.photos, ())
     rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
-    sys.stdout.write("".join(f"{row}\n" for row in rows))
-    write_figures(
-        args.json,
-        {"usable": part.usable, "registered": part.registered, "ingest_s": part.wall_s} | error_figures(rows),
-    )
+    counts = {"usable": part.usable, "registered": part.registered, "ingest_s": part.wall_s}
+    write_figures(args.json, counts | error_figures(rows))
     return 0
-
-
-def every_nth(folder: Path) -> tuple[str, ...]:
-    """Names of every fifth photo of the folder."""
-    return tuple(photo_names(folder)[_EVERY // 2 :: _EVERY])
 
 
 def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None) -> Ingest:
@@ -104,16 +87,13 @@ def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | No
     """
     if database.exists():
         raise SystemExit(f"{database} is there already; a map is made from nothing there")
-    database.parent.mkdir(parents=True, exist_ok=True)
     report = database.with_name(f"{database.name}-report")
-    command = [sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)]
-    command += ["--quiet", "--report", str(report), *(f"--exclude={name}" for name in exclude)]
-    command += [] if work is None else ["--work", str(work)]
-    cpu_before, start = _children_cpu_s(), time.perf_counter()
-    done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
+    words = ["ingest", "photos", str(database), str(photos), "--quiet", "--report", str(report)]
+    words += [f"--exclude={name}" for name in exclude]
+    words += [] if work is None else ["--work", str(work)]
+    start = time.perf_counter()
+    featuredb(*words)
     wall_s = time.perf_counter() - start
-    if done.returncode != 0:
-        raise SystemExit(f"{' '.join(command)}\n{done.stdout}{done.stderr}")
     document = json.loads((report / "report.json").read_text(encoding="utf-8"))
     statuses = [photo["status"] for photo in document["photos"]]
     return Ingest(
@@ -121,8 +101,6 @@ def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | No
         usable=sum(status != "skipped" for status in statuses),
         registered=statuses.count("registered"),
         wall_s=wall_s,
-        cpu_s=_children_cpu_s() - cpu_before,
-        stages_s={stage["name"]: stage["seconds"] for stage in document["stages"]},
     )
 
 
@@ -169,6 +147,7 @@ def ask_poses(
         for name in names:
             reply = client.localise(photos / name, camera=camera, timeout_s=60.0)
             rows.append(_row(name, reply, frame, poses[name]))
+            sys.stdout.write(f"{rows[-1]}\n")
     return rows
 
 
@@ -181,8 +160,6 @@ def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3) -> He
         name=name,
         reason=reply.reason or "",
         error=error,
-        inliers=reply.inliers,
-        camera=reply.camera.source if reply.camera else "",
         position_68_m=nan if reply.covariance is None else error_radius(np.array(reply.covariance)[3:, 3:]),
         orientation_68_deg=reply.accuracy.orientation_68_deg if reply.accuracy else nan,
     )
@@ -191,29 +168,8 @@ def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3) -> He
 def error_figures(rows: Sequence[HeldOutRow]) -> dict[str, float]:
     """How many photos were answered, and the errors of the answers."""
     errors = [row.error for row in rows if row.error is not None]
-    metres = [e.position_m for e in errors] or [float("nan")]
-    degrees = [e.angle_deg for e in errors] or [float("nan")]
-    return {
-        "asked": len(rows),
-        "answered": len(errors),
-        "median_m": float(np.median(metres)),
-        "largest_m": max(metres),
-        "median_deg": float(np.median(degrees)),
-        "largest_deg": max(degrees),
-    }
-
-
-def _children_cpu_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__, "--photos", "--work")
-    parser.add_argument(
-        "--held-out", nargs="+", default=[], metavar="NAME", help=f"default: every {_EVERY}th photo"
-    )
-    return parser.parse_args(argv)
+    counts = {"asked": len(rows), "answered": len(errors)}
+    return counts | spread([e.position_m for e in errors], [e.angle_deg for e in errors])
 
 
 if __name__ == "__main__":

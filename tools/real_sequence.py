@@ -15,10 +15,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import pose_difference
 from featuredb.store import Database
@@ -26,8 +23,7 @@ from featuredb.video.folder import natural_key
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
-from tools.figures import study_parser, write_figures
-from tools.growth_common import table
+from tools.figures import laid_on, spread, study_parser, write_figures
 from tools.made_maps import photo_names
 from tools.real_photos import ingest, reference
 
@@ -40,46 +36,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not (work / name).exists():
             ingest(work / name, args.photos, left_out, work / "cache")
     part, whole = reference(work / "part"), reference(work / "whole")
-    moved, off_m = laid_on(whole, part)
+    sim = laid_on(centers(whole), centers(part))
+    assert sim is not None
+    moved = {image.name: sim.act_on_pose(image.cam_from_local) for image in whole.images}
     frames = film_of(args.photos, names, work / "frames")
     tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
-    mapped = {image.name for image in part.images}
-    rows, metres = [], []
-    for name, point in zip(names, tracked.trajectory.points, strict=True):
-        kind = "in the map" if name in mapped else "new"
-        if point.pose is None:
-            rows.append((name, kind, "lost", "", "", point.detail[:60]))
-            continue
-        if name not in moved:
-            rows.append((name, kind, point.state, "", "", "not in the reconstruction"))
-            continue
-        off = pose_difference(
-            part.frame, moved[name], point.pose.epsg, point.pose.utm, point.pose.cam_from_utm_xyzw
-        )
-        metres.append(off.position_m)
-        rows.append((name, kind, point.state, f"{off.position_m:.3f}", f"{off.angle_deg:.3f}", ""))
-    sys.stdout.write(table(rows, ("frame", "photo", "state", "m", "degrees", "why")) + "\n")
-    unknown = sum(row[5] == "not in the reconstruction" for row in rows)
-    lost = sum(row[2] == "lost" for row in rows)
-    middle, largest = (np.median(metres), max(metres)) if metres else (np.nan, np.nan)
-    figures = {"frames": len(rows), "lost": lost, "median_m": float(middle), "largest_m": float(largest)}
-    figures |= {"compared": len(metres), "unknown": unknown, "apart_m": off_m}
-    write_figures(args.json, figures)
+    poses = {name: p.pose for name, p in zip(names, tracked.trajectory.points, strict=True) if p.pose}
+    off = []
+    for name, pose in poses.items():
+        if name in moved:
+            off.append(pose_difference(part.frame, moved[name], pose.epsg, pose.utm, pose.cam_from_utm_xyzw))
+            sys.stdout.write(f"{name}: {off[-1]}\n")
+    figures = {
+        "frames": len(names),
+        "lost": len(names) - len(poses),
+        "unknown": len(poses.keys() - moved.keys()),
+    }
+    write_figures(args.json, figures | spread([e.position_m for e in off], [e.angle_deg for e in off]))
     return 0
 
 
-def laid_on(whole: FeatureMap, part: FeatureMap) -> tuple[dict[str, Rigid3], float]:
-    """Poses of the whole's images in the part's frame, by name, and the median distance of common cameras."""
-    there = {image.name: image.cam_from_local for image in part.images}
-    both = [image for image in whole.images if image.name in there]
-    here = np.array([image.cam_from_local.center for image in both])
-    wanted = np.array([there[image.name].center for image in both])
-    sim = similarity_closed_form(here, wanted)
-    assert sim is not None
-    off = np.linalg.norm(sim.act(here) - wanted, axis=1)
-    return {image.name: sim.act_on_pose(image.cam_from_local) for image in whole.images}, float(
-        np.median(off)
-    )
+def centers(feature_map: FeatureMap) -> dict[str, FloatArray]:
+    """Of a map's cameras, by the names of its images."""
+    return {image.name: image.cam_from_local.center for image in feature_map.images}
 
 
 def film_of(photos: Path, names: Sequence[str], folder: Path) -> Path:

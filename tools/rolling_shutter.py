@@ -10,12 +10,10 @@
 
 """
 
-import multiprocessing
-import subprocess
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +31,9 @@ from featuredb.simworld.camera.sensor import jpeg_bytes
 from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
+from tools.commands import said
 from tools.figures import study_parser, write_figures
+from tools.worlds.film_frame import Exposure, in_order
 from tools.worlds.film_world import FilmOptions, film_frame
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
@@ -56,7 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             for receiver in ("plain", "rtk"):
                 name = f"{style}-{seed}-{receiver}"
                 photos = tagged(film, pictures, receiver == "rtk", args.work / name)
-                said = ingested(args.work / f"{name}.db", photos)
+                words = ("ingest", "photos", str(args.work / f"{name}.db"), str(photos))
+                report = said(*words, "--max-features", "4000", "--quiet")
                 maps = Database.open(args.work / f"{name}.db").snapshot()
                 active = [m for m in maps.maps() if m.status == "active"]
                 squares = [normalised(film, maps.load_map(m.map_id)) for m in active]
@@ -64,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 figures["active"] += bool(active)
                 figures["outside"] += sum(max(one) > _OUTSIDE for one in squares)
                 figures["held_back"] += not active
-                figures["unnamed"] += "rolling shutter" not in said
+                figures["unnamed"] += "rolling shutter" not in report
                 worst = max([worst, *(max(one) for one in squares)])
                 words = ", ".join(f"position {a:.1f} and orientation {b:.1f}" for a, b in squares)
                 sys.stdout.write(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}\n")
@@ -82,8 +83,7 @@ def film_options(style: FlightStyle, seed: int) -> FilmOptions:
         rate_hz=1.0,
         width=960,
         height=540,
-        samples=2,
-        readout_s=_READOUT_S,
+        exposure=Exposure(samples=2, readout_s=_READOUT_S),
     )
 
 
@@ -91,12 +91,9 @@ def drawn(film: FilmOptions, folder: Path) -> list[Path]:
     """The film's frames as JPEG; what is there is taken as it is."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"{k:04d}.jpg" for k in range(film.frames)]
-    missing = [k for k, file in enumerate(files) if not file.is_file()]
-    if missing:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(mp_context=context) as pool:
-            for k, data in zip(missing, pool.map(_jpeg, [film] * len(missing), missing), strict=True):
-                files[k].write_bytes(data)
+    if not all(file.is_file() for file in files):
+        for file, data in zip(files, in_order(partial(_jpeg, film), film.frames), strict=True):
+            file.write_bytes(data)
     return files
 
 
@@ -138,15 +135,6 @@ def tagged(film: FilmOptions, pictures: Sequence[Path], rtk: bool, folder: Path)
         with Image.open(picture) as image:
             (folder / picture.name).write_bytes(jpeg_bytes(np.asarray(image), 92, exif))
     return folder
-
-
-def ingested(database: Path, photos: Path) -> str:
-    """What `featuredb ingest photos` says."""
-    words = ("ingest", "photos", str(database), str(photos), "--max-features", "4000", "--quiet")
-    command = [sys.executable, "-m", "featuredb.cli", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    sys.stdout.write(f"$ featuredb {' '.join(words)}\n{done.stdout}{done.stderr}")
-    return done.stdout
 
 
 def normalised(film: FilmOptions, feature_map: FeatureMap) -> tuple[float, float]:

@@ -24,14 +24,15 @@ from featuredb.features.exif.write import gps_directory
 from featuredb.features.image_header import read_header
 from featuredb.features.jpeg_segments import with_app1
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.truth import TrueImage, Truth
 from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database
-from tools.anchor_simworld import camera_errors, featuredb
+from tools.anchor_simworld import camera_errors
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
-from tools.made_maps import copied
+from tools.made_maps import copied, position_table
+from tools.worlds.seen_places import SeenPlaces
 
 _SEED = 1
 _SIGMA_M, _OTHERWISE_M, _DATUM_M = 0.02, 5.0, 20.0
@@ -85,15 +86,16 @@ def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
         return folder
     copied(world.folder / "drone", names, folder, strip=True)
     geodetic = np.array([world.truth.frame.geodetic_from_enu(place) for place in places])
-    table = folder / ("geo.txt" if way == "geo_txt" else "table.csv")
-    lines = ["EPSG:4326" if way == "geo_txt" else "path,lat,lon,height,accuracy,accuracy_height"]
-    for name, (lat, lon, up) in zip(names, geodetic.tolist(), strict=True):
-        if way == "geo_txt":
-            lines.append(f"{name} {lon:.10f} {lat:.10f} {up:.4f} 0 0 0 {_SIGMA_M} {_SIGMA_M}")
-        else:
-            lines.append(f"{name},{lat:.10f},{lon:.10f},{up:.4f},{_SIGMA_M},{_SIGMA_M}")
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return table
+    rows = list(zip(names, geodetic.tolist(), strict=True))
+    if way == "table":
+        return position_table(folder, [(name, *place, _SIGMA_M, _SIGMA_M) for name, place in rows])
+    lines = ["EPSG:4326"]
+    lines += [
+        f"{name} {lon:.10f} {lat:.10f} {up:.4f} 0 0 0 {_SIGMA_M} {_SIGMA_M}" for name, (lat, lon, up) in rows
+    ]
+    file = folder / "geo.txt"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
 
 
 def tagged(data: bytes, truth: Truth, place: FloatArray, error_m: float, words: str) -> bytes:
@@ -118,7 +120,6 @@ def ingested(database: Path, source: Path, truth: Truth, way: str) -> dict[str, 
     return {
         f"{way}_m": float(np.median(metres)),
         f"{way}_active": int(placed.status == "active"),
-        f"{way}_photos": len(metres),
         f"{way}_sigma_m": sigma_m,
     }
 
@@ -149,25 +150,19 @@ def with_control(
 def control_text(world: World, options: WorldOptions, rng: np.random.Generator) -> str:
     """OpenDroneMap's list: spots of the ground around the middles of photos, marked where they are seen."""
     scene, images = town_of(options), world.truth.group("drone")
-    depths = [render_depth(scene, image.camera, image.cam_from_local).depth for image in images]
+    views = [SeenPlaces(scene, image.camera, image.cam_from_local) for image in images]
     lines = [f"EPSG:{world.truth.epsg}"]
     for k, own in enumerate(np.linspace(0, len(images) - 5, _POINTS).astype(int)):
-        spot = seen_at(images[own], depths[own])
+        height, width = views[own].depth.shape
+        (spot,) = views[own].places(np.array([[width // 2 + 0.5, height // 2 + 0.5]]))
         utm = world.truth.frame.utm_from_enu(spot + rng.normal(0.0, _SIGMA_M, 3), world.truth.epsg)
-        for image, depth in zip(images, depths, strict=True):
-            xy = marked(image, depth, spot)
+        for image, view in zip(images, views, strict=True):
+            xy = marked(image, view.depth, spot)
             if xy is not None:
                 x, y = xy + rng.normal(0.0, _MARK_PX, 2)
                 words = " ".join(f"{v:.4f}" for v in (*utm, x, y))
                 lines.append(f"{words} {Path(image.name).name} point{k}")
     return "\n".join(lines) + "\n"
-
-
-def seen_at(image: TrueImage, depth: np.ndarray) -> FloatArray:
-    """The spot (3,) in the middle of a photo."""
-    row, column = depth.shape[0] // 2, depth.shape[1] // 2
-    ray = np.append(image.camera.unproject(np.array([[column + 0.5, row + 0.5]]))[0], 1.0)
-    return image.cam_from_local.inverse().act(ray * float(depth[row, column]))
 
 
 def marked(image: TrueImage, depth: np.ndarray, spot: FloatArray) -> FloatArray | None:

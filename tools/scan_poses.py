@@ -20,11 +20,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pyproj
 
 from tools.scan_to_photo import (
-    Floats,
-    Frame,
+    ColouredScan,
     Lens,
     PosedPicture,
     adjust,
@@ -40,20 +38,19 @@ _ROUNDS = ((0, 3), (0, 1, 2, 3, 4), tuple(range(7)))  # lens parameters that are
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("scan", type=Path, metavar="SCAN", help="LAS or LAZ with colour, and its CRS")
+    parser.add_argument("photos", type=Path, metavar="FOLDER", help="photos of one camera")
+    parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="write there")
+    args = parser.parse_args(argv)
     cv2.setNumThreads(1)
-    found = register(args.scan, args.photos, args.crs)
-    text = json.dumps(found, indent=1) + "\n"
-    if args.poses:
-        args.poses.write_text(text)
-    else:
-        sys.stdout.write(text)
+    args.poses.write_text(json.dumps(register(args.scan, args.photos), indent=1) + "\n")
     return 0
 
 
-def register(scan_path: Path, folder: Path, crs: str | None) -> dict[str, Any]:
+def register(scan_path: Path, folder: Path) -> dict[str, Any]:
     """Poses of all photos of a folder that register, with the camera and the accuracy, JSON-able."""
-    scan = read_scan(scan_path, crs)
+    scan = read_scan(scan_path)
     raster = nadir_raster(scan)
     features = raster_features(raster)
     photos, lens = [], None
@@ -75,51 +72,31 @@ def register(scan_path: Path, folder: Path, crs: str | None) -> dict[str, Any]:
         raise SystemExit(f"{folder}: fewer than two photos register to {scan_path}")
     for free in _ROUNDS:
         photos = [correspond(photo, lens, scan) for photo in photos]
-        photos, lens, covariance = adjust(photos, lens, free)
+        photos, lens = adjust(photos, lens, free)
         _say(f"{sum(len(p.world) for p in photos)} correspondences, focal length {lens.f:.1f} px")
-    return _plain(photos, lens, covariance, scan.frame, scan.origin, pyproj.CRS(crs or scan.crs).to_string())
+    return _plain(photos, lens, scan)
 
 
-def _plain(
-    photos: list[PosedPicture],
-    lens: Lens,
-    covariance: Floats,
-    frame: Frame,
-    origin: Sequence[float],
-    crs: str,
-) -> dict[str, Any]:
-    sigmas = np.sqrt(np.diag(covariance)[-7:])
+def _plain(photos: list[PosedPicture], lens: Lens, scan: ColouredScan) -> dict[str, Any]:
     return {
-        "crs": crs,
-        "origin": list(origin),
+        "crs": scan.crs,
+        "origin": list(scan.origin),
         "camera": {
             "model": "OPENCV",
             "width": lens.width,
             "height": lens.height,
             # COLMAP's pixels: centre of the top-left pixel at (0.5, 0.5).
             "params": [lens.f, lens.f, lens.cx + 0.5, lens.cy + 0.5, lens.k1, lens.k2, lens.p1, lens.p2],
-            "formal_sigmas": sigmas.tolist(),
         },
         "halves_of_correspondences": halves_of_correspondences(photos, lens),
         "halves_of_photos": halves_of_photos(photos, lens),
-        "poses": {p.name: _pose(p, lens, frame) for p in photos},
-    }
-
-
-def _pose(photo: PosedPicture, lens: Lens, frame: Frame) -> dict[str, Any]:
-    rotation = cv2.Rodrigues(photo.pose[:3])[0]
-    center = -rotation.T @ photo.pose[3:]
-    predicted = cv2.projectPoints(
-        photo.world, photo.pose[:3], photo.pose[3:], lens.matrix(), lens.distortion()
-    )[0][:, 0]
-    return {
-        "cam_from_local_rotation": rotation.tolist(),
-        "cam_from_local_translation": photo.pose[3:].tolist(),
-        "center_local": center.tolist(),
-        "center_grid": frame.grid(center[None])[0].tolist(),
-        "cam_from_grid_rotation": (rotation @ frame.grid_from_local().T).tolist(),
-        "correspondences": len(photo.world),
-        "median_residual_px": float(np.median(np.linalg.norm(photo.pixels - predicted, axis=1))),
+        "poses": {
+            photo.name: {
+                "cam_from_local_rotation": cv2.Rodrigues(photo.pose[:3])[0].tolist(),
+                "cam_from_local_translation": photo.pose[3:].tolist(),
+            }
+            for photo in photos
+        },
     }
 
 
@@ -148,34 +125,19 @@ def _difference(first: list[PosedPicture], second: list[PosedPicture]) -> dict[s
     for a, b in zip(first, second, strict=True):
         ra, rb = cv2.Rodrigues(a.pose[:3])[0], cv2.Rodrigues(b.pose[:3])[0]
         shifts.append(ra.T @ a.pose[3:] - rb.T @ b.pose[3:])
-        turns.append(_angle_deg(ra, rb))
-    lengths = np.abs(shifts)
+        turns.append(np.degrees(np.linalg.norm(cv2.Rodrigues(ra @ rb.T)[0])))
+    east, north, up = np.median(np.abs(shifts), axis=0).tolist()
     return {
-        "east_m": float(np.median(lengths[:, 0])),
-        "north_m": float(np.median(lengths[:, 1])),
-        "up_m": float(np.median(lengths[:, 2])),
+        "east_m": east,
+        "north_m": north,
+        "up_m": up,
         "position_m": float(np.median(np.linalg.norm(shifts, axis=1))),
         "rotation_deg": float(np.median(turns)),
     }
 
 
-def _angle_deg(a: Floats, b: Floats) -> float:
-    return float(np.degrees(np.linalg.norm(cv2.Rodrigues(a @ b.T)[0])))
-
-
 def _say(text: str) -> None:
     sys.stderr.write(text + "\n")
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("scan", type=Path, metavar="SCAN", help="LAS or LAZ with colour")
-    parser.add_argument("photos", type=Path, metavar="FOLDER", help="photos of one camera")
-    parser.add_argument("--crs", default=None, help="of the scan, where the file names none")
-    parser.add_argument(
-        "--poses", type=Path, default=None, metavar="FILE", help="write there, not on the output"
-    )
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

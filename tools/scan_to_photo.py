@@ -27,7 +27,6 @@ class ColouredScan:
 
     xyz: Floats
     bgr: NDArray[np.uint8]
-    frame: "Frame"
     origin: tuple[float, float, float]
     crs: str
 
@@ -71,50 +70,30 @@ class PosedPicture:
     pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
 
 
-def read_scan(path: Path, crs: str | None) -> ColouredScan:
+def read_scan(path: Path) -> ColouredScan:
     las = laspy.read(path)
-    found = las.header.parse_crs()
-    if crs is None and found is None:
-        raise SystemExit(f"{path}: the file names no CRS; give --crs")
-    projected = pyproj.CRS.from_user_input(crs or found)
+    crs = las.header.parse_crs()
+    if crs is None:
+        raise SystemExit(f"{path}: the file names no CRS")
     grid = np.column_stack([las.x, las.y, las.z]).astype(np.float64)
     origin = tuple(np.round(np.median(grid, axis=0)).tolist())
-    frame = Frame(projected, origin)
     rgb = np.column_stack([las.red, las.green, las.blue])
     if rgb.max() > 255:
         rgb = rgb >> 8
     bgr = np.ascontiguousarray(rgb[:, ::-1].astype(np.uint8))
-    return ColouredScan(frame.local(grid), bgr, frame, origin, projected.to_string())
+    return ColouredScan(_local(grid, crs, origin), bgr, origin, crs.to_string())
 
 
-class Frame:
-    """East, north, up at an origin given in the scan's projected CRS, and back, by PROJ."""
-
-    def __init__(self, crs: pyproj.CRS, origin: tuple[float, float, float]) -> None:
-        self._to_geodetic = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
-        lon, lat = self._to_geodetic.transform(origin[0], origin[1])
-        self._pipeline = pyproj.Transformer.from_pipeline(
-            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-            f"+step +proj=topocentric +ellps=WGS84 +lon_0={lon!r} +lat_0={lat!r} +h_0={origin[2]!r}"
-        )
-
-    def local(self, grid: Floats) -> Floats:
-        """Local metres of projected coordinates (n, 3)."""
-        lon, lat = self._to_geodetic.transform(grid[:, 0], grid[:, 1])
-        return np.column_stack(self._pipeline.transform(lon, lat, grid[:, 2])).astype(np.float64)
-
-    def grid(self, local: Floats) -> Floats:
-        """Projected coordinates of local metres (n, 3)."""
-        lon, lat, height = self._pipeline.transform(*local.T, direction="INVERSE")
-        east, north = self._to_geodetic.transform(lon, lat, direction="INVERSE")
-        return np.column_stack([east, north, height]).astype(np.float64)
-
-    def grid_from_local(self) -> Floats:
-        """Rotation (3, 3) from local axes to the grid's at the origin."""
-        ends = self.grid(np.vstack([np.zeros(3), 10.0 * np.eye(3)]))
-        columns = ends[1:] - ends[0]
-        u, _, vt = np.linalg.svd(columns.T)
-        return np.asarray(u @ vt)
+def _local(grid: Floats, crs: pyproj.CRS, origin: tuple[float, float, float]) -> Floats:
+    """East, north, up (n, 3) of projected coordinates (n, 3) at an origin given in these, by PROJ."""
+    to_geodetic = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+    lon, lat = to_geodetic.transform(origin[0], origin[1])
+    pipeline = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        f"+step +proj=topocentric +ellps=WGS84 +lon_0={lon!r} +lat_0={lat!r} +h_0={origin[2]!r}"
+    )
+    lon, lat = to_geodetic.transform(grid[:, 0], grid[:, 1])
+    return np.column_stack(pipeline.transform(lon, lat, grid[:, 2])).astype(np.float64)
 
 
 def nadir_raster(scan: ColouredScan) -> tuple[NDArray[np.uint8], Floats, Floats]:
@@ -261,11 +240,9 @@ def _equal_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.clip(128 + 45 * (values - mean) / (deviation + 4), 0, 255).astype(np.uint8)
 
 
-def adjust(
-    photos: list[PosedPicture], lens: Lens, free: tuple[int, ...]
-) -> tuple[list[PosedPicture], Lens, Floats]:
+def adjust(photos: list[PosedPicture], lens: Lens, free: tuple[int, ...]) -> tuple[list[PosedPicture], Lens]:
     """Poses of all photos and the lens parameters `free` (0 f, 1 cx, 2 cy, 3 k1, 4 k2, 5 p1, 6 p2) from all
-    correspondences, robustly (Geman-McClure at three times the spread); also the covariance of the lens."""
+    correspondences, robustly (Geman-McClure at three times the spread)."""
     count = len(photos)
     poses = np.array([p.pose for p in photos])
     values = lens.values()
@@ -276,12 +253,9 @@ def adjust(
         current = Lens(lens.width, lens.height, *values.tolist())
         results = [_linearise(p, pose, current) for p, pose in zip(photos, poses, strict=True)]
         sigma = 1.4826 * float(np.median(np.concatenate([np.abs(r).ravel() for r, _ in results])))
-        total, used = 0.0, 0.0
         for i, (residual, jacobian) in enumerate(results):
             squared = (residual**2).sum(axis=1) / (3 * sigma) ** 2
             weight = np.repeat(1 / (1 + squared) ** 2, 2)
-            total += float((weight * residual.ravel() ** 2).sum())
-            used += float(weight.sum())
             columns = np.concatenate([jacobian[:, :6], jacobian[:, 6:][:, list(free)]], axis=1)
             at = np.concatenate([np.arange(6 * i, 6 * i + 6), np.arange(6 * count, size)])
             normal[np.ix_(at, at)] += columns.T @ (weight[:, None] * columns)
@@ -291,9 +265,8 @@ def adjust(
         values[list(free)] += step[6 * count :]
         if np.abs(step[: 6 * count].reshape(-1, 6)[:, 3:]).max() < 1e-4:
             break
-    covariance = np.linalg.inv(normal) * total / used
     moved = [replace(p, pose=pose) for p, pose in zip(photos, poses, strict=True)]
-    return moved, Lens(lens.width, lens.height, *values.tolist()), covariance
+    return moved, Lens(lens.width, lens.height, *values.tolist())
 
 
 def _linearise(photo: PosedPicture, pose: Floats, lens: Lens) -> tuple[Floats, Floats]:

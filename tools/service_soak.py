@@ -7,7 +7,6 @@ and truncated photos and broken messages sent, in turn. Every answer must be tha
 question must have an answer or an error of the server's, and the memory must stay as it was.
 """
 
-import argparse
 import os
 import random
 import signal
@@ -28,7 +27,6 @@ from reloc.client.replies import NO_SERVER, TIMEOUT
 from tools.figures import write_figures
 from tools.service_world import (
     ATTACKER,
-    MemoryWatch,
     Service,
     first_answers,
     honest_clients,
@@ -36,6 +34,7 @@ from tools.service_world import (
     photos_of,
     running_service,
     service_parser,
+    watched_memory,
 )
 
 _EVENT_S = 5.0  # between two of what happens beside the queries
@@ -78,7 +77,9 @@ class Events:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = service_parser(__doc__)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    args = parser.parse_args(argv)
     database = Database.open(args.db)
     photos = photos_of(args.photos, 4)
     with tempfile.TemporaryDirectory() as scratch:
@@ -87,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             events = Events(database, service, photos[0], seed=1)
             end = time.monotonic() + 60 * args.minutes
             with (
-                MemoryWatch(service.server, every_s=5.0) as memory,
+                watched_memory(service.server, every_s=5.0) as memory,
                 honest_clients(service, photos, expected) as heard,
             ):
                 while time.monotonic() < end:
@@ -97,34 +98,23 @@ def main(argv: Sequence[str] | None = None) -> int:
                 status = client.status()
         exit_code = service.server.process.returncode
     failures = Counter(heard.failures)
-    quarter = len(memory.mib) // 4
-    early, late = median(memory.mib[quarter : 2 * quarter]), median(memory.mib[-quarter:])
+    quarter = len(memory) // 4
+    early, late = median(memory[quarter : 2 * quarter]), median(memory[-quarter:])
+    sys.stdout.write(f"failures {dict(failures)}, events {dict(events.counts)}, {status.reload}\n")
     figures = {
-        "minutes": args.minutes,
         "asked": len(heard.seconds),
         "wrong": heard.wrong,
         "missing": failures[TIMEOUT] + failures[NO_SERVER],
         "failed": sum(failures.values()),
-        "failures": dict(failures),
         "kills": events.counts["kill"],
-        "events": dict(events.counts),
         "reloads": status.reload.count,
-        "reload_error": status.reload.error or "",
         "p99_s": heard.p99_s(),
-        "early_mib": early,
         "late_mib": late,
         "grown_mib": late - early,
         "exit_code": exit_code,
-        "load": os.getloadavg()[0],
     }
     write_figures(args.json, figures)
     return 0
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = service_parser(__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

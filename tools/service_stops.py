@@ -7,13 +7,11 @@ random moment. Clean is: exit code 0 within the time that queries in hand may ta
 processes, and an answer or an error for each question that it had taken.
 """
 
-import argparse
 import random
 import subprocess
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -86,7 +84,9 @@ def stopped_under_load(database: Path, photo: bytes, after_s: float) -> Stopped:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = service_parser(__doc__)
+    parser.add_argument("--stops", type=int, default=200)
+    args = parser.parse_args(argv)
     (photo,) = photos_of(args.photos, 1)
     rng = random.Random(1)
     found = []
@@ -95,21 +95,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not found[-1].clean:
             sys.stdout.write(f"stop {number}: {replace(found[-1], log=())}\n{''.join(found[-1].log)}")
             sys.stdout.flush()
-    codes = Counter(code or "answered" for one in found for code in one.codes)
     figures = {
         "stops": len(found),
         "clean": sum(one.clean for one in found),
         "slowest_s": max(one.seconds for one in found),
-        "codes": dict(codes),
     }
     write_figures(args.json, figures)
     return 0
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = service_parser(__doc__)
-    parser.add_argument("--stops", type=int, default=200)
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 import argparse
 import io
-import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -19,9 +18,10 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from reloc.authority.folder import Authority
 from reloc.client import Client, LocaliseReply
+from reloc.service.session import bind_free_port
 from tools.figures import study_parser
 from tools.proxy_process import proxied
-from tools.serve_process import CommandProcess, ServeProcess
+from tools.serve_process import CommandProcess, ServeProcess, beside
 
 HONEST, ATTACKER, WEB = ("alice", "bob", "carol"), "mallory", "web"
 _SAME_M = 0.5  # two answers to one photo
@@ -81,9 +81,7 @@ def photos_of(folder: Path, count: int) -> list[bytes]:
 
 def free_port() -> int:
     """One that nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    return int(bind_free_port("tcp/127.0.0.1:0").rpartition(":")[2])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,26 +139,21 @@ class Heard:
 
     Attributes:
         seconds: of each question, failed ones as long as they may take. failures: codes.
-        wrong: answers that are another place than the first one to the same question, or none where that had
-            a place.
+        same: of each answer, whether it is the place of the first one to the same question, or none where
+            that had none.
     """
 
     seconds: list[float] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
-    wrong: int = 0
-    localised: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    same: list[bool] = field(default_factory=list)
 
-    def answered(self, seconds: float, reply: LocaliseReply, expected: LocaliseReply) -> None:
-        with self._lock:
-            self.seconds.append(seconds)
-            self.localised += reply.status == "localised"
-            self.wrong += not same_place(reply, expected)
+    @property
+    def wrong(self) -> int:
+        return self.same.count(False)
 
     def failed(self, code: str) -> None:
-        with self._lock:
-            self.seconds.append(DEADLINE_S)
-            self.failures.append(code)
+        self.seconds.append(DEADLINE_S)
+        self.failures.append(code)
 
     def p99_s(self) -> float:
         return float(np.percentile(self.seconds, 99)) if self.seconds else float("nan")
@@ -204,7 +197,8 @@ def honest_clients(
         except ServiceError as error:
             heard.failed(error.code)
         else:
-            heard.answered(time.monotonic() - start, reply, expected[which])
+            heard.seconds.append(time.monotonic() - start)
+            heard.same.append(same_place(reply, expected[which]))
 
     def run(name: str, number: int) -> None:
         path, again = service.config(name), name == HONEST[-1]
@@ -221,36 +215,18 @@ def honest_clients(
                 heard.failed(error.code)
 
     threads = [threading.Thread(target=run, args=(name, 3 * k)) for k, name in enumerate(HONEST)]
-    for thread in threads:
-        thread.start()
-    try:
+    with beside(threads, stop):
         yield heard
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
 
 
-class MemoryWatch:
-    """Looks at a process's memory again and again, within a `with` block.
+@contextmanager
+def watched_memory(process: CommandProcess, every_s: float = 1.0) -> Iterator[list[float]]:
+    """Looks at a process's memory again and again within the block: what it sees (MiB), in order."""
+    seen, stop = [process.memory_mib()], threading.Event()
 
-    Attributes:
-        mib: what it saw, in order.
-    """
+    def run() -> None:
+        while not stop.wait(every_s):
+            seen.append(process.memory_mib())
 
-    def __init__(self, process: CommandProcess, every_s: float = 1.0) -> None:
-        self.mib = [process.memory_mib()]
-        self._process, self._every_s, self._stop = process, every_s, threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> "MemoryWatch":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._stop.wait(self._every_s):
-            self.mib.append(self._process.memory_mib())
+    with beside([threading.Thread(target=run)], stop):
+        yield seen

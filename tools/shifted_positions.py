@@ -10,7 +10,6 @@
 """
 
 import re
-import subprocess
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -23,9 +22,9 @@ from featuredb.geo.utm import geodetic_from_utm, utm_epsg, utm_from_geodetic
 from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb, said
 from tools.figures import study_parser, write_figures
-from tools.made_maps import copied, photo_names
+from tools.made_maps import copied, photo_names, position_table
 
 _SHIFT_M = 50_000.0
 
@@ -38,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     database, grown = args.work / "db", args.work / "grown.db"
     for one in (database, grown):
         featuredb("ingest", "photos", str(one), str(right), "--quiet")
-    table = write_table(shifted, names[1::2])
+    table = position_table(shifted, (_table_row(shifted / name) for name in names[1::2]))
     ingest_km = told_km("ingest", "photos", str(database), str(table), "--trust-geotags", "--quiet")
     _, second = sorted(Database.open(database).snapshot().maps(), key=lambda m: m.created_at)
     featuredb("lidar", "add", str(database), str(args.scan))
@@ -58,35 +57,28 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def shifted_position(photo: Path) -> tuple[ExifInfo, float, float]:
     """What a photo says of itself, and its latitude and longitude 50 km further east."""
-    said = read_exif(photo.read_bytes())
-    assert said.latitude_deg is not None
-    assert said.longitude_deg is not None
-    epsg = utm_epsg(said.latitude_deg, said.longitude_deg)
-    utm = utm_from_geodetic((said.latitude_deg, said.longitude_deg, 0.0), epsg)
+    exif = read_exif(photo.read_bytes())
+    assert exif.latitude_deg is not None
+    assert exif.longitude_deg is not None
+    epsg = utm_epsg(exif.latitude_deg, exif.longitude_deg)
+    utm = utm_from_geodetic((exif.latitude_deg, exif.longitude_deg, 0.0), epsg)
     latitude, longitude, _ = geodetic_from_utm(utm + np.array([_SHIFT_M, 0.0, 0.0]), epsg)
-    return said, float(latitude), float(longitude)
+    return exif, float(latitude), float(longitude)
 
 
-def write_table(folder: Path, names: Sequence[str]) -> Path:
-    """A table of the shifted positions beside the photos."""
-    lines = ["path,lat,lon,height,accuracy,accuracy_height"]
-    for name in names:
-        said, latitude, longitude = shifted_position(folder / name)
-        sigmas = f"{said.sigma_horizontal_m},{said.sigma_vertical_m}"
-        lines.append(f"{name},{latitude:.8f},{longitude:.8f},{said.altitude_m},{sigmas}")
-    table = folder / "table.csv"
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return table
+def _table_row(photo: Path) -> tuple[object, ...]:
+    exif, latitude, longitude = shifted_position(photo)
+    return photo.name, latitude, longitude, exif.altitude_m, exif.sigma_horizontal_m, exif.sigma_vertical_m
 
 
 def contribution(photo: Path) -> Contribution:
     """The photo as a query contributed it, from its shifted position."""
-    said, latitude, longitude = shifted_position(photo)
-    prior = {"lat": latitude, "lon": longitude, "h": said.altitude_m, "sigma_m": said.sigma_horizontal_m}
+    exif, latitude, longitude = shifted_position(photo)
+    prior = {"lat": latitude, "lon": longitude, "h": exif.altitude_m, "sigma_m": exif.sigma_horizontal_m}
     return Contribution(
         image=photo.read_bytes(),
-        width=said.width,
-        height=said.height,
+        width=exif.width,
+        height=exif.height,
         credit="somebody",
         licence="CC-BY-4.0",
         client_id="shifted",
@@ -99,11 +91,7 @@ def contribution(photo: Path) -> Contribution:
 
 def told_km(*words: str) -> float | None:
     """The distance that a command of featuredb names, None where it names none."""
-    command = [sys.executable, "-m", "featuredb.cli", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    sys.stdout.write(f"$ featuredb {' '.join(words)}\n{done.stdout}{done.stderr}")
-    sys.stdout.flush()
-    text = done.stdout + done.stderr
+    text = said(*words)
     found = [float(km) for km in re.findall(r"([0-9.]+) km to the", text)]
     found += [float(m.replace(",", "")) / 1000.0 for m in re.findall(r"([0-9,]+) m from where", text)]
     return found[0] if found else None

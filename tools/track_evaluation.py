@@ -9,15 +9,12 @@
 3. Each is tracked as `featuredb track` does, with the lens of its camera. --on says by what: the map, or the
    scan alone (from a pose of the first frame that is off by 10 m and 5 degrees).
 
-Writes into track.json for each film what `Tracked` says; with --draw how far a layer that `featuredb draw`
+Writes into track.json for each film what `judge_film` says; with --draw how far a layer that `featuredb draw`
 lays over the film by that track is from where it belongs (tools/drawn_layer.py), too.
 """
 
-import argparse
-import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +36,10 @@ from reloc.tracking.ground import Finder
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from reloc.tracking.trajectory.values import Trajectory
-from tools.anchor_simworld import anchored, featuredb
-from tools.drawn_layer import DrawnMarks, drawn_marks
-from tools.figures import write_figures
+from tools.anchor_simworld import anchored
+from tools.commands import featuredb
+from tools.drawn_layer import drawn_marks
+from tools.figures import study_parser, write_figures
 from tools.growth_common import say
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
 from tools.worlds.flight_path import FlightStyle, PathOptions
@@ -53,52 +51,17 @@ _END = 200  # frames at each end whose errors are compared; of short films, a ha
 _CUT = (0.4, 0.55)  # of the film
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tracked:
-    """What became of a film.
-
-    Attributes:
-        frames, lost: of the frames that show the town. invented: poses of frames that do not.
-        mean_m, p95_m, largest_m, mean_deg: errors of the frames that have poses.
-        first_m, last_m: means over the first and the last 200 of them, or over the halves of fewer than 400.
-        found_s: from the town's return to the first pose, of the film's time; 0 without a cut.
-        rate_hz, gap_s: frames a second over the whole run, and the longest time between two poses.
-        load: of the machine, when the run ended.
-        position_68 to orientation_95: shares of the errors inside these bounds. squared: mean squared error
-            of the position over its covariance; 3 is right. few_*: of the quarter of the frames with the
-            fewest landmarks.
-    """
-
-    frames: int
-    lost: int
-    invented: int
-    mean_m: float
-    p95_m: float
-    largest_m: float
-    mean_deg: float
-    first_m: float
-    last_m: float
-    found_s: float
-    rate_hz: float
-    gap_s: float
-    load: float
-    position_68: float
-    position_95: float
-    orientation_68: float
-    orientation_95: float
-    squared: float
-    few_position_95: float
-    few_orientation_95: float
-    few_squared: float
-
-
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    parser = study_parser(__doc__, "--out", "--inputs", "--seed")
+    parser.add_argument("--frames", type=int, default=1200)
+    parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
+    parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
+    parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
+    args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.out
     database = anchored_map(args.out, inputs, args.seed)
-    results: dict[str, Tracked] = {}
-    drawn: dict[str, DrawnMarks] = {}
+    results: dict[str, dict[str, float]] = {}
     for name in args.films:
         options = film_options(name, args.frames, args.seed)
         film = inputs / f"film-{name}-{args.frames}-{args.seed}"
@@ -106,16 +69,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         truth = read_film_truth(folder)
         finder = finder_on(args.on, database, truth, args.seed)
         tracked = track_video(folder / FILM_FILE, finder, camera=truth.camera)
-        load = os.getloadavg()[0]
-        results[name] = judge_film(tracked, truth, load)
+        results[name] = judge_film(tracked, truth)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
         if args.draw:
-            drawn[name] = drawn_marks(
-                args.out, film, truth, town_of(options.world), tracked.trajectory, database
-            )
-            say(f"{name}: {drawn[name]}")
-    layers = {f"{name}_layer": asdict(marks) for name, marks in drawn.items()}
-    write_figures(args.out / "track.json", {n: asdict(r) for n, r in results.items()} | layers)
+            scene, track = town_of(options.world), tracked.trajectory
+            results[f"{name}_layer"] = drawn_marks(args.out, film, truth, scene, track, database)
+    write_figures(args.out / "track.json", results)
     return 0
 
 
@@ -187,8 +146,17 @@ def axis_errors(
     return off
 
 
-def judge_film(tracked: TrackedVideo, truth: FilmTruth, load: float) -> Tracked:
-    """The film's track against its truth; load: of the machine."""
+def judge_film(tracked: TrackedVideo, truth: FilmTruth) -> dict[str, float]:
+    """The film's track against its truth.
+
+    - frames, lost: of the frames that show the town. invented: poses of frames that do not.
+    - mean_m, largest_m: errors of the frames that have poses. first_m, last_m: means over the first and the
+      last 200 of them, or over the halves of fewer than 400.
+    - found_s: from the town's return to the first pose, of the film's time; 0 without a cut.
+    - rate_hz: frames a second over the whole run.
+    - position_95, orientation_95: shares of the errors inside these bounds. squared: mean squared error of
+      the position over its covariance; 3 is right. few_*: of the quarter of the frames with fewest landmarks.
+    """
     off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
     metres = np.linalg.norm(off[:, 3:], axis=1)
     known = np.isfinite(metres)
@@ -196,26 +164,22 @@ def judge_film(tracked: TrackedVideo, truth: FilmTruth, load: float) -> Tracked:
         raise SystemExit(f"track_evaluation: no frame of {tracked.trajectory.source} has a pose")
     m = metres[known]
     end = min(_END, max(len(m) // 2, 1))  # ends that overlap could not differ
-    return Tracked(
-        frames=int(truth.at_home.sum()),
-        lost=int((truth.at_home & np.isnan(metres)).sum()),
-        invented=sum(p.pose is not None for p in tracked.trajectory.points) - int(known.sum()),
-        mean_m=float(m.mean()),
-        p95_m=float(np.quantile(m, 0.95)),
-        largest_m=float(m.max()),
-        mean_deg=float(np.degrees(np.linalg.norm(off[known, :3], axis=1)).mean()),
-        first_m=float(m[:end].mean()),
-        last_m=float(m[-end:].mean()),
-        found_s=_found_s(truth, known),
-        rate_hz=len(metres) / tracked.seconds["total"],
-        gap_s=tracked.seconds["longest_gap"],
-        load=load,
+    return {
+        "frames": int(truth.at_home.sum()),
+        "lost": int((truth.at_home & np.isnan(metres)).sum()),
+        "invented": sum(p.pose is not None for p in tracked.trajectory.points) - int(known.sum()),
+        "mean_m": float(m.mean()),
+        "largest_m": float(m.max()),
+        "first_m": float(m[:end].mean()),
+        "last_m": float(m[-end:].mean()),
+        "found_s": _found_s(truth, known),
+        "rate_hz": len(metres) / tracked.seconds["total"],
         **_inside(tracked.trajectory, off),
-    )
+    }
 
 
 def _inside(trajectory: Trajectory, off: FloatArray) -> dict[str, float]:
-    """How true the bounds are: the last figures of `Tracked`."""
+    """How true the bounds are: the last figures of `judge_film`."""
     rows = [k for k in range(len(off)) if np.isfinite(off[k]).all()]
     points = [trajectory.points[k] for k in rows]
     few = np.argsort([p.inliers for p in points], kind="stable")[: (len(points) + 3) // 4]
@@ -228,9 +192,8 @@ def _inside(trajectory: Trajectory, off: FloatArray) -> dict[str, float]:
                 if p.pose is not None
             ]
         )
-        for level in (0.68, 0.95):
-            figures[f"{name}_{level:.0%}".rstrip("%")] = float((squared <= chi2.ppf(level, 3)).mean())
-        figures[f"few_{name}_95"] = float((squared[few] <= chi2.ppf(0.95, 3)).mean())
+        inside = squared <= chi2.ppf(0.95, 3)
+        figures |= {f"{name}_95": float(inside.mean()), f"few_{name}_95": float(inside[few].mean())}
         if name == "position":
             figures |= {"squared": float(squared.mean()), "few_squared": float(squared[few].mean())}
     return figures
@@ -252,18 +215,6 @@ def _progress(name: str) -> Callable[[int, int], None]:
             say(f"{name}: {done} of {total} frames drawn")
 
     return told
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("track-evaluation"))
-    parser.add_argument("--frames", type=int, default=1200)
-    parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
-    parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
-    parser.add_argument("--seed", type=int, default=1, help="of world and films; default: 1")
-    parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
-    parser.add_argument("--inputs", type=Path, default=None, help="keep world and films there, not in --out")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -28,22 +28,20 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.index.descriptor_index import use_threads
 from featuredb.index.vocabulary import Vocabulary
-from ingest.executor import InProcessExecutor, PoolExecutor
+from ingest.executor import InProcessExecutor
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.sfm.extract import extract_photos, features_key
 from ingest.workspace import Workspace, read_array
 
 _FEATURES = 3000  # the strongest of a photo, those that PairOptions aggregates
+_PER_PHOTO = 1500  # of these, what the centres are trained on
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="of each folder's photos, each Nth")
-    parser.add_argument("--words", type=int, default=128)
-    parser.add_argument("--dimensions", type=int, default=32)
     parser.add_argument("--lists", type=int, default=None, metavar="K", help="centres of K inverted lists")
-    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args(argv)
     use_threads(1)
@@ -51,11 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = ExtractorOptions(max_features=_FEATURES)
     with tempfile.TemporaryDirectory() as scratch:
         workspace = Workspace(root=Path(scratch))
-        if args.workers == 1:
-            extract_photos(photos, workspace, options, InProcessExecutor())
-        else:
-            with PoolExecutor(args.workers) as pool:
-                extract_photos(photos, workspace, options, pool)
+        extract_photos(photos, workspace, options, InProcessExecutor())
         key = features_key(options)
         descriptors = [read_array(workspace.features(key, p.sha256), "descriptors") for p in photos]
     args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -63,12 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         np.savez_compressed(args.out, centers=train_lists(descriptors, args.lists))
         sys.stdout.write(f"{args.out}: {args.lists} lists from {len(photos)} photos\n")
         return 0
-    vocabulary = train_vocabulary(descriptors, words=args.words, dimensions=args.dimensions)
+    vocabulary = train_vocabulary(descriptors)
     args.out.write_bytes(vocabulary.to_bytes())
-    sys.stdout.write(
-        f"{args.out}: {args.words} words of {args.dimensions} dimensions from {len(photos)} photos, "
-        f"digest {vocabulary.digest}\n"
-    )
+    sys.stdout.write(f"{args.out}: {len(photos)} photos, digest {vocabulary.digest}\n")
     return 0
 
 
@@ -77,19 +68,17 @@ def train_vocabulary(
     *,
     words: int = 128,
     dimensions: int = 32,
-    per_photo: int = 1500,
     seed: int = 0,
 ) -> Vocabulary:
     """Principal components and k-means of some descriptors of each photo, with fixed random choices.
 
     Args:
         descriptors: (n, 128) of each photo.
-        per_photo: descriptors taken of each.
 
     Raises:
         InvalidValueError: fewer descriptors than 40 a word, which k-means wants at least.
     """
-    samples = _samples(descriptors, per_photo, words, seed)
+    samples = _samples(descriptors, words, seed)
     mean = samples.mean(axis=0, dtype=np.float64)
     _, vectors = np.linalg.eigh(np.cov((samples - mean).T))
     projection = vectors[:, ::-1][:, :dimensions]
@@ -102,21 +91,17 @@ def train_vocabulary(
     )
 
 
-def train_lists(
-    descriptors: Sequence[NDArray[np.uint8]], lists: int, per_photo: int = 1500, seed: int = 0
-) -> NDArray[np.uint8]:
+def train_lists(descriptors: Sequence[NDArray[np.uint8]], lists: int) -> NDArray[np.uint8]:
     """Centres (lists, 128) of inverted lists, rounded as descriptors are; arguments as there."""
-    centers = _kmeans(_samples(descriptors, per_photo, lists, seed), lists, seed, iterations=10)
+    centers = _kmeans(_samples(descriptors, lists, 0), lists, 0, iterations=10)
     return np.asarray(np.clip(np.rint(centers), 0, 255), dtype=np.uint8)
 
 
-def _samples(
-    descriptors: Sequence[NDArray[np.uint8]], per_photo: int, clusters: int, seed: int
-) -> NDArray[np.float32]:
+def _samples(descriptors: Sequence[NDArray[np.uint8]], clusters: int, seed: int) -> NDArray[np.float32]:
     generator = np.random.default_rng(seed)
     parts = []
     for photo in descriptors:
-        rows = generator.choice(len(photo), min(per_photo, len(photo)), replace=False)
+        rows = generator.choice(len(photo), min(_PER_PHOTO, len(photo)), replace=False)
         parts.append(photo[np.sort(rows)].astype(np.float32))
     samples = np.concatenate(parts) if parts else np.zeros((0, DESCRIPTOR_SIZE), np.float32)
     if len(samples) < 40 * clusters:

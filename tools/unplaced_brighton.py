@@ -13,15 +13,15 @@ was stopped goes on in --work.
 """
 
 import json
-import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
+from tools.commands import anchor, featuredb, newest_copy
 from tools.figures import write_figures
 from tools.made_maps import copied, make, photo_names
 from tools.picked import Scan, picks, read_scan, write_picks
@@ -39,24 +39,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = scan_parser(__doc__, "--work").parse_args(argv)
     truth = scan_truth(args)
     scan = read_scan(args.scan, truth.frame, truth.epsg)
-    placed: list[dict[str, float]] = []
     work: Path = args.work
     figures: dict[str, object] = {"draws": _DRAWS, **unplaced_map(args.photos, work)}
     if not (work / "scanned").exists():
         featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
         (work / "scanned").touch()
     (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
-    for number in range(_DRAWS):
-        done = work / f"draw-{number}.json"
-        if not done.exists():
-            judgement = _draw(number, work, summary.map_id, scan, truth)
-            done.write_text(json.dumps(judgement), encoding="utf-8")
-        one = json.loads(done.read_text(encoding="utf-8"))
-        sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
-        placed += [one] if one else []
-    figures |= summed(placed, _DRAWS)
-    write_figures(args.json, figures)
+    draw = partial(_draw, work=work, map_id=summary.map_id, scan=scan, truth=truth)
+    write_figures(args.json, figures | summed(all_drawn("draw", _DRAWS, draw, work), _DRAWS))
     return 0
+
+
+def all_drawn(
+    name: str, draws: int, draw: Callable[[int], dict[str, float] | None], work: Path
+) -> list[dict[str, float]]:
+    """What comes of each draw that is not refused; `work` keeps them, so that who starts again goes on."""
+    placed = []
+    for number in range(draws):
+        done = work / f"{name}-{number}.json"
+        if not done.exists():
+            done.write_text(json.dumps(draw(number)), encoding="utf-8")
+        one = json.loads(done.read_text(encoding="utf-8"))
+        sys.stdout.write(f"{name} {number}: {one or 'refused'}\n")
+        sys.stdout.flush()
+        placed += [one] if one else []
+    return placed
 
 
 def _draw(number: int, work: Path, map_id: str, scan: Scan, truth: ScanTruth) -> dict[str, float] | None:
@@ -66,9 +73,7 @@ def _draw(number: int, work: Path, map_id: str, scan: Scan, truth: ScanTruth) ->
     image = str(rng.choice([name for name in photo_names(photos) if name in truth.poses]))
     drawn = picks(scan, truth.camera, truth.poses[image], rng, _SIGMA_PX)
     file = write_picks(work / f"picks-{number}.csv", image, *drawn)
-    database = work / "placed"
-    shutil.rmtree(database, ignore_errors=True)
-    shutil.copytree(work / "db", database)
+    database = newest_copy(work / "db", work / "placed")
     return placed_by(database, map_id, work, truth, "--picks", str(file), "--image", image)
 
 
@@ -78,7 +83,7 @@ def unplaced_map(photos: Path, work: Path) -> dict[str, object]:
     if not (work / _MADE).exists():
         without = copied(photos, names, work / "photos", strip=True)
         copied(photos, HELD_OUT, work / "asked", strip=True)
-        made = make(work / "db", "photos", without, len(names))
+        made = make(work / "db", "photos", without)
         write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
     told: dict[str, object] = json.loads((work / _MADE).read_text(encoding="utf-8"))
     return {"photos": len(names), **told}
@@ -88,10 +93,8 @@ def placed_by(
     database: Path, map_id: str, work: Path, truth: ScanTruth, *start: str
 ) -> dict[str, float] | None:
     """Place the map by `featuredb anchor` and its arguments: errors of the held-out photos; None: refused."""
-    words = ("anchor", str(database), map_id, "--photos", str(work / "photos"), *start)
     # 1: the map is not placed. 2: where it starts from is open, before anything is tried.
-    out = ("--out", str(database.parent / "anchor"), "--auto", "--quiet")
-    if featuredb(*words, *out, may_refuse=True, refusals=(1, 2)) != 0:
+    if not anchor(database, map_id, work / "photos", database.parent / "anchor", *start, refusals=(1, 2)):
         return None
     asked = ask_poses(Database.open(database), work / "asked", HELD_OUT, truth.frame, truth.poses)
     return error_figures(asked)

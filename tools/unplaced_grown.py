@@ -19,13 +19,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from tools.anchor_simworld import featuredb
-from tools.figures import write_figures
+from tools.commands import featuredb
+from tools.figures import spread, write_figures
 from tools.made_maps import copied, photo_names
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
@@ -86,13 +85,8 @@ def errors(feature_map: FeatureMap, truth: ScanTruth, move: Sim3) -> dict[str, f
         if name in truth.poses:
             true = move.act_on_pose(truth.poses[name])
             metres.append(float(np.linalg.norm(true.center - pose.center)))
-            between: FloatArray = pose.rotation @ true.rotation.T
-            degrees.append(float(np.degrees(Rotation.from_matrix(between).magnitude())))
-    return {
-        "median_m": float(np.median(metres)),
-        "largest_m": max(metres),
-        "median_deg": float(np.median(degrees)),
-    }
+            degrees.append(pose.angle_to_deg(true))
+    return spread(metres, degrees)
 
 
 def _poses(feature_map: FeatureMap, frame: LocalFrame) -> dict[str, Rigid3]:

@@ -9,10 +9,10 @@ a mirrored scan, which is no place on Earth: nothing may be placed. The held-out
 placed map and compared with the poses that tools/scan_poses.py finds.
 """
 
-import json
 import shutil
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import laspy
@@ -21,10 +21,10 @@ import numpy as np
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
-from tools.anchor_simworld import featuredb
+from tools.commands import featuredb, newest_copy
 from tools.figures import write_figures
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
-from tools.unplaced_brighton import placed_by, summed, unplaced_map
+from tools.unplaced_brighton import all_drawn, placed_by, summed, unplaced_map
 
 _KINDS = ("colour", "intensity", "mirrored")
 _DRAWS, _SEED = 10, 1
@@ -43,15 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             shutil.copytree(work / "db", work / "making", dirs_exist_ok=True)
             featuredb("lidar", "add", str(work / "making"), str(scan_of(kind, args.scan, work)), "--quiet")
             (work / "making").rename(database)
-        placed = []
-        for number in range(_DRAWS):
-            done = work / f"{kind}-{number}.json"
-            if not done.exists():
-                done.write_text(json.dumps(_draw(number, database, work, truth)), encoding="utf-8")
-            one = json.loads(done.read_text(encoding="utf-8"))
-            sys.stdout.write(f"{kind} {number}: {one or 'refused'}\n")
-            sys.stdout.flush()
-            placed += [one] if one else []
+        placed = all_drawn(kind, _DRAWS, partial(_draw, made=database, work=work, truth=truth), work)
         figures |= {f"{kind}_{name}": value for name, value in summed(placed, _DRAWS).items()}
     write_figures(args.json, figures)
     return 0
@@ -82,9 +74,7 @@ def scan_of(kind: str, scan: Path, work: Path) -> Path:
 
 def _draw(number: int, made: Path, work: Path, truth: ScanTruth) -> dict[str, float] | None:
     angle = np.random.default_rng((_SEED, number)).uniform(0.0, 2.0 * np.pi)
-    database = work / "placed"
-    shutil.rmtree(database, ignore_errors=True)
-    shutil.copytree(made, database)
+    database = newest_copy(made, work / "placed")
     opened = Database.open(database)
     (summary, *_) = opened.snapshot().unplaced_maps()
     (scan, *_) = list_scans(opened)

@@ -7,7 +7,6 @@
 3. The map's cameras against the truth.
 """
 
-import argparse
 import shutil
 import sys
 from collections.abc import Sequence
@@ -20,8 +19,8 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from ingest.workspace import default_root
-from tools.anchor_simworld import featuredb
-from tools.figures import write_figures
+from tools.commands import anchor, featuredb
+from tools.figures import study_parser, write_figures
 from tools.track_evaluation import film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from tools.worlds.scan_world import make_scan_world
@@ -30,7 +29,7 @@ _FRAMES = 1200
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    args = study_parser(__doc__, "--out").parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     world = make_scan_world(args.out)
     folder = write_film(args.out / "film-smooth", film_options("smooth", _FRAMES))
@@ -42,11 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     clock.lap("ingest")
     (made,) = Database.open(database).snapshot().maps()
     (stills,) = (default_root(Database.open(database).url) / "films").iterdir()
-    out = args.out / "film-anchor"
-    words = ("anchor", str(database), made.map_id, "--photos", str(stills), "--out", str(out), "--auto")
-    placed = featuredb(*words, "--quiet", may_refuse=True) == 0
+    placed = anchor(database, made.map_id, stills, args.out / "film-anchor")
     clock.lap("anchor")
-    made_s, anchored_s = clock.seconds["ingest"], clock.seconds["anchor"]
     snapshot = Database.open(database).snapshot()
     feature_map = snapshot.load_map(made.map_id)
     off = keyframe_errors(feature_map, read_film_truth(folder))
@@ -55,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "keyframes_m": float(np.median(off)),
         "keyframes_largest_m": float(off.max()),
         "placed": int(placed),
-        "made_s": made_s,
-        "anchored_s": anchored_s,
+        "made_s": clock.seconds["ingest"],
+        "anchored_s": clock.seconds["anchor"],
     }
     write_figures(args.out / "video_map.json", figures)
     return 0
@@ -71,12 +67,6 @@ def keyframe_errors(feature_map: FeatureMap, truth: FilmTruth) -> FloatArray:
         assert true is not None
         found.append(float(np.linalg.norm(here.act(image.cam_from_local.center) - true.center)))
     return np.array(found)
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("video-map"))
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.frames import VideoOptions, open_video
 from featuredb.video.telemetry.read import read_telemetry
+from tools.worlds.film_frame import Exposure
 from tools.worlds.film_world import (
     FILM_FILE,
     TELEMETRY_FILE,
@@ -31,7 +32,7 @@ _OPTIONS = FilmOptions(
     width=320,
     height=180,
     cut=(4, 6),
-    samples=2,
+    exposure=Exposure(samples=2),
     gps_sigma_m=0.5,
 )
 
@@ -91,7 +92,7 @@ def test_a_rolling_shutter_shows_its_rows_one_after_the_other() -> None:
     """The first rows are those of half a frame before, the middle ones those of the frame's own time."""
     still = replace(_OPTIONS, frames=20, cut=None, ev_range=0.0, rate_hz=10.0)
     between = replace(still, frames=40, rate_hz=20.0)
-    rolling = replace(still, readout_s=0.1)
+    rolling = replace(still, exposure=replace(still.exposure, readout_s=0.1))
 
     def grey(options: FilmOptions, frame: int) -> np.ndarray:
         picture = cv2.cvtColor(film_frame(options, frame), cv2.COLOR_RGB2GRAY)
@@ -145,7 +146,7 @@ def test_impossible_films_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="cut"):
         FilmOptions(frames=10, cut=(5, 20))
     with pytest.raises(InvalidValueError, match="value out of range"):
-        FilmOptions(frames=10, readout_s=0.1)
+        FilmOptions(frames=10, exposure=Exposure(readout_s=0.1))
     with pytest.raises(InvalidValueError, match="heights_m"):
         PathOptions(heights_m=(5.0, 10.0))
     with pytest.raises(InvalidValueError, match="truth of a simulated film"):

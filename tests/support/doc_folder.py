@@ -33,6 +33,7 @@ from featuredb.simworld.truth import Truth
 from featuredb.simworld.world import World, WorldOptions, town_of, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
+from tools.worlds.film_frame import Exposure
 from tools.worlds.film_world import FilmOptions, write_film
 from tools.worlds.flight_path import PathOptions
 
@@ -71,7 +72,7 @@ _FILM = FilmOptions(
     rate_hz=4.0,
     width=480,
     height=270,
-    samples=1,
+    exposure=Exposure(samples=1),
 )
 _FIRST_NAME = 27  # so that DJI_0034.JPG registers best
 

@@ -13,21 +13,19 @@ from tools import growth_community, growth_poison, growth_walk
 from tools.growth_common import Album, Registered, Verdict, world_told
 from tools.growth_poison import PoisonOutcome
 from tools.growth_walk import Probe, Step, worst_map
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact
 from tools.worlds.community import CommunityOptions
 from tools.worlds.walk_world import WalkOptions
 
 WALK = WalkOptions()
 
 
-def test_another_seed_and_the_full_size_are_other_worlds(tmp_path: Path) -> None:
+def test_another_seed_is_another_world(tmp_path: Path) -> None:
     def told(*words: str) -> CommunityOptions:
-        return world_told("", ["--out", str(tmp_path / "kept"), *words], 1, growth_community._SIZES)[1]
+        return world_told("", ["--out", str(tmp_path / "kept"), *words], 1, CommunityOptions)[1]
 
     assert told() == CommunityOptions(seed=1)
-    assert told("--seed", "7", "--size", "full") == CommunityOptions.full(7)
-    assert CommunityOptions.full(7).photos == 300
-    assert told("--size", "alike").zipf is None
+    assert told("--seed", "7") == CommunityOptions(seed=7)
     assert (tmp_path / "kept").is_dir()
 
 
@@ -38,7 +36,6 @@ def fact(i: int, kind: str = "drone") -> AlbumFact:
         kind=kind,
         owner="anna",
         licence="CC0-1.0",
-        title="",
         time=datetime(2025, 1, 1, tzinfo=UTC),
         home=kind == "drone",
     )
@@ -57,7 +54,6 @@ def placed(f: AlbumFact, error_m: float | None, status: str = "active", drift_m:
         status=status,
         generation=1,
         offset_m=None if error_m is None else np.array([0.0, error_m, 0.0]),
-        angle_deg=0.0,
         drift_m=drift_m,
         bound_m=2.0 * drift_m,
     )
@@ -90,23 +86,8 @@ def test_each_line_of_the_community_can_fail(line: str, change) -> None:  # type
 
 
 def steps(ratio: float = 0.5, stopped: int = 0, reach: float = 700.0, drift: float = 0.4) -> list[Step]:
-    probes = tuple(
-        Probe(name=str(i), step=0, away_m=float(i), error_m=0.1, normalised=2.0) for i in range(10)
-    )
-    return [
-        Step(
-            step=0,
-            reach_m=reach,
-            maps=1,
-            quarantined=0,
-            drift_m=drift,
-            true_m=ratio * drift,
-            ratio=ratio,
-            worst_m=ratio * drift,
-            stopped=stopped,
-            probes=probes,
-        )
-    ]
+    probes = tuple(Probe(error_m=0.1, normalised=2.0) for _ in range(10))
+    return [Step(step=0, reach_m=reach, drift_m=drift, ratio=ratio, stopped=stopped, failed=0, probes=probes)]
 
 
 def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
@@ -136,7 +117,7 @@ def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:
 
 
 def test_poison_that_gets_in_fails() -> None:
-    clean = PoisonOutcome(sent=10, active=0, quarantined=0, wrong={}, off_share=0.0)
+    clean = PoisonOutcome(sent=10, active=0, wrong={}, off_share=0.0)
     good = {"changed": True, "restored": True}
     assert all(holding(growth_poison.judge(clean, 0.01, good)).values())
     for bad in (replace(clean, wrong={"mirrored": 1}), replace(clean, off_share=0.03)):

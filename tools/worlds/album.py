@@ -1,25 +1,22 @@
 """Albums: photos of many people as planned, taken, edited, tagged, and written with a table and the truth.
 
 An album's photos lie in a folder per owner under names that give nothing away. Beside them stand
-`table.csv`, `table.jsonl` and `table.parquet` as a photo site's programming interface would give them,
-`truth.json` with every true pose, and `facts.jsonl` with what each photo really is.
+`table.jsonl` as a photo site's programming interface would give it, `truth.json` with every true pose, and
+`facts.jsonl` with what each photo really is.
 """
 
-import multiprocessing
+import json
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
-import cv2
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.exif import exif_of
 from featuredb.simworld.camera.photograph import take_photo
 from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
@@ -27,13 +24,58 @@ from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.truth import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
-from tools.worlds.album_files import AlbumFact, Geotag, write_facts, write_tables
 from tools.worlds.edits import Edit, edited, edited_camera
+from tools.worlds.film_frame import in_order, process_count
 from tools.worlds.indoors import indoor_photo, portrait_photo
+
+FACTS_FILE = "facts.jsonl"
+TABLE_FILE = "table.jsonl"
 
 Progress = Callable[[int, int], None]
 Subject = Literal["town", "indoor", "portrait"]
 ExifPolicy = Literal["full", "no_gps", "none"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Geotag:
+    """A position as claimed.
+
+    Attributes:
+        latitude_deg, longitude_deg: WGS84. height_m: above the ellipsoid, or None.
+        accuracy_m: what the site or the phone says of it, or None.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float | None = None
+    accuracy_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlbumFact:
+    """What a photo really is; nobody but the evaluation reads it.
+
+    Attributes:
+        name: path within the album. photo_id: the site's number.
+        kind: survey, street, drone, other_town, copy, indoor, portrait, ...; the worlds' modules list theirs.
+        owner, licence: as in the table.
+        time: of capture as claimed, timezone-aware.
+        home: it shows the town whose frame the truth is in, so that it has a true pose.
+        copy_of: the original, "" where this is one.
+        visit: photos of one visit by one person share it; -1 for those of none.
+        batch: when it arrives, for worlds that arrive in steps.
+    """
+
+    name: str
+    photo_id: str
+    kind: str
+    owner: str
+    licence: str
+    time: datetime
+    home: bool = True
+    copy_of: str = ""
+    visit: int = -1
+    batch: int = 0
 
 
 class SceneSource(Protocol):
@@ -61,7 +103,6 @@ class PlannedPhoto:
         quality: of the JPEG.
         sensor: of its camera, as this person uses it.
         orientation: EXIF orientation, 6 or 8 for a phone held upright that stores landscape pictures.
-        scene_from_home: where the scene has a local frame of its own, that frame from the truth's.
     """
 
     shot: Shot
@@ -74,7 +115,6 @@ class PlannedPhoto:
     quality: int = 90
     sensor: SensorOptions = field(default_factory=SensorOptions)
     orientation: int = 1
-    scene_from_home: Rigid3 | None = None
 
 
 def write_album(
@@ -84,7 +124,7 @@ def write_album(
     workers: int = 0,
     progress: Progress | None = None,
 ) -> Path:
-    """Write all photos, tables and truth into `folder`; files that are there already are kept.
+    """Write all photos, the table and the truth into `folder`; files that are there already are kept.
 
     Photos whose fact says `home` get a true pose in the frame of the scene "home/0/000".
 
@@ -109,11 +149,14 @@ def write_album(
     # The same scenes lie together: a process takes a part of the list, and paints few scenes.
     todo = sorted((p for p in photos if not (folder / p.shot.name).exists()), key=lambda p: p.scene)
     there = len(photos) - len(todo)
-    for done, _ in enumerate(_run(folder, world, todo, workers), start=there + 1):
+    # A row of its own for each process.
+    share = -(-len(todo) // max(process_count(workers, len(todo)), 1))
+    written = in_order(partial(_write, folder, world, todo), len(todo), workers, max(share, 1))
+    for done, _ in enumerate(written, start=there + 1):
         if progress is not None:
             progress(done, len(photos))
     truths = {p.shot.name: true for p in photos if (true := _truth(home, p)) is not None}
-    write_tables(folder, [(p.fact, p.geotag) for p in photos])
+    write_table(folder, [(p.fact, p.geotag) for p in photos])
     write_facts(folder, [p.fact for p in photos])
     write_truth(folder, Truth(seed=home.seed, epsg=home.epsg, frame=home.frame, images=truths))
     return folder
@@ -131,12 +174,8 @@ def _truth(home: Scene, photo: PlannedPhoto) -> TrueImage | None:
     camera = edited_camera(photo.shot.device.camera, photo.edits, photo.shot.seed)
     if camera is None:
         return None
-    pose = photo.shot.cam_from_local
-    if photo.scene_from_home is not None:
-        pose = pose @ photo.scene_from_home
     device = replace(photo.shot.device, camera=camera)
-    shot = replace(photo.shot, device=device, cam_from_local=pose, gps_enu=None)
-    return true_image(home, shot)
+    return true_image(home, replace(photo.shot, device=device, gps_enu=None))
 
 
 def _picture(scene: Scene, photo: PlannedPhoto) -> Image8:
@@ -170,38 +209,63 @@ def _exif(photo: PlannedPhoto, image: Image8) -> Image.Exif | None:
     return exif
 
 
-def _run(folder: Path, world: SceneSource, todo: list[PlannedPhoto], workers: int) -> Iterator[str]:
-    """Write each photo, in a pool of processes (or here, for one worker); names as they are done."""
-    count = min(workers or os.cpu_count() or 1, len(todo))
-    if count <= 1:
-        for photo in todo:
-            yield _write(folder, world, photo)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ExitStack() as stack:
-        futures = []
-        for share in range(count):  # a row of its own for each process: few scenes are painted twice
-            pool = ProcessPoolExecutor(1, mp_context=context, initializer=_one_thread)
-            stack.enter_context(pool)
-            start, stop = (len(todo) * edge // count for edge in (share, share + 1))
-            futures += [pool.submit(_write, folder, world, photo) for photo in todo[start:stop]]
-        for future in as_completed(futures):
-            yield future.result()
-
-
-def _one_thread() -> None:
-    cv2.setNumThreads(1)
-
-
 @lru_cache(maxsize=4)
 def _scene(world: SceneSource, key: str) -> Scene:
     return world.scene(key)
 
 
-def _write(folder: Path, world: SceneSource, photo: PlannedPhoto) -> str:
+def _write(folder: Path, world: SceneSource, photos: Sequence[PlannedPhoto], number: int) -> None:
     """Write one file under its name by renaming, so that a file that is there is whole."""
+    photo = photos[number]
     target = folder / photo.shot.name
-    partial = target.with_suffix(f".{os.getpid()}.part")
-    partial.write_bytes(photo_file(_scene(world, photo.scene), photo))
-    partial.replace(target)
-    return photo.shot.name
+    part = target.with_suffix(f".{os.getpid()}.part")
+    part.write_bytes(photo_file(_scene(world, photo.scene), photo))
+    part.replace(target)
+
+
+def write_facts(folder: Path, facts: Sequence[AlbumFact]) -> None:
+    """Write folder/facts.jsonl, a line per photo, sorted by name."""
+    lines = [
+        json.dumps({**asdict(fact), "time": fact.time.isoformat()})
+        for fact in sorted(facts, key=lambda f: f.name)
+    ]
+    (folder / FACTS_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_facts(folder: Path) -> dict[str, AlbumFact]:
+    """Facts by name.
+
+    Raises:
+        InvalidValueError: no such file, or not one of an album.
+    """
+    path = Path(folder) / FACTS_FILE
+    try:
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        facts = [AlbumFact(**{**row, "time": datetime.fromisoformat(row["time"])}) for row in rows]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InvalidValueError(
+            f"{path}: expected the facts of a simulated album, found {error!r}"
+        ) from error
+    return {fact.name: fact for fact in facts}
+
+
+def write_table(folder: Path, rows: Sequence[tuple[AlbumFact, Geotag | None]]) -> None:
+    """Write table.jsonl, sorted by path; photos of a survey are not part of a photo site."""
+    table = [
+        _table_row(fact, tag) for fact, tag in sorted(rows, key=lambda r: r[0].name) if fact.kind != "survey"
+    ]
+    lines = "".join(json.dumps(row) + "\n" for row in table)
+    (folder / TABLE_FILE).write_text(lines, encoding="utf-8")
+
+
+def _table_row(fact: AlbumFact, tag: Geotag | None) -> dict[str, Any]:
+    return {
+        "path": fact.name,
+        "id": fact.photo_id,
+        "lat": None if tag is None else round(tag.latitude_deg, 7),
+        "lon": None if tag is None else round(tag.longitude_deg, 7),
+        "accuracy": None if tag is None else tag.accuracy_m,
+        "time": fact.time.isoformat(),
+        "owner": fact.owner,
+        "licence": fact.licence,
+    }

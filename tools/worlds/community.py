@@ -6,33 +6,21 @@ other_town; copy (a re-upload by somebody else); indoor, portrait (belong nowher
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from typing import Self
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
-from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto, Subject
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact, PlannedPhoto, Subject
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
-from tools.worlds.geotags import GeotagOptions, geotag_at
+from tools.worlds.geotags import ACCURACY_SHARE, GeotagOptions, geotag_at
 from tools.worlds.people import Person, community
 from tools.worlds.sights import find_sights
-from tools.worlds.surveyed import (
-    DAYS,
-    day_scene,
-    moment,
-    shot_seed,
-    survey_photos,
-)
+from tools.worlds.surveyed import DAYS, TownOptions, moment, shot_seed, survey_photos
 
-_OTHER_SEED = 1000
 _TAGGED_HERE, _TAGGED_THERE = (
     0.6,
     0.8,
@@ -40,20 +28,13 @@ _TAGGED_HERE, _TAGGED_THERE = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CommunityOptions:
-    """What to write. The same options give the same bytes.
+class CommunityOptions(TownOptions):
+    """What to write; the survey is of most of what people visit.
 
     Attributes:
-        seed: of everything. town_size_m: width and height of the town.
-        flight: the anchored survey, of most of what people visit.
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
         sights: places that people visit.
-        zipf: how much more they visit the first ones (`plan_visits`). Photo sites show a few landmarks: the
-            paper's 120,000 photos were of seven, and in every town one place leads. None: nearly alike.
-        width: of the widest camera, pixels.
-        geotags: how wrong they are.
-        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
     """
 
     seed: int = 1
@@ -69,61 +50,6 @@ class CommunityOptions:
     indoor: int = 2
     portraits: int = 2
     sights: int = 6
-    zipf: float | None = 1.0
-    width: int = 1200
-    geotags: GeotagOptions = field(default_factory=GeotagOptions)
-    texel_m: float = 0.06
-    pieces: int = 4
-
-    def __post_init__(self) -> None:
-        if min(self.photos, self.other_town, self.copies, self.indoor, self.portraits) < 0:
-            raise InvalidValueError(f"CommunityOptions: expected numbers >= 0, found {self}")
-        if not (self.sights > 0 and self.width >= 64):
-            raise InvalidValueError(f"CommunityOptions: value out of range in {self}")
-
-    @classmethod
-    def full(cls, seed: int) -> Self:
-        """A town with 300 photos of it."""
-        return cls(
-            seed=seed,
-            town_size_m=(440.0, 350.0),
-            flight=FlightOptions(
-                lines=9, per_line=13, height_m=100.0, oblique=14, gps_error="rtk", center_m=(-50.0, 15.0)
-            ),
-            photos=300,
-            other_town=100,
-            copies=40,
-            indoor=12,
-            portraits=12,
-            sights=12,
-            width=1600,
-            pieces=16,
-        )
-
-    @classmethod
-    def alike(cls, seed: int) -> Self:
-        """The full world, whose thirty sights are visited nearly alike."""
-        return replace(cls.full(seed), sights=30, zipf=None)
-
-    def scene(self, key: str) -> Scene:
-        """Scenes "home/light/week" and "away/light/week"."""
-        return day_scene(_base(self, key.split("/")[0]), key)
-
-
-@lru_cache(maxsize=4)
-def _base(options: CommunityOptions, town: str) -> Scene:
-    if town == "home":
-        return make_town(
-            options.seed, size_m=options.town_size_m, texel_m=options.texel_m, pieces=options.pieces
-        )
-    return make_town(
-        options.seed + _OTHER_SEED,
-        name="other town",
-        size_m=options.town_size_m,
-        place=OTHER_TOWN_PLACE,
-        texel_m=options.texel_m,
-        pieces=options.pieces,
-    )
 
 
 def community_album(options: CommunityOptions) -> list[PlannedPhoto]:
@@ -137,7 +63,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
     home, away = options.scene("home/0/000"), options.scene("away/0/000")
     people = community(options.width)
     places = find_sights(home, options.sights, options.seed, options.flight.center_m)
-    mine = plan_visits(home, people, places, options.photos, options.seed, "home", zipf=options.zipf)
+    mine = plan_visits(home, people, places, options.photos, options.seed, "home", by_rank=True)
     places = find_sights(away, options.sights, options.seed + 1)
     theirs = plan_visits(
         away,
@@ -148,11 +74,11 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
         "away",
         first_visit=10_000,
         kind="other_town",
-        zipf=options.zipf,
+        by_rank=True,
     )
     rng = np.random.default_rng((options.seed, 58))
-    mine = tagged(home, mine, people, options.geotags, rng)
-    theirs = _other_tags(home, away, theirs, options.geotags, rng)
+    mine = tagged(home, mine, people, GeotagOptions(), rng)
+    theirs = _other_tags(home, away, theirs, GeotagOptions(), rng)
     copies = plan_copies(mine, people, options.copies, options.seed)
     nowhere = _plan_nowhere(options, people, home)
     return named([*mine, *theirs, *copies, *nowhere], options.seed)
@@ -168,16 +94,16 @@ def _other_tags(
         half = 0.4 * np.asarray(home.plan.size)
         drawn = float(rng.random()), np.array([*rng.uniform(-half, half), 2.0])
         fate, spot = place_of.setdefault(p.fact.visit, drawn)
-        accuracy = float(np.round(options.sigma_m)) if rng.random() < options.accuracy_share else None
+        accuracy = float(np.round(options.sigma_m)) if rng.random() < ACCURACY_SHARE else None
         jitter = np.array([*rng.normal(0, 0.5 * options.sigma_m, 2), 0.0])
         if fate < _TAGGED_HERE:
             tag = geotag_at(home, home.enu_from_town @ spot + jitter, 0.0, accuracy)
-            result.append(replace(p, geotag=tag, fact=replace(p.fact, geotag="far")))
+            result.append(replace(p, geotag=tag))
         elif fate < _TAGGED_THERE:
             tag = geotag_at(away, p.shot.cam_from_local.center + jitter, 0.0, accuracy)
             result.append(replace(p, geotag=tag))
         else:
-            result.append(replace(p, fact=replace(p.fact, geotag="none")))
+            result.append(p)
     return result
 
 
@@ -218,8 +144,6 @@ def plan_copies(
                     owner=owner.name,
                     licence=owner.licence,
                     copy_of=original.shot.name,
-                    geotag=original.fact.geotag if keeps_tag else "none",
-                    title="found this",
                 ),
             )
         )
@@ -251,10 +175,8 @@ def _plan_nowhere(options: CommunityOptions, people: tuple[Person, ...], home: S
             kind=subject,
             owner=person.name,
             licence=person.licence,
-            title="at home" if subject == "indoor" else "me",
             time=shot.time,
             home=False,
-            geotag="near" if has_tag else "none",
         )
         photos.append(
             PlannedPhoto(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from featuredb.simworld.town.texture import Image8
 _GLITTER_HZ = 5.0  # how often the water looks new
 _BANDS = 12  # of rows, where they are not exposed at once
 _CHUNK = 4  # frames that travel to a process at a time
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,9 +84,9 @@ def draw_frame(
     return expose(np.clip(light, 0, 255).astype(np.uint8), rng, sensor)
 
 
-def in_order(draw: Callable[[int], Image8], count: int, workers: int = 0) -> Iterator[Image8]:
+def in_order(draw: Callable[[int], T], count: int, workers: int = 0, chunk: int = _CHUNK) -> Iterator[T]:
     """`draw(i)` of all i below `count` in their order, from a pool of processes (or here, for one worker)."""
-    processes = min(workers or os.cpu_count() or 1, count)
+    processes = process_count(workers, count)
     if processes <= 1:
         yield from map(draw, range(count))
         return
@@ -92,16 +94,21 @@ def in_order(draw: Callable[[int], Image8], count: int, workers: int = 0) -> Ite
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, cv2.setNumThreads, (1,)) as pool:
         # A few chunks ahead of the writer, so that a slow disk does not fill the memory.
-        chunks = [range(first, min(first + _CHUNK, count)) for first in range(0, count, _CHUNK)]
+        chunks = [range(first, min(first + chunk, count)) for first in range(0, count, chunk)]
         ahead = 4 * processes
-        waiting = [pool.submit(_drawn, draw, chunk) for chunk in chunks[:ahead]]
+        waiting = [pool.submit(_drawn, draw, frames) for frames in chunks[:ahead]]
         for k in range(len(chunks)):
             yield from waiting.pop(0).result()
             if k + ahead < len(chunks):
                 waiting.append(pool.submit(_drawn, draw, chunks[k + ahead]))
 
 
-def _drawn(draw: Callable[[int], Image8], frames: range) -> list[Image8]:
+def process_count(workers: int, tasks: int) -> int:
+    """Processes for so many tasks; 0 workers: one per core."""
+    return min(workers or os.cpu_count() or 1, tasks)
+
+
+def _drawn(draw: Callable[[int], T], frames: range) -> list[T]:
     return [draw(frame) for frame in frames]
 
 

@@ -22,7 +22,6 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.sensor import SensorOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import WorldOptions, other_town_of, town_of
@@ -44,16 +43,12 @@ class FilmOptions:
     Attributes:
         world: whose town is filmed. path: how the camera flies; its duration is that of the frames.
         frames, rate_hz: of the film. width, height: pixels.
-        shutter_s: how long a frame is exposed; what moves meanwhile is blurred. samples: pictures of that
-            time that are averaged; each looks through other parts of the pixels.
-        readout_s: rolling shutter, from the first row of a frame to the last; a frame's time and true pose
-            are those of its middle row. 0: all rows at once.
+        exposure: of a frame; what it says of stops is not used.
         ev_range: stops between the darkest and the brightest exposure, which follow each other slowly, and
             leap once where the flight is jerky.
         cut: frames (first, last + 1) that show another town, or None.
         gps_sigma_m: of the telemetry: errors that wander.
         telemetry_late_s: how much later than the picture the telemetry is.
-        sensor: noise and lens of the camera.
     """
 
     world: WorldOptions = field(default_factory=WorldOptions)
@@ -62,23 +57,14 @@ class FilmOptions:
     rate_hz: float = 30.0
     width: int = 1280
     height: int = 720
-    shutter_s: float = 1 / 100
-    samples: int = 4
-    readout_s: float = 0.0
+    exposure: Exposure = field(default_factory=Exposure)
     ev_range: float = 0.7
     cut: tuple[int, int] | None = None
     gps_sigma_m: float = 1.5
     telemetry_late_s: float = 0.3
-    sensor: SensorOptions = field(default_factory=SensorOptions)
 
     def __post_init__(self) -> None:
-        if not (
-            self.frames > 0
-            and self.rate_hz > 0
-            and self.samples > 0
-            and self.shutter_s >= 0
-            and 0 <= self.readout_s <= 1 / self.rate_hz
-        ):
+        if not (self.frames > 0 and self.rate_hz > 0 and self.exposure.readout_s <= 1 / self.rate_hz):
             raise InvalidValueError(f"FilmOptions: value out of range in {self}")
         if self.cut is not None and not 0 <= self.cut[0] < self.cut[1] <= self.frames:
             raise InvalidValueError(
@@ -104,6 +90,8 @@ class FilmOptions:
         """Digest of what the files depend on."""
         options = asdict(self)
         options["world"].pop("workers")
+        options |= options.pop("exposure")
+        options.pop("ev")
         if options["readout_s"] == 0:
             options.pop("readout_s")  # films that were written before there was one
         return hashlib.sha256(json.dumps([_FORMAT, options], sort_keys=True).encode()).hexdigest()
@@ -194,13 +182,7 @@ def read_film_truth(folder: Path) -> FilmTruth:
 def film_frame(options: FilmOptions, frame: int) -> Image8:
     """One frame (h, w, 3) uint8 RGB as the camera's sensor gives it."""
     home, time_s = options.at_home(frame), options.time_s(frame)
-    exposure = Exposure(
-        shutter_s=options.shutter_s,
-        samples=options.samples,
-        readout_s=options.readout_s,
-        ev=_exposure_ev(options, time_s),
-        sensor=options.sensor,
-    )
+    exposure = replace(options.exposure, ev=_exposure_ev(options, time_s))
     pose_at = _path(options, home).pose
     seeds = (options.path.seed, frame)
     return draw_frame(_scene(options, home), options.camera, pose_at, time_s, exposure, seeds)

@@ -2,15 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album_files import Geotag, GeotagState
+from tools.worlds.album import Geotag
 
+GeotagState = Literal["near", "far", "none"]
 _FAR_M = (1_000.0, 12_000.0)
+_HEIGHT_SIGMA_M = 15.0  # of the heights, where there are any
+ACCURACY_SHARE = 0.6  # of the tagged photos, those that say how accurate they are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,17 +25,13 @@ class GeotagOptions:
         sigma_m: standard deviation per horizontal axis of an ordinary geotag; half of the variance is
             common to the photos of a visit. So the distance from the truth is sigma times root 2, rms.
         far_share: of the tagged photos, those that are wrong by 1 to 12 km; half of them as whole visits.
-        height_sigma_m: of the heights, where there are any.
-        accuracy_share: of the tagged photos, those that say how accurate they are.
     """
 
     sigma_m: float = 30.0
     far_share: float = 0.1
-    height_sigma_m: float = 15.0
-    accuracy_share: float = 0.6
 
     def __post_init__(self) -> None:
-        if not (self.sigma_m >= 0 and 0 <= self.far_share <= 1 and 0 <= self.accuracy_share <= 1):
+        if not (self.sigma_m >= 0 and 0 <= self.far_share <= 1):
             raise InvalidValueError(f"GeotagOptions: value out of range in {self}")
 
 
@@ -60,9 +60,9 @@ def give_geotags(
         common = shared.setdefault(photo.visit, rng.normal(0, share, 2)) if photo.visit >= 0 else None
         own = rng.normal(0, share, 2)
         error = own + (common if common is not None else rng.normal(0, share, 2))
-        height_error = float(rng.normal(0, options.height_sigma_m))
+        height_error = float(rng.normal(0, _HEIGHT_SIGMA_M))
         claimed = float(np.clip(np.round(options.sigma_m * rng.lognormal(0.0, 0.4)), 3, 200))
-        says = rng.random() < options.accuracy_share
+        says = rng.random() < ACCURACY_SHARE
         if not photo.tagged:
             given.append((None, "none"))
             continue

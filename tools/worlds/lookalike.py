@@ -4,8 +4,9 @@ For the block's copy everything is copied: buildings, cars, trees, the painted g
 Only what surrounds it differs.
 """
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from featuredb.simworld.town.solids import face
 from featuredb.simworld.town.town import BUILDING_ID
 
 Rect = tuple[float, float, float, float]
+T = TypeVar("T", Faces, Ellipsoids)
 
 _PATCH_M = 0.02  # the copied ground lies this much over the old one
 _ID_SHIFT = 50_000
@@ -71,8 +73,8 @@ def with_copied_block(scene: Scene, source: Rect, target: Rect, *, mirrored: boo
     crown_kept, crown_taken = ~_inside(crown_at, cleared), _inside(crown_at, source)
     all_faces = Faces.concatenate([_rows(faces, kept), copy, patch])
     all_crowns = _joined(
-        _crown_rows(crowns, crown_kept),
-        _moved_crowns(_crown_rows(crowns, crown_taken), middle, shift, mirrored),
+        _rows(crowns, crown_kept),
+        _moved_crowns(_rows(crowns, crown_taken), middle, shift, mirrored),
     )
     plan = scene.plan
     houses = [b for b in plan.buildings if not _inside(np.array([[b.x, b.y]]), cleared)[0]]
@@ -125,12 +127,8 @@ def _object_centers(faces: Faces) -> FloatArray:
     return np.asarray((sums / np.bincount(row)[:, None])[row])
 
 
-def _rows(faces: Faces, rows: NDArray[np.bool_]) -> Faces:
-    return Faces(**{name: getattr(faces, name)[rows] for name in Faces.__dataclass_fields__})
-
-
-def _crown_rows(crowns: Ellipsoids, rows: NDArray[np.bool_]) -> Ellipsoids:
-    return Ellipsoids(**{name: getattr(crowns, name)[rows] for name in Ellipsoids.__dataclass_fields__})
+def _rows(things: T, rows: NDArray[np.bool_]) -> T:
+    return type(things)(**{field.name: getattr(things, field.name)[rows] for field in fields(things)})
 
 
 def _joined(a: Ellipsoids, b: Ellipsoids) -> Ellipsoids:

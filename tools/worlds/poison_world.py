@@ -17,27 +17,25 @@ stands there mirrored. Kinds of photos:
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.scene import Scene
-from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto
-from tools.worlds.album_files import Geotag
+from tools.worlds.album import Geotag, PlannedPhoto
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.geotags import GeotagOptions, geotag_at
 from tools.worlds.lookalike import Rect, blocks_of, forged, with_copied_block
 from tools.worlds.people import Person, community
 from tools.worlds.sights import Sight, find_sights
-from tools.worlds.surveyed import day_scene, survey_photos
+from tools.worlds.surveyed import TownOptions, day_scene, survey_photos, town_of
 
 POISONS = ("lookalike", "mirrored", "mirror_block", "liar", "liar_other", "altered", "forged")
-_OTHER_SEED = 1000
 _LIE_M = (130.0, 75.0)  # shift of the liar's positions, east and north: another block
+_TAGS = GeotagOptions(sigma_m=15.0, far_share=0.0)  # of those who do not lie
 _EDITS = (
     Edit(kind="pasted", amount=0.3),
     Edit(kind="moved", amount=0.25),
@@ -47,17 +45,13 @@ _EDITS = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PoisonOptions:
-    """What to write. The same options give the same bytes.
+class PoisonOptions(TownOptions):
+    """What to write; the survey is in the west of the town.
 
     Attributes:
-        seed: of everything. town_size_m: width and height; the survey is in the west.
-        flight: of the survey.
         honest, late: photos of honest people before and after the poison. canaries: held-out photos.
         per_poison: photos of each of POISONS.
-        sights: places that honest people visit. width: of the widest camera, pixels.
-        geotags: of those who do not lie.
-        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
+        sights: places that honest people visit.
     """
 
     seed: int = 4
@@ -72,34 +66,11 @@ class PoisonOptions:
     canaries: int = 6
     per_poison: int = 10
     sights: int = 6
-    width: int = 1200
-    geotags: GeotagOptions = field(default_factory=lambda: GeotagOptions(sigma_m=15.0, far_share=0.0))
-    texel_m: float = 0.06
-    pieces: int = 4
-
-    def __post_init__(self) -> None:
-        if min(self.honest, self.late, self.canaries, self.per_poison) < 0 or self.sights < 1:
-            raise InvalidValueError(f"PoisonOptions: value out of range in {self}")
-
-    @classmethod
-    def full(cls, seed: int) -> Self:
-        """A larger town and three times the photos."""
-        return cls(
-            seed=seed,
-            town_size_m=(560.0, 260.0),
-            flight=FlightOptions(lines=6, per_line=12, oblique=8, gps_error="rtk", center_m=(-130.0, 0.0)),
-            honest=60,
-            late=40,
-            canaries=20,
-            per_poison=30,
-            sights=14,
-            width=1440,
-            pieces=16,
-        )
 
     def scene(self, key: str) -> Scene:
         """Scenes "home/...", "forged/..." and "away/light/week"."""
-        return day_scene(_base(self, key.split("/")[0]), key)
+        kind = key.split("/")[0]
+        return day_scene(town_of(self, away=True) if kind == "away" else _with_traps(self, kind), key)
 
 
 class Places(NamedTuple):
@@ -113,32 +84,11 @@ class Places(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _base(options: PoisonOptions, town: str) -> Scene:
-    if town == "away":
-        return make_town(
-            options.seed + _OTHER_SEED,
-            name="other town",
-            size_m=options.town_size_m,
-            place=OTHER_TOWN_PLACE,
-            texel_m=options.texel_m,
-            pieces=options.pieces,
-        )
+def _with_traps(options: PoisonOptions, kind: str) -> Scene:
     places = poison_places(options)
-    scene = _plain(options)
-    scene = with_copied_block(scene, places.source, places.target)
+    scene = with_copied_block(town_of(options), places.source, places.target)
     scene = with_copied_block(scene, places.mirror_source, places.mirror_target, mirrored=True)
-    return scene if town == "home" else forged(scene, places.mapped, options.seed)
-
-
-@lru_cache(maxsize=2)
-def _plain(options: PoisonOptions) -> Scene:
-    return make_town(
-        options.seed,
-        name="town with traps",
-        size_m=options.town_size_m,
-        texel_m=options.texel_m,
-        pieces=options.pieces,
-    )
+    return scene if kind == "home" else forged(scene, places.mapped, options.seed)
 
 
 def poison_places(options: PoisonOptions) -> Places:
@@ -151,7 +101,7 @@ def poison_places(options: PoisonOptions) -> Places:
     cx, cy = options.flight.center_m
     mapped = (cx - half_x, cy - half_y, cx + half_x, cy + half_y)
     rows: dict[float, list[Rect]] = {}
-    for block in blocks_of(_plain(options).plan):
+    for block in blocks_of(town_of(options).plan):
         rows.setdefault(block[1], []).append(block)
     pairs = []
     for row in rows.values():
@@ -174,7 +124,7 @@ def _unfit(options: PoisonOptions, source: Rect, target: Rect) -> float:
     or its mirror image would be itself."""
     wider = (source[2] - source[0]) - (target[2] - target[0])
     x0, y0, x1, y1 = source
-    looks = {b.detail_u for b in _plain(options).plan.buildings if x0 < b.x < x1 and y0 < b.y < y1}
+    looks = {b.detail_u for b in town_of(options).plan.buildings if x0 < b.x < x1 and y0 < b.y < y1}
     return (100.0 if wider > 4.0 else abs(wider)) - 4.0 * min(len(looks), 6)
 
 
@@ -217,7 +167,7 @@ def plan_poison(options: PoisonOptions) -> list[PlannedPhoto]:
         seed = options.seed + 10 * i
         taken = plan_visits(scene, owners, towns[sights], count, seed, town, first_visit=1000 * i, kind=kind)
         rng = np.random.default_rng((seed, 58))
-        taken = tagged(scene, taken, owners, options.geotags, rng)
+        taken = tagged(scene, taken, owners, _TAGS, rng)
         taken = [_poisoned(p, home, places, rng) for p in taken]
         photos += [_renamed(p, kind, batch) for p in taken]
     return named(photos, options.seed)
@@ -274,4 +224,4 @@ def _poisoned(photo: PlannedPhoto, home: Scene, places: Places, rng: np.random.G
 
 
 def _claiming(photo: PlannedPhoto, tag: Geotag) -> PlannedPhoto:
-    return replace(photo, geotag=tag, exif="full", fact=replace(photo.fact, geotag="far"))
+    return replace(photo, geotag=tag, exif="full")

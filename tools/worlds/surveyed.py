@@ -1,6 +1,6 @@
 """What worlds of contributed photos share: a town on many days, and the anchored survey of a part of it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 
@@ -9,14 +9,49 @@ import numpy as np
 from featuredb.simworld.flight import FlightOptions, survey
 from featuredb.simworld.town.days import DayOptions, another_day
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import PlannedPhoto
-from tools.worlds.album_files import AlbumFact, Geotag
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
+from tools.worlds.album import AlbumFact, Geotag, PlannedPhoto
 
 # Suns by the hour, town axes; index 0 is the scene's own.
 _SUNS = (None, (0.62, -0.42, 0.62), (0.10, -0.55, 0.83), (-0.66, -0.30, 0.55))
 _SEASONS = ((1.0, 1.0, 1.0), (1.05, 1.08, 0.9), (1.35, 0.95, 0.6), (0.9, 0.95, 0.9))
 _FIRST = datetime(2024, 3, 2, 0, 0, tzinfo=UTC)
 DAYS = 730
+_OTHER_SEED = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TownOptions:
+    """What to write. The same options give the same bytes.
+
+    Attributes:
+        seed: of everything. town_size_m: width and height of the town.
+        flight: the anchored survey. width: of people's widest camera, pixels.
+        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
+    """
+
+    seed: int
+    town_size_m: tuple[float, float]
+    flight: FlightOptions
+    width: int = 1200
+    texel_m: float = 0.06
+    pieces: int = 4
+
+    def scene(self, key: str) -> Scene:
+        """Scenes "home/light/week" and, of another town, "away/light/week"."""
+        return day_scene(town_of(self, away=key.startswith("away/")), key)
+
+
+@lru_cache(maxsize=4)
+def town_of(options: TownOptions, *, away: bool = False) -> Scene:
+    """The town as it was built, or another one elsewhere on Earth."""
+    return make_town(
+        options.seed + (_OTHER_SEED if away else 0),
+        size_m=options.town_size_m,
+        place=OTHER_TOWN_PLACE if away else TOWN_PLACE,
+        texel_m=options.texel_m,
+        pieces=options.pieces,
+    )
 
 
 def day_key(town: str, day: int, hour: float) -> str:
@@ -58,7 +93,6 @@ def survey_photos(
             kind="survey",
             owner="survey office",
             licence="CC-BY-4.0",
-            title=f"survey photo {i + 1}",
             time=shot.time,
         )
         tag = Geotag(latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=float(height))

@@ -17,12 +17,11 @@ _TRIES = 6  # a photographer who sees nothing but a wall takes a step and tries 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """One photo of a visit: with what, from where, how the phone was held, its name for people."""
+    """One photo of a visit: with what, from where, how the phone was held."""
 
     device: Device
     cam_from_local: Rigid3
     orientation: int
-    mode: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,7 +58,7 @@ def ground_visit(
             device, roll, orientation = _held(device, person, upright)
             wobble = rng.normal(0, [3.0, 2.0, 0.8 + 3.0 * careless])
             look = Viewpoint(eye=eye, target=aim, turn_deg=(wobble[0], wobble[1], wobble[2] + roll))
-            view = _view(around, look, device, orientation, "ground", _NEAREST_GROUND_M)
+            view = _view(around, look, device, orientation, _NEAREST_GROUND_M)
             if view is not None:
                 views.append(view)
                 break
@@ -93,7 +92,6 @@ def drone_visit(
             Viewpoint(eye=look.eye, target=look.target, turn_deg=turn),
             person.drone,
             1,
-            mode,
             _NEAREST_DRONE_M,
         )
         if view is not None:
@@ -102,7 +100,7 @@ def drone_visit(
 
 
 def _view(
-    around: Surroundings, look: Viewpoint, device: Device, orientation: int, mode: str, nearest_m: float
+    around: Surroundings, look: Viewpoint, device: Device, orientation: int, nearest_m: float
 ) -> View | None:
     """The view, or None where nobody would take it or the camera would stand in something."""
     inside = np.abs(look.eye[:2]) < 0.5 * np.asarray(around.scene.plan.size) + 20.0
@@ -111,7 +109,7 @@ def _view(
     pose = look_at(around.scene, look.eye, look.target, look.turn_deg)
     if not around.worth_taking(device.camera, pose, nearest_m):
         return None
-    return View(device=device, cam_from_local=pose, orientation=orientation, mode=mode)
+    return View(device=device, cam_from_local=pose, orientation=orientation)
 
 
 def _height(person: Person, rng: np.random.Generator) -> float:

@@ -7,23 +7,26 @@ survey_far/. Kinds: survey, survey_far, walk, probe.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from typing import Self
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
-from featuredb.simworld.town.town import make_town
-from tools.worlds.album import PlannedPhoto
-from tools.worlds.album_files import AlbumFact
+from tools.worlds.album import AlbumFact, PlannedPhoto
 from tools.worlds.geotags import geotag_at
 from tools.worlds.people import Person, community
 from tools.worlds.sights import Surroundings, look_at
-from tools.worlds.surveyed import day_key, day_scene, moment, photo_ids, shot_seed, survey_photos
+from tools.worlds.surveyed import (
+    TownOptions,
+    day_key,
+    moment,
+    photo_ids,
+    shot_seed,
+    survey_photos,
+    town_of,
+)
 
 _PROBE = "probe"
 _TRIES = 8
@@ -50,17 +53,14 @@ WALKERS = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WalkOptions:
-    """What to write. The same options give the same bytes.
+class WalkOptions(TownOptions):
+    """What to write; people walk along the width of the town.
 
     Attributes:
-        seed: of everything. town_size_m: width and height; people walk along the width.
-        flight: both surveys; `start_m` and `end_m` are where they stand along the town's x axis.
+        start_m, end_m: where the two surveys stand along the town's x axis.
         step_m: how far the people get from one step to the next; they start at the edge of the first survey
             and arrive in the second.
         per_step: photos of each walker in a step. probes: photos of a step that nobody contributes.
-        width: of the widest camera, pixels.
-        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
     """
 
     seed: int = 2
@@ -73,46 +73,12 @@ class WalkOptions:
     step_m: float = 35.0
     per_step: int = 4
     probes: int = 2
-    width: int = 1200
     texel_m: float = 0.08
-    pieces: int = 4
-
-    def __post_init__(self) -> None:
-        if not (self.start_m < self.end_m and self.step_m > 0 and self.per_step > 0 and self.probes >= 0):
-            raise InvalidValueError(f"WalkOptions: value out of range in {self}")
-
-    @classmethod
-    def full(cls, seed: int) -> Self:
-        """A walk of 690 m between the surveys."""
-        return cls(
-            seed=seed,
-            town_size_m=(1020.0, 210.0),
-            flight=FlightOptions(lines=5, per_line=8, oblique=6, gps_error="rtk"),
-            start_m=-430.0,
-            end_m=410.0,
-            width=1440,
-            pieces=16,
-        )
 
     @property
     def steps(self) -> int:
         """Number of steps from one survey to the other."""
         return int(np.ceil((self.end_m - self.start_m) / self.step_m)) + 1
-
-    def scene(self, key: str) -> Scene:
-        """Scenes "home/light/week"."""
-        return day_scene(_base(self), key)
-
-
-@lru_cache(maxsize=2)
-def _base(options: WalkOptions) -> Scene:
-    return make_town(
-        options.seed,
-        name="long town",
-        size_m=options.town_size_m,
-        texel_m=options.texel_m,
-        pieces=options.pieces,
-    )
 
 
 def plan_walk(options: WalkOptions) -> list[PlannedPhoto]:
@@ -139,7 +105,7 @@ def plan_walk(options: WalkOptions) -> list[PlannedPhoto]:
 
 def _middle(options: WalkOptions) -> float:
     """The y of the way: the middle of the town north of the river."""
-    return 0.5 * (0.5 * options.town_size_m[1] + max(_base(options).plan.river))
+    return 0.5 * (0.5 * options.town_size_m[1] + max(town_of(options).plan.river))
 
 
 Aim = tuple[FloatArray, FloatArray]
@@ -221,12 +187,9 @@ def _photos(
             kind=kind,
             owner=owner,
             licence=person.licence,
-            title=f"step {step + 1}",
             time=shot.time,
-            geotag="near" if tag else "none",
             visit=10 * step + who,
             batch=step,
-            place=f"step {step + 1}",
         )
         photos.append(
             PlannedPhoto(
