@@ -218,7 +218,7 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
     files = find_photos(loaded, request.photos)
     first: FirstPlace | None = None
     if isinstance(loaded, UnplacedMap):
-        first = first_place(database, loaded, request.start, request.scan_ids)
+        first = first_place(database, loaded, request.start, request.scan_ids, files)
         feature_map, cloud, scan_ids = first.feature_map, first.cloud, first.scan_ids
     else:
         assert isinstance(summary, MapSummary)

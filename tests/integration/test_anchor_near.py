@@ -14,10 +14,13 @@ from featuredb.lidar.add import add_scan
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import moved_image
 from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
+from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from ingest.register.anchor import frames
 from ingest.register.anchor.anchor_map import AnchorOptions
+from ingest.register.anchor.files import PhotoFiles
 from ingest.register.anchor.start import first_place
+from ingest.register.anchor.start.from_ortho import FoundByOrtho
 from tests.support.hill_map import hill_map
 from tests.support.hill_photos import FRAME, hill_photos
 from tests.support.hill_scan import write_hill_scan
@@ -46,12 +49,13 @@ def without_place(placed: FeatureMap) -> UnplacedMap:
     )
 
 
-def words(made: Path, tmp_path: Path, texture: int) -> list[str]:
+def words(made: Path, tmp_path: Path, texture: int, *, laser: bool = False) -> list[str]:
     """The command, on a database with the map and the scan of a field of that texture."""
     placed = Database.open(made / "db").snapshot()
     database = Database.create(tmp_path / "db")
     database.commit_map(without_place(placed.load_map(placed.maps()[0].map_id)))
-    add_scan(database, [write_hill_scan(tmp_path / "scan.laz", texture_seed=texture, half_side_m=35.0)])
+    scan = write_hill_scan(tmp_path / "scan.laz", texture_seed=texture, half_side_m=35.0, laser=laser)
+    add_scan(database, [scan])
     near = FRAME.geodetic_from_enu(_AWAY_M)
     return [
         *("anchor", str(tmp_path / "db"), "adrift", "--photos", str(made / "photos"), "--quiet", "--auto"),
@@ -74,9 +78,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return hill_map(tmp_path_factory)
 
 
-def test_the_map_is_found_and_placed(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words(made, tmp_path, texture=1)) == 0
-    assert "found near" in capsys.readouterr().out
+def _is_where_it_was_made(tmp_path: Path) -> None:
     placed = Database.open(tmp_path / "db").snapshot().load_map("adrift")
     truth = {photo.name: photo.cam_from_local for photo in hill_photos()}
     frame_from_map = FRAME.enu_from(placed.frame)
@@ -86,9 +88,41 @@ def test_the_map_is_found_and_placed(made: Path, tmp_path: Path, capsys: pytest.
         assert pose.angle_to_deg(truth[image.name]) < 0.3
 
 
-def test_on_the_scan_of_another_field_it_is_not_found(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_map_is_found_and_placed(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words(made, tmp_path, texture=1)) == 0
+    assert "found near" in capsys.readouterr().out
+    _is_where_it_was_made(tmp_path)
+
+
+def test_where_its_picture_from_above_agrees_photos_are_registered(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Intensities that share no features with photos."""
+    snapshot = Database.open(made / "db").snapshot()
+    frame = snapshot.load_map(snapshot.maps()[0].map_id).frame
+    off = Sim3(
+        scale=1.02, rotation=so3_exp(np.radians([1.0, -0.5, 1.5])), translation=np.array([1.5, -1.0, 1])
+    )
+
+    def about_there(_: UnplacedMap, cloud: PointCloud, photos: PhotoFiles) -> FoundByOrtho:
+        assert len(photos.paths) == len(hill_photos())
+        right = Sim3.from_rigid3(cloud.frame.enu_from(frame)) @ off @ OWN_FROM_LOCAL.inverse()
+        spread = np.diag(np.square([0.02, 0.03, 0.03, 0.03, 5.0, 5.0, 5.0]))
+        return FoundByOrtho(
+            local_from_own=right, covariance=spread, over_chance=1.5, elsewhere=1.1, source="intensity"
+        )
+
+    monkeypatch.setattr(first_place, "found_from_above", lambda *_: None)
+    monkeypatch.setattr(first_place, "found_by_ortho", about_there)
+    assert main(words(made, tmp_path, texture=1, laser=True)) == 0
+    assert "agree with the scan's intensity 1.50 times as well" in capsys.readouterr().out
+    _is_where_it_was_made(tmp_path)
+
+
+def test_on_the_scan_of_another_field_it_is_not_found(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(first_place, "found_by_ortho", lambda *_: None)
     assert main(words(made, tmp_path, texture=7)) == 2
     said = capsys.readouterr().err
     assert "map adrift is not found within 150 m" in said

@@ -20,12 +20,14 @@ def write_hill_scan(
     texture_seed: int = 1,
     half_side_m: float = 45.0,
     spacing_m: float = 0.2,
+    laser: bool = False,
 ) -> Path:
     """Write a scan with points about `spacing_m` apart, under another light than the photos.
 
     Args:
         offset_m: the scan lies so far east, north and up of where the photos' GPS has the hills.
         texture_seed: another seed is another field.
+        laser: intensities in place of colours, which grow with the grey value, then fall, with speckle.
     """
     rng = np.random.default_rng(texture_seed)
     steps = np.arange(-half_side_m, half_side_m, spacing_m)
@@ -39,5 +41,9 @@ def write_hill_scan(
     other_light = 255.0 * (grey.ravel() / 255.0) ** 1.3 * 0.85
     height = hill_height(east, north) + rng.normal(0, 0.02, len(east))
     utm = FRAME.utm_from_enu(np.column_stack([east, north, height]) + offset_m, EPSG)
+    if laser:
+        returned = np.abs(grey.ravel() - np.median(grey)) * rng.uniform(0.8, 1.2, len(east))
+        intensity = (returned * 256.0).astype(np.uint16)
+        return write_scan(path, utm, crs=f"EPSG:{EPSG}", point_format=6, intensity=intensity)
     value = (other_light * 256.0).astype(np.uint16)
     return write_scan(path, utm, crs=f"EPSG:{EPSG}", red=value, green=value, blue=value)

@@ -17,8 +17,10 @@ from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary
+from ingest.register.anchor.files import PhotoFiles
 from ingest.register.anchor.start.files import RoughPose, read_picks, read_pose
-from ingest.register.anchor.start.from_above import found_from_above
+from ingest.register.anchor.start.from_above import FoundFromAbove, found_from_above
+from ingest.register.anchor.start.from_ortho import FoundByOrtho, found_by_ortho
 from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks
 from ingest.register.anchor.start.priors import image_named
 from ingest.register.frame_registration import FramePrior
@@ -173,9 +175,16 @@ def _by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -
 
 
 def first_place(
-    database: Database, unplaced: UnplacedMap, files: StartFiles, scan_ids: Sequence[str]
+    database: Database,
+    unplaced: UnplacedMap,
+    files: StartFiles,
+    scan_ids: Sequence[str],
+    photos: PhotoFiles,
 ) -> FirstPlace:
     """Put a map without a place where a person's photo says, or where it is found near, on the scans.
+
+    Args:
+        photos: of the map, for the picture that they make from above.
 
     Raises:
         RegistrationError: nothing says where, the photo does not see the scan from there, or the map is not
@@ -192,7 +201,7 @@ def first_place(
     ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
     started: list[StartedImage] = []
     if files.near is not None:
-        feature_map, note = _found_near(database, unplaced, files.near, ids)
+        feature_map, note = _found_near(database, unplaced, files.near, ids, photos)
         notes: tuple[str, ...] = (note,)
     else:
         told = files.read()
@@ -211,7 +220,7 @@ def first_place(
 
 
 def _found_near(
-    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...]
+    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...], photos: PhotoFiles
 ) -> tuple[FeatureMap, str]:
     """The map where the scans near a place show the same, and a line on it."""
     frame = LocalFrame(latitude_deg=near.lat, longitude_deg=near.lon, height_m=0.0)
@@ -227,14 +236,17 @@ def _found_near(
             f"scan {', '.join(scan_ids)} has neither colours nor intensities, and nothing is looked for by "
             "heights alone; say where one photo is: --page, --picks FILE, --pose FILE"
         )
-    found = found_from_above(unplaced, cloud)
-    if found is None or not found.sure:
-        said = (
-            "nothing of it matches the scan" if found is None else f"{found.words()}, which chance gives, too"
-        )
+    by_features = found_from_above(unplaced, cloud)
+    found: FoundFromAbove | FoundByOrtho | None = by_features
+    if by_features is None or not by_features.sure:
+        found = found_by_ortho(unplaced, cloud, photos)
+    if found is None:
+        words = "nothing of it matches the scan"
+        if by_features is not None:
+            words = f"{by_features.words()}, which chance gives, too"
         raise RegistrationError(
             f"map {unplaced.map_id} is not found within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}: "
-            f"{said}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show more "
+            f"{words}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show more "
             "than intensities; or say where one photo is: --page, --picks FILE, --pose FILE"
         )
     placement = Placement(

@@ -2,7 +2,8 @@
 
 The scan is drawn from above, side by side. Features of these pictures have places on the scan, those of the
 map have points of its frame: where they match, a similarity takes the one to the other. SIFT minds neither
-the heading nor the size, so neither needs to be known, nor which way is up. All photos decide together.
+the heading nor the size, so neither needs to be known, nor which way is up. All photos decide together. Only
+places with the cameras above the ground count: seen from below, flat ground is its own mirror image.
 
 How sure that is: the expected number of similarities that as many chance matches would fit as well
 (a-contrario; Moulon, Monasse, Marlet 2012), matches with one point of the map or one spot of the scan being
@@ -100,9 +101,11 @@ def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> Fo
     if len(point) <= _SAMPLE:
         return None
     own, local = unplaced.points.xyz[point], places[place]
+    centers = np.array([image.cam_from_local.center for image in unplaced.images])
+    upwards = np.median(centers, axis=0) - np.median(unplaced.points.xyz, axis=0)
     area_m2 = float(np.prod(np.ptp(places[:, :2], axis=0)))
     judged = [
-        _judged(_most_fitting(own, local, tolerance), own, local, point, tolerance, area_m2, source)
+        _judged(_most_fitting(own, local, upwards, tolerance), own, local, point, tolerance, area_m2, source)
         for tolerance in (px * wide_m / _SIDE_PX for px in _TOLERANCES_PX)
     ]
     return max((one for one in judged if one is not None), key=lambda one: one.log_nfa, default=None)
@@ -144,14 +147,20 @@ def _matched(
     return point[kept, 0].astype(np.int64), kept
 
 
-def _most_fitting(own: FloatArray, local: FloatArray, tolerance_m: float) -> Sim3 | None:
-    """Of similarities of three matches that which takes most of own (n, 3) to local (n, 3)."""
+def _most_fitting(own: FloatArray, local: FloatArray, upwards: FloatArray, tolerance_m: float) -> Sim3 | None:
+    """Of similarities of three matches that which takes most of own (n, 3) to local (n, 3).
+
+    Args:
+        upwards: (3,) from the map's points to its cameras, which must lie above them.
+    """
     rng = np.random.default_rng(0)
     scored = rng.permutation(len(own))[:_SCORED]
+    wide = float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))  # a dot fits any spot
     best, most = None, 0
     for batch in range(1, _BATCHES + 1):
         rows = rng.integers(0, len(own), (_BATCH, _SAMPLE))
         scale, rotation, translation, usable = _similarities(own[rows], local[rows])
+        usable &= (rotation[:, 2] @ upwards > 0.0) & (scale * wide > tolerance_m)
         if usable.any():
             scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
             off = (scale[:, None, None] * rotation).reshape(-1, 3) @ own[scored].T + translation.reshape(

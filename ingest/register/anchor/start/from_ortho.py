@@ -1,0 +1,288 @@
+"""A map without a place, found on a scan whose intensities share no features with photos.
+
+Grey values of a photo and a laser's intensities are related by no function; where edges run stays. So the
+map's photos are laid out as one small picture from above (`ortho`), whose oriented gradients are compared
+with the scan's (`dense.pictures`) at all places, headings and sizes: coarse, then the best of them finer.
+All photos decide together.
+
+What comes out is a start. Whether it is right, frames say that are registered from there one by one.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import rotation_to_up, so3_exp
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.move import moved_image
+from featuredb.maps.unplaced_map import UnplacedMap
+from featuredb.render.cloud import PointCloud
+from ingest.register.anchor.files import PhotoFiles
+from ingest.register.anchor.start.ortho import FloatImage, OrthoPicture, picture_of_map, picture_of_scan
+from ingest.register.frame.dense.pictures import inner_part, oriented_gradients, plan_spacing_m
+from ingest.register.frame.sources import searched_sources
+from ingest.register.frame_registration import RenderSource
+
+_CELLS = 440  # along the scan's longer side, at most; with 220 a town's streets all look alike
+_LEAST_SHARE, _SIZE_STEP = 0.12, 0.06  # of the map's picture over the scan's; logarithm between sizes
+_TURN_STEP = np.radians(6.0)
+_AGAIN, _AGAIN_STEP = 40, 1.0 / 3.0  # so many are searched again in such parts of the steps
+_COVER = 0.9  # of the map that must lie on the scan
+_LEAST_ENERGY = 0.3  # of the scan's edges under the map, over the mean
+_SHRUNK_SIGMA = 0.4  # of the blur before a picture is made smaller, in pixels of the smaller one
+_WHOLE = 0.99  # of a pixel that is shown
+_NEAR_MIDDLE = 3.0  # of the median distance: points that tell the ground
+# Of the best similarity: half a step of the finer search, what a vertical is good to, a cell and the lean of
+# houses, and what relief leaves of the height.
+_SIZE_SIGMA, _TURN_SIGMA, _TILT_SIGMA = 0.02, np.radians(2.0), np.radians(2.0)
+_PLACE_SIGMAS_M = (2.0, 2.0, 3.0)
+_INSIDE = 2  # cells from the border of what is shown that show no edge
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FoundByOrtho:
+    """Where a map's picture agrees best with a scan.
+
+    Attributes:
+        local_from_own: similarity. covariance: (7, 7) of its left perturbation, by the steps of the search.
+        over_chance, elsewhere: as in `PicturePlace`.
+        source: what of the scan was drawn.
+    """
+
+    local_from_own: Sim3
+    covariance: FloatArray
+    over_chance: float
+    elsewhere: float
+    source: RenderSource
+
+    def words(self) -> str:
+        return (
+            f"its photos from above agree with the scan's {self.source} {self.over_chance:.2f} times as well "
+            f"as when they are mirrored, elsewhere {self.elsewhere:.2f} times"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Try:
+    """A place that was tried, as in `PicturePlace`."""
+
+    size: float
+    turn: float
+    middle: FloatArray
+    correlation: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PicturePlace:
+    """A picture with cells of `size` metres, turned by `turn` (radians, x to y), its middle at `middle` (2,).
+
+    Attributes:
+        over_chance: correlation of the gradients there over the best of the mirrored picture, which is
+            nowhere. elsewhere: the same of the best with another heading or place, or of the mirrored picture
+            over the best of the picture.
+    """
+
+    size: float
+    turn: float
+    middle: FloatArray
+    over_chance: float
+    elsewhere: float
+
+
+class _Scan:
+    """The scan's gradients in the frequency domain."""
+
+    def __init__(self, picture: OrthoPicture) -> None:
+        self.picture = picture
+        channels = oriented_gradients(picture.gray, picture.valid)
+        energy = np.square(channels).sum(axis=0)
+        self._shape = [fft.next_fast_len(n, real=True) for n in picture.gray.shape]
+        self._channels = [self._forward(channel) for channel in channels]
+        self._energy, self._valid = self._forward(energy), self._forward(picture.valid)
+        self._mean = float(energy[picture.valid].mean())
+
+    def best(self, of: OrthoPicture, size: float, turn: float) -> _Try | None:
+        """The best place of a picture; None where it lies nowhere on the scan."""
+        scale = size / self.picture.cell
+        gray, valid, matrix = _turned(of, scale, turn)
+        mask = inner_part(valid, _INSIDE)
+        rows, columns = (n - k + 1 for n, k in zip(self.picture.gray.shape, mask.shape, strict=True))
+        if rows <= 0 or columns <= 0 or not mask.any():
+            return None
+        channels = oriented_gradients(gray, valid) * mask
+        shown = np.conj(self._forward(mask))
+        cells = float(mask.sum())
+        agreeing = [a * np.conj(self._forward(b)) for a, b in zip(self._channels, channels, strict=True)]
+        found = self._back(np.sum(agreeing, axis=0))[:rows, :columns]
+        energy = self._back(self._energy * shown)[:rows, :columns]
+        cover = self._back(self._valid * shown)[:rows, :columns] / cells
+        usable = (cover > _COVER) & (energy > _LEAST_ENERGY * self._mean * cells)
+        if not usable.any():
+            return None
+        own = float(np.square(channels).sum())
+        score = np.where(usable, found / np.sqrt(np.maximum(energy * own, 1e-12)), -1.0)
+        row, column = np.unravel_index(int(score.argmax()), score.shape)
+        at = np.array([column, row]) + matrix @ np.array([of.gray.shape[1] / 2, of.gray.shape[0] / 2, 1.0])
+        return _Try(
+            size=size,
+            turn=turn,
+            middle=self.picture.corner + at * self.picture.cell,
+            correlation=float(score[row, column]),
+        )
+
+    def _forward(self, of: NDArray[np.generic]) -> NDArray[np.complex64]:
+        return np.asarray(fft.rfft2(np.asarray(of, dtype=np.float32), self._shape))
+
+    def _back(self, of: NDArray[np.complex64]) -> FloatImage:
+        return np.asarray(fft.irfft2(of, self._shape))
+
+
+def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles) -> FoundByOrtho | None:
+    """The best place of a map on a scan; None where its mirror image fits as well.
+
+    Args:
+        cloud: all of the scan on which the map may lie.
+    """
+    upright = _upright(unplaced)
+    there = [image for image in unplaced.images if image.image_id in photos.paths]
+    images = [moved_image(image, upright) for image in there]
+    picture = picture_of_map(upright.act(unplaced.points.xyz), images, unplaced.cameras, photos.paths)
+    if not picture.valid.any():
+        return None
+    found = [_found(picture, cloud, source, upright) for source in searched_sources(cloud)]
+    return max((one for one in found if one is not None), key=lambda one: one.over_chance, default=None)
+
+
+def _found(
+    picture: OrthoPicture, cloud: PointCloud, source: RenderSource, upright: Sim3
+) -> FoundByOrtho | None:
+    extent_m = float(np.ptp(cloud.xyz[:, :2], axis=0).max())
+    drawn = picture_of_scan(cloud, source, max(extent_m / _CELLS, plan_spacing_m(cloud)))
+    best = best_place(picture, drawn)
+    if best is None or best.over_chance <= best.elsewhere:
+        return None
+    middle = np.array([*picture.middle, float(np.median(picture.height[picture.valid]))])
+    there = np.array([*best.middle, float(np.nanmedian(_under(drawn, picture, best)))])
+    scale, turn = best.size / picture.cell, so3_exp([0.0, 0.0, best.turn])
+    local_from_upright = Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
+    sigmas = [_SIZE_SIGMA, _TILT_SIGMA, _TILT_SIGMA, _TURN_SIGMA, *_PLACE_SIGMAS_M]
+    about = Sim3(scale=1.0, rotation=np.eye(3), translation=there)
+    return FoundByOrtho(
+        local_from_own=local_from_upright @ upright,
+        covariance=about.carried(np.diag(np.square(sigmas))),
+        over_chance=best.over_chance,
+        elsewhere=best.elsewhere,
+        source=source,
+    )
+
+
+def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | None:
+    """Where a picture of whatever unit agrees best with one in metres; None where it fits nowhere on it."""
+    searched, longer = _Scan(drawn), max(picture.gray.shape)
+    extent_m = max(drawn.gray.shape) * drawn.cell
+    sizes = np.exp(np.arange(np.log(_LEAST_SHARE), 0.0, _SIZE_STEP)) * extent_m / longer
+    turns = np.arange(0.0, 2.0 * np.pi, _TURN_STEP)
+    tries = _tried(searched, picture, sizes, turns)
+    mirrored = _tried(searched, picture.mirrored(), sizes, turns)
+    chance, other_chance = (_best_by_size(of, len(turns)) for of in (mirrored, tries))
+    if chance is None or other_chance is None:
+        return None
+    again: list[_Try] = []
+    steps = np.array([-1.0, 0.0, 1.0]) * _AGAIN_STEP
+    for one in sorted(tries, key=lambda one: one.correlation / chance(one.size), reverse=True)[:_AGAIN]:
+        again += _tried(
+            searched, picture, one.size * np.exp(_SIZE_STEP * steps), one.turn + _TURN_STEP * steps
+        )
+    best = max(again, key=lambda one: one.correlation / chance(one.size))
+    others = [one.correlation / chance(one.size) for one in again if _apart(one, best, longer)]
+    others += [one.correlation / other_chance(one.size) for one in mirrored]
+    there = [one for one in again if not _apart(one, best, longer)]
+    best = max(there, key=lambda one: one.correlation - chance(one.size))
+    return PicturePlace(
+        size=best.size,
+        turn=best.turn,
+        middle=best.middle,
+        over_chance=best.correlation / chance(best.size),
+        elsewhere=max(others),
+    )
+
+
+def _tried(scan: _Scan, picture: OrthoPicture, sizes: FloatArray, turns: FloatArray) -> list[_Try]:
+    found = (scan.best(picture, size, turn) for size in sizes.tolist() for turn in turns.tolist())
+    return [one for one in found if one is not None]
+
+
+def _best_by_size(tries: Sequence[_Try], turns: int) -> Callable[[float], float] | None:
+    """The best correlation at a size: small pictures agree with anything, and streets with streets.
+
+    Infinite for sizes at which fewer than half of the `turns` fit on the scan: few places say nothing of
+    chance.
+    """
+    sizes, fitting = np.unique([one.size for one in tries], return_counts=True)
+    sizes = sizes[fitting >= turns / 2]
+    if not len(sizes):
+        return None
+    best = [max(one.correlation for one in tries if one.size == size) for size in sizes]
+    play = float(np.exp(_SIZE_STEP / 2))
+
+    def at(size: float) -> float:
+        inside = sizes[0] / play <= size <= sizes[-1] * play
+        return max(float(np.interp(size, sizes, best)), 1e-6) if inside else np.inf
+
+    return at
+
+
+def _apart(one: _Try, other: _Try, cells: int) -> bool:
+    """Whether two tries lie a tenth of the picture or two steps of the heading apart."""
+    turn = np.abs((one.turn - other.turn + np.pi) % (2.0 * np.pi) - np.pi)
+    away = float(np.linalg.norm(one.middle - other.middle))
+    return bool(turn > 2.0 * _TURN_STEP or away > 0.1 * cells * other.size)
+
+
+def _under(scan: OrthoPicture, picture: OrthoPicture, found: PicturePlace) -> FloatArray:
+    """Heights of the scan under the map's picture."""
+    _, valid, matrix = _turned(picture, found.size / scan.cell, found.turn)
+    half = matrix @ np.array([picture.gray.shape[1] / 2, picture.gray.shape[0] / 2, 1.0])
+    column, row = np.round((found.middle - scan.corner) / scan.cell - half).astype(np.int64)
+    under = scan.height[max(row, 0) : row + valid.shape[0], max(column, 0) : column + valid.shape[1]]
+    return np.asarray(under[valid[: under.shape[0], : under.shape[1]]])
+
+
+def _turned(
+    picture: OrthoPicture, scale: float, turn: float
+) -> tuple[FloatImage, NDArray[np.bool_], FloatArray]:
+    """The picture turned and resized, and the (2, 3) that takes its coordinates there."""
+    height, width = picture.gray.shape
+    cos, sin = scale * np.cos(turn), scale * np.sin(turn)
+    matrix = np.array([[cos, -sin], [sin, cos]])
+    half = np.array([width, height]) / 2
+    size = np.ceil(2.0 * (np.abs(matrix) @ half)).astype(np.int64) + 2
+    whole = np.column_stack([matrix, size / 2 - matrix @ half])
+    by_pixel = whole.copy()
+    by_pixel[:, 2] += matrix @ [0.5, 0.5] - 0.5  # OpenCV's half pixel
+    gray = picture.gray
+    if scale < 1.0:
+        gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), _SHRUNK_SIGMA / scale))
+    shape = (int(size[0]), int(size[1]))
+    turned = cv2.warpAffine(gray, by_pixel, shape, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    valid = cv2.warpAffine(picture.valid.astype(np.float32), by_pixel, shape, flags=cv2.INTER_LINEAR) > _WHOLE
+    return np.asarray(turned, dtype=np.float32), np.asarray(valid), whole
+
+
+def _upright(unplaced: UnplacedMap) -> Sim3:
+    """The map's own frame turned until z is up: by its photos, or else by the ground that it shows."""
+    rotation = np.eye(3)
+    if not unplaced.frame.upright:
+        xyz = unplaced.points.xyz - np.median(unplaced.points.xyz, axis=0)
+        across = np.linalg.svd(
+            xyz[np.linalg.norm(xyz, axis=1) < _NEAR_MIDDLE * np.median(np.linalg.norm(xyz, axis=1))],
+            full_matrices=False,
+        )[2][2]
+        above = np.mean([image.cam_from_local.center for image in unplaced.images], axis=0)
+        rotation = rotation_to_up(across * np.sign(across @ (above - np.median(unplaced.points.xyz, axis=0))))
+    return Sim3(scale=1.0, rotation=rotation, translation=np.zeros(3))
