@@ -73,16 +73,20 @@ def scan_of(kind: str, scan: Path, work: Path) -> Path:
 
 
 def _draw(number: int, made: Path, work: Path, truth: ScanTruth) -> dict[str, float] | None:
-    angle = np.random.default_rng((_SEED, number)).uniform(0.0, 2.0 * np.pi)
     database = newest_copy(made, work / "placed")
-    opened = Database.open(database)
-    (summary, *_) = opened.snapshot().unplaced_maps()
-    (scan, *_) = list_scans(opened)
+    (summary, *_) = Database.open(database).snapshot().unplaced_maps()
+    return placed_by(database, summary.map_id, work, truth, near_words(database, number))
+
+
+def near_words(database: Path, number: int) -> str:
+    """A circle whose middle lies in a random direction from the middle of a database's scan."""
+    angle = np.random.default_rng((_SEED, number)).uniform(0.0, 2.0 * np.pi)
+    (scan, *_) = list_scans(Database.open(database))
     box = scan.box
     middle = np.array([box.min_easting + box.max_easting, box.min_northing + box.max_northing]) / 2.0
     point = middle + _AWAY_M * np.array([np.cos(angle), np.sin(angle)])
     lat, lon, _ = geodetic_from_utm((*point, box.min_height), scan.epsg)
-    return placed_by(database, summary.map_id, work, truth, f"--near={lat:.7f},{lon:.7f},{_RADIUS_M:g}")
+    return f"--near={lat:.7f},{lon:.7f},{_RADIUS_M:g}"
 
 
 if __name__ == "__main__":
