@@ -2,12 +2,12 @@
 
     python -m tools.film_near --work DIR [--inputs FOLDER]
 
-The film `smooth` of `tools.track_evaluation`, without its telemetry, becomes a map
-without a place. Each draw names a point 100 m from the middle of the town's scan in a random direction, and
-`featuredb anchor --near` places a copy of the map; then the same on the scan of another town, where nothing
-may be placed. A placed map is wrong where a camera is a metre off.
+The film `smooth` of `tools.track_evaluation`, without its telemetry, becomes a map without a place. Each draw
+names a point 100 m from the middle of the town's scan in a random direction, and `featuredb anchor --near`
+places a copy of the map; then the same on the scan of another town, where nothing may be placed. A placed map is wrong where a camera is a metre off.
 """
 
+import shutil
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -19,7 +19,7 @@ from featuredb.store import Database
 from ingest.workspace import default_root
 from tools.commands import anchor, featuredb, newest_copy
 from tools.figures import study_parser, write_figures
-from tools.made_maps import bare_film, make
+from tools.made_maps import make
 from tools.track_evaluation import film_options
 from tools.unplaced_brighton import all_drawn
 from tools.unplaced_near import near_words
@@ -37,7 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder = write_film(inputs / f"film-smooth-{_FRAMES}-1", film_options("smooth", _FRAMES))
     truth = read_film_truth(folder)
     if not (work / "db").exists():
-        make(work / "making", "video", bare_film(folder / FILM_FILE, work), 0)
+        work.mkdir(parents=True, exist_ok=True)
+        make(work / "making", "video", Path(shutil.copy(folder / FILM_FILE, work)))  # with nothing beside it
         (work / "making").rename(work / "db")
     figures: dict[str, float] = {"draws": _DRAWS}
     for kind, scan in (("here", world.scan), ("elsewhere", world.other_scan)):
