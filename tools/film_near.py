@@ -4,7 +4,8 @@
 
 The film `smooth` of `tools.track_evaluation`, without its telemetry, becomes a map without a place. Each draw
 names a point 100 m from the middle of the town's scan in a random direction, and `featuredb anchor --near`
-places a copy of the map; then the same on the scan of another town, where nothing may be placed. A placed map is wrong where a camera is a metre off.
+places a copy of the map; then the same on the scan of another town, where nothing may be placed. A placed
+map is wrong where a camera is a metre off.
 """
 
 import shutil

@@ -180,6 +180,17 @@ SIMULATED: tuple[Row, ...] = (
         minutes=20,
     ),
     _row(
+        name="film-near",
+        claim="a film of 1,200 frames without telemetry, looked for within 250 m of a point 100 m off on a "
+        "scan with intensities alone; ten points, and ten on the scan of another town",
+        commands=f"tools.film_near --work {{work}}/near --inputs {{cache}} {OUT}",
+        text="{here_placed} of {draws} placed, {here_wrong} wrong, cameras median {here_m:.3f} m; on the "
+        "other scan: {elsewhere_placed}",
+        limits="7 <= here_placed, here_wrong <= 0, elsewhere_placed <= 0",
+        resumes=True,
+        minutes=40,
+    ),
+    _row(
         name="paper-film",
         claim="a film of 1,200 frames without telemetry and an intensity-only scan: placed by six picks in "
         "one frame, tracked from end to end (paper: 0.4 m, 29.7 frames/s with a GPU; a frame 15 to 30 s, "
