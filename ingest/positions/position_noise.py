@@ -205,7 +205,6 @@ def fit_noisy(
         times_s: (n,) of capture; None: in the order given, and nothing is known of a lag.
         held: how the photos are held.
     """
-    sigmas = told_once(positions, sigmas)
     stated = np.array([stated_sigma(sigmas[:, axes]) for axes in _AXES])
     middle = Sim3(scale=1.0, rotation=np.eye(3), translation=np.median(np.nan_to_num(positions), axis=0))
     speed, order = np.zeros_like(centers), np.arange(len(centers), dtype=np.float64)
@@ -213,6 +212,9 @@ def fit_noisy(
         speed, order = _speeds(centers, times_s), times_s
     moving = np.linalg.norm(speed, axis=1)
     usual = start.scale * float(np.median(moving[moving > 0])) if moving.any() else 0.0
+    taken = np.zeros((len(centers), 1))
+    taken[np.argsort(order, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = 1.0
+    sigmas = told_once(positions, sigmas, start.act(centers), taken[:, 0] > 0)
     data = _Data(
         centers=centers,
         positions=middle.inverse().act(positions),
@@ -225,8 +227,6 @@ def fit_noisy(
         held=held,
     )
     state, theta = _State(middle.inverse() @ start, 0.0), prior_mean(stated)
-    taken = np.zeros((len(centers), 1))
-    taken[np.argsort(order, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = 1.0
     weights = taken * _start_weights(data, state)
     for _ in range(_ROUNDS):  # heavy tails: a start that nothing far out decides
         state, theta, settled = _round(data, state, weights, theta)

@@ -116,6 +116,7 @@ def ipython(folder: Path) -> Iterator[InteractiveShell]:
     finally:
         atexit.unregister(shell.atexit_operations)
         shell.atexit_operations()
+        shell.cleanup()
 
 
 @pytest.fixture(scope="module")

@@ -89,6 +89,29 @@ def test_one_height_for_all_photos_does_not_level_their_way() -> None:
     assert off @ np.linalg.solve(placed.covariance, off) < chi2.ppf(0.99, 7)
 
 
+@pytest.mark.parametrize("count", [399, 401, 900])
+def test_one_height_for_many_photos_is_that_of_the_map(count: int) -> None:
+    """However many are thinned out."""
+    rng = np.random.default_rng(2)
+    positions = np.column_stack([rng.uniform(-150, 150, (count, 2)), np.full(count, 60.0)])
+    measured = positions + rng.normal(0.0, 1.0, positions.shape) * [2.0, 2.0, 0.0]
+    measured[0, :2] += 2500.0  # one is tagged elsewhere
+    placed = place(positions, measured - positions, np.tile([4.0, 4.0, 10.0], (count, 1)))
+    assert placed.local_from_sfm is not None
+    assert placed.covariance is not None
+    assert np.abs(placed.local_from_sfm.act(TRUE.inverse().act(positions))[:, 2] - 60.0).max() < 15.0
+    assert 5.0 < np.sqrt(placed.covariance[6, 6]) < 20.0
+
+
+def test_measured_heights_of_a_level_flight_all_count() -> None:
+    """Survey-grade heights 2 cm apart over a kilometre are no one height."""
+    rng = np.random.default_rng(3)
+    positions = np.column_stack([rng.uniform(-500, 500, (60, 2)), np.full(60, 80.0)])
+    placed = place(positions, rng.normal(0.0, 0.02, positions.shape), np.full((60, 3), 0.03))
+    assert placed.covariance is not None
+    assert np.degrees(np.sqrt(placed.covariance[1, 1])) < 0.01
+
+
 def test_a_refusal_without_heights_names_none() -> None:
     rng = np.random.default_rng(1)
     positions = flight(25)

@@ -257,6 +257,12 @@ def _found_near(
         evidence={"start": {"near": str(near), "no_place": unplaced.no_place.reason_code}},
     )
     note = f"found near {near.lat:.6f}, {near.lon:.6f}: {found.words()}"
+    if isinstance(found, FoundByOrtho):
+        note = (
+            f"tried near {near.lat:.6f}, {near.lon:.6f}: {found.words()}; if no photo is registered from "
+            "there, name a smaller circle (--near=LAT,LON,RADIUS_M), or say where one photo is: --page, "
+            "--picks FILE, --pose FILE"
+        )
     return placed_map(unplaced, placement, cloud.frame, cloud.height_datum), note
 
 

@@ -32,15 +32,17 @@ _CELLS = 440  # along the scan's longer side, at most; with 220 a town's streets
 _LEAST_SHARE, _SIZE_STEP = 0.12, 0.06  # of the map's picture over the scan's; logarithm between sizes
 _TURN_STEP = np.radians(6.0)
 _AGAIN, _AGAIN_STEP = 40, 1.0 / 3.0  # so many are searched again in such parts of the steps
+_SMOOTH = 2  # degree of a polynomial in logarithms
 _COVER = 0.9  # of the map that must lie on the scan
 _LEAST_ENERGY = 0.3  # of the scan's edges under the map, over the mean
 _SHRUNK_SIGMA = 0.4  # of the blur before a picture is made smaller, in pixels of the smaller one
 _WHOLE = 0.99  # of a pixel that is shown
 _NEAR_MIDDLE = 3.0  # of the median distance: points that tell the ground
-# Of the best similarity: half a step of the finer search, what a vertical is good to, a cell and the lean of
-# houses, and what relief leaves of the height.
-_SIZE_SIGMA, _TURN_SIGMA, _TILT_SIGMA = 0.02, np.radians(2.0), np.radians(2.0)
-_PLACE_SIGMAS_M = (2.0, 2.0, 3.0)
+# Of the best similarity: half a step of the finer search, what a vertical is good to by photos and by the
+# ground, the lean of houses and a cell and a half, and what relief leaves of the height.
+_SIZE_SIGMA, _TURN_SIGMA = 0.02, np.radians(2.0)
+_TILT_SIGMA, _SLOPE_SIGMA = np.radians(2.0), np.radians(10.0)
+_PLAN_SIGMA_M, _PLAN_CELLS, _HEIGHT_SIGMA_M = 2.0, 1.5, 3.0
 _INSIDE = 2  # cells from the border of what is shown that show no edge
 
 
@@ -104,7 +106,7 @@ class _Scan:
         self._shape = [fft.next_fast_len(n, real=True) for n in picture.gray.shape]
         self._channels = [self._forward(channel) for channel in channels]
         self._energy, self._valid = self._forward(energy), self._forward(picture.valid)
-        self._mean = float(energy[picture.valid].mean())
+        self._mean = float(energy[picture.valid].mean()) if picture.valid.any() else np.inf
 
     def best(self, of: OrthoPicture, size: float, turn: float) -> _Try | None:
         """The best place of a picture; None where it lies nowhere on the scan."""
@@ -152,15 +154,18 @@ def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles)
     there = [image for image in unplaced.images if image.image_id in photos.paths]
     images = [moved_image(image, upright) for image in there]
     picture = picture_of_map(upright.act(unplaced.points.xyz), images, unplaced.cameras, photos.paths)
-    if not picture.valid.any():
+    if picture is None:
         return None
-    found = [_found(picture, cloud, source, upright) for source in searched_sources(cloud)]
+    found = [
+        _found(picture, cloud, source, upright, unplaced.frame.upright) for source in searched_sources(cloud)
+    ]
     return max((one for one in found if one is not None), key=lambda one: one.over_chance, default=None)
 
 
 def _found(
-    picture: OrthoPicture, cloud: PointCloud, source: RenderSource, upright: Sim3
+    picture: OrthoPicture, cloud: PointCloud, source: RenderSource, upright: Sim3, by_photos: bool
 ) -> FoundByOrtho | None:
+    """Args: by_photos: these tell the vertical, and not the ground."""
     extent_m = float(np.ptp(cloud.xyz[:, :2], axis=0).max())
     drawn = picture_of_scan(cloud, source, max(extent_m / _CELLS, plan_spacing_m(cloud)))
     best = best_place(picture, drawn)
@@ -170,7 +175,9 @@ def _found(
     there = np.array([*best.middle, float(np.nanmedian(_under(drawn, picture, best)))])
     scale, turn = best.size / picture.cell, so3_exp([0.0, 0.0, best.turn])
     local_from_upright = Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
-    sigmas = [_SIZE_SIGMA, _TILT_SIGMA, _TILT_SIGMA, _TURN_SIGMA, *_PLACE_SIGMAS_M]
+    tilt = _TILT_SIGMA if by_photos else _SLOPE_SIGMA
+    plan_m = float(np.hypot(_PLAN_SIGMA_M, _PLAN_CELLS * drawn.cell))
+    sigmas = [_SIZE_SIGMA, tilt, tilt, _TURN_SIGMA, plan_m, plan_m, _HEIGHT_SIGMA_M]
     about = Sim3(scale=1.0, rotation=np.eye(3), translation=there)
     return FoundByOrtho(
         local_from_own=local_from_upright @ upright,
@@ -184,7 +191,7 @@ def _found(
 def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | None:
     """Where a picture of whatever unit agrees best with one in metres; None where it fits nowhere on it."""
     searched, longer = _Scan(drawn), max(picture.gray.shape)
-    extent_m = max(drawn.gray.shape) * drawn.cell
+    extent_m = min(drawn.gray.shape) * drawn.cell
     sizes = np.exp(np.arange(np.log(_LEAST_SHARE), 0.0, _SIZE_STEP)) * extent_m / longer
     turns = np.arange(0.0, 2.0 * np.pi, _TURN_STEP)
     tries = _tried(searched, picture, sizes, turns)
@@ -192,15 +199,13 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | Non
     chance, other_chance = (_best_by_size(of, len(turns)) for of in (mirrored, tries))
     if chance is None or other_chance is None:
         return None
-    again: list[_Try] = []
-    steps = np.array([-1.0, 0.0, 1.0]) * _AGAIN_STEP
-    for one in sorted(tries, key=lambda one: one.correlation / chance(one.size), reverse=True)[:_AGAIN]:
-        again += _tried(
-            searched, picture, one.size * np.exp(_SIZE_STEP * steps), one.turn + _TURN_STEP * steps
-        )
+    again, again_mirrored = (
+        _again(searched, of, among, by)
+        for of, among, by in ((picture, tries, chance), (picture.mirrored(), mirrored, other_chance))
+    )
     best = max(again, key=lambda one: one.correlation / chance(one.size))
     others = [one.correlation / chance(one.size) for one in again if _apart(one, best, longer)]
-    others += [one.correlation / other_chance(one.size) for one in mirrored]
+    others += [one.correlation / other_chance(one.size) for one in again_mirrored]
     there = [one for one in again if not _apart(one, best, longer)]
     best = max(there, key=lambda one: one.correlation - chance(one.size))
     return PicturePlace(
@@ -212,27 +217,38 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | Non
     )
 
 
+def _again(
+    scan: _Scan, picture: OrthoPicture, tries: Sequence[_Try], chance: Callable[[float], float]
+) -> list[_Try]:
+    """The best of the tries with finer steps around them."""
+    steps = np.array([-1.0, 0.0, 1.0]) * _AGAIN_STEP
+    found: list[_Try] = []
+    for one in sorted(tries, key=lambda one: one.correlation / chance(one.size), reverse=True)[:_AGAIN]:
+        found += _tried(scan, picture, one.size * np.exp(_SIZE_STEP * steps), one.turn + _TURN_STEP * steps)
+    return found
+
+
 def _tried(scan: _Scan, picture: OrthoPicture, sizes: FloatArray, turns: FloatArray) -> list[_Try]:
     found = (scan.best(picture, size, turn) for size in sizes.tolist() for turn in turns.tolist())
     return [one for one in found if one is not None]
 
 
 def _best_by_size(tries: Sequence[_Try], turns: int) -> Callable[[float], float] | None:
-    """The best correlation at a size: small pictures agree with anything, and streets with streets.
+    """The best correlation at a size, smoothly: small pictures agree with anything, and streets with streets.
 
-    Infinite for sizes at which fewer than half of the `turns` fit on the scan: few places say nothing of
-    chance.
+    Infinite for sizes at which not all `turns` fit on the scan: few places say nothing of chance.
     """
     sizes, fitting = np.unique([one.size for one in tries], return_counts=True)
-    sizes = sizes[fitting >= turns / 2]
-    if not len(sizes):
-        return None
+    sizes = sizes[fitting == turns]
     best = [max(one.correlation for one in tries if one.size == size) for size in sizes]
+    if len(sizes) <= _SMOOTH or min(best) <= 0.0:
+        return None
+    curve = np.polyfit(np.log(sizes), np.log(best), _SMOOTH)
     play = float(np.exp(_SIZE_STEP / 2))
 
     def at(size: float) -> float:
         inside = sizes[0] / play <= size <= sizes[-1] * play
-        return max(float(np.interp(size, sizes, best)), 1e-6) if inside else np.inf
+        return float(np.exp(np.polyval(curve, np.log(size)))) if inside else np.inf
 
     return at
 

@@ -66,15 +66,21 @@ def picture_of_map(
     images: Sequence[MapImage],
     cameras: Sequence[Camera],
     paths: Mapping[int, Path],
-) -> OrthoPicture:
+) -> OrthoPicture | None:
     """The photos laid over the ground of a map, each cell by the photo that looks at it most steeply.
+
+    None where no photo that can be read shows it.
 
     Args:
         xyz: (n, 3) points in a frame whose z is up; poses of the images are in it, too.
         paths: of the photos by image id; those that cannot be read are left out.
     """
+    if not len(xyz) or not images:
+        return None
     low, high = np.percentile(xyz[:, :2], (2, 98), axis=0)
     cell = float((high - low).max()) / _SIDE_CELLS
+    if cell <= 0.0:
+        return None
     size = np.ceil((high - low) / cell).astype(np.int64) + 1
     height, near = _ground(xyz, low, cell, size)
     across, up = (low[k] + (np.arange(size[k]) + 0.5) * cell for k in (0, 1))
@@ -88,9 +94,8 @@ def picture_of_map(
         steep, shown = _seen(cells, image.cam_from_local, cameras[image.camera_id], photo)
         better = steep > steepest
         gray[better], steepest[better] = shown[better], steep[better]
-    return OrthoPicture(
-        gray=gray, valid=near & (steepest > _LEAST_STEEP), height=height, corner=low, cell=cell
-    )
+    valid = near & (steepest > _LEAST_STEEP)
+    return OrthoPicture(gray=gray, valid=valid, height=height, corner=low, cell=cell) if valid.any() else None
 
 
 def _ground(
