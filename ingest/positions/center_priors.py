@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from featuredb.adjust.terms import CenterPriors
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.positions.one_height import one_height
+from ingest.positions.one_height import COUNTS_FOR, one_height
 from ingest.positions.position_noise import fit_noisy
 from ingest.positions.variance_components import stated_sigma
 
@@ -29,8 +29,8 @@ def center_priors(
     fit = fit_noisy(start, centers, positions, sigmas)
     stated = np.array([stated_sigma(sigmas[:, :2]), stated_sigma(sigmas[:, 2:])])
     known = np.flatnonzero(np.isfinite(sigmas[:, 2]))
-    if one_height(positions, known):  # counts for three
-        sigmas = sigmas * [1.0, 1.0, np.sqrt(len(known) / 3.0)]
+    if one_height(positions, known):
+        sigmas = sigmas * [1.0, 1.0, np.sqrt(len(known) / COUNTS_FOR)]
     share = np.minimum(np.hypot(fit.noise.white, fit.noise.drift) / stated, 1.0)[[0, 0, 1]]
     move = fit.local_from_sfm.inverse()
     axes = move.scale * move.rotation * share

@@ -29,7 +29,7 @@ from ingest.register.frame.sources import searched_sources
 from ingest.register.frame_registration import RenderSource
 
 _CELLS = 440  # along the scan's longer side, at most; with 220 a town's streets all look alike
-_LEAST_SHARE, _SIZE_STEP = 0.12, 0.06  # of the map's picture over the scan's; logarithm between sizes
+_LEAST_SHARE, _SIZE_STEP = 0.12, 0.06  # of the map's picture over the scan's shorter side; logarithm
 _TURN_STEP = np.radians(6.0)
 _AGAIN, _AGAIN_STEP = 40, 1.0 / 3.0  # so many are searched again in such parts of the steps
 _SMOOTH = 2  # degree of a polynomial in logarithms
@@ -165,10 +165,15 @@ def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles)
 def _found(
     picture: OrthoPicture, cloud: PointCloud, source: RenderSource, upright: Sim3, by_photos: bool
 ) -> FoundByOrtho | None:
-    """Args: by_photos: these tell the vertical, and not the ground."""
+    """The best place by one property of the scan.
+
+    Args:
+        upright: own frame to one whose z is up. by_photos: whether photos tell the vertical.
+    """
     extent_m = float(np.ptp(cloud.xyz[:, :2], axis=0).max())
     drawn = picture_of_scan(cloud, source, max(extent_m / _CELLS, plan_spacing_m(cloud)))
     best = best_place(picture, drawn)
+    # Chance alone passes this in one case of two: what is placed is up to the photos that are registered.
     if best is None or best.over_chance <= best.elsewhere:
         return None
     middle = np.array([*picture.middle, float(np.median(picture.height[picture.valid]))])
