@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 
-# Of heights that are one number. Four that are good to 3 cm come as close by chance in one case of 2,000; a few
-# that a barometer tells in steps of 10 cm may well, and their place is then wider than it need be.
+# Of heights that are one number. Four that are good to 3 cm come as close by chance in one case of 2,000;
+# some that a barometer tells in steps of 10 cm may well, and their place is then wider than it need be.
 _SAME_M = 5e-3
 _EARTH_M = 6.371e6
 COUNTS_FOR = 3  # photos: they level a plane, and leave nothing over from which their noise could be told
