@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import RegistrationError
-from featuredb.features.decode import INGEST_LIMITS, decode_gray, decode_rgb
+from featuredb.features.decode import INGEST_LIMITS, decode_rgb
 from featuredb.geo.utm import geodetic_from_utm, utm_from_geodetic
 from featuredb.geo.words import way_words
 from featuredb.lidar.load import chosen_scans, load_cloud
@@ -108,9 +108,6 @@ class _Job:
     out: Path
     options: AnchorOptions
 
-    def gray(self, image: MapImage) -> NDArray[np.uint8]:
-        return decode_gray(self.files.path(image), INGEST_LIMITS)
-
     def rgb(self, image: MapImage) -> NDArray[np.uint8]:
         return decode_rgb(self.files.path(image), INGEST_LIMITS)
 
@@ -137,7 +134,7 @@ def anchor(
         tried = try_frames(
             job.feature_map,
             job.cloud,
-            job.gray,
+            job.files.gray,
             job.options.frames,
             job.options.max_tries,
             starts=starts,
@@ -149,7 +146,7 @@ def anchor(
     if request.auto or request.confirm:
         supervised = bool(request.confirm or request.start.pose or request.start.picks)
         result = place_map(
-            job.feature_map, job.cloud, tried, job.gray, job.options,
+            job.feature_map, job.cloud, tried, job.files.gray, job.options,
             confirmed=bool(request.confirm), supervised=supervised, progress=progress,
         )  # fmt: skip
     return _finished(database, job, tried, result, notes)

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.errors import IngestError, RegistrationError
+from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import MapImage
@@ -100,6 +102,15 @@ class PhotoFiles:
                 f"--photos must name the folder that the map was made of, searched: {self.folder}"
             )
         return self.paths[image.image_id]
+
+    def gray(self, image: MapImage) -> NDArray[np.uint8]:
+        """Grey pixels (h, w) of one image.
+
+        Raises:
+            RegistrationError: it was not found.
+            ImageError: it cannot be read.
+        """
+        return decode_gray(self.path(image), INGEST_LIMITS)
 
 
 def find_photos(feature_map: AnyMap, folder: Path) -> PhotoFiles:

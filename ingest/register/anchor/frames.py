@@ -22,7 +22,8 @@ from ingest.register.anchor.proposals import (
     propose_frames,
 )
 from ingest.register.anchor.start.priors import HeightShift, height_shift, prior_from_map
-from ingest.register.frame.register import register_frame
+from ingest.register.anchor.together.register import TOGETHER, register_together
+from ingest.register.frame.register import fit_vouched_for, register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 
 _LOG = logging.getLogger(__name__)
@@ -134,6 +135,10 @@ def try_frames(
     # A frame that a person chose is tried whether it sees much of the scan or not.
     order = [ranked.get(i) or _unranked(images[i], prior) for i, prior in starts.items()]
     order += [p for p in ranking if p.image.image_id not in starts]
+    if not starts:
+        together = _tried_together(feature_map, cloud, ranking, read_gray, wanted)
+        if together:
+            return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(together))
     tried: list[TriedFrame] = []
     least = max(max_tries, len(starts))
     for number, proposal in enumerate(order[: max(least, _MORE_TRIES)]):
@@ -145,6 +150,27 @@ def try_frames(
             tried.append(frame)
         progress("register", sum(f.registration.accepted for f in tried), wanted)
     return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(tried), unreadable=reader.unreadable)
+
+
+def _tried_together(
+    feature_map: FeatureMap,
+    cloud: PointCloud,
+    ranking: Sequence[FrameProposal],
+    read_gray: PhotoReader,
+    wanted: int,
+) -> list[TriedFrame]:
+    """The frames that all photos together register; none where they do not tell where the map is."""
+    start, cpu = time.perf_counter(), time.process_time()
+    proposals = {p.image.image_id: p for p in ranking}
+    found = register_together(feature_map, [p.image for p in ranking], cloud, read_gray, wanted)
+    if found is None or not found.registrations:
+        return []
+    count = len(found.registrations)
+    seconds, cpu_s = (time.perf_counter() - start) / count, (time.process_time() - cpu) / count
+    return [
+        TriedFrame(proposal=proposals[i], registration=registration, seconds=seconds, cpu_s=cpu_s)
+        for i, registration in found.registrations.items()
+    ]
 
 
 def _unranked(image: MapImage, prior: FramePrior) -> FrameProposal:
@@ -160,13 +186,21 @@ def _try(
     cloud: PointCloud,
     proposal: FrameProposal,
     reader: "_Reader",
+    before: FrameRegistration | None = None,
 ) -> TriedFrame | None:
+    """Args:
+    before: the frame's registration with another lens.
+    """
     gray = reader.full(proposal.image)
     if gray is None:
         return None
     camera = feature_map.cameras[proposal.image.camera_id]
     start, cpu = time.perf_counter(), time.process_time()
-    registration = register_frame(gray, camera, proposal.prior, cloud)
+    if before is not None and before.source is not None and TOGETHER in before.evidence:
+        evidence = {TOGETHER: before.evidence[TOGETHER]}
+        registration = fit_vouched_for(gray, camera, proposal.prior, cloud, before.source, evidence)
+    else:
+        registration = register_frame(gray, camera, proposal.prior, cloud)
     seconds = time.perf_counter() - start
     _LOG.info(
         "%s: %s in %.1f s",
@@ -196,7 +230,7 @@ def register_again(
         image = poses[frame.image.image_id]
         prior = FramePrior.around(image.cam_from_local, _AGAIN_SIGMA_M, _AGAIN_SIGMA_DEG)
         proposal = replace(frame.proposal, image=image, prior=prior)
-        tried = _try(feature_map, cloud, proposal, reader)
+        tried = _try(feature_map, cloud, proposal, reader, frame.registration)
         if tried is not None:
             again.append(tried)
     return again

@@ -14,12 +14,14 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.candidates import Judged, best_candidate, by_agreement, polished
+from ingest.register.frame.dense.fit import dense_fitted
 from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.features.search import FrameHypothesis, pose_options, unmatched
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import CORRELATED_INLIERS, loosened, prior_information, prior_sigmas
 from ingest.register.frame.verdict import (
     MAX_PLACES_ELSEWHERE,
+    MAX_PRIOR_SIGMAS,
     MIN_COVER,
     MIN_INLIERS,
     FrameEvidence,
@@ -103,6 +105,37 @@ def fit_near(
         words = f"{len(found.inliers)} independent inliers, {MIN_INLIERS} needed"
         return _refused("TOO_FEW_MATCHES", words, {}, clock)
     return _accepted(found, frame_covariance(views, prior, found), {}, clock)
+
+
+def fit_vouched_for(
+    gray: NDArray[np.uint8],
+    camera: Camera,
+    prior: FramePrior,
+    cloud: PointCloud,
+    source: RenderSource,
+    evidence: dict[str, Any],
+) -> FrameRegistration:
+    """Fit the pose of a photo (h, w) from one that other photos of its map vouch for; it is not asked again.
+
+    Args:
+        prior: the pose that all photos give together, with how far this one may be off it.
+        evidence: of all photos.
+    """
+    clock, options = StageClock(), FrameOptions()
+    views = _views(gray, camera, prior, cloud, options, clock)
+    if isinstance(views, FrameRegistration):
+        return views
+    with clock.stage("fit"):
+        start = unmatched(prior.cam_from_local, camera, source)
+        found = dense_fitted(views, loosened(prior), start, options.dense_fit)
+    if found is None or len(found.inliers) < MIN_INLIERS:
+        count = 0 if found is None else len(found.inliers)
+        return _refused("TOO_FEW_MATCHES", f"{count} independent inliers, {MIN_INLIERS} needed", {}, clock)
+    away = prior_sigmas(prior, found.pose.cam_from_local)
+    if away > MAX_PRIOR_SIGMAS:
+        words = f"the pose lies {away:.1f} deviations from where all photos together have it"
+        return _refused("CONTRADICTS_PRIOR", words, {}, clock)
+    return _accepted(found, frame_covariance(views, prior, found), evidence, clock)
 
 
 def _views(

@@ -42,7 +42,7 @@ _MIN_WEIGHED_LOG_NFA = 5.0
 _RIVAL_SHARE = 0.5  # a pose elsewhere with this share of the inliers makes the registration ambiguous
 # Largest distance from the prior, in its own standard deviations over all six axes together. Generous: people
 # and devices understate their errors.
-_MAX_PRIOR_SIGMAS = 6.0
+MAX_PRIOR_SIGMAS = 6.0
 # Largest standard deviation of the position, as a share of the distance to what is seen; above it the
 # geometry does not determine the pose.
 _MAX_POSITION_SIGMA_SHARE = 0.05
@@ -125,10 +125,10 @@ def verdict(evidence: FrameEvidence) -> tuple[FrameReason, str] | None:
             f"the matches do not determine the pose: position known to {100 * e.position_sigma_share:.1f} % "
             f"of the distance, {100 * _MAX_POSITION_SIGMA_SHARE:.1f} % needed",
         )
-    if e.prior_sigmas > _MAX_PRIOR_SIGMAS:
+    if e.prior_sigmas > MAX_PRIOR_SIGMAS:
         return (
             "CONTRADICTS_PRIOR",
-            f"the pose lies {e.prior_sigmas:.1f} deviations from the prior, {_MAX_PRIOR_SIGMAS:.0f} "
+            f"the pose lies {e.prior_sigmas:.1f} deviations from the prior, {MAX_PRIOR_SIGMAS:.0f} "
             "allowed; if the prior's deviations are too small, give larger ones",
         )
     return None

@@ -70,7 +70,7 @@ class FoundByOrtho:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Try:
+class PictureTry:
     """A place that was tried, as in `PicturePlace`."""
 
     size: float
@@ -96,7 +96,7 @@ class PicturePlace:
     elsewhere: float
 
 
-class _Scan:
+class ScanSearch:
     """The scan's gradients in the frequency domain."""
 
     def __init__(self, picture: OrthoPicture) -> None:
@@ -108,7 +108,7 @@ class _Scan:
         self._energy, self._valid = self._forward(energy), self._forward(picture.valid)
         self._mean = float(energy[picture.valid].mean()) if picture.valid.any() else np.inf
 
-    def best(self, of: OrthoPicture, size: float, turn: float) -> _Try | None:
+    def best(self, of: OrthoPicture, size: float, turn: float) -> PictureTry | None:
         """The best place of a picture; None where it lies nowhere on the scan."""
         scale = size / self.picture.cell
         gray, valid, matrix = _turned(of, scale, turn)
@@ -130,7 +130,7 @@ class _Scan:
         score = np.where(usable, found / np.sqrt(np.maximum(energy * own, 1e-12)), -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
         at = np.array([column, row]) + matrix @ np.array([of.gray.shape[1] / 2, of.gray.shape[0] / 2, 1.0])
-        return _Try(
+        return PictureTry(
             size=size,
             turn=turn,
             middle=self.picture.corner + at * self.picture.cell,
@@ -153,7 +153,7 @@ def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles)
     upright = _upright(unplaced)
     there = [image for image in unplaced.images if image.image_id in photos.paths]
     images = [moved_image(image, upright) for image in there]
-    picture = picture_of_map(upright.act(unplaced.points.xyz), images, unplaced.cameras, photos.paths)
+    picture = picture_of_map(upright.act(unplaced.points.xyz), images, unplaced.cameras, photos.gray)
     if picture is None:
         return None
     found = [
@@ -195,7 +195,7 @@ def _found(
 
 def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | None:
     """Where a picture of whatever unit agrees best with one in metres; None where it fits nowhere on it."""
-    searched, longer = _Scan(drawn), max(picture.gray.shape)
+    searched, longer = ScanSearch(drawn), max(picture.gray.shape)
     extent_m = min(drawn.gray.shape) * drawn.cell
     sizes = np.exp(np.arange(np.log(_LEAST_SHARE), 0.0, _SIZE_STEP)) * extent_m / longer
     turns = np.arange(0.0, 2.0 * np.pi, _TURN_STEP)
@@ -223,22 +223,22 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | Non
 
 
 def _again(
-    scan: _Scan, picture: OrthoPicture, tries: Sequence[_Try], chance: Callable[[float], float]
-) -> list[_Try]:
+    scan: ScanSearch, picture: OrthoPicture, tries: Sequence[PictureTry], chance: Callable[[float], float]
+) -> list[PictureTry]:
     """The best of the tries with finer steps around them."""
     steps = np.array([-1.0, 0.0, 1.0]) * _AGAIN_STEP
-    found: list[_Try] = []
+    found: list[PictureTry] = []
     for one in sorted(tries, key=lambda one: one.correlation / chance(one.size), reverse=True)[:_AGAIN]:
         found += _tried(scan, picture, one.size * np.exp(_SIZE_STEP * steps), one.turn + _TURN_STEP * steps)
     return found
 
 
-def _tried(scan: _Scan, picture: OrthoPicture, sizes: FloatArray, turns: FloatArray) -> list[_Try]:
+def _tried(scan: ScanSearch, picture: OrthoPicture, sizes: FloatArray, turns: FloatArray) -> list[PictureTry]:
     found = (scan.best(picture, size, turn) for size in sizes.tolist() for turn in turns.tolist())
     return [one for one in found if one is not None]
 
 
-def _best_by_size(tries: Sequence[_Try], turns: int) -> Callable[[float], float] | None:
+def _best_by_size(tries: Sequence[PictureTry], turns: int) -> Callable[[float], float] | None:
     """The best correlation at a size, smoothly: small pictures agree with anything, and streets with streets.
 
     Infinite for sizes at which not all `turns` fit on the scan: few places say nothing of chance.
@@ -258,7 +258,7 @@ def _best_by_size(tries: Sequence[_Try], turns: int) -> Callable[[float], float]
     return at
 
 
-def _apart(one: _Try, other: _Try, cells: int) -> bool:
+def _apart(one: PictureTry, other: PictureTry, cells: int) -> bool:
     """Whether two tries lie a tenth of the picture or two steps of the heading apart."""
     turn = np.abs((one.turn - other.turn + np.pi) % (2.0 * np.pi) - np.pi)
     away = float(np.linalg.norm(one.middle - other.middle))

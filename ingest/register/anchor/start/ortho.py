@@ -1,21 +1,20 @@
 """A map's photos and a scan, both drawn from straight above as one small picture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
-from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import MapImage
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
+from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.frame.sources import source_image
 from ingest.register.frame_registration import RenderSource
 
@@ -65,7 +64,7 @@ def picture_of_map(
     xyz: FloatArray,
     images: Sequence[MapImage],
     cameras: Sequence[Camera],
-    paths: Mapping[int, Path],
+    read_gray: PhotoReader,
 ) -> OrthoPicture | None:
     """The photos laid over the ground of a map, each cell by the photo that looks at it most steeply.
 
@@ -73,7 +72,7 @@ def picture_of_map(
 
     Args:
         xyz: (n, 3) points in a frame whose z is up; poses of the images are in it, too.
-        paths: of the photos by image id; those that cannot be read are left out.
+        read_gray: grey pixels (h, w) of an image; those that cannot be read are left out.
     """
     if not len(xyz) or not images:
         return None
@@ -88,7 +87,7 @@ def picture_of_map(
     gray, steepest = np.zeros(near.shape, np.float32), np.full(near.shape, _LEAST_STEEP)
     for image in images[:: -(-len(images) // _MOST_PHOTOS)]:
         try:
-            photo = decode_gray(paths[image.image_id], INGEST_LIMITS)
+            photo = read_gray(image)
         except ImageError:
             continue
         steep, shown = _seen(cells, image.cam_from_local, cameras[image.camera_id], photo)
@@ -134,22 +133,35 @@ def _seen(
     return steep, np.asarray(shown, dtype=np.float32)
 
 
-def picture_of_scan(cloud: PointCloud, source: RenderSource, cell_m: float) -> OrthoPicture:
-    """The scan by one of its properties."""
-    low, high = (np.asarray(of, dtype=np.float64) for of in (cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)))
-    width, height = (int(n) for n in np.ceil((high - low)[:2] / cell_m) + 1)
+def picture_of_scan(
+    cloud: PointCloud,
+    source: RenderSource,
+    cell_m: float,
+    box: tuple[FloatArray, FloatArray] | None = None,
+) -> OrthoPicture:
+    """The scan by one of its properties.
+
+    Args:
+        box: least and largest x and y of the part that is drawn; None: all.
+    """
+    low, high = (
+        np.asarray(of, dtype=np.float64)[:2] for of in (cloud.xyz.min(axis=0), cloud.xyz.max(axis=0))
+    )
+    if box is not None:
+        low, high = np.maximum(low, box[0]), np.maximum(np.minimum(high, box[1]), np.maximum(low, box[0]))
+    width, height = (int(n) for n in np.ceil((high - low) / cell_m) + 1)
     away_px = _AWAY * max(width, height)
     camera = Camera(
         model="SIMPLE_PINHOLE", width=width, height=height, params=(away_px, width / 2.0, height / 2.0)
     )
     level = float(np.median(cloud.xyz[:, 2]))
-    center = np.array([*(low[:2] + 0.5 * cell_m * np.array([width, height])), level + away_px * cell_m])
+    center = np.array([*(low + 0.5 * cell_m * np.array([width, height])), level + away_px * cell_m])
     rotation = np.diag([1.0, -1.0, -1.0])
     view = render(cloud, camera, Rigid3(rotation=rotation, translation=-rotation @ center))
     return OrthoPicture(
         gray=np.ascontiguousarray(source_image(view, source)[::-1], dtype=np.float32),
         valid=view.valid[::-1],
         height=center[2] - view.depth[::-1].astype(np.float64),
-        corner=low[:2],
+        corner=low,
         cell=cell_m,
     )

@@ -54,6 +54,8 @@ _MIN_LAYER_M = 2.0
 # Smallest evidence, -log10 of the probability that chance puts as many so near, less six free parameters'
 # worth.
 MIN_LOG_NFA = 5.0
+# Of a piece whose best place is anywhere in the window.
+CHANCE = float(np.pi * (_NEAR_PX + 0.5) ** 2 / (2 * _SEARCH_PX + 1) ** 2)
 _MIN_CELLS = 4  # of 16 parts of the photo, how many must hold a piece that agrees: a pose needs width
 
 
@@ -68,6 +70,23 @@ class ConfirmOptions:
 
     finest_spacing: float = 1.2
     min_agreeing: float = 0.18
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pieces:
+    """Pieces of a photo that were compared with the scan at a pose.
+
+    Attributes:
+        points_local: (n, 3) of the scan at their middles, metres.
+        pixels: (n, 2) of their best places, as shares of the photo's sides.
+        near: (n,) whose best place is where the pose puts them; by chance one of 1 / CHANCE.
+        side_m: of a piece, at the median distance.
+    """
+
+    points_local: FloatArray
+    pixels: FloatArray
+    near: NDArray[np.bool_]
+    side_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,10 +127,8 @@ def confirm_pose(
     Args:
         photo_gray: (h, w) uint8 of `camera`'s size.
     """
-    finest = finest_side_px(camera, cam_from_local, cloud, options.finest_spacing)
-    view = pinhole_view(photo_gray, camera, min(_SIDE_PX, finest))
-    maps = _maps(view, cam_from_local, cloud, source)
-    n = len(maps)
+    found = compared_pieces(photo_gray, camera, cam_from_local, cloud, source, options)
+    n, near = len(found.near), found.near
     if n < MIN_PIECES:
         return PictureConfirmation(
             confirmed=False,
@@ -121,17 +138,12 @@ def confirm_pose(
             cells=0,
             message=f"only {n} pieces of the picture have structure, {MIN_PIECES} are needed",
         )
-    places, _ = peaks(maps.maps)
-    off = places - _SEARCH_PX
-    near = np.linalg.norm(off, axis=1) <= _NEAR_PX
-    chance = np.pi * (_NEAR_PX + 0.5) ** 2 / (2 * _SEARCH_PX + 1) ** 2
     agreeing = int(near.sum())
     # Six parameters can bring three pieces into place whatever they show.
     free, total = max(agreeing // _OVERLAP - 3, 0), n // _OVERLAP - 3
-    log_nfa = float(-binom.logsf(free - 1, total, chance) / np.log(10.0))
-    pixels = (maps.origin + places)[near] / (view.camera.width, view.camera.height)
-    cells = len(np.unique(np.clip((pixels * 4).astype(int), 0, 3) @ (4, 1)))
-    layers = _layers(maps.points_local[:, 2], near)
+    log_nfa = float(-binom.logsf(free - 1, total, CHANCE) / np.log(10.0))
+    cells = len(np.unique(np.clip((found.pixels[near] * 4).astype(int), 0, 3) @ (4, 1)))
+    layers = _layers(found.points_local[:, 2], near)
     message = _objection(agreeing / n, log_nfa, cells, layers, options)
     return PictureConfirmation(
         confirmed=not message,
@@ -140,6 +152,32 @@ def confirm_pose(
         log_nfa=log_nfa,
         cells=cells,
         message=message,
+    )
+
+
+def compared_pieces(
+    photo_gray: NDArray[np.uint8],
+    camera: Camera,
+    cam_from_local: Rigid3,
+    cloud: PointCloud,
+    source: RenderSource,
+    options: ConfirmOptions = ConfirmOptions(),
+) -> Pieces:
+    """Where pieces of a rendering at a pose fit the photo best, beside where the pose puts them.
+
+    Args:
+        photo_gray: (h, w) uint8 of `camera`'s size.
+    """
+    finest = finest_side_px(camera, cam_from_local, cloud, options.finest_spacing)
+    view = pinhole_view(photo_gray, camera, min(_SIDE_PX, finest))
+    maps = _maps(view, cam_from_local, cloud, source)
+    places = peaks(maps.maps)[0] if len(maps) else np.zeros((0, 2))
+    depth = cam_from_local.act(maps.points_local)[:, 2] if len(maps) else np.zeros(1)
+    return Pieces(
+        points_local=maps.points_local,
+        pixels=(maps.origin + places) / (view.camera.width, view.camera.height),
+        near=np.linalg.norm(places - _SEARCH_PX, axis=1) <= _NEAR_PX,
+        side_m=_PIECES.size_px * float(np.median(depth)) / view.camera.focal_px,
     )
 
 

@@ -71,7 +71,7 @@ def near_places(
 
 _MIN_PLACES = 12  # twice what six parameters need
 _FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart
-_MAX_SIDE_PX = 1200  # beyond, pieces of 40 px are too small a part of the picture to have structure
+MAX_SIDE_PX = 1200  # beyond, pieces of 40 px are too small a part of the picture to have structure
 
 
 def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource) -> list[FrameHypothesis]:
@@ -117,7 +117,7 @@ def _fit_round(
     piece_px: int,
     near_px: int,
 ) -> FrameHypothesis | None:
-    side_px = views.side_px(spacing_px, _MAX_SIDE_PX)
+    side_px = views.side_px(spacing_px, MAX_SIDE_PX)
     renderings = views.renders([start.pose.cam_from_local], side_px)
     if not renderings:
         return None
@@ -136,7 +136,7 @@ def _moved_px(views: FrameViews, before: FrameHypothesis, after: FrameHypothesis
     here, there = (
         views.camera.project(found.pose.cam_from_local.act(after.matches.points)) for found in (before, after)
     )
-    side_px = views.side_px(views.options.dense_fit.spacing_px[-1], _MAX_SIDE_PX)
+    side_px = views.side_px(views.options.dense_fit.spacing_px[-1], MAX_SIDE_PX)
     moved = float(np.median(np.linalg.norm(here - there, axis=1)))
     return moved * side_px / max(views.camera.width, views.camera.height)
 

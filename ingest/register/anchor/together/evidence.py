@@ -1,0 +1,83 @@
+"""How many pieces of all photos lie where one similarity of the map puts them, and how often chance would.
+
+As one photo is asked (`ingest.register.frame.dense.confirmation`), with all photos counted together: photos
+that say little alone say enough together. Pieces that show the same place of the scan count as one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom
+
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import MapImage
+from featuredb.render.cloud import PointCloud
+from ingest.register.frame.dense.confirmation import CHANCE, Pieces, compared_pieces
+from ingest.register.frame_registration import RenderSource
+
+# Of a piece's side: pieces that overlap by half say about half as much as ones that do not.
+_CELL = 0.7
+_BEFORE = 30.0  # places that weigh as much as chance alone; so many elsewhere say as much themselves
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """Of one similarity.
+
+    Attributes:
+        places: of the scan that pieces show. agreeing: of these, in shares of the pieces of each.
+    """
+
+    places: int
+    agreeing: float
+
+    def log_nfa(self, elsewhere: Sequence["Evidence"]) -> float:
+        """-log10 of how often as many would agree at one of so many wrong places.
+
+        How often a place agrees that is wrong is taken from the others, and from chance: pictures of streets
+        agree with streets.
+        """
+        places = _BEFORE + sum(other.places for other in elsewhere)
+        share = (_BEFORE * CHANCE + sum(other.agreeing for other in elsewhere)) / places
+        tail = float(binom.logsf(int(self.agreeing) - 1, self.places, share)) / np.log(10.0)
+        return max(-tail - float(np.log10(1 + len(elsewhere))), 0.0)
+
+
+def evidence_of(
+    new_from_old: Sim3,
+    images: Sequence[MapImage],
+    cameras: Sequence[Camera],
+    grays: Mapping[int, NDArray[np.uint8]],
+    cloud: PointCloud,
+    source: RenderSource,
+) -> Evidence:
+    """What the photos say of a place of the map.
+
+    Args:
+        grays: (h, w) of each image, by id.
+    """
+    asked = [
+        compared_pieces(
+            grays[image.image_id],
+            cameras[image.camera_id],
+            new_from_old.act_on_pose(image.cam_from_local),
+            cloud,
+            source,
+        )
+        for image in images
+    ]
+    return _counted([pieces for pieces in asked if len(pieces.near)])
+
+
+def _counted(asked: Sequence[Pieces]) -> Evidence:
+    if not asked:
+        return Evidence(places=0, agreeing=0.0)
+    side_m = _CELL * float(np.median([pieces.side_m for pieces in asked]))
+    cells = np.floor(np.vstack([pieces.points_local for pieces in asked])[:, :2] / side_m)
+    place = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    count = np.bincount(place)
+    near = np.bincount(place, weights=np.concatenate([pieces.near for pieces in asked]))
+    return Evidence(places=len(count), agreeing=float((near / count).sum()))
