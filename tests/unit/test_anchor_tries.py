@@ -20,6 +20,7 @@ def tried(monkeypatch: pytest.MonkeyPatch, registered: list[bool]) -> int:
     monkeypatch.setattr(frames, "height_shift", lambda *_: None)
     monkeypatch.setattr(frames, "prior_from_map", lambda *_: None)
     monkeypatch.setattr(frames, "propose_frames", lambda *_: proposals)
+    monkeypatch.setattr(frames, "register_together", lambda *_: None)
     monkeypatch.setattr(frames, "_try", try_one)
     found = try_frames(SimpleNamespace(images=images), None, lambda _: None, 3, 6)  # type: ignore[arg-type, return-value]
     return len(found.tried)

@@ -24,7 +24,7 @@ _BEFORE = 30.0  # places that weigh as much as chance alone; so many elsewhere s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Evidence:
+class JointEvidence:
     """Of one similarity.
 
     Attributes:
@@ -34,7 +34,7 @@ class Evidence:
     places: int
     agreeing: float
 
-    def log_nfa(self, elsewhere: Sequence["Evidence"]) -> float:
+    def log_nfa(self, elsewhere: Sequence["JointEvidence"]) -> float:
         """-log10 of how often as many would agree at one of so many wrong places.
 
         How often a place agrees that is wrong is taken from the others, and from chance: pictures of streets
@@ -43,7 +43,7 @@ class Evidence:
         places = _BEFORE + sum(other.places for other in elsewhere)
         share = (_BEFORE * CHANCE + sum(other.agreeing for other in elsewhere)) / places
         tail = float(binom.logsf(int(self.agreeing) - 1, self.places, share)) / np.log(10.0)
-        return max(-tail - float(np.log10(1 + len(elsewhere))), 0.0)
+        return float(max(-tail - np.log10(1 + len(elsewhere)), 0.0))
 
 
 def evidence_of(
@@ -53,7 +53,7 @@ def evidence_of(
     grays: Mapping[int, NDArray[np.uint8]],
     cloud: PointCloud,
     source: RenderSource,
-) -> Evidence:
+) -> JointEvidence:
     """What the photos say of a place of the map.
 
     Args:
@@ -72,12 +72,12 @@ def evidence_of(
     return _counted([pieces for pieces in asked if len(pieces.near)])
 
 
-def _counted(asked: Sequence[Pieces]) -> Evidence:
+def _counted(asked: Sequence[Pieces]) -> JointEvidence:
     if not asked:
-        return Evidence(places=0, agreeing=0.0)
+        return JointEvidence(places=0, agreeing=0.0)
     side_m = _CELL * float(np.median([pieces.side_m for pieces in asked]))
     cells = np.floor(np.vstack([pieces.points_local for pieces in asked])[:, :2] / side_m)
     place = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
     count = np.bincount(place)
     near = np.bincount(place, weights=np.concatenate([pieces.near for pieces in asked]))
-    return Evidence(places=len(count), agreeing=float((near / count).sum()))
+    return JointEvidence(places=len(count), agreeing=float((near / count).sum()))

@@ -71,8 +71,10 @@ def fitted_together(
             camera = cameras[image.camera_id]
             pose = new_from_old.act_on_pose(image.cam_from_local)
             views = views_at(grays[image.image_id], camera, pose, cloud)
-            side_px = 0 if views is None else views.side_px(spacing_px, MAX_SIDE_PX)
-            for rendering in [] if views is None else views.renders([pose], side_px):
+            if views is None:
+                continue
+            side_px = views.side_px(spacing_px, MAX_SIDE_PX)
+            for rendering in views.renders([pose], side_px):
                 found = near_places(views.gray, camera, rendering, source, piece_px, near_px)
                 seen.append(
                     _Seen(

@@ -12,7 +12,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.anchor.together.evidence import Evidence, evidence_of
+from ingest.register.anchor.together.evidence import JointEvidence, evidence_of
 from ingest.register.anchor.together.fit import fitted_together
 from ingest.register.anchor.together.start import starts_from_above
 from ingest.register.frame.register import fit_vouched_for
@@ -91,11 +91,11 @@ def _placed(
     grays: Mapping[int, NDArray[np.uint8]],
     cloud: PointCloud,
     source: RenderSource,
-) -> tuple[Sim3, Evidence] | None:
+) -> tuple[Sim3, JointEvidence] | None:
     """The fitted place that chance does not give, where no other one is nearly as good."""
     cameras = feature_map.cameras
 
-    def evidence(similarity: Sim3) -> Evidence:
+    def evidence(similarity: Sim3) -> JointEvidence:
         return evidence_of(similarity, images, cameras, grays, cloud, source)
 
     asked = [(start, evidence(start)) for start in starts]
@@ -120,7 +120,7 @@ def _registered(
     cloud: PointCloud,
     source: RenderSource,
     wanted: int,
-    evidence: Evidence,
+    evidence: JointEvidence,
 ) -> dict[int, FrameRegistration]:
     """The first photos that have correspondences of their own."""
     figures = {TOGETHER: asdict(evidence)}

@@ -72,12 +72,12 @@ def _left_open(feature_map: FeatureMap, picture: OrthoPicture) -> tuple[float, f
     plan = (jacobian @ covariance @ jacobian.T)[:2, :2]
     sigmas = np.sqrt([np.linalg.eigvalsh(plan)[-1], covariance[3, 3], covariance[0, 0]])
     reach, turn, size = np.maximum(_REACH * sigmas, [_LEAST_REACH_M, _LEAST_TURN, _LEAST_SIZE]).tolist()
-    return reach, min(turn, np.pi), size
+    return reach, min(turn, float(np.pi)), size
 
 
 def _steps(reach: float, step: float) -> FloatArray:
     count = int(np.ceil(reach / step))
-    return step * np.arange(-count, count + 1)
+    return np.asarray(step * np.arange(-count, count + 1), dtype=np.float64)
 
 
 def _around(picture: OrthoPicture, reach_m: float) -> tuple[FloatArray, FloatArray]:
@@ -86,7 +86,7 @@ def _around(picture: OrthoPicture, reach_m: float) -> tuple[FloatArray, FloatArr
     corners = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
     middle = picture.corner + picture.cell * corners.mean(axis=0)
     half = 0.5 * picture.cell * float(np.linalg.norm(corners[1] - corners[0])) + reach_m
-    return middle - half, middle + half
+    return np.asarray(middle - half, np.float64), np.asarray(middle + half, np.float64)
 
 
 def _distinct(tries: Sequence[PictureTry], picture: OrthoPicture) -> list[PictureTry]:
@@ -134,7 +134,7 @@ def _levelled(new_from_old: Sim3, points: FloatArray, scan: OrthoPicture) -> Sim
 def _surface(scan: OrthoPicture, plan: FloatArray) -> FloatArray:
     """Heights (n,) of the scan at places (n, 2); NaN where it shows nothing."""
     cells = np.floor((plan - scan.corner) / scan.cell).astype(np.int64)
-    inside = ((cells >= 0) & (cells < scan.gray.shape[::-1])).all(axis=1)
+    inside = np.asarray(((cells >= 0) & (cells < scan.gray.shape[::-1])).all(axis=1))
     columns, rows = np.where(inside[:, None], cells, 0).T
     known = inside & scan.valid[rows, columns]
     return np.asarray(np.where(known, scan.height[rows, columns], np.nan))

@@ -1,0 +1,222 @@
+"""Photos of simulated towns registered to scans that have intensities alone: one by one, and together.
+
+    python -m tools.frames_on_scan --work DIR [--inputs DIR] [--towns 101 102 ...] [--negatives 2]
+
+Of each town, on which nothing was chosen:
+
+- ten photos from 70 m, each from a prior that is 15 m and 10 degrees off, on the town's scan, and so many on
+  the scan of another town, where none may be registered;
+- a map of ten photos from 25 m, of which hardly one is registered by itself (two are tried), moved by 15 m
+  and turned by 10 degrees: placed on the town's scan by all photos together, and tried on the scan of another
+  town, and with mirrored photos.
+
+What is found of a town is kept in DIR.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from featuredb.geometry.sim3 import Sim3
+from featuredb.lidar.add import add_scan
+from featuredb.lidar.load import PlanBox, load_cloud, scan_frame
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.move import move_map
+from featuredb.render.cloud import PointCloud
+from featuredb.simworld.flight import FlightOptions
+from featuredb.simworld.truth import Truth
+from featuredb.simworld.world import WorldOptions, open_world, write_world
+from featuredb.store import Database
+from featuredb.store.scans import list_scans
+from ingest.register.anchor.anchor_map import AnchorOptions, place_map
+from ingest.register.anchor.frames import try_frames
+from ingest.register.anchor.start.first_place import plan_box
+from ingest.register.anchor.together.register import register_together
+from ingest.register.frame.register import register_frame
+from ingest.register.frame_registration import FramePrior
+from tools.figures import study_parser, write_figures
+from tools.made_maps import all_maps, make
+from tools.worlds.scan_world import make_scan_world
+
+_TOWNS = tuple(range(301, 311))
+_OFF_M, _OFF_DEG = 15.0, 10.0
+_RIGHT_M, _RIGHT_DEG, _WRONG_M = 0.3, 0.3, 1.0
+_PHOTOS, _ALONE = 10, 2
+_LOW = FlightOptions(lines=2, per_line=5, oblique=0, width=1024, height_m=25.0)
+_AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = study_parser(__doc__, "--work", "--inputs")
+    parser.add_argument("--towns", type=int, nargs="+", default=_TOWNS, help="seeds")
+    parser.add_argument("--negatives", type=int, default=2, help="of each town")
+    args = parser.parse_args(argv)
+    cv2.setNumThreads(1)
+    args.work.mkdir(parents=True, exist_ok=True)
+    towns = [_town(seed, args.inputs or args.work, args.work, args.negatives) for seed in args.towns]
+    singles = [np.array(one) for town in towns for one in town["singles"]]
+    right = sum(one[0] <= _RIGHT_M and one[1] <= _RIGHT_DEG for one in singles)
+    placed = [town["own_m"] for town in towns if town["own_m"] is not None]
+    write_figures(
+        args.json,
+        {
+            "towns": len(towns),
+            "tried": _PHOTOS * len(towns),
+            "right_share": right / (_PHOTOS * len(towns)),
+            "singles_wrong": sum(one[0] > _WRONG_M for one in singles),
+            "negatives": args.negatives * len(towns),
+            "negatives_accepted": sum(town["negatives"] for town in towns),
+            "alone": sum(town["alone"] for town in towns),
+            "alone_tried": _ALONE * len(towns),
+            "placed": len(placed),
+            "wrong": sum(metres > _WRONG_M for metres in placed),
+            "median_m": float(np.median(placed or [np.nan])),
+            "largest_m": float(max(placed, default=np.nan)),
+            "other_placed": sum(town["other"] for town in towns),
+            "mirrored_placed": sum(town["mirrored"] for town in towns),
+        },
+    )
+    return 0
+
+
+def _town(seed: int, inputs: Path, work: Path, negatives: int) -> dict[str, Any]:
+    """What is found of one town, made once."""
+    path = work / f"town-{seed}-{negatives}.json"
+    if not path.exists():
+        world = make_scan_world(inputs, seed)
+        scans = [
+            _scanned(work / f"scan-{seed}-{k}", of) for k, of in enumerate((world.scan, world.other_scan))
+        ]
+        clouds = [_cloud(database, scan_frame(list_scans(database)[0])) for database in scans]
+        found = _alone(world.world.folder, world.world.truth, clouds, seed, negatives)
+        found |= _together(work / f"low-{seed}", scans, seed)
+        path.write_text(json.dumps(found))
+        sys.stdout.write(f"town {seed}: {found}\n")
+        sys.stdout.flush()
+    return dict(json.loads(path.read_text()))
+
+
+def _scanned(path: Path, scan: Path) -> Database:
+    database = Database.open(path) if path.exists() else Database.create(path)
+    add_scan(database, [scan])
+    return database
+
+
+def _cloud(database: Database, frame: LocalFrame, box: PlanBox | None = None) -> PointCloud:
+    return replace(load_cloud(database, frame, box), rgb=None)
+
+
+def _gray(path: Path) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+
+
+def _alone(
+    folder: Path, truth: Truth, scans: Sequence[PointCloud], seed: int, negatives: int
+) -> dict[str, Any]:
+    """Metres and degrees of the survey's photos that are registered, and how many are on another scan."""
+    named = truth.group("drone")
+    named = named[:: max(1, len(named) // _PHOTOS)][:_PHOTOS]
+    singles, accepted = [], 0
+    for number, image in enumerate(named):
+        rng = np.random.default_rng((seed, number))
+        for cloud in scans if number < negatives else scans[:1]:
+            true = image.cam_from_local @ cloud.frame.enu_from(truth.frame).inverse()
+            prior = _prior(_moved(true.center, rng).act_on_pose(true))
+            found = register_frame(_gray(folder / image.name), image.camera, prior, cloud)
+            if cloud is not scans[0]:
+                accepted += found.accepted
+            elif found.cam_from_local is not None:
+                off = float(np.linalg.norm(found.cam_from_local.center - true.center))
+                singles.append((off, found.cam_from_local.angle_to_deg(true)))
+    return {"singles": singles, "negatives": accepted}
+
+
+def _together(folder: Path, scanned: Sequence[Database], seed: int) -> dict[str, Any]:
+    """How far off the low map's cameras are, metres, median, None without a place; what else is placed."""
+    if not (folder / "db").exists():
+        rng = np.random.default_rng(seed)
+        middle = (float(rng.uniform(-60.0, 60.0)), float(rng.uniform(-50.0, 50.0)))
+        flight = replace(_LOW, center_m=middle)
+        write_world(
+            folder,
+            replace(WorldOptions.short(seed), flight=flight, queries=0, street=0, negatives_per_kind=0),
+        )
+        make(folder / "making", "photos", folder / "drone")
+        (folder / "making").rename(folder / "db")
+    truth = open_world(folder).truth
+    made = max(all_maps(folder / "db"), key=lambda one: len(one.images))
+    assert isinstance(made, FeatureMap)
+
+    def read(image: MapImage) -> NDArray[np.uint8]:
+        return _gray(folder / "drone" / image.name)
+
+    def mirrored(image: MapImage) -> NDArray[np.uint8]:
+        return np.ascontiguousarray(read(image)[:, ::-1])
+
+    start = _misplaced(made, np.random.default_rng((seed, 99)))
+    scans = [_cloud(database, start.frame, plan_box(start)) for database in scanned]
+    alone = [
+        register_frame(
+            read(image), start.cameras[image.camera_id], _prior(image.cam_from_local), scans[0]
+        ).accepted
+        for image in start.images[:_ALONE]
+    ]
+    tried = try_frames(start, scans[0], read, AnchorOptions().frames, AnchorOptions().max_tries)
+    placed = place_map(start, scans[0], tried, read, AnchorOptions()).feature_map
+    own_m = None
+    if placed is not None:
+        here = truth.frame.enu_from(placed.frame)
+        own_m = float(
+            np.median(
+                [
+                    np.linalg.norm(
+                        here.act(image.cam_from_local.center)
+                        - truth.images[f"drone/{image.name}"].cam_from_local.center
+                    )
+                    for image in placed.images
+                ]
+            )
+        )
+    return {
+        "alone": sum(alone),
+        "own_m": own_m,
+        "other": register_together(start, start.images, scans[1], read, 1) is not None,
+        "mirrored": register_together(start, start.images, scans[0], mirrored, 1) is not None,
+    }
+
+
+def _moved(middle: FloatArray, rng: np.random.Generator) -> Sim3:
+    """A turn about a place, and a shift."""
+    axis, way = (value / np.linalg.norm(value) for value in rng.normal(size=(2, 3)))
+    turn = so3_exp(np.radians(_OFF_DEG) * axis)
+    return Sim3(scale=1.0, rotation=turn, translation=middle + _OFF_M * way - turn @ middle)
+
+
+def _prior(pose: Rigid3) -> FramePrior:
+    return FramePrior.around(pose, _OFF_M * _AXIS, _OFF_DEG * _AXIS)
+
+
+def _misplaced(feature_map: FeatureMap, rng: np.random.Generator) -> FeatureMap:
+    """The map moved, with a placement that says how far."""
+    middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
+    move = _moved(middle, rng)
+    about = Sim3(scale=1.0, rotation=np.eye(3), translation=move.act(middle))
+    sigmas = [0.01, *[np.radians(_OFF_DEG) * _AXIS] * 3, *[_OFF_M * _AXIS] * 3]
+    covariance = about.carried(np.diag(np.square(sigmas)))
+    moved = move_map(feature_map, move)
+    return replace(moved, placement=replace(moved.placement, covariance=covariance))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
