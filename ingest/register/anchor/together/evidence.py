@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom
+from scipy.stats import betabinom
 
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
@@ -20,7 +20,7 @@ from ingest.register.frame_registration import RenderSource
 
 # Of a piece's side: pieces that overlap by half say about half as much as ones that do not.
 _CELL = 0.7
-_BEFORE = 30.0  # places that weigh as much as chance alone; so many elsewhere say as much themselves
+_BEFORE = 10.0  # so many places elsewhere weigh as much as what is known before: chance alone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,14 +35,14 @@ class JointEvidence:
     agreeing: float
 
     def log_nfa(self, elsewhere: Sequence["JointEvidence"]) -> float:
-        """-log10 of how often as many would agree at one of so many wrong places.
+        """-log10 of how often as many would agree at one of so many wrong places (beta-binomial).
 
         How often a place agrees that is wrong is taken from the others, and from chance: pictures of streets
         agree with streets.
         """
-        places = _BEFORE + sum(other.places for other in elsewhere)
-        share = (_BEFORE * CHANCE + sum(other.agreeing for other in elsewhere)) / places
-        tail = float(binom.logsf(int(self.agreeing) - 1, self.places, share)) / np.log(10.0)
+        agreed = _BEFORE * CHANCE + sum(other.agreeing for other in elsewhere)
+        failed = _BEFORE * (1.0 - CHANCE) + sum(other.places - other.agreeing for other in elsewhere)
+        tail = betabinom.logsf(int(self.agreeing) - 1, self.places, agreed, failed) / np.log(10.0)
         return float(max(-tail - np.log10(1 + len(elsewhere)), 0.0))
 
 

@@ -14,7 +14,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.anchor.together.evidence import JointEvidence, evidence_of
 from ingest.register.anchor.together.fit import fitted_together
-from ingest.register.anchor.together.start import starts_from_above
+from ingest.register.anchor.together.start import Starts, starts_from_above
 from ingest.register.frame.register import fit_vouched_for
 from ingest.register.frame.sources import searched_sources
 from ingest.register.frame_registration import FramePrior, FrameRegistration, RenderSource
@@ -86,7 +86,7 @@ def register_together(
 
 def _placed(
     feature_map: FeatureMap,
-    starts: Sequence[Sim3],
+    starts: Starts,
     images: Sequence[MapImage],
     grays: Mapping[int, NDArray[np.uint8]],
     cloud: PointCloud,
@@ -98,14 +98,15 @@ def _placed(
     def evidence(similarity: Sim3) -> JointEvidence:
         return evidence_of(similarity, images, cameras, grays, cloud, source)
 
-    asked = [(start, evidence(start)) for start in starts]
+    asked = [(start, evidence(start)) for start in starts.there]
     asked.sort(key=lambda one: -one[1].agreeing)
+    wrong = [evidence(one) for one in starts.wrong] if asked else []
     for number, (start, _) in enumerate(asked[:_FITTED]):
         similarity = fitted_together(start, images, cameras, grays, cloud, source)
         if similarity is None:
             continue
         found = evidence(similarity)
-        log_nfa = found.log_nfa([other for k, (_, other) in enumerate(asked) if k != number])
+        log_nfa = found.log_nfa([*(other for k, (_, other) in enumerate(asked) if k != number), *wrong])
         _LOG.info("together by %s: %s, 10^-%.1f", source, found, log_nfa)
         if log_nfa >= _LOG_RATE:
             return similarity, found

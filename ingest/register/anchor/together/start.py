@@ -6,6 +6,7 @@ tilted by some degrees looks the same from above; its points against the scan's 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,10 +27,25 @@ _TURN_STEP, _SIZE_STEP = np.radians(2.0), 0.02  # three cells at the rim of the 
 _MOST_CELLS = 700  # along the longer side of the part of the scan that is searched
 _CELL = 0.7  # of the spacing of its points
 _APART = 0.1  # of the picture: another place
-_PLACES = 6
+_PLACES = 4
+_QUARTERS = (0.5 * np.pi, np.pi, 1.5 * np.pi)
 _LEVEL_ROUNDS, _WEIGHT_ROUNDS = 2, 20  # of tilting the points, and of Cauchy's weights
 _LEAST_POINTS = 30
 _LEAST_M = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Starts:
+    """Similarities of a map's frame under which it looks like the scan from above.
+
+    Attributes:
+        there: within what the placement leaves open, apart from each other, best first.
+        wrong: the best of those that are turned by one, two and three right angles: streets of most towns
+            are square to each other, so these agree as wrong places do.
+    """
+
+    there: tuple[Sim3, ...]
+    wrong: tuple[Sim3, ...]
 
 
 def starts_from_above(
@@ -38,9 +54,8 @@ def starts_from_above(
     cloud: PointCloud,
     read_gray: PhotoReader,
     source: RenderSource,
-) -> list[Sim3]:
-    """The best places within what the placement leaves open, by similarities of the map's frame; best first,
-    empty without a view from above.
+) -> Starts:
+    """The best places within what the placement leaves open; none without a view from above.
 
     Args:
         images: of the map, whose photos are there.
@@ -49,19 +64,27 @@ def starts_from_above(
     points = feature_map.points_local(cloud.frame)
     picture = picture_of_map(points, images, feature_map.cameras, read_gray)
     if picture is None:
-        return []
+        return Starts(there=(), wrong=())
     reach_m, turn, size = _left_open(feature_map, picture)
     low, high = _around(picture, reach_m)
     cell_m = max(float((high - low).max()) / _MOST_CELLS, _CELL * plan_spacing_m(cloud))
     drawn = picture_of_scan(cloud, source, cell_m, (low, high))
     if not drawn.valid.any():
-        return []
+        return Starts(there=(), wrong=())
     search = ScanSearch(drawn)
     sizes = picture.cell * np.exp(_steps(size, _SIZE_STEP))
-    turns = _steps(turn, _TURN_STEP)
-    found = [search.best(picture, one, angle) for one in sizes.tolist() for angle in turns.tolist()]
-    tries = sorted((one for one in found if one is not None), key=lambda one: -one.correlation)
-    return [_levelled(_in_plan(picture, one), points, drawn) for one in _distinct(tries, picture)]
+    turns = _steps(turn, _TURN_STEP).tolist()
+
+    def best(around: float) -> list[Sim3]:
+        """Similarities, best first, with headings about one."""
+        found = [search.best(picture, one, around + angle) for one in sizes.tolist() for angle in turns]
+        tries = sorted((one for one in found if one is not None), key=lambda one: -one.correlation)
+        return [_levelled(_in_plan(picture, one), points, drawn) for one in _distinct(tries, picture)]
+
+    quarters = _QUARTERS if turn < 0.5 * _QUARTERS[0] else ()
+    return Starts(
+        there=tuple(best(0.0)), wrong=tuple(one for quarter in quarters for one in best(quarter)[:1])
+    )
 
 
 def _left_open(feature_map: FeatureMap, picture: OrthoPicture) -> tuple[float, float, float]:
