@@ -26,6 +26,7 @@ from ingest.register.anchor.pictures import (
     view_rgb,
 )
 from ingest.register.anchor.report import FRAME_HEADER, AnchorReport, frame_rows, report_json
+from ingest.register.anchor.together.register import TOGETHER
 from ingest.workspace import atomic_file, write_json
 
 REPORT_JSON, REPORT_HTML = "anchor.json", "anchor.html"
@@ -168,7 +169,8 @@ def _frame(
 
 
 def _evidence_line(evidence: Mapping[str, Any]) -> str:
-    pictures = {f"confirmation {k}": v for k, v in evidence.get("confirmation", {}).items()}
+    parts = ("confirmation", TOGETHER)
+    pictures = {f"{part} {k}": v for part in parts for k, v in evidence.get(part, {}).items()}
     shown = {
         k: v
         for k, v in {**evidence, **pictures}.items()

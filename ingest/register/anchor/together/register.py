@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,12 +74,12 @@ def register_together(
         starts = starts_from_above(feature_map, images, cloud, read_gray, source)
         found = _placed(feature_map, starts, asked, grays, cloud, source)
         if found is not None:
-            new_from_old, evidence = found
+            new_from_old, figures = found
             return TogetherFrames(
                 new_from_old=new_from_old,
                 source=source,
                 registrations=_registered(
-                    feature_map, new_from_old, asked, grays, cloud, source, wanted, evidence
+                    feature_map, new_from_old, asked, grays, cloud, source, wanted, figures
                 ),
             )
     return None
@@ -91,8 +92,8 @@ def _placed(
     grays: Mapping[int, NDArray[np.uint8]],
     cloud: PointCloud,
     source: RenderSource,
-) -> tuple[Sim3, JointEvidence] | None:
-    """The fitted place that chance does not give, where no other one is nearly as good."""
+) -> tuple[Sim3, dict[str, Any]] | None:
+    """The fitted place that wrong places do not explain, and its evidence as figures."""
     cameras = feature_map.cameras
 
     def evidence(similarity: Sim3) -> JointEvidence:
@@ -109,7 +110,7 @@ def _placed(
         log_nfa = found.log_nfa([*(other for k, (_, other) in enumerate(asked) if k != number), *wrong])
         _LOG.info("together by %s: %s, 10^-%.1f", source, found, log_nfa)
         if log_nfa >= _LOG_RATE:
-            return similarity, found
+            return similarity, {TOGETHER: asdict(found) | {"log_nfa": log_nfa}}
     return None
 
 
@@ -121,10 +122,9 @@ def _registered(
     cloud: PointCloud,
     source: RenderSource,
     wanted: int,
-    evidence: JointEvidence,
+    figures: dict[str, Any],
 ) -> dict[int, FrameRegistration]:
     """The first photos that have correspondences of their own."""
-    figures = {TOGETHER: asdict(evidence)}
     registrations: dict[int, FrameRegistration] = {}
     for image in images:
         if len(registrations) == wanted:
