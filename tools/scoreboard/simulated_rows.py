@@ -180,6 +180,20 @@ SIMULATED: tuple[Row, ...] = (
         minutes=20,
     ),
     _row(
+        name="frames-on-scan",
+        claim="ten towns, scans with intensities alone: photos from 70 m, each from 15 m and 10 degrees off, "
+        "one by one; maps of ten photos from 25 m, as far off, together; on another town's scan; mirrored",
+        commands=f"tools.frames_on_scan --work {{work}}/towns --inputs {{cache}} {OUT}",
+        text="{right_share:.0%} of {tried} single photos within 0.3 m and 0.3 degrees, {singles_wrong} "
+        "wrong, {negatives_accepted} of {negatives} registered elsewhere; {placed} of {towns} low maps "
+        "placed, median {median_m:.3f} m, largest {largest_m:.2f} m ({alone} of {alone_tried} of their "
+        "photos alone); elsewhere {other_placed}, mirrored {mirrored_placed}",
+        limits="0.9 <= right_share, singles_wrong <= 0, negatives_accepted <= 0, 8 <= placed, wrong <= 0, "
+        "other_placed <= 0, mirrored_placed <= 0",
+        resumes=True,
+        minutes=70,
+    ),
+    _row(
         name="film-near",
         claim="a film of 1,200 frames without telemetry, looked for within 250 m of a point 100 m off on a "
         "scan with intensities alone; ten points, and ten on the scan of another town",

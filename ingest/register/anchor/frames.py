@@ -1,4 +1,4 @@
-"""The first half of anchoring: frames of a map, ranked and registered to a scan one by one."""
+"""The first half of anchoring: frames of a map, ranked and registered to a scan, together or one by one."""
 
 import logging
 import time
@@ -32,6 +32,7 @@ _LOG = logging.getLogger(__name__)
 # Frames tried at most once one is registered. Where one of three registers, as low films over a scan without
 # colours, 18 leave fewer than two registered once in 150 maps.
 _MORE_TRIES = 18
+_LEAST_TOGETHER = 2  # as many as must agree without a person
 # How far a placed map's frames may be off that are registered again.
 _AGAIN_SIGMA_M = 2.0
 _AGAIN_SIGMA_DEG = 1.0
@@ -111,7 +112,9 @@ def try_frames(
 ) -> TriedFrames:
     """Rank the map's frames and register the best until enough are accepted.
 
-    Each starts from its own prior and knows nothing of the others, so that their agreement is evidence.
+    All photos together are asked first where the map is; they register the frames if they tell. Else, and
+    where a person says where single photos are, each frame starts from its own prior and knows nothing of the
+    others, so that their agreement is evidence.
 
     Args:
         cloud: the scan around the map, in the map's local frame.
@@ -137,7 +140,7 @@ def try_frames(
     order += [p for p in ranking if p.image.image_id not in starts]
     if not starts:
         together = _tried_together(feature_map, cloud, ranking, read_gray, wanted)
-        if together:
+        if len(together) >= min(wanted, _LEAST_TOGETHER):
             return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(together))
     tried: list[TriedFrame] = []
     least = max(max_tries, len(starts))
