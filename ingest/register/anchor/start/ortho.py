@@ -142,13 +142,12 @@ def picture_of_scan(
     """The scan by one of its properties.
 
     Args:
-        box: least and largest x and y of the part that is drawn; None: all.
+        box: least and largest x and y of what is drawn; None: of the scan.
     """
-    low, high = (
-        np.asarray(of, dtype=np.float64)[:2] for of in (cloud.xyz.min(axis=0), cloud.xyz.max(axis=0))
-    )
-    if box is not None:
-        low, high = np.maximum(low, box[0]), np.maximum(np.minimum(high, box[1]), np.maximum(low, box[0]))
+    if box is None:
+        plan = cloud.xyz[:, :2]
+        box = np.asarray(plan.min(axis=0), np.float64), np.asarray(plan.max(axis=0), np.float64)
+    low, high = box
     width, height = (int(n) for n in np.ceil((high - low) / cell_m) + 1)
     away_px = _AWAY * max(width, height)
     camera = Camera(
