@@ -109,13 +109,13 @@ def test_where_its_picture_from_above_agrees_photos_are_registered(
         right = Sim3.from_rigid3(cloud.frame.enu_from(frame)) @ off @ OWN_FROM_LOCAL.inverse()
         spread = np.diag(np.square([0.02, 0.03, 0.03, 0.03, 5.0, 5.0, 5.0]))
         return FoundByOrtho(
-            local_from_own=right, covariance=spread, over_chance=1.5, elsewhere=1.1, source="intensity"
+            local_from_own=right, covariance=spread, over_chance=9.5, elsewhere=5.1, source="intensity"
         )
 
     monkeypatch.setattr(first_place, "found_from_above", lambda *_: None)
     monkeypatch.setattr(first_place, "found_by_ortho", about_there)
     assert main(words(made, tmp_path, texture=1, laser=True)) == 0
-    assert "agree with the scan's intensity 1.50 times as well" in capsys.readouterr().out
+    assert "agree with the scan's intensity by 9.5 deviations" in capsys.readouterr().out
     _is_where_it_was_made(tmp_path)
 
 

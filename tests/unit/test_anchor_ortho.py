@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
@@ -48,11 +49,11 @@ def _picture(gray: FloatImage, cell: float) -> OrthoPicture:
     )
 
 
-def _of_photos(town: FloatImage, side: int = 130) -> OrthoPicture:
+def _of_photos(town: FloatImage, side: int = 130, at: FloatArray = _AT) -> OrthoPicture:
     """A part of the town turned and in finer cells, bright where the scan is dark and in between."""
     cos, sin = np.cos(_TURN) * _SIZE_M / _CELL_M, np.sin(_TURN) * _SIZE_M / _CELL_M
     turn = np.array([[cos, -sin], [sin, cos]])
-    whole = np.column_stack([turn, _AT - turn @ [side / 2, side / 2]])
+    whole = np.column_stack([turn, at - turn @ [side / 2, side / 2]])
     whole[:, 2] += turn @ [0.5, 0.5] - 0.5  # OpenCV's half pixel
     part = cv2.warpAffine(town, whole, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     noise = np.random.default_rng(5).normal(0.0, 4.0, part.shape)
@@ -74,6 +75,18 @@ def test_a_picture_is_found_by_its_edges() -> None:
     assert found.size == pytest.approx(_SIZE_M, rel=0.04)
     assert np.degrees(found.turn) % 360.0 == pytest.approx(131.0, abs=3.0)
     assert np.linalg.norm(found.middle - ([40.0, -7.0] + _AT * _CELL_M)) < 3.0
+
+
+def test_a_round_picture_is_found_in_the_corner_of_the_scan() -> None:
+    """The corners of its file would lie beside the scan."""
+    town, at = _town(1), np.array([40.0, 41.0])
+    picture = _of_photos(town, at=at)
+    row, column = np.mgrid[: picture.gray.shape[0], : picture.gray.shape[1]] + 0.5 - picture.gray.shape[0] / 2
+    found = best_place(replace(picture, valid=np.hypot(row, column) < 62.0), _picture(town, _CELL_M))
+    assert found is not None
+    assert found.over_chance > 1.2 * found.elsewhere
+    assert found.size == pytest.approx(_SIZE_M, rel=0.04)
+    assert np.linalg.norm(found.middle - ([40.0, -7.0] + at * _CELL_M)) < 3.0
 
 
 def test_a_mirrored_picture_is_not_found() -> None:

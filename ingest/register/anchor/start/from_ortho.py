@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.ndimage import gaussian_filter
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import rotation_to_up, so3_exp
@@ -32,7 +33,7 @@ _CELLS = 440  # along the scan's longer side, at most; with 220 a town's streets
 _LEAST_SHARE, _SIZE_STEP = 0.12, 0.06  # of the map's picture over the scan's shorter side; logarithm
 _TURN_STEP = np.radians(6.0)
 _AGAIN, _AGAIN_STEP = 40, 1.0 / 3.0  # so many are searched again in such parts of the steps
-_SMOOTH = 2  # degree of a polynomial in logarithms
+_SMOOTH, _HIGH_PERCENT = 2, 84.0  # degree of a polynomial in logarithms; a deviation over the median
 _COVER = 0.9  # of the map that must lie on the scan
 _LEAST_ENERGY = 0.3  # of the scan's edges under the map, over the mean
 _SHRUNK_SIGMA = 0.4  # of the blur before a picture is made smaller, in pixels of the smaller one
@@ -43,7 +44,12 @@ _NEAR_MIDDLE = 3.0  # of the median distance: points that tell the ground
 _SIZE_SIGMA, _TURN_SIGMA = 0.02, np.radians(2.0)
 _TILT_SIGMA, _SLOPE_SIGMA = np.radians(2.0), np.radians(10.0)
 _PLAN_SIGMA_M, _PLAN_CELLS, _HEIGHT_SIGMA_M = 2.0, 1.5, 3.0
+# The harmonic of the angle doubled; the other one tells little more. Edges of a direction and a spacing that
+# the scan is full of, as streets are and rows of seats, agree in many places and count for less: by the root
+# of their power, smoothed over so many frequencies.
+_CHANNELS, _POWER_SIGMA, _LEAST_POWER = 2, 3.0, 1e-3
 _INSIDE = 2  # cells from the border of what is shown that show no edge
+_LEAST_SHOWN = 100  # cells inside: fewer agree with anything
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,8 +70,8 @@ class FoundByOrtho:
 
     def words(self) -> str:
         return (
-            f"its photos from above agree with the scan's {self.source} {self.over_chance:.2f} times as well "
-            f"as when they are mirrored, elsewhere {self.elsewhere:.2f} times"
+            f"its photos from above agree with the scan's {self.source} by {self.over_chance:.1f} deviations "
+            f"more than their mirror images, elsewhere by {self.elsewhere:.1f}"
         )
 
 
@@ -84,9 +90,9 @@ class PicturePlace:
     """A picture with cells of `size` metres, turned by `turn` (radians, x to y), its middle at `middle` (2,).
 
     Attributes:
-        over_chance: correlation of the gradients there over the best of the mirrored picture, which is
-            nowhere. elsewhere: the same of the best with another heading or place, or of the mirrored picture
-            over the best of the picture.
+        over_chance: correlation of the gradients there over those of the mirrored picture, which is nowhere,
+            in deviations. elsewhere: the same of the best with another heading or place, or of the mirrored
+            picture over the picture.
     """
 
     size: float
@@ -97,14 +103,21 @@ class PicturePlace:
 
 
 class ScanSearch:
-    """The scan's gradients in the frequency domain."""
+    """The scan's gradients in the frequency domain.
 
-    def __init__(self, picture: OrthoPicture) -> None:
-        self.picture = picture
-        channels = oriented_gradients(picture.gray, picture.valid)
-        energy = np.square(channels).sum(axis=0)
+    Args:
+        least_cover: share of what a picture shows that must lie on the scan.
+    """
+
+    def __init__(self, picture: OrthoPicture, least_cover: float = _COVER) -> None:
+        self.picture, self._least_cover = picture, least_cover
+        channels = oriented_gradients(picture.gray, picture.valid)[:_CHANNELS]
         self._shape = [fft.next_fast_len(n, real=True) for n in picture.gray.shape]
-        self._channels = [self._forward(channel) for channel in channels]
+        spectra = np.array([self._forward(channel) for channel in channels])
+        power = gaussian_filter(np.square(np.abs(spectra)).sum(axis=0), _POWER_SIGMA, mode=("wrap", "mirror"))
+        self._channels = spectra / np.sqrt(power + _LEAST_POWER * power.mean())
+        height, width = picture.gray.shape
+        energy = np.square([self._back(of)[:height, :width] for of in self._channels]).sum(axis=0)
         self._energy, self._valid = self._forward(energy), self._forward(picture.valid)
         self._mean = float(energy[picture.valid].mean()) if picture.valid.any() else np.inf
 
@@ -112,24 +125,35 @@ class ScanSearch:
         """The best place of a picture; None where it lies nowhere on the scan."""
         scale = size / self.picture.cell
         gray, valid, matrix = _turned(of, scale, turn)
-        mask = inner_part(valid, _INSIDE)
-        rows, columns = (n - k + 1 for n, k in zip(self.picture.gray.shape, mask.shape, strict=True))
-        if rows <= 0 or columns <= 0 or not mask.any():
+        inner = inner_part(valid, _INSIDE)
+        if np.count_nonzero(inner) < _LEAST_SHOWN:
             return None
-        channels = oriented_gradients(gray, valid) * mask
+        # Corners that show nothing may lie beside the scan.
+        held = [np.flatnonzero(inner.any(axis=axis)) for axis in (1, 0)]
+        there = tuple(slice(of[0], of[-1] + 1) for of in held)
+        mask = inner[there]
+        rows, columns = (n - k + 1 for n, k in zip(self.picture.gray.shape, mask.shape, strict=True))
+        if rows <= 0 or columns <= 0:
+            return None
+        channels = oriented_gradients(gray, valid)[:_CHANNELS, *there] * mask
         shown = np.conj(self._forward(mask))
         cells = float(mask.sum())
         agreeing = [a * np.conj(self._forward(b)) for a, b in zip(self._channels, channels, strict=True)]
         found = self._back(np.sum(agreeing, axis=0))[:rows, :columns]
         energy = self._back(self._energy * shown)[:rows, :columns]
         cover = self._back(self._valid * shown)[:rows, :columns] / cells
-        usable = (cover > _COVER) & (energy > _LEAST_ENERGY * self._mean * cells)
+        usable = (cover > self._least_cover) & (energy > _LEAST_ENERGY * self._mean * cells * cover)
         if not usable.any():
             return None
-        own = float(np.square(channels).sum())
-        score = np.where(usable, found / np.sqrt(np.maximum(energy * own, 1e-12)), -1.0)
+        own = self._back(self._valid * np.conj(self._forward(np.square(channels).sum(axis=0))))
+        own = own[:rows, :columns]  # where the scan shows something; less of it agrees more easily
+        score = found * np.sqrt(
+            cover / np.maximum(energy * own, 1e-12), where=usable, out=np.zeros_like(cover)
+        )
+        score = np.where(usable, score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
-        at = np.array([column, row]) + matrix @ np.array([of.gray.shape[1] / 2, of.gray.shape[0] / 2, 1.0])
+        first = np.array([column - held[1][0], row - held[0][0]])
+        at = first + matrix @ np.array([of.gray.shape[1] / 2, of.gray.shape[0] / 2, 1.0])
         return PictureTry(
             size=size,
             turn=turn,
@@ -201,34 +225,38 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | Non
     turns = np.arange(0.0, 2.0 * np.pi, _TURN_STEP)
     tries = _tried(searched, picture, sizes, turns)
     mirrored = _tried(searched, picture.mirrored(), sizes, turns)
-    chance, other_chance = (_best_by_size(of, len(turns)) for of in (mirrored, tries))
+    chance, other_chance = (_over_chance(of, len(turns)) for of in (mirrored, tries))
     if chance is None or other_chance is None:
         return None
     again, again_mirrored = (
         _again(searched, of, among, by)
         for of, among, by in ((picture, tries, chance), (picture.mirrored(), mirrored, other_chance))
     )
-    best = max(again, key=lambda one: one.correlation / chance(one.size))
-    others = [one.correlation / chance(one.size) for one in again if _apart(one, best, longer)]
-    others += [one.correlation / other_chance(one.size) for one in again_mirrored]
-    there = [one for one in again if not _apart(one, best, longer)]
-    best = max(there, key=lambda one: one.correlation - chance(one.size))
+    best = max(again, key=chance)
+    others = [chance(one) for one in again if _apart(one, best, longer)]
+    # A symmetric building agrees with its mirror image, at the size that is right.
+    others += [
+        other_chance(one) for one in again_mirrored if abs(np.log(one.size / best.size)) > 1.5 * _SIZE_STEP
+    ]
     return PicturePlace(
         size=best.size,
         turn=best.turn,
         middle=best.middle,
-        over_chance=best.correlation / chance(best.size),
+        over_chance=chance(best),
         elsewhere=max(others),
     )
 
 
 def _again(
-    scan: ScanSearch, picture: OrthoPicture, tries: Sequence[PictureTry], chance: Callable[[float], float]
+    scan: ScanSearch,
+    picture: OrthoPicture,
+    tries: Sequence[PictureTry],
+    chance: Callable[[PictureTry], float],
 ) -> list[PictureTry]:
     """The best of the tries with finer steps around them."""
     steps = np.array([-1.0, 0.0, 1.0]) * _AGAIN_STEP
     found: list[PictureTry] = []
-    for one in sorted(tries, key=lambda one: one.correlation / chance(one.size), reverse=True)[:_AGAIN]:
+    for one in sorted(tries, key=chance, reverse=True)[:_AGAIN]:
         found += _tried(scan, picture, one.size * np.exp(_SIZE_STEP * steps), one.turn + _TURN_STEP * steps)
     return found
 
@@ -238,24 +266,31 @@ def _tried(scan: ScanSearch, picture: OrthoPicture, sizes: FloatArray, turns: Fl
     return [one for one in found if one is not None]
 
 
-def _best_by_size(tries: Sequence[PictureTry], turns: int) -> Callable[[float], float] | None:
-    """The best correlation at a size, smoothly: small pictures agree with anything, and streets with streets.
+def _over_chance(tries: Sequence[PictureTry], turns: int) -> Callable[[PictureTry], float] | None:
+    """By how many deviations of `tries` of its size a correlation exceeds their median.
 
-    Infinite for sizes at which not all `turns` fit on the scan: few places say nothing of chance.
+    Small pictures agree with anything, streets with streets, and large ones have few places, whose best is
+    the less sure: both figures are smooth in the size. Sizes at which not all `turns` fit say nothing.
     """
     sizes, fitting = np.unique([one.size for one in tries], return_counts=True)
     sizes = sizes[fitting == turns]
-    best = [max(one.correlation for one in tries if one.size == size) for size in sizes]
-    if len(sizes) <= _SMOOTH or min(best) <= 0.0:
+    if len(sizes) <= _SMOOTH:
         return None
-    curve = np.polyfit(np.log(sizes), np.log(best), _SMOOTH)
+    at_size = [[one.correlation for one in tries if one.size == size] for size in sizes]
+    middle, high = np.percentile(at_size, (50.0, _HIGH_PERCENT), axis=1)
+    if middle.min() <= 0.0 or (high <= middle).any():
+        return None
+    middles = np.polyfit(np.log(sizes), np.log(middle), _SMOOTH)
+    spreads = np.polyfit(np.log(sizes), np.log(high - middle), 1)
     play = float(np.exp(_SIZE_STEP / 2))
 
-    def at(size: float) -> float:
-        inside = sizes[0] / play <= size <= sizes[-1] * play
-        return float(np.exp(np.polyval(curve, np.log(size)))) if inside else np.inf
+    def over(one: PictureTry) -> float:
+        if not sizes[0] / play <= one.size <= sizes[-1] * play:
+            return -np.inf
+        at, spread = (float(np.exp(np.polyval(of, np.log(one.size)))) for of in (middles, spreads))
+        return (one.correlation - at) / spread
 
-    return at
+    return over
 
 
 def _apart(one: PictureTry, other: PictureTry, cells: int) -> bool:
@@ -270,8 +305,9 @@ def _under(scan: OrthoPicture, picture: OrthoPicture, found: PicturePlace) -> Fl
     _, valid, matrix = _turned(picture, found.size / scan.cell, found.turn)
     half = matrix @ np.array([picture.gray.shape[1] / 2, picture.gray.shape[0] / 2, 1.0])
     column, row = np.round((found.middle - scan.corner) / scan.cell - half).astype(np.int64)
-    under = scan.height[max(row, 0) : row + valid.shape[0], max(column, 0) : column + valid.shape[1]]
-    return np.asarray(under[valid[: under.shape[0], : under.shape[1]]])
+    cells = np.argwhere(valid) + np.array([row, column])
+    cells = cells[((cells >= 0) & (cells < scan.height.shape)).all(axis=1)]
+    return np.asarray(scan.height[tuple(cells.T)])
 
 
 def _turned(

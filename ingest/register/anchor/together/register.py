@@ -25,7 +25,8 @@ _LOG = logging.getLogger(__name__)
 TOGETHER = "together"  # in the evidence of frames that were registered so
 _LOG_RATE = 3.0  # of a thousand maps that lie elsewhere one is placed wrongly
 _FITTED = 2  # of the places; the others tell how well wrong ones agree
-_MOST_PHOTOS = 12  # asked and fitted; more cost time
+# So many photos are asked and fitted as show so many places of the scan, by what one of them shows.
+_LEAST_PHOTOS, _MOST_PHOTOS, _ENOUGH_PLACES = 4, 12, 150
 # What a photo's own pose may differ from the similarity's by, as a map is bent: of the viewing distance, and
 # as an angle. Structure projection takes maps that are bent by as much.
 _BENT = 0.003
@@ -95,6 +96,8 @@ def _placed(
 ) -> tuple[Sim3, dict[str, Any]] | None:
     """The fitted place that wrong places do not explain, and its evidence as figures."""
     cameras = feature_map.cameras
+    one = [evidence_of(start, images[:1], cameras, grays, cloud, source).places for start in starts.there]
+    images = images[: max(_LEAST_PHOTOS, _ENOUGH_PLACES // max([1, *one]))]
 
     def evidence(similarity: Sim3) -> JointEvidence:
         return evidence_of(similarity, images, cameras, grays, cloud, source)

@@ -28,6 +28,7 @@ _MOST_CELLS = 700  # along the longer side of the part of the scan that is searc
 _CELL = 0.7  # of the spacing of its points
 _APART = 0.1  # of the picture: another place
 _PLACES = 4
+_COVER = 0.3  # of the picture that the scan shows
 _QUARTERS = (0.5 * np.pi, np.pi, 1.5 * np.pi)
 _LEVEL_ROUNDS, _WEIGHT_ROUNDS = 2, 20  # of tilting the points, and of Cauchy's weights
 _LEAST_POINTS = 30
@@ -71,7 +72,7 @@ def starts_from_above(
     drawn = picture_of_scan(cloud, source, cell_m, (low, high))
     if not drawn.valid.any():
         return Starts(there=(), wrong=())
-    search = ScanSearch(drawn)
+    search = ScanSearch(drawn, _COVER)
     sizes = picture.cell * np.exp(_steps(size, _SIZE_STEP))
     turns = _steps(turn, _TURN_STEP).tolist()
 
