@@ -139,6 +139,7 @@ def anchor(
             job.options.max_tries,
             starts=starts,
             readable=list(job.files.paths),
+            together=job.first is None or not job.first.by_look,
             progress=progress,
         )
     notes += _about_photos(job, tried)

@@ -108,16 +108,20 @@ def test_a_map_is_placed_by_all_its_photos() -> None:
 
 
 @pytest.mark.parametrize("other", ["another town", "mirrored photos"])
-def test_where_the_scan_shows_something_else_nothing_is_placed(other: str) -> None:
+def test_where_the_scan_shows_something_else_nothing_is_placed(
+    other: str, caplog: pytest.LogCaptureFixture
+) -> None:
     poses, pictures, points = _photos(_town(3))
     feature_map = _misplaced(poses, points)
     if other == "mirrored photos":
         pictures = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures]
     cloud = _cloud(_town(3 if other == "mirrored photos" else 8))
-    found = register_together(
-        feature_map, feature_map.images, cloud, lambda image: pictures[image.image_id], 2
-    )
+    with caplog.at_level("INFO"):
+        found = register_together(
+            feature_map, feature_map.images, cloud, lambda image: pictures[image.image_id], 2
+        )
     assert found is None
+    assert "together by intensity" in caplog.text, "no place was asked"
 
 
 def test_chance_passes_at_its_rate() -> None:
@@ -131,6 +135,13 @@ def test_chance_passes_at_its_rate() -> None:
         others = [one for k, one in enumerate(drawn) if k != best]
         passed += drawn[best].log_nfa(others) >= 3.0
     assert passed <= 10
+
+
+def test_more_that_agrees_says_more() -> None:
+    empty = [JointEvidence(places=25, agreeing=0.2)] * 6
+    said = [JointEvidence(places=40, agreeing=float(k)).log_nfa(empty) for k in range(41)]
+    assert np.isfinite(said).all()
+    assert np.diff(said[4:]).min() > 0.0
 
 
 def test_what_agrees_elsewhere_as_well_says_nothing() -> None:

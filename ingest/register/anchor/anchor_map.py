@@ -1,8 +1,9 @@
 """Anchoring: frames registered to a scan place the whole map on Earth (paper, figure 2).
 
-Frames start from the map's present placement (or from a person's), are registered each on its own, must
-agree with each other on where the map goes, and then place it together. Nothing is written here: the result
-is a new map, or a reason. Gates ask of the map as a whole whether it lies on the scan, and may be there.
+Frames start from the map's present placement (or from a person's), are registered together or each on its
+own, must agree with each other on where the map goes, and then place it together. Nothing is written here:
+the result is a new map, or a reason. Gates ask of the map as a whole whether it lies on the scan, and may be
+there.
 """
 
 from collections.abc import Mapping, Sequence

@@ -22,7 +22,7 @@ from ingest.register.anchor.proposals import (
     propose_frames,
 )
 from ingest.register.anchor.start.priors import HeightShift, height_shift, prior_from_map
-from ingest.register.anchor.together.register import TOGETHER, register_together
+from ingest.register.anchor.together.register import TOGETHER, prior_by_others, register_together
 from ingest.register.frame.register import fit_vouched_for, register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 
@@ -108,6 +108,7 @@ def try_frames(
     *,
     starts: Mapping[int, FramePrior] | None = None,
     readable: Sequence[int] | None = None,
+    together: bool = True,
     progress: Progress = no_progress,
 ) -> TriedFrames:
     """Rank the map's frames and register the best until enough are accepted.
@@ -122,6 +123,8 @@ def try_frames(
         wanted: accepted frames. max_tries: until the first one is accepted.
         starts: priors by a person, by image id; these frames are tried first.
         readable: ids of images whose photos are there; None for all.
+        together: ask all photos together. Not where the map was put where it looks most like the scan: the
+            evidence of all photos would be that look once more.
     """
     starts = starts or {}
     shift = height_shift(feature_map, cloud)
@@ -138,10 +141,15 @@ def try_frames(
     # A frame that a person chose is tried whether it sees much of the scan or not.
     order = [ranked.get(i) or _unranked(images[i], prior) for i, prior in starts.items()]
     order += [p for p in ranking if p.image.image_id not in starts]
-    if not starts:
-        together = _tried_together(feature_map, cloud, ranking, read_gray, wanted)
-        if len(together) >= min(wanted, _LEAST_TOGETHER):
-            return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(together))
+    if together and not starts:
+        found = _tried_together(feature_map, cloud, ranking, read_gray, wanted)
+        if len(found) >= min(wanted, _LEAST_TOGETHER):
+            return TriedFrames(
+                shift=shift,
+                ranking=tuple(ranking),
+                tried=tuple(found),
+                unreadable=reader.unreadable,
+            )
     tried: list[TriedFrame] = []
     least = max(max_tries, len(starts))
     for number, proposal in enumerate(order[: max(least, _MORE_TRIES)]):
@@ -191,8 +199,10 @@ def _try(
     reader: "_Reader",
     before: FrameRegistration | None = None,
 ) -> TriedFrame | None:
-    """Args:
-    before: the frame's registration with another lens.
+    """A frame by itself, or where others vouch for it; None where its photo cannot be read.
+
+    Args:
+        before: its registration with another lens.
     """
     gray = reader.full(proposal.image)
     if gray is None:
@@ -229,9 +239,13 @@ def register_again(
     again = []
     reader = _Reader(read_gray)
     poses = {image.image_id: image for image in feature_map.images}
+    points, observations = feature_map.points_local(cloud.frame), feature_map.observations
     for frame in frames:
         image = poses[frame.image.image_id]
         prior = FramePrior.around(image.cam_from_local, _AGAIN_SIGMA_M, _AGAIN_SIGMA_DEG)
+        if TOGETHER in frame.registration.evidence:
+            seen = observations.point_index[observations.image_id == image.image_id]
+            prior = prior_by_others(image.cam_from_local, points[seen])
         proposal = replace(frame.proposal, image=image, prior=prior)
         tried = _try(feature_map, cloud, proposal, reader, frame.registration)
         if tried is not None:

@@ -127,6 +127,7 @@ class FirstPlace:
     Attributes:
         feature_map: the map there; a start, not a placement. cloud: the scan around it, in its frame.
         starts: priors of the person's photos by image id. notes: a line on each, or on how it was found.
+        by_look: it was put where its picture from above is most like the scan's, which chance may be.
     """
 
     feature_map: FeatureMap
@@ -134,6 +135,7 @@ class FirstPlace:
     scan_ids: tuple[str, ...]
     starts: Mapping[int, FramePrior]
     notes: tuple[str, ...]
+    by_look: bool = False
 
 
 def started_images(
@@ -200,8 +202,9 @@ def first_place(
     scans = scans_of_one_zone(database, scan_ids)
     ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
     started: list[StartedImage] = []
+    by_look = False
     if files.near is not None:
-        feature_map, note = _found_near(database, unplaced, files.near, ids, photos)
+        feature_map, note, by_look = _found_near(database, unplaced, files.near, ids, photos)
         notes: tuple[str, ...] = (note,)
     else:
         told = files.read()
@@ -216,13 +219,14 @@ def first_place(
         scan_ids=ids,
         starts={s.image.image_id: s.prior for s in started},
         notes=notes,
+        by_look=by_look,
     )
 
 
 def _found_near(
     database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...], photos: PhotoFiles
-) -> tuple[FeatureMap, str]:
-    """The map where the scans near a place show the same, and a line on it."""
+) -> tuple[FeatureMap, str, bool]:
+    """The map where the scans near a place show the same, a line on it, and whether it was only its look."""
     frame = LocalFrame(latitude_deg=near.lat, longitude_deg=near.lon, height_m=0.0)
     reach = near.radius_m
     cloud = load_cloud(database, frame, (-reach, -reach, reach, reach), scan_ids=scan_ids)
@@ -263,7 +267,8 @@ def _found_near(
             "there, name a smaller circle (--near=LAT,LON,RADIUS_M), or say where one photo is: --page, "
             "--picks FILE, --pose FILE"
         )
-    return placed_map(unplaced, placement, cloud.frame, cloud.height_datum), note
+    placed = placed_map(unplaced, placement, cloud.frame, cloud.height_datum)
+    return placed, note, isinstance(found, FoundByOrtho)
 
 
 def _put_by(

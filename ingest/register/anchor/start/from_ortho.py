@@ -48,6 +48,7 @@ _PLAN_SIGMA_M, _PLAN_CELLS, _HEIGHT_SIGMA_M = 2.0, 1.5, 3.0
 # the scan is full of, as streets are and rows of seats, agree in many places and count for less: by the root
 # of their power, smoothed over so many frequencies.
 _CHANNELS, _POWER_SIGMA, _LEAST_POWER = 2, 3.0, 1e-3
+_TINY = 1e-12
 _INSIDE = 2  # cells from the border of what is shown that show no edge
 _LEAST_SHOWN = 100  # cells inside: fewer agree with anything
 
@@ -115,7 +116,7 @@ class ScanSearch:
         self._shape = [fft.next_fast_len(n, real=True) for n in picture.gray.shape]
         spectra = np.array([self._forward(channel) for channel in channels])
         power = gaussian_filter(np.square(np.abs(spectra)).sum(axis=0), _POWER_SIGMA, mode=("wrap", "mirror"))
-        self._channels = spectra / np.sqrt(power + _LEAST_POWER * power.mean())
+        self._channels = spectra / np.sqrt(power + _LEAST_POWER * power.mean() + _TINY)
         height, width = picture.gray.shape
         energy = np.square([self._back(of)[:height, :width] for of in self._channels]).sum(axis=0)
         self._energy, self._valid = self._forward(energy), self._forward(picture.valid)
@@ -243,7 +244,7 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | Non
         turn=best.turn,
         middle=best.middle,
         over_chance=chance(best),
-        elsewhere=max(others),
+        elsewhere=max(others, default=-np.inf),
     )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 from scipy.stats import betabinom
 
 from featuredb.geometry.camera import Camera
@@ -18,8 +19,9 @@ from featuredb.render.cloud import PointCloud
 from ingest.register.frame.dense.confirmation import CHANCE, Pieces, compared_pieces
 from ingest.register.frame_registration import RenderSource
 
-# Of a piece's side: pieces that overlap by half say about half as much as ones that do not.
+# Of a piece's side, half of its area: pieces that overlap by half say about half as much as ones that do not.
 _CELL = 0.7
+_MOST_EACH = 10.0  # places of one similarity that count as such: neighbours on a street agree together
 _BEFORE = 10.0  # so many places elsewhere weigh as much as what is known before: chance alone
 
 
@@ -40,9 +42,13 @@ class JointEvidence:
         How often a place agrees that is wrong is taken from the others, and from chance: pictures of streets
         agree with streets.
         """
-        agreed = _BEFORE * CHANCE + sum(other.agreeing for other in elsewhere)
-        failed = _BEFORE * (1.0 - CHANCE) + sum(other.places - other.agreeing for other in elsewhere)
-        tail = betabinom.logsf(int(self.agreeing) - 1, self.places, agreed, failed) / np.log(10.0)
+        agreed, failed = _BEFORE * CHANCE, _BEFORE * (1.0 - CHANCE)
+        for other in elsewhere:
+            weight = min(1.0, _MOST_EACH / max(other.places, 1))
+            agreed += weight * other.agreeing
+            failed += weight * (other.places - other.agreeing)
+        counts = np.arange(int(self.agreeing), self.places + 1)
+        tail = float(logsumexp(betabinom.logpmf(counts, self.places, agreed, failed))) / np.log(10.0)
         return float(max(-tail - np.log10(1 + len(elsewhere)), 0.0))
 
 

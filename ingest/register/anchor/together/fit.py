@@ -2,7 +2,7 @@
 
 As one photo's pose is fitted to its pieces (`ingest.register.frame.dense.fit`), round by round: renders are
 made at the poses that the similarity gives, each piece takes its best place near by, and the similarity is
-fitted to all of them with a robust loss, under how far its start may be off.
+fitted to all of them with a robust loss, and held near its start where they tell little.
 """
 
 from collections.abc import Mapping, Sequence

@@ -13,17 +13,18 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.anchor.start.from_ortho import PictureTry, ScanSearch
-from ingest.register.anchor.start.ortho import OrthoPicture, picture_of_map, picture_of_scan
+from ingest.register.anchor.start.ortho import OrthoPicture, picture_of_scan
 from ingest.register.frame.dense.pictures import plan_spacing_m
 from ingest.register.frame_registration import RenderSource
 
 _REACH = 2.5  # standard deviations of the placement
+_MOST_REACH_M = 100.0  # the scan is loaded to some 60 m around the map
 _LEAST_REACH_M, _LEAST_TURN, _LEAST_SIZE = 5.0, np.radians(4.0), 0.02
 _TURN_STEP, _SIZE_STEP = np.radians(2.0), 0.02  # three cells at the rim of the picture
+_MOST_TRIES = 1000  # of sizes and headings
 _MOST_CELLS = 700  # along the longer side of the part of the scan that is searched
 _CELL = 0.7  # of the spacing of its points
 _APART = 0.1  # of the picture: another place
@@ -51,30 +52,26 @@ class Starts:
 
 def starts_from_above(
     feature_map: FeatureMap,
-    images: Sequence[MapImage],
+    picture: OrthoPicture,
     cloud: PointCloud,
-    read_gray: PhotoReader,
     source: RenderSource,
 ) -> Starts:
-    """The best places within what the placement leaves open; none without a view from above.
+    """The best places within what the placement leaves open; none where that is too much.
 
     Args:
-        images: of the map, whose photos are there.
+        picture: of the map, in its frame.
         cloud: the scan around the map, in the map's frame.
     """
     points = feature_map.points_local(cloud.frame)
-    picture = picture_of_map(points, images, feature_map.cameras, read_gray)
-    if picture is None:
-        return Starts(there=(), wrong=())
     reach_m, turn, size = _left_open(feature_map, picture)
     low, high = _around(picture, reach_m)
     cell_m = max(float((high - low).max()) / _MOST_CELLS, _CELL * plan_spacing_m(cloud))
     drawn = picture_of_scan(cloud, source, cell_m, (low, high))
-    if not drawn.valid.any():
-        return Starts(there=(), wrong=())
-    search = ScanSearch(drawn, _COVER)
     sizes = picture.cell * np.exp(_steps(size, _SIZE_STEP))
     turns = _steps(turn, _TURN_STEP).tolist()
+    if not drawn.valid.any() or len(sizes) * len(turns) > _MOST_TRIES:
+        return Starts(there=(), wrong=())
+    search = ScanSearch(drawn, _COVER)
 
     def best(around: float) -> list[Sim3]:
         """Similarities, best first, with headings about one."""
@@ -96,7 +93,7 @@ def _left_open(feature_map: FeatureMap, picture: OrthoPicture) -> tuple[float, f
     plan = (jacobian @ covariance @ jacobian.T)[:2, :2]
     sigmas = np.sqrt([np.linalg.eigvalsh(plan)[-1], covariance[3, 3], covariance[0, 0]])
     reach, turn, size = np.maximum(_REACH * sigmas, [_LEAST_REACH_M, _LEAST_TURN, _LEAST_SIZE]).tolist()
-    return reach, min(turn, float(np.pi)), size
+    return min(reach, _MOST_REACH_M), min(turn, float(np.pi)), size
 
 
 def _steps(reach: float, step: float) -> FloatArray:
@@ -148,7 +145,8 @@ def _levelled(new_from_old: Sim3, points: FloatArray, scan: OrthoPicture) -> Sim
         for _ in range(_WEIGHT_ROUNDS):
             off = lack - rows @ plane
             weight = 1.0 / (1.0 + (off / (1.4826 * np.median(np.abs(off)) + _LEAST_M)) ** 2)
-            plane = np.linalg.solve((rows.T * weight) @ rows, (rows.T * weight) @ lack)
+            root = np.sqrt(weight)
+            plane = np.linalg.lstsq(rows * root[:, None], root * lack)[0]
         turn = so3_exp([plane[2], -plane[1], 0.0])
         lifted = middle + np.array([0.0, 0.0, plane[0]])
         new_from_old = Sim3(scale=1.0, rotation=turn, translation=lifted - turn @ middle) @ new_from_old

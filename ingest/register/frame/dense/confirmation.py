@@ -79,7 +79,7 @@ class Pieces:
     Attributes:
         points_local: (n, 3) of the scan at their middles, metres.
         pixels: (n, 2) of their best places, as shares of the photo's sides.
-        near: (n,) whose best place is where the pose puts them; by chance one of 1 / CHANCE.
+        near: (n,) whose best place is where the pose puts them; a share of CHANCE is so by accident.
         side_m: of a piece, at the median distance.
     """
 
