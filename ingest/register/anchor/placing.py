@@ -11,6 +11,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress
 from ingest.register.anchor.frames import TriedFrame, register_again
 from ingest.register.anchor.proposals import PhotoReader
+from ingest.register.anchor.together.register import TOGETHER
 from ingest.register.structure.adjustment import adjust_to_scan, placed_map
 from ingest.register.structure.projection import project_structure
 
@@ -74,6 +75,8 @@ def place_in_rounds(
         adjust_s = time.perf_counter() - start
         if adjustment.accepted:
             placed = adjusted = placed_map(feature_map, structure, cloud, adjustment)
+        elif placed is None and adjustment.reason == "CONTROL" and _vouched_for(frames):
+            return None, rounds, f"the map's lens or shape contradicts its place: {adjustment.message}"
         elif placed is None:
             placed = placed_map(feature_map, structure, cloud)
         rounds.append(
@@ -104,3 +107,12 @@ def place_in_rounds(
             break
         frames = kept
     return placed, rounds, ""
+
+
+def _vouched_for(frames: Sequence[TriedFrame]) -> bool:
+    """Whether frames were registered by what all photos say of the place, and none by itself.
+
+    That holds in plan where the lens is wrong: a map of ten photos from 25 m with a focal length a quarter too
+    long lay right, with its cameras 6 m too high.
+    """
+    return any(TOGETHER in frame.registration.evidence for frame in frames)
