@@ -112,7 +112,7 @@ def place_in_rounds(
 def _vouched_for(frames: Sequence[TriedFrame]) -> bool:
     """Whether frames were registered by what all photos say of the place, and none by itself.
 
-    That holds in plan where the lens is wrong: a map of ten photos from 25 m with a focal length a quarter too
-    long lay right, with its cameras 6 m too high.
+    That holds in plan where the lens is wrong: a map of ten photos from 25 m with a focal length a quarter
+    too long lay right, with its cameras 6 m too high.
     """
     return any(TOGETHER in frame.registration.evidence for frame in frames)
