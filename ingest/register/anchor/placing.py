@@ -49,11 +49,16 @@ def place_in_rounds(
     cloud: PointCloud,
     read_gray: PhotoReader,
     progress: Progress,
+    *,
+    confirmed: bool = False,
 ) -> tuple[FeatureMap | None, list[PlaceRound], str]:
     """The map by structure projection and adjustment, again with a better lens while that changes.
 
     A frame registered with a wrong lens finds matches that fit the wrong lens: the adjustment moves it part
     of the way, and the next registration finds others. Each round places the map as it was.
+
+    Args:
+        confirmed: a person has looked at the frames.
     """
     placed: FeatureMap | None = None
     adjusted: FeatureMap | None = None
@@ -75,7 +80,7 @@ def place_in_rounds(
         adjust_s = time.perf_counter() - start
         if adjustment.accepted:
             placed = adjusted = placed_map(feature_map, structure, cloud, adjustment)
-        elif placed is None and adjustment.reason == "CONTROL" and _vouched_for(frames):
+        elif placed is None and adjustment.reason == "CONTROL" and not confirmed and _vouched_for(frames):
             return None, rounds, f"the map's lens or shape contradicts its place: {adjustment.message}"
         elif placed is None:
             placed = placed_map(feature_map, structure, cloud)
