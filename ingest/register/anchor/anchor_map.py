@@ -131,9 +131,7 @@ def place_map(
         return replace(refusal, agreement=agreement if lone else None)
     used = [frame for frame in frames if frame.image.image_id in agreement.agreeing]
     clock.lap("agreement")
-    placed, rounds, words = place_in_rounds(
-        feature_map, used, cloud, read_gray, progress, confirmed=confirmed
-    )
+    placed, rounds, words = place_in_rounds(feature_map, used, cloud, read_gray, progress)
     seconds = clock.seconds | {
         "structure projection": sum(r.structure_s for r in rounds),
         "adjustment": sum(r.adjust_s for r in rounds),

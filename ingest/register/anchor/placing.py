@@ -11,7 +11,6 @@ from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress
 from ingest.register.anchor.frames import TriedFrame, register_again
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.anchor.together.register import TOGETHER
 from ingest.register.structure.adjustment import adjust_to_scan, placed_map
 from ingest.register.structure.projection import project_structure
 
@@ -49,19 +48,15 @@ def place_in_rounds(
     cloud: PointCloud,
     read_gray: PhotoReader,
     progress: Progress,
-    *,
-    confirmed: bool = False,
 ) -> tuple[FeatureMap | None, list[PlaceRound], str]:
     """The map by structure projection and adjustment, again with a better lens while that changes.
 
     A frame registered with a wrong lens finds matches that fit the wrong lens: the adjustment moves it part
-    of the way, and the next registration finds others. Each round places the map as it was.
-
-    Args:
-        confirmed: a person has looked at the frames.
+    of the way, and the next registration finds others. Each round places the map as it was. A map that the
+    first adjustment refuses has no place: the similarity would lay its points on the ground and leave its
+    cameras where the wrong lens has them.
     """
     placed: FeatureMap | None = None
-    adjusted: FeatureMap | None = None
     rounds: list[PlaceRound] = []
     for number in range(_LENS_ROUNDS):
         lens = (placed or feature_map).cameras
@@ -70,20 +65,13 @@ def place_in_rounds(
         structure = project_structure(feature_map, registered, cloud)
         structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
         if not structure.accepted:
-            if placed is not None:
-                _LOG.warning(
-                    "round %d: %s; the map stays as the round before placed it", number + 1, structure.message
-                )
-            return placed, rounds, f"{structure.reason}: {structure.message}"
+            return _unless_before(placed, rounds, f"{structure.reason}: {structure.message}")
         start = time.perf_counter()
-        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, adjusted)
+        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, placed)
         adjust_s = time.perf_counter() - start
-        if adjustment.accepted:
-            placed = adjusted = placed_map(feature_map, structure, cloud, adjustment)
-        elif placed is None and adjustment.reason == "CONTROL" and not confirmed and _vouched_for(frames):
-            return None, rounds, f"the map's lens or shape contradicts its place: {adjustment.message}"
-        elif placed is None:
-            placed = placed_map(feature_map, structure, cloud)
+        if not adjustment.accepted:
+            return _unless_before(placed, rounds, f"{adjustment.reason}: {adjustment.message}")
+        placed = placed_map(feature_map, structure, cloud, adjustment)
         rounds.append(
             PlaceRound(
                 frames=tuple(frames),
@@ -93,7 +81,7 @@ def place_in_rounds(
                 focal_px=tuple(camera.focal_px for camera in placed.cameras),
                 figures={
                     "structure": structure.figures,
-                    "adjustment": adjustment.figures | {"reason": adjustment.reason},
+                    "adjustment": adjustment.figures,
                 },
             )
         )
@@ -114,10 +102,9 @@ def place_in_rounds(
     return placed, rounds, ""
 
 
-def _vouched_for(frames: Sequence[TriedFrame]) -> bool:
-    """Whether frames were registered by what all photos say of the place, and none by itself.
-
-    That holds in plan where the lens is wrong: a map of ten photos from 25 m with a focal length a quarter
-    too long lay right, with its cameras 6 m too high.
-    """
-    return any(TOGETHER in frame.registration.evidence for frame in frames)
+def _unless_before(
+    placed: FeatureMap | None, rounds: list[PlaceRound], words: str
+) -> tuple[FeatureMap | None, list[PlaceRound], str]:
+    if placed is not None:
+        _LOG.warning("round %d: %s; the map stays as the round before placed it", len(rounds) + 1, words)
+    return placed, rounds, words

@@ -11,18 +11,21 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as f_distribution
 
 from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import LensWidths, Marks, Terms, lens_prior, surface_priors
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from featuredb.render.cloud import PointCloud
 from ingest.colmap.adjust import AdjustOptions, longest_side, residuals_of
-from ingest.colmap.precision import design_effect
+from ingest.colmap.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import Registered
 from ingest.register.structure.projection import StructurePlacement
@@ -30,7 +33,6 @@ from ingest.register.structure.surface_fit import Surface, nearest_planes, surfa
 
 _LOG = logging.getLogger(__name__)
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
-_MIN_CONTROL = 60  # correspondences of registered frames; fewer leave lens and height to the surface alone
 # Least standard deviation of keypoints and of correspondences with the scan, as a share of the photo's longer
 # side: a pixel in 4000. Tracks alone may fit to a third of that, but what lens models leave is common to
 # neighbours and does not average out; trusted to their noise, thousands of tracks outvote the frames'
@@ -46,22 +48,24 @@ _ROUNDS = 25  # of looking up the scan's planes; it ends earlier when points mov
 _STEPS = 8  # of the solver in each round
 _SETTLED_M = 1e-3  # see above; far below a scan's noise
 _REACH_M = 1.0  # a plane further from a point says nothing of it
-# Median miss of the correspondences after the adjustment, as a share of the photo's longer side: 8 pixels in
-# 4000. Honest ones miss by about two; more means that frames, map and scan contradict each other, and that
-# robust weights have put the frames aside.
-_MAX_CONTROL_REL = 0.002
+# How often correspondences that agree with the map would be refused: their spread about the adjusted map
+# against that about each frame's own best pose, by F. How far they miss by itself says nothing: where the
+# scan has two points in a metre and the photo 30 pixels, honest ones miss by five.
+_CONTROL_RATE = 1e-4
+_MAD_EFFICIENCY = 0.37  # of a spread by the median, of normal residuals (Rousseeuw and Croux 1993)
+_OWN_ROUNDS = 8  # of a frame's own pose
 # Of the median reprojection error, or of _REPROJECTION_FLOOR_REL of the longer side where it is smaller (half
 # a pixel in 4000).
 _MAX_REPROJECTION_GROWTH = 0.1
 _MAX_SURFACE_POINTS = 250_000  # finer than for the similarity, since single points are moved
 _REPROJECTION_FLOOR_REL = 0.000125
 
-AdjustReason = Literal["NO_CONTROL", "NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
+AdjustReason = Literal["NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LidarAdjustment:
-    """An adjusted map, or why the similarity stands.
+    """An adjusted map, or why scan and photos contradict each other.
 
     Attributes:
         reason: gate that refused it, or None; `message` says it for people.
@@ -101,9 +105,6 @@ def adjust_to_scan(
     to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
     start = whole_lens(block_of_map(feature_map).moved(structure.new_from_old @ to_cloud))
     control = _control_of(feature_map, registered)
-    if len(control.xyz) < _MIN_CONTROL:
-        words = f"{len(control.xyz)} correspondences with the scan, at least {_MIN_CONTROL} are needed"
-        return LidarAdjustment(reason="NO_CONTROL", message=words)
     low, high = np.percentile(start.xyz, [1, 99], axis=0)
     surface = surface_near(cloud, np.clip(start.xyz, low, high), _MAX_SURFACE_POINTS)
     if surface is None:
@@ -117,6 +118,7 @@ def adjust_to_scan(
         "frames": len(np.unique(control.photo_of)),
         "before": _state(start, control, surface),
         "after": _state(block, control, surface),
+        "own": _own_spread(block, control),
     }
     reason, message = _gate(block, figures)
     if reason is not None:
@@ -226,7 +228,9 @@ def _terms(
     return Terms(
         keypoint_px=max(least_rel * longer, _spread(residuals_of(block)[0])),
         lenses=tuple(lens_prior(camera, _LENS) for camera in lenses),
-        marks=replace(control, sigma_px=max(least_rel * longer, _spread(_control_residuals(block, control)))),
+        marks=replace(
+            control, sigma_px=max(least_rel * longer, _spread(_control_residuals(block, control)[0]))
+        ),
         points=surface_priors(block.xyz, offset, normals, max(least_m, _spread(offset))),
     )
 
@@ -254,17 +258,17 @@ def _spread(residuals: FloatArray) -> float:
     return 1.4826 * float(np.median(finite)) if len(finite) else 0.0
 
 
-def _control_residuals(block: Block, control: Marks) -> FloatArray:
-    """(m, 2) of the correspondences that their photos can see, pixels."""
+def _control_residuals(block: Block, control: Marks) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """`residuals_of` the correspondences that their photos can see."""
     rows = np.arange(len(control.xyz))
     return residuals_of(
         replace(block, xyz=control.xyz, point_of=rows, photo_of=control.photo_of, xy=control.xy)
-    )[0]
+    )
 
 
 def _state(block: Block, control: Marks, surface: Surface) -> dict[str, Any]:
     tracks = np.linalg.norm(residuals_of(block)[0], axis=1)
-    seen = np.linalg.norm(_control_residuals(block, control), axis=1)
+    seen = np.linalg.norm(_control_residuals(block, control)[0], axis=1)
     distances = nearest_planes(surface, block.xyz, _REACH_M)[0]
     near = np.abs(distances[np.isfinite(distances)])
     return {
@@ -278,15 +282,50 @@ def _state(block: Block, control: Marks, surface: Surface) -> dict[str, Any]:
     }
 
 
+def _own_spread(block: Block, control: Marks) -> dict[str, float]:
+    """Spread of the correspondences about the map and about each frame's own best pose, and what is allowed.
+
+    Where map, scan and frames contradict each other, robust weights put the frames aside.
+    """
+    alone = replace(
+        block, cam_from_block=tuple(_own_pose(block, control, k) for k in range(len(block.names)))
+    )
+    own = _control_residuals(alone, control)
+    longer = longest_side(block.cameras)
+    own_px = max(_spread(own[0]), _MIN_SIGMA_REL * longer)
+    shared = design_effect(*own, longer)
+    free = _MAD_EFFICIENCY * own[0].size / shared
+    allowed_px = own_px * float(f_distribution.isf(_CONTROL_RATE, free, free)) ** 0.5
+    in_map_px = _spread(_control_residuals(block, control)[0])
+    return {"own_px": own_px, "in_map_px": in_map_px, "allowed_px": allowed_px}
+
+
+def _own_pose(block: Block, control: Marks, photo: int) -> Rigid3:
+    """The pose that fits a frame's correspondences best (Cauchy's loss), from that of the map."""
+    pose, rows = block.cam_from_block[photo], control.photo_of == photo
+    xyz, xy, only = control.xyz[rows], control.xy[rows], np.zeros(int(rows.sum()), np.int64)
+    for _ in range(_OWN_ROUNDS if len(only) else 0):
+        found = linearise((block.camera(photo),), only[:1], [pose], xyz, np.arange(len(only)), only, xy)
+        seen = np.isfinite(found.residual).all(axis=1)
+        residual, by_pose = found.residual[seen], found.by_pose[seen]
+        relative = (residual**2).sum(axis=1) / max(4.0 * _spread(residual) ** 2, 1e-12)
+        root = 1.0 / np.sqrt(1.0 + relative)[:, None]
+        step = np.linalg.lstsq(
+            (by_pose * root[:, None]).reshape(-1, 6), (residual * root).ravel(), rcond=None
+        )
+        pose = Rigid3.exp(step[0]) @ pose
+    return pose
+
+
 def _gate(block: Block, figures: dict[str, Any]) -> tuple[AdjustReason | None, str]:
     before, after = figures["before"], figures["after"]
     if any(_folds_inside(camera) for camera in block.cameras):
         return "LENS", "the adjusted lens would fold the picture's corners"
-    allowed = _MAX_CONTROL_REL * longest_side(block.cameras)
-    if after["control_median_px"] > allowed:
+    own = figures["own"]
+    if own["in_map_px"] > own["allowed_px"]:
         return "CONTROL", (
-            f"the frames' correspondences still miss by {after['control_median_px']:.1f} pixels, at most "
-            f"{allowed:.1f} are believed"
+            f"what the frames see of the scan misses the map by {own['in_map_px']:.1f} pixels, and their own "
+            f"best poses by {own['own_px']:.1f}; at most {own['allowed_px']:.1f} are believed"
         )
     limit = (1.0 + _MAX_REPROJECTION_GROWTH) * max(
         before["reprojection_median_px"], _REPROJECTION_FLOOR_REL * longest_side(block.cameras)
