@@ -1,11 +1,11 @@
 """Photos of simulated towns registered to scans that have intensities alone: one by one, and together.
 
-    python -m tools.frames_on_scan --work DIR [--inputs DIR] [--towns 101 102 ...] [--negatives 2]
+    python -m tools.frames_on_scan --work DIR [--inputs DIR] [--towns 101 102 ...] [--negatives 40]
 
 Of each town, on which nothing was chosen:
 
-- ten photos from 70 m, each from a prior that is 15 m and 10 degrees off, on the town's scan, and so many on
-  the scan of another town, where none may be registered;
+- ten photos from 70 m, each from a prior that is 15 m and 10 degrees off, on the town's scan; and on the scan
+  of another town, from four such priors each, where none may be registered;
 - a map of ten photos from 25 m, of which hardly one is registered by itself (two are tried), moved by 15 m
   and turned by 10 degrees: placed on the town's scan by all photos together, and tried on the scan of another
   town, and with mirrored photos.
@@ -15,7 +15,7 @@ What is found of a town is kept in DIR.
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.move import move_map
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.truth import Truth
+from featuredb.simworld.truth import TrueImage
 from featuredb.simworld.world import WorldOptions, open_world, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
@@ -44,10 +44,10 @@ from ingest.register.anchor.frames import try_frames
 from ingest.register.anchor.start.first_place import plan_box
 from ingest.register.anchor.together.register import register_together
 from ingest.register.frame.register import register_frame
-from ingest.register.frame_registration import FramePrior
+from ingest.register.frame_registration import FramePrior, FrameRegistration
 from tools.figures import study_parser, write_figures
 from tools.made_maps import all_maps, make
-from tools.worlds.scan_world import make_scan_world
+from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 _TOWNS = tuple(range(301, 311))
 _OFF_M, _OFF_DEG = 15.0, 10.0
@@ -60,11 +60,13 @@ _AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
 def main(argv: Sequence[str] | None = None) -> int:
     parser = study_parser(__doc__, "--work", "--inputs")
     parser.add_argument("--towns", type=int, nargs="+", default=_TOWNS, help="seeds")
-    parser.add_argument("--negatives", type=int, default=2, help="of each town")
+    parser.add_argument("--negatives", type=int, default=40, help="of each town")
     args = parser.parse_args(argv)
     cv2.setNumThreads(1)
     args.work.mkdir(parents=True, exist_ok=True)
-    towns = [_town(seed, args.inputs or args.work, args.work, args.negatives) for seed in args.towns]
+    inputs = args.inputs or args.work
+    towns = [_town(seed, inputs, args.work) for seed in args.towns]
+    accepted = sum(_registered_elsewhere(seed, inputs, args.work, args.negatives) for seed in args.towns)
     singles = [np.array(one) for town in towns for one in town["singles"]]
     right = sum(one[0] <= _RIGHT_M and one[1] <= _RIGHT_DEG for one in singles)
     placed = [town["own_m"] for town in towns if town["own_m"] is not None]
@@ -76,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "right_share": right / (_PHOTOS * len(towns)),
             "singles_wrong": sum(one[0] > _WRONG_M for one in singles),
             "negatives": args.negatives * len(towns),
-            "negatives_accepted": sum(town["negatives"] for town in towns),
+            "negatives_accepted": accepted,
             "alone": sum(town["alone"] for town in towns),
             "alone_tried": _ALONE * len(towns),
             "placed": len(placed),
@@ -90,21 +92,49 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _town(seed: int, inputs: Path, work: Path, negatives: int) -> dict[str, Any]:
-    """What is found of one town, made once."""
-    path = work / f"town-{seed}-{negatives}.json"
+def _town(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
+    """What is found of one town."""
+    return _kept(work / f"town-{seed}.json", lambda: _found(seed, inputs, work))
+
+
+def _kept(path: Path, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What is in a file, made once."""
     if not path.exists():
-        world = make_scan_world(inputs, seed)
-        scans = [
-            _scanned(work / f"scan-{seed}-{k}", of) for k, of in enumerate((world.scan, world.other_scan))
-        ]
-        clouds = [_cloud(database, scan_frame(list_scans(database)[0])) for database in scans]
-        found = _alone(world.world.folder, world.world.truth, clouds, seed, negatives)
-        found |= _together(work / f"low-{seed}", scans, seed)
+        found = made()
         path.write_text(json.dumps(found))
-        sys.stdout.write(f"town {seed}: {found}\n")
+        sys.stdout.write(f"{path.stem}: {found}\n")
         sys.stdout.flush()
     return dict(json.loads(path.read_text()))
+
+
+def _found(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
+    world = make_scan_world(inputs, seed)
+    scans = _scans(world, seed, work)
+    own = _whole(scans[0])
+    singles = []
+    for number, image in enumerate(_singles(world)):
+        true, found = _single(world, image, own, (seed, number))
+        if found.cam_from_local is not None:
+            off = float(np.linalg.norm(found.cam_from_local.center - true.center))
+            singles.append((off, found.cam_from_local.angle_to_deg(true)))
+    return {"singles": singles} | _together(work / f"low-{seed}", scans, seed)
+
+
+def _registered_elsewhere(seed: int, inputs: Path, work: Path, count: int) -> int:
+    """How many of a town's photos, each from several priors, are registered on another town's scan."""
+
+    def made() -> dict[str, Any]:
+        world = make_scan_world(inputs, seed)
+        other = _whole(_scans(world, seed, work)[1])
+        images = _singles(world)
+        found = [_single(world, images[k % len(images)], other, (seed, 1000, k))[1] for k in range(count)]
+        return {"accepted": sum(one.accepted for one in found)}
+
+    return int(_kept(work / f"elsewhere-{seed}-{count}.json", made)["accepted"])
+
+
+def _scans(world: ScanWorld, seed: int, work: Path) -> list[Database]:
+    return [_scanned(work / f"scan-{seed}-{k}", of) for k, of in enumerate((world.scan, world.other_scan))]
 
 
 def _scanned(path: Path, scan: Path) -> Database:
@@ -121,25 +151,22 @@ def _gray(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
-def _alone(
-    folder: Path, truth: Truth, scans: Sequence[PointCloud], seed: int, negatives: int
-) -> dict[str, Any]:
-    """Metres and degrees of the survey's photos that are registered, and how many are on another scan."""
-    named = truth.group("drone")
-    named = named[:: max(1, len(named) // _PHOTOS)][:_PHOTOS]
-    singles, accepted = [], 0
-    for number, image in enumerate(named):
-        rng = np.random.default_rng((seed, number))
-        for cloud in scans if number < negatives else scans[:1]:
-            true = image.cam_from_local @ cloud.frame.enu_from(truth.frame).inverse()
-            prior = _prior(_moved(true.center, rng).act_on_pose(true))
-            found = register_frame(_gray(folder / image.name), image.camera, prior, cloud)
-            if cloud is not scans[0]:
-                accepted += found.accepted
-            elif found.cam_from_local is not None:
-                off = float(np.linalg.norm(found.cam_from_local.center - true.center))
-                singles.append((off, found.cam_from_local.angle_to_deg(true)))
-    return {"singles": singles, "negatives": accepted}
+def _whole(database: Database) -> PointCloud:
+    return _cloud(database, scan_frame(list_scans(database)[0]))
+
+
+def _singles(world: ScanWorld) -> list[TrueImage]:
+    named = world.world.truth.group("drone")
+    return named[:: max(1, len(named) // _PHOTOS)][:_PHOTOS]
+
+
+def _single(
+    world: ScanWorld, image: TrueImage, cloud: PointCloud, seed: tuple[int, ...]
+) -> tuple[Rigid3, FrameRegistration]:
+    """The pose of a photo in a cloud, and its registration from a prior that is off."""
+    true = image.cam_from_local @ cloud.frame.enu_from(world.world.truth.frame).inverse()
+    prior = _prior(_moved(true.center, np.random.default_rng(seed)).act_on_pose(true))
+    return true, register_frame(_gray(world.world.folder / image.name), image.camera, prior, cloud)
 
 
 def _together(folder: Path, scanned: Sequence[Database], seed: int) -> dict[str, Any]:

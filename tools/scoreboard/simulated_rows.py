@@ -191,7 +191,7 @@ SIMULATED: tuple[Row, ...] = (
         limits="0.9 <= right_share, singles_wrong <= 0, negatives_accepted <= 0, 8 <= placed, wrong <= 0, "
         "other_placed <= 0, mirrored_placed <= 0",
         resumes=True,
-        minutes=70,
+        minutes=120,
     ),
     _row(
         name="film-near",

@@ -20,7 +20,7 @@ class DenseFitOptions:
     """
 
     spacing_px: tuple[float, ...] = (2.4, 3.75, 3.75)
-    piece_px: tuple[int, ...] = (28, 40, 40)
+    piece_px: tuple[int, ...] = (28, 40, 56)
     more_rounds: int = 8
     near_px: tuple[int, ...] = (10, 6, 6)
 
