@@ -36,11 +36,14 @@ class JointEvidence:
     places: int
     agreeing: float
 
-    def log_nfa(self, elsewhere: Sequence["JointEvidence"]) -> float:
+    def log_nfa(self, elsewhere: Sequence["JointEvidence"], asked: int) -> float:
         """-log10 of how often as many would agree at one of so many wrong places (beta-binomial).
 
-        How often a place agrees that is wrong is taken from the others, and from chance: pictures of streets
+        How often a place agrees that is wrong is taken from others, and from chance: pictures of streets
         agree with streets.
+
+        Args:
+            elsewhere: of wrong places. asked: places of which this is the best.
         """
         agreed, failed = _BEFORE * CHANCE, _BEFORE * (1.0 - CHANCE)
         for other in elsewhere:
@@ -49,7 +52,7 @@ class JointEvidence:
             failed += weight * (other.places - other.agreeing)
         counts = np.arange(int(self.agreeing), self.places + 1)
         tail = float(logsumexp(betabinom.logpmf(counts, self.places, agreed, failed))) / np.log(10.0)
-        return float(max(-tail - np.log10(1 + len(elsewhere)), 0.0))
+        return float(max(-tail - np.log10(asked), 0.0))
 
 
 def evidence_of(

@@ -117,7 +117,7 @@ def _placed(
     # All as they are found: fitted to its pieces a wrong place agrees more, too.
     start, found = max(asked, key=lambda one: one[1].agreeing)
     wrong = [one for other, one in asked if other is not start] + [evidence(one) for one in starts.wrong]
-    log_nfa = found.log_nfa(wrong) - float(np.log10(sources))
+    log_nfa = found.log_nfa(wrong, sources * len(asked))
     _LOG.info("together by %s: %s, 10^-%.1f, elsewhere %s", source, found, log_nfa, wrong)
     if log_nfa < _LOG_RATE or found.agreeing < _LEAST_SHARE * found.places:
         return None

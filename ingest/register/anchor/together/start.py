@@ -29,6 +29,7 @@ _MOST_CELLS = 700  # along the longer side of the part of the scan that is searc
 _CELL = 0.7  # of the spacing of its points
 _APART = 0.1  # of the picture: another place
 _PLACES = 4
+_WRONG_PLACES = 3  # of each right angle
 _COVER = 0.3  # of the picture that the scan shows
 _QUARTERS = (0.5 * np.pi, np.pi, 1.5 * np.pi)
 _LEVEL_ROUNDS, _WEIGHT_ROUNDS = 2, 20  # of tilting the points, and of Cauchy's weights
@@ -42,7 +43,7 @@ class Starts:
 
     Attributes:
         there: within what the placement leaves open, apart from each other, best first.
-        wrong: the best of those that are turned by one, two and three right angles: streets of most towns
+        wrong: the best few of those that are turned by one, two and three right angles: streets of most towns
             are square to each other, so these agree as wrong places do.
     """
 
@@ -81,7 +82,8 @@ def starts_from_above(
 
     quarters = _QUARTERS if turn < 0.5 * _QUARTERS[0] else ()
     return Starts(
-        there=tuple(best(0.0)), wrong=tuple(one for quarter in quarters for one in best(quarter)[:1])
+        there=tuple(best(0.0)),
+        wrong=tuple(one for quarter in quarters for one in best(quarter)[:_WRONG_PLACES]),
     )
 
 
