@@ -90,7 +90,7 @@ def test_coloured_scan_from_a_prior_wrong_by_15_m_and_10_degrees() -> None:
     assert found.camera == CAMERA
     residual = CAMERA.project(found.cam_from_local.act(found.points_local)) - found.pixels
     assert np.median(np.linalg.norm(residual, axis=1)) < 3.0
-    assert {"render star", "fit", "confirm", "verdict"} <= set(found.seconds)
+    assert {"search prior's view", "fit", "confirm", "verdict"} <= set(found.seconds)
 
 
 def test_a_heading_that_nobody_knows_is_found() -> None:

@@ -113,9 +113,9 @@ def try_frames(
 ) -> TriedFrames:
     """Rank the map's frames and register the best until enough are accepted.
 
-    All photos together are asked first where the map is; they register the frames if they tell. Else, and
-    where a person says where single photos are, each frame starts from its own prior and knows nothing of the
-    others, so that their agreement is evidence.
+    Each frame starts from its own prior and knows nothing of the others, so that their agreement is evidence.
+    Where the scan has no colours, or one frame is refused, all photos together are asked where the map is,
+    and register the frames if they tell; not where a person says where single photos are.
 
     Args:
         cloud: the scan around the map, in the map's local frame.
@@ -141,21 +141,19 @@ def try_frames(
     # A frame that a person chose is tried whether it sees much of the scan or not.
     order = [ranked.get(i) or _unranked(images[i], prior) for i, prior in starts.items()]
     order += [p for p in ranking if p.image.image_id not in starts]
-    if together and not starts:
-        found = _tried_together(feature_map, cloud, ranking, read_gray, wanted)
-        if len(found) >= min(wanted, _LEAST_TOGETHER):
-            return TriedFrames(
-                shift=shift,
-                ranking=tuple(ranking),
-                tried=tuple(found),
-                unreadable=reader.unreadable,
-            )
     tried: list[TriedFrame] = []
     least = max(max_tries, len(starts))
+    ask = together and not starts
     for number, proposal in enumerate(order[: max(least, _MORE_TRIES)]):
         accepted = sum(frame.registration.accepted for frame in tried)
         if accepted >= wanted or (number >= least and not accepted):
             break
+        if ask and (cloud.rgb is None or accepted < len(tried)):
+            ask = False
+            found = _tried_together(feature_map, cloud, ranking, read_gray, wanted)
+            if len(found) >= min(wanted, _LEAST_TOGETHER):
+                tried = found
+                break
         frame = _try(feature_map, cloud, proposal, reader)
         if frame is not None:
             tried.append(frame)

@@ -16,6 +16,7 @@ from ingest.register.frame.dense.fit import (
 from ingest.register.frame.features.search import (
     FrameHypothesis,
     fan_groups,
+    prior_group,
     search,
     star_group,
 )
@@ -74,7 +75,15 @@ def _looked_again(views: FrameViews, prior: FramePrior, judged: Judged, clock: S
 
 
 def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator[FrameHypothesis]:
-    """Poses to begin with, made as they are asked for: by source, features first, then dense templates."""
+    """Poses to begin with, made as they are asked for: by source, features first, then dense templates.
+
+    Features of colours at the prior's own view come before the star around it: often they decide.
+    """
+    if views.cloud.rgb is not None:
+        with clock.stage("search prior's view"):
+            found = search(views, [prior_group(views, prior)], "rgb")
+        if found is not None and found.log_nfa >= DECISIVE_LOG_NFA:
+            yield found
     with clock.stage("render star"):
         groups = [star_group(views, prior), *fan_groups(views, prior)]
     for source in searched_sources(views.cloud):

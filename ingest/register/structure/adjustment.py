@@ -322,7 +322,7 @@ def _gate(block: Block, figures: dict[str, Any]) -> tuple[AdjustReason | None, s
     if any(_folds_inside(camera) for camera in block.cameras):
         return "LENS", "the adjusted lens would fold the picture's corners"
     own = figures["own"]
-    if own["in_map_px"] > own["allowed_px"]:
+    if not own["in_map_px"] <= own["allowed_px"]:  # nor where nothing is seen any more
         return "CONTROL", (
             f"what the frames see of the scan misses the map by {own['in_map_px']:.1f} pixels, and their own "
             f"best poses by {own['own_px']:.1f}; at most {own['allowed_px']:.1f} are believed"

@@ -23,6 +23,7 @@ from ingest.register.frame.features.search import FrameHypothesis, independent, 
 from ingest.register.frame.options import DenseFitOptions
 from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.sources import source_image
+from ingest.register.frame.verdict import DECISIVE_LOG_NFA
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.options import PoseOptions
@@ -86,10 +87,13 @@ def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource)
 def dense_fitted(
     views: FrameViews, prior: FramePrior, start: FrameHypothesis, options: DenseFitOptions
 ) -> FrameHypothesis | None:
-    """The pose fitted to all pieces near it, under the prior, coarse to fine; None with too few."""
+    """The pose fitted to all pieces near it, under the prior, coarse to fine; None with too few.
+
+    Features that decide leave less than the coarse round takes up.
+    """
     found: FrameHypothesis | None = start
     rounds = list(zip(options.spacing_px, options.piece_px, options.near_px, strict=True))
-    for sizes in rounds:
+    for sizes in rounds[1:] if start.log_nfa >= DECISIVE_LOG_NFA else rounds:
         found = found and _fit_round(views, prior, found, *sizes)
     # A pose that is still on its way may look right already: the pieces that lie near have made it.
     for _ in range(options.more_rounds):

@@ -6,7 +6,9 @@ at the true pose (`ingest/register/frame/dense/search.py`).
 """
 
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
@@ -140,16 +142,15 @@ def search_around(
         np.round(pixels[inside] - size / 2.0).astype(np.int64) - radius_px
     )  # first row and column of the window
     padded = np.pad(photo, ((0, 0), (reach + 1, reach + 1), (reach + 1, reach + 1)))
-    span = size + 2 * radius_px
-    shape = (fft.next_fast_len(span, real=True),) * 2
-    cells = 2 * radius_px + 1
-    maps = np.empty((int(inside.sum()), cells, cells), np.float32)
-    for row, (piece, (x, y)) in enumerate(zip(templates.channels[inside], corner, strict=True)):
-        window = padded[:, y + reach + 1 : y + reach + 1 + span, x + reach + 1 : x + reach + 1 + span]
-        product = np.einsum("kij,kij->ij", fft.rfft2(window, shape), np.conj(fft.rfft2(piece, shape)))
-        correlation = fft.irfft2(product, shape)[:cells, :cells]
-        energy = _window_means(np.einsum("khw,khw->hw", window, window), size) * size**2
-        maps[row] = _standardised(correlation, energy, float(np.sum(piece**2)))
+    energy = _window_means(np.einsum("khw,khw->hw", padded, padded), size) * size**2
+    picture = np.ascontiguousarray(padded.transpose(1, 2, 0))
+    pieces = np.ascontiguousarray(templates.channels[inside].transpose(0, 2, 3, 1))
+    span, cells = size + 2 * radius_px, 2 * radius_px + 1
+    maps = np.empty((len(pieces), cells, cells), np.float32)
+    for row, (piece, (x, y)) in enumerate(zip(pieces, corner + reach + 1, strict=True)):
+        correlation = cv2.matchTemplate(picture[y : y + span, x : x + span], piece, cv2.TM_CCORR)
+        there = energy[y : y + cells, x : x + cells]
+        maps[row] = _standardised(correlation, there, float(np.sum(piece**2)))
     return ScoreMaps(
         points_local=templates.points_local[inside], maps=maps, origin=corner + size / 2.0, camera=camera
     )
@@ -171,7 +172,9 @@ def scores_at(score_maps: ScoreMaps, pixels: FloatArray) -> tuple[NDArray[np.flo
     return np.where(inside, top * (1 - fy) + bottom * fy, np.float32(0)), inside
 
 
-def _standardised(correlation: FloatArray, energy: FloatImage, own_energy: float) -> FloatImage:
+def _standardised(
+    correlation: NDArray[np.floating[Any]], energy: FloatImage, own_energy: float
+) -> FloatImage:
     """Normalised correlation over its spread: how far each place stands out of chance agreement."""
     # A window with a tenth of the piece's structure is not to win by being normalised up.
     normalised = correlation / np.sqrt(own_energy * np.maximum(energy, 0.1 * own_energy) + 1e-12)

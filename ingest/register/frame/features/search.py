@@ -1,7 +1,7 @@
 """From a coarse prior to a first pose: star renders, pooled features, consistent matches, LO-RANSAC."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -71,6 +71,12 @@ class RenderGroup:
     renderings: Sequence[Rendering]
 
 
+def prior_group(views: FrameViews, prior: FramePrior) -> RenderGroup:
+    """The render at the prior alone."""
+    pose = prior.cam_from_local
+    return RenderGroup(reference=pose, renderings=views.renders([pose], views.features_side_px))
+
+
 def star_group(views: FrameViews, prior: FramePrior) -> RenderGroup:
     """Renders of the star around the prior."""
     poses = star_poses(prior, views.look.depth_m, views.camera)
@@ -84,7 +90,7 @@ def fan_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
     groups = []
     for angle in fan_headings_deg(prior.sigma_heading_deg)[1:]:
         pose = turned_about_vertical(prior.cam_from_local, angle)
-        groups.append(RenderGroup(reference=pose, renderings=views.renders([pose], views.features_side_px)))
+        groups.append(prior_group(views, replace(prior, cam_from_local=pose)))
     return groups
 
 
