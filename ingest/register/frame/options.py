@@ -13,14 +13,16 @@ class DenseFitOptions:
     Attributes:
         spacing_px: distance of neighbouring scan points in the renders, round by round: finer than the scan,
             since edges between splats are known better than their spacing.
-        piece_px: side of a piece, round by round.
+        piece_px: least side of a piece, round by round.
+        piece_points: so many scan points are at least across a piece.
         more_rounds: at most, like the last one, until the pose moves less than a fifth of a pixel.
         near_px: a piece's place is looked for this near, round by round: the first takes up what the search
             left.
     """
 
     spacing_px: tuple[float, ...] = (2.4, 3.75, 3.75)
-    piece_px: tuple[int, ...] = (28, 40, 56)
+    piece_px: tuple[int, ...] = (28, 40, 40)
+    piece_points: float = 15.0
     more_rounds: int = 8
     near_px: tuple[int, ...] = (10, 6, 6)
 

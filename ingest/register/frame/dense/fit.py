@@ -125,6 +125,8 @@ def _fit_round(
     renderings = views.renders([start.pose.cam_from_local], side_px)
     if not renderings:
         return None
+    between_px = views.spacing_full_px * side_px / max(views.camera.width, views.camera.height)
+    piece_px = max(piece_px, 2 * round(0.5 * views.options.dense_fit.piece_points * between_px))
     matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px)
     if len(matches) < _MIN_PLACES:
         return None
