@@ -172,7 +172,7 @@ def test_frames_that_contradict_the_map_are_refused(world: ScannedMap) -> None:
     }
     adjustment = adjust_to_scan(world.feature_map, structure, pulled, world.cloud)
     assert adjustment.reason == "CONTROL"
-    assert adjustment.block is None
+    assert not adjustment.accepted
     assert adjustment.figures["own"]["own_px"] == pytest.approx(0.5, rel=0.2)
 
 

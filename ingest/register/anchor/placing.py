@@ -52,33 +52,38 @@ def place_in_rounds(
     """The map by structure projection and adjustment, again with a better lens while that changes.
 
     A frame registered with a wrong lens finds matches that fit the wrong lens: the adjustment moves it part
-    of the way, and the next registration finds others. Each round places the map as it was. A map that the
-    first adjustment refuses has no place: the similarity would lay its points on the ground and leave its
-    cameras where the wrong lens has them.
+    of the way, and the next registration finds others. Each round places the map as it was. A map of which no
+    adjustment is accepted has no place: the similarity would lay its points on the ground and leave its
+    cameras where the wrong lens has them. Frames may contradict the map (CONTROL) until its lens is found.
     """
     placed: FeatureMap | None = None
+    latest: FeatureMap | None = None
+    words = ""
     rounds: list[PlaceRound] = []
     for number in range(_LENS_ROUNDS):
-        lens = (placed or feature_map).cameras
+        lens = (latest or feature_map).cameras
         registered = {frame.image.image_id: frame.registration for frame in frames}
         start, cpu = time.perf_counter(), time.process_time()
         structure = project_structure(feature_map, registered, cloud)
         structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
         if not structure.accepted:
-            return _unless_before(placed, rounds, f"{structure.reason}: {structure.message}")
+            words = f"{structure.reason}: {structure.message}"
+            break
         start = time.perf_counter()
-        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, placed)
+        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, latest)
         adjust_s = time.perf_counter() - start
-        if not adjustment.accepted:
-            return _unless_before(placed, rounds, f"{adjustment.reason}: {adjustment.message}")
-        placed = placed_map(feature_map, structure, cloud, adjustment)
+        words = "" if adjustment.accepted else f"{adjustment.reason}: {adjustment.message}"
+        if adjustment.block is None:
+            break
+        latest = placed_map(feature_map, structure, cloud, adjustment)
+        placed = latest if adjustment.accepted else placed
         rounds.append(
             PlaceRound(
                 frames=tuple(frames),
                 structure_s=structure_s,
                 structure_cpu_s=structure_cpu_s,
                 adjust_s=adjust_s,
-                focal_px=tuple(camera.focal_px for camera in placed.cameras),
+                focal_px=tuple(camera.focal_px for camera in latest.cameras),
                 figures={
                     "structure": structure.figures,
                     "adjustment": adjustment.figures,
@@ -87,11 +92,11 @@ def place_in_rounds(
         )
         progress("place", number + 1, _LENS_ROUNDS)
         change = max(
-            abs(new.focal_px / old.focal_px - 1.0) for new, old in zip(placed.cameras, lens, strict=True)
+            abs(new.focal_px / old.focal_px - 1.0) for new, old in zip(latest.cameras, lens, strict=True)
         )
         if change < _LENS_SETTLED or number + 1 == _LENS_ROUNDS:
             break
-        again = register_again(placed, cloud, frames, read_gray)
+        again = register_again(latest, cloud, frames, read_gray)
         kept = [frame for frame in again if frame.registration.accepted]
         if len(kept) < len(frames):
             lost = [f.image.name for f in again if not f.registration.accepted]
@@ -99,12 +104,6 @@ def place_in_rounds(
         if not kept:
             break
         frames = kept
-    return placed, rounds, ""
-
-
-def _unless_before(
-    placed: FeatureMap | None, rounds: list[PlaceRound], words: str
-) -> tuple[FeatureMap | None, list[PlaceRound], str]:
-    if placed is not None:
-        _LOG.warning("round %d: %s; the map stays as the round before placed it", len(rounds) + 1, words)
+    if words and placed is not None:
+        _LOG.warning("round %d: %s; the map stays as an earlier round placed it", len(rounds), words)
     return placed, rounds, words

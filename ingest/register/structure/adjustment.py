@@ -69,9 +69,11 @@ class LidarAdjustment:
 
     Attributes:
         reason: gate that refused it, or None; `message` says it for people.
-        block: the map in the cloud's local frame, None when refused.
-        poses: (6, 6) of each pose, with all that points and lenses leave open; none when refused.
-        lenses: what is left open of the lenses; None when refused, or where no lens has OPENCV's parameters.
+        block: the map in the cloud's local frame; None when refused, but for CONTROL: frames that were
+            registered with a wrong lens may contradict the right one.
+        poses: (6, 6) of each pose, with all that points and lenses leave open; none without a block.
+        lenses: what is left open of the lenses; None without a block, or where no lens has OPENCV's
+            parameters.
         figures: before and after, JSON-able.
     """
 
@@ -121,12 +123,12 @@ def adjust_to_scan(
         "own": _own_spread(block, control),
     }
     reason, message = _gate(block, figures)
-    if reason is not None:
+    if reason not in (None, "CONTROL"):
         return LidarAdjustment(reason=reason, message=message, figures=figures)
     poses, lenses = _left_open(block, control, surface, structure, start)
     return LidarAdjustment(
-        reason=None,
-        message="adjusted to the scan",
+        reason=reason,
+        message=message,
         block=block,
         poses=poses,
         lenses=lenses,
@@ -321,12 +323,6 @@ def _gate(block: Block, figures: dict[str, Any]) -> tuple[AdjustReason | None, s
     before, after = figures["before"], figures["after"]
     if any(_folds_inside(camera) for camera in block.cameras):
         return "LENS", "the adjusted lens would fold the picture's corners"
-    own = figures["own"]
-    if not own["in_map_px"] <= own["allowed_px"]:  # nor where nothing is seen any more
-        return "CONTROL", (
-            f"what the frames see of the scan misses the map by {own['in_map_px']:.1f} pixels, and their own "
-            f"best poses by {own['own_px']:.1f}; at most {own['allowed_px']:.1f} are believed"
-        )
     limit = (1.0 + _MAX_REPROJECTION_GROWTH) * max(
         before["reprojection_median_px"], _REPROJECTION_FLOOR_REL * longest_side(block.cameras)
     )
@@ -337,7 +333,13 @@ def _gate(block: Block, figures: dict[str, Any]) -> tuple[AdjustReason | None, s
         )
     if after["surface_median_m"] is None or _further(before, after):
         return "SURFACE", "the adjustment brings the map no closer to the scan"
-    return None, ""
+    own = figures["own"]
+    if not own["in_map_px"] <= own["allowed_px"]:  # nor where nothing is seen any more
+        return "CONTROL", (
+            f"what the frames see of the scan misses the map by {own['in_map_px']:.1f} pixels, and their own "
+            f"best poses by {own['own_px']:.1f}; at most {own['allowed_px']:.1f} are believed"
+        )
+    return None, "adjusted to the scan"
 
 
 def _folds_inside(camera: Camera) -> bool:
