@@ -4,11 +4,13 @@ import math
 from html import escape
 from pathlib import Path
 
+import numpy as np
+
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
 from ingest.register.control.report import control_html
 from ingest.report.films import films_html
 from ingest.report.gps_figures import figure_rows
-from ingest.report.plots import histograms_png, plan_png
+from ingest.report.plots import plan_png
 from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, report_json
 from ingest.workspace import atomic_file, write_json
 
@@ -83,6 +85,7 @@ def _map(outcome: MapOutcome) -> str:
         ("photos", str(outcome.photos)),
         ("points", f"{outcome.points:,}"),
         ("observations", f"{outcome.observations:,}, {outcome.descriptors:,} with descriptors"),
+        ("reprojection error", _error_words(outcome)),
         (f"residual to {method}", number(outcome.residual_rms_m, "{:.2f} m root mean square")),
         *(words.split(": ", 1) for words in outcome.place_words),
         ("scale", number(outcome.scale, "{:.4g} m per unit of the reconstruction")),
@@ -95,9 +98,7 @@ def _map(outcome: MapOutcome) -> str:
     notes = "".join(note(warning) for warning in outcome.warnings)
     pictures = ""
     if outcome.plan is not None:
-        pictures += picture(plan_png(outcome.plan), "Plan view and side view of the map")
-    if len(outcome.errors_px):
-        pictures += picture(histograms_png(outcome), "Reprojection errors and track lengths")
+        pictures = picture(plan_png(outcome.plan), "Plan view and side view of the map")
     return (
         f"<h2>Map {escape(outcome.name)} {pill(*_MAP_PILLS[outcome.status])}</h2><section>{reason}{notes}"
         + table((), facts, names=(0,))
@@ -107,6 +108,15 @@ def _map(outcome: MapOutcome) -> str:
         + _gates(outcome)
         + "</section>"
     )
+
+
+def _error_words(outcome: MapOutcome) -> str:
+    """Of its points; nothing where there are none."""
+    if not len(outcome.errors_px):
+        return ""
+    median, most = np.percentile(outcome.errors_px, (50, 99))
+    views = np.median(outcome.track_lengths)
+    return f"median {median:.2f} px, 99 % below {most:.2f} px; a point is seen by {views:.0f} photos (median)"
 
 
 def _gates(outcome: MapOutcome) -> str:

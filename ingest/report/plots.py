@@ -10,10 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import OffsetFrom
 from numpy.typing import NDArray
 
-from featuredb.geo.tiles import TILE_SIZE_M, tile_of
 from featuredb.geometry.arrays import FloatArray
 from ingest.plot_parts import nice_length, png_bytes, residual_exaggeration
-from ingest.report.values import MapOutcome, PlanView
+from ingest.report.values import PlanView
 
 _DPI = 110
 _MAX_POINTS = 40_000  # more only hide each other and cost seconds
@@ -22,7 +21,7 @@ _INK, _GPS, _BAD, _FAINT = "#1b2733", "#1565c0", "#c62828", "#9aa7b4"
 
 
 def plan_png(plan: PlanView) -> bytes:
-    """Plan view (points by height, cameras, GPS with residual vectors, tiles) above a side view."""
+    """Plan view (points by height, cameras, GPS with residual vectors) above a side view."""
     plan_box = _box(plan)
     width_m, height_m = plan_box[1] - plan_box[0], plan_box[3] - plan_box[2]
     side_low, side_high = _heights(plan)
@@ -55,41 +54,10 @@ def plan_png(plan: PlanView) -> bytes:
     return png_bytes(figure)
 
 
-def histograms_png(outcome: MapOutcome) -> bytes:
-    """Histograms of the points' reprojection errors and track lengths, side by side."""
-    figure = Figure(figsize=(9.2, 2.7), dpi=_DPI, facecolor="white", layout="constrained")
-    left, right = figure.subplots(1, 2)
-    errors, tracks = outcome.errors_px, outcome.track_lengths
-    limit = max(float(np.percentile(errors, 99)), 0.1) if len(errors) else 1.0
-    left.hist(np.minimum(errors, limit), bins=40, range=(0, limit), color="#3f7fbf")
-    left.set_xlabel("mean reprojection error of a point, pixels (last bar: and more)")
-    if len(errors):
-        median = float(np.median(errors))
-        left.axvline(median, color=_BAD, lw=1.2)
-        left.annotate(
-            f"median {median:.2f} px",
-            (median, 1),
-            xycoords=("data", "axes fraction"),
-            xytext=(5, -11),
-            textcoords="offset points",
-            fontsize=8,
-            color=_BAD,
-        )
-    most = int(min(max(tracks.max(initial=2), 4), 30))
-    right.hist(np.minimum(tracks, most), bins=np.arange(1.5, most + 1), color="#4f9d69", rwidth=0.85)
-    right.set_xlabel("photos that see a point" + (" (last bar: and more)" if most == 30 else ""))
-    right.xaxis.get_major_locator().set_params(integer=True)
-    for axes in (left, right):
-        axes.set_ylabel("points")
-        _tidy(axes)
-    return png_bytes(figure)
-
-
 def _draw_plan(axes: Any, plan: PlanView, shown: FloatArray, colours: Normalize, box: NDArray[Any]) -> None:
     axes.set_xlim(box[0], box[1])
     axes.set_ylim(box[2], box[3])
     axes.set_aspect("equal", adjustable="box")
-    _draw_tiles(axes, box)
     axes.scatter(shown[:, 0], shown[:, 1], c=shown[:, 2], cmap="viridis", norm=colours, s=3, lw=0, zorder=2)
     residuals = (plan.gps - plan.cameras)[:, :2]
     factor = residual_exaggeration(residuals[plan.gps_used], float(max(box[1] - box[0], box[3] - box[2])))
@@ -120,7 +88,7 @@ def _draw_plan(axes: Any, plan: PlanView, shown: FloatArray, colours: Normalize,
     )
     _draw_north(axes, plan.convergence_deg)
     _draw_scale_bar(axes, box)
-    axes.set_title(f"EPSG:{plan.epsg}, {_tile_words(box)}", fontsize=9, color=_INK, loc="left", pad=22)
+    axes.set_title(f"EPSG:{plan.epsg}", fontsize=9, color=_INK, loc="left", pad=22)
     axes.set_xlabel("easting, m", fontsize=8)
     axes.set_ylabel("northing, m", fontsize=8)
     _tidy(axes)
@@ -149,28 +117,17 @@ def _draw_side(
     _tidy(axes)
 
 
-def _draw_tiles(axes: Any, box: NDArray[Any]) -> None:
-    for low, high, draw in ((box[0], box[1], axes.axvline), (box[2], box[3], axes.axhline)):
-        for line in np.arange(math.ceil(low / TILE_SIZE_M), math.floor(high / TILE_SIZE_M) + 1) * TILE_SIZE_M:
-            draw(line, color=_INK, lw=1.0, ls=(0, (6, 4)), alpha=0.7, zorder=3)
-
-
-def _tile_words(box: NDArray[Any]) -> str:
-    corners = np.array([[box[0], box[2], 0.0], [box[1], box[3], 0.0]])
-    first, last = (str(name) for name in tile_of(corners))
-    return f"tile {first}" if first == last else f"tiles {first} to {last} (dashed)"
-
-
 def _draw_north(axes: Any, convergence_deg: float) -> None:
     """An arrow to true north; the picture's own up is grid north."""
     angle = math.radians(-convergence_deg)
     x, y, length = 0.955, 0.86, 34.0
+    middle = OffsetFrom(axes.patch, (x, y))
     axes.annotate(
         "",
         xy=(length * math.sin(angle), length * math.cos(angle)),
         xytext=(0, 0),
-        xycoords=_offset_from(axes, x, y),
-        textcoords=_offset_from(axes, x, y),
+        xycoords=middle,
+        textcoords=middle,
         arrowprops={"arrowstyle": "-|>", "color": _INK, "lw": 1.8},
         zorder=8,
     )
@@ -187,10 +144,6 @@ def _draw_north(axes: Any, convergence_deg: float) -> None:
         zorder=8,
         bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
     )
-
-
-def _offset_from(axes: Any, x: float, y: float) -> Any:
-    return OffsetFrom(axes.patch, (x, y))
 
 
 def _draw_scale_bar(axes: Any, box: NDArray[Any]) -> None:
