@@ -6,6 +6,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from importlib import resources
 from typing import Any, TypeVar
 
 from fastapi import FastAPI, Request, Response
@@ -29,13 +30,11 @@ from reloc.gateway.failures import (
     status_of,
 )
 from reloc.gateway.geopose import NotLocalisedError, check_version, parse, question_of, response_of
-from reloc.gateway.intake import Intake
+from reloc.gateway.intake import Intake, read_form
 from reloc.gateway.link import Link
 from reloc.gateway.metrics import MEDIA_TYPE as METRICS_TYPE
 from reloc.gateway.metrics import GatewayMetrics
-from reloc.gateway.multipart import read_form
 from reloc.gateway.options import GatewayOptions
-from reloc.gateway.phone import add_phone_page
 from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
 from reloc.gateway.protocol import VERSION as GEOPOSE_VERSION
 from reloc.gateway.protocol import GeoPoseResp
@@ -52,6 +51,37 @@ _STATUS_TIMEOUT_S = 2.0  # what a health check or a scrape may take; the server 
 _DEADLINE_MARGIN_S = 0.2
 # Of a client that has gone; nobody reads it, but the count of requests shows it (nginx's custom).
 _CLIENT_GONE = 499
+
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {
+    "Content-Security-Policy": _POLICY,
+    "Permissions-Policy": "camera=(self), geolocation=(self)",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+_MEDIA_TYPES = {"css": "text/css", "html": "text/html", "js": "text/javascript"}
+
+
+def add_phone_page(app: FastAPI, prefix: str) -> None:
+    """`prefix`/phone, and its script and style below it; it asks `prefix`/localise as any client does."""
+    root = resources.files("reloc.gateway") / "assets"
+    files = {file.name: file.read_bytes() for file in root.iterdir()}
+
+    @app.get(f"{prefix}/phone", include_in_schema=False)
+    async def page() -> Response:
+        return _file("phone.html")
+
+    @app.get(f"{prefix}/phone/{{name}}", include_in_schema=False)
+    async def asset(name: str) -> Response:
+        return _file(name)
+
+    def _file(name: str) -> Response:
+        if name not in files:
+            raise HTTPException(404, f"no file {name[:100]!r}")
+        return Response(files[name], media_type=_MEDIA_TYPES[name.rsplit(".", 1)[-1]], headers=_HEADERS)
 
 
 class Gateway:
