@@ -12,8 +12,7 @@ from PIL import ExifTags, Image
 
 from featuredb.errors import VideoError
 from featuredb.features.exif.angles import DJI_GIMBAL
-from featuredb.features.exif.write import gps_directory
-from featuredb.features.exif.xmp_write import with_properties
+from featuredb.features.exif.write import gps_directory, with_properties
 from featuredb.features.film_lens import UNNAMED_MAKE, shot_model
 from featuredb.features.shrink import shrunk
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
