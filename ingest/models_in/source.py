@@ -6,8 +6,7 @@ from pathlib import Path
 
 from featuredb.errors import IngestError
 from featuredb.export.formats.colmap import DATABASE
-from ingest.models_in.colmap_database import open_keypoints
-from ingest.models_in.colmap_folder import model_folder, read_colmap
+from ingest.models_in.colmap_folder import model_folder, open_keypoints, read_colmap
 from ingest.models_in.opensfm_folder import opensfm_folder, read_opensfm
 from ingest.models_in.stored import ModelFormat, ModelSource
 

@@ -1,4 +1,4 @@
-"""Metadata of photos that are written here: positions in EXIF, properties in XMP, and the segments that hold them."""
+"""Metadata of photos that are written here: positions in EXIF, properties in XMP, the segments for both."""
 
 import re
 import struct
