@@ -18,12 +18,11 @@ from featuredb.geo.crs.utm_transform import UtmTransform, utm_transform
 from featuredb.lidar.clean import Colouring, clean_block
 from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
-from featuredb.lidar.intensity import stretch_of
 from featuredb.lidar.levels import finest_level
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 from featuredb.lidar.ortho import open_ortho
 from featuredb.lidar.spill import Spill
-from featuredb.lidar.staged import BlockPlan, Staged
+from featuredb.lidar.staged import BlockPlan, Staged, stretch_of
 from featuredb.lidar.work import WorkFolder, work_folder
 from featuredb.store import Database
 from featuredb.store.encode import Row

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from featuredb.extras import require
-from featuredb.simworld.laser.airborne import scan_town
-from featuredb.simworld.laser.scan_options import AirborneScanOptions
+from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
 from featuredb.simworld.ortho import OrthoOptions, make_ortho
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import make_town

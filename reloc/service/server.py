@@ -12,17 +12,22 @@ from typing import Self
 import zenoh
 
 from reloc.service.contributions.inbox import Inbox
-from reloc.service.exposure import authenticates, check_exposure
 from reloc.service.live.follower import Follower
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
-from reloc.service.session import ServiceStartError, bind_free_port, open_server_session, server_config
-from reloc.service.source import DatabaseSource, ServedArea
+from reloc.service.session import (
+    ServiceStartError,
+    authenticates,
+    bind_free_port,
+    check_exposure,
+    open_server_session,
+    server_config,
+)
+from reloc.service.source import AreaWatcher, DatabaseSource, ServedArea
 from reloc.service.tally import Tally
-from reloc.service.watcher import AreaWatcher
 from reloc.service.workers.pool import WorkerPool
 from reloc.service.workers.process import prepare_workers
 from reloc.wire.keys import Keys, client_of

@@ -1,6 +1,6 @@
 """The town scanned by a laser from an aircraft: strips, several returns, classes, outliers, exact truth."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.photograph import moving_cars
 from featuredb.simworld.laser.beams import NOTHING, Beams, Hits, cross_ellipsoids, hit_faces
 from featuredb.simworld.laser.echoes import Echoes, echoes_of, return_numbers
-from featuredb.simworld.laser.scan_options import AirborneScanOptions
-from featuredb.simworld.town.days import another_day
+from featuredb.simworld.town.days import DayOptions, another_day
 from featuredb.simworld.town.reflectance import LEAVES, Reflectance, scene_reflectance
 from featuredb.simworld.town.scene import TEXTURES, Faces, Scene
 from featuredb.simworld.town.town import BRIDGE_ID, BUILDING_ID, GROUND_ID, TREE_ID, WATER_ID
@@ -29,6 +28,45 @@ BUILDING, LOW_NOISE, WATER, BRIDGE_DECK, HIGH_NOISE = 6, 7, 9, 17, 18
 _MIRROR_DEG = 2.5  # within this angle off the nadir calm water throws the beam back
 _WATER_SEEN = 0.08  # share of beams that water answers beyond it
 _HIGH_M = 20.0  # above the ground: where noise counts as high
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AirborneScanOptions:
+    """An airborne scan. The same options and scene give the same points.
+
+    Attributes:
+        seed: of everything random.
+        height_m: of the flight over the town's origin.
+        max_scan_angle_deg: to either side.
+        overlap: share of a swath that the neighbouring strip covers too.
+        heading_deg: of the first strip, clockwise from north; None draws it.
+        density_per_m2: pulses of one strip per square metre of its swath; overlaps have twice that.
+        margin_m: how far the scan reaches beyond the town.
+        range_noise_m: standard deviation along the beam.
+        strip_shift_m: standard deviation of each strip's displacement from their mean, per axis; half of it
+            in height.
+        divergence_mrad: full angle of the beam.
+        sway_deg: amplitude of the aircraft's roll and pitch; they are known, and only unsettle the pattern.
+        birds, multipath: shares of pulses whose only return is above the town, or below its ground.
+        noise_labelled: share of these that carry a class of noise; the rest is unclassified.
+        day: what differs from the day of the photos.
+    """
+
+    seed: int = 1
+    height_m: float = 420.0
+    max_scan_angle_deg: float = 20.0
+    overlap: float = 0.3
+    heading_deg: float | None = None
+    density_per_m2: float = 8.0
+    margin_m: float = 30.0
+    range_noise_m: float = 0.025
+    strip_shift_m: float = 0.02
+    divergence_mrad: float = 0.3
+    sway_deg: float = 0.15
+    birds: float = 1e-4
+    multipath: float = 2e-4
+    noise_labelled: float = 0.7
+    day: DayOptions = field(default_factory=lambda: DayOptions(seed=2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
