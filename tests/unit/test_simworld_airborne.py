@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.laser import strip as classes
+from featuredb.simworld.laser import airborne as classes
 from featuredb.simworld.laser.airborne import AirborneScan, AirborneScanOptions, scan_town
 from featuredb.simworld.laser.echoes import RANGE_RESOLUTION_M
 from featuredb.simworld.town.days import DayOptions, another_day
