@@ -180,14 +180,14 @@ class FlowTrack:
 
     def _fitted(self, marks: Landmarks, predicted: Rigid3) -> FittedPose | None:
         """The pose of landmarks, with the focal length where it was not given."""
-        fit, lens = self._options.fit, self._lens
+        lens = self._lens
         if lens is None:
-            return fit_pose(self._given, marks.pixels, marks.points, predicted, fit)
-        fitted = fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.doubt)
+            return fit_pose(self._given, marks.pixels, marks.points, predicted)
+        fitted = fit_pose(lens.camera, marks.pixels, marks.points, predicted, lens.doubt)
         if lens.zooming or (fitted is not None and not lens.surprised(fitted.focal_px, fitted.focal_rel)):
             return fitted
         lens.zooms()
-        return fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.doubt)
+        return fit_pose(lens.camera, marks.pixels, marks.points, predicted, lens.doubt)
 
     def _predicted(self, time_s: float) -> Rigid3:
         """The last pose, moved on as it moved before."""

@@ -26,21 +26,6 @@ class FlowOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PoseFitOptions:
-    """The pose of a frame, at 1280 px.
-
-    Attributes:
-        loss_px: scale of the Cauchy loss. tolerance_px: beyond it a landmark does not agree with the pose.
-        iterations: at most.
-    """
-
-    loss_px: float = 1.0
-    tolerance_px: float = 4.0
-    iterations: int = 10
-    reference_side_px: int = 1280
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LensWalkOptions:
     """How a focal length is followed; shares of it are standard deviations of its logarithm.
 
@@ -111,7 +96,6 @@ class TrackOptions:
     """
 
     flow: FlowOptions = field(default_factory=FlowOptions)
-    fit: PoseFitOptions = field(default_factory=PoseFitOptions)
     lens: LensWalkOptions = field(default_factory=LensWalkOptions)
     landmarks: int = 220
     columns: int = 16

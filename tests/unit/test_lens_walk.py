@@ -9,7 +9,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shot import look_pose
 from reloc.tracking.lens_walk import LensWalk
-from reloc.tracking.options import LensWalkOptions, PoseFitOptions
+from reloc.tracking.options import LensWalkOptions
 from reloc.tracking.pose_fit import FittedPose, LensSigmas, fit_pose
 
 CAMERA = Camera(model="RADIAL", width=1280, height=720, params=(970.0, 641.0, 359.0, -0.03, 0.01))
@@ -26,7 +26,7 @@ def points_in_view(rng: np.random.Generator, count: int = 150) -> np.ndarray:
 def fitted(camera: Camera, start: Camera, rng: np.random.Generator, doubt: LensSigmas) -> FittedPose:
     points = points_in_view(np.random.default_rng(7))
     pixels = camera.project(POSE.act(points)) + rng.normal(0, 0.4, (len(points), 2))
-    found = fit_pose(start, pixels, points, POSE, PoseFitOptions(), doubt)
+    found = fit_pose(start, pixels, points, POSE, doubt)
     assert found is not None
     return found
 
