@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +18,132 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.formats.ortho_image import OrthoImage as OrthoImage
 from featuredb.lidar.formats.ortho_image import open_ortho as open_ortho
 from featuredb.lidar.formats.ortho_image import sample_ortho
-from featuredb.lidar.nadir_view import NadirOptions, point_spacing_m, seen_from_above
+
+_EMPTY_M = np.float32(-1e9)
+_SPACING_CELL_M = 1.0  # cells in which the scan's area is counted
+_FINEST_M, _COARSEST_M = 0.03, 2.0
+_MAX_CELLS = 200_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NadirOptions:
+    """What counts as seen from above.
+
+    Attributes:
+        splat_spacings: radius of the disc that a point covers, in spacings of the points. Points of a regular
+            pattern leave no gap from 0.71 on; scan lines are farther apart than points within them.
+        steepest_slope: rise over run of a surface that does not hide itself: roofs reach 50 degrees.
+        step_m: what a point may lie deeper on top of that: noise, roughness, strips that do not fit.
+        gap_m: width up to which a hole in what is above is taken as covered: crowns are not tight to a laser,
+            and an image shows leaves there.
+        gap_depth_m: how deep such a hole must be; shallower ones (gutters, furrows) are seen into.
+        spacing_m: of the points, or None to measure it.
+    """
+
+    splat_spacings: float = 1.2
+    steepest_slope: float = 1.2
+    step_m: float = 0.15
+    gap_m: float = 1.6
+    gap_depth_m: float = 1.5
+    spacing_m: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (
+            self.splat_spacings > 0
+            and min(self.steepest_slope, self.step_m, self.gap_m) >= 0
+            and self.gap_depth_m > 0
+            and (self.spacing_m is None or self.spacing_m > 0)
+        ):
+            raise InvalidValueError(f"NadirOptions: value out of range in {self}")
+
+    @property
+    def margin_m(self) -> float:
+        """How far around a tile points must be known for its points to be judged as in the whole scan."""
+        splat = self.splat_spacings * (_COARSEST_M if self.spacing_m is None else self.spacing_m)
+        return self.gap_m + 2.0 * splat
+
+
+def seen_from_above(xyz: FloatArray, options: NadirOptions | None = None) -> NDArray[np.bool_]:
+    """Which points (n,) a nadir view of the scan shows.
+
+    Each point covers a disc; who lies clearly below such a disc, or in a narrow and deep hole of the surface
+    that they make, is hidden. Walls and eaves are hidden by the roof's edge.
+
+    Args:
+        xyz: (n, 3) float64 in metres, z up; outliers above the scene hide what is below them.
+    """
+    options = options or NadirOptions()
+    if not len(xyz):
+        return np.zeros(0, dtype=bool)
+    spacing = options.spacing_m or point_spacing_m(xyz)
+    radius = float(np.clip(options.splat_spacings * spacing, _FINEST_M, _COARSEST_M))
+    local = (xyz - np.floor(xyz.min(axis=0))).astype(np.float32)
+    cell = np.floor(local[:, :2] / radius).astype(np.int64) + 1
+    columns, rows = (int(cell[:, k].max()) + 2 for k in (0, 1))
+    if columns * rows > _MAX_CELLS:
+        raise InvalidValueError(
+            f"seen_from_above: expected a tile, found points over {columns} x {rows} cells of "
+            f"{radius:.2f} m; call it by tiles with a margin"
+        )
+    at = cell[:, 1] * columns + cell[:, 0]
+    highest = _highest(at, local[:, 2], rows * columns)
+    return ~(
+        _below_neighbours(local, at, highest, columns, radius, options)
+        | _in_hole(local[:, 2], at, highest, (rows, columns), radius, options)
+    )
+
+
+def point_spacing_m(xyz: FloatArray) -> float:
+    """Root of the area per point, metres: of the cells of a square metre that hold points."""
+    cell = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / _SPACING_CELL_M).astype(np.int64)
+    occupied = len(np.unique(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]))
+    return float(np.clip(np.sqrt(occupied * _SPACING_CELL_M**2 / len(xyz)), _FINEST_M, _COARSEST_M))
+
+
+def _highest(at: NDArray[np.int64], z: NDArray[np.float32], cells: int) -> NDArray[np.int64]:
+    """Row of the highest point of each cell, -1 in empty ones."""
+    highest = np.full(cells, -1, dtype=np.int64)
+    order = np.argsort(z, kind="stable")
+    highest[at[order]] = order  # the last one written wins
+    return highest
+
+
+def _below_neighbours(
+    local: NDArray[np.float32],
+    at: NDArray[np.int64],
+    highest: NDArray[np.int64],
+    columns: int,
+    radius: float,
+    options: NadirOptions,
+) -> NDArray[np.bool_]:
+    """Which points lie below the disc of the highest point of a cell next to theirs."""
+    hidden = np.zeros(len(local), dtype=bool)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            other = highest[at + down * columns + right]
+            difference = local[other] - local  # row -1 is some point, and left out below
+            distance = np.hypot(difference[:, 0], difference[:, 1])
+            limit = options.step_m + options.steepest_slope * distance
+            hidden |= (other >= 0) & (distance <= radius) & (difference[:, 2] > limit)
+    return hidden
+
+
+def _in_hole(
+    z: NDArray[np.float32],
+    at: NDArray[np.int64],
+    highest: NDArray[np.int64],
+    shape: tuple[int, int],
+    cell_m: float,
+    options: NadirOptions,
+) -> NDArray[np.bool_]:
+    """Which points lie deep in a narrow hole of the surface: below its morphological closing."""
+    reach = int(np.floor(0.5 * options.gap_m / cell_m))
+    if reach < 1:
+        return np.zeros(len(z), dtype=bool)
+    surface = np.where(highest >= 0, z[highest], _EMPTY_M).reshape(shape)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    closed = np.asarray(cv2.morphologyEx(surface, cv2.MORPH_CLOSE, disc))
+    return np.asarray(closed.ravel()[at] - z > options.gap_depth_m, dtype=bool)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

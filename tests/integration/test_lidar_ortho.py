@@ -16,8 +16,7 @@ from featuredb.geo.crs.scan import scan_crs
 from featuredb.geo.crs.utm_transform import utm_transform
 from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.formats.geotiff import write_geotiff
-from featuredb.lidar.nadir_view import NadirOptions
-from featuredb.lidar.ortho import ColourOptions, colour_by_ortho, open_ortho
+from featuredb.lidar.ortho import ColourOptions, NadirOptions, colour_by_ortho, open_ortho
 
 EPSG = 32632
 WEST, NORTH, PIXEL = 679_900.0, 5_334_500.0, 0.2

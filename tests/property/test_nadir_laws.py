@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.nadir_view import NadirOptions, seen_from_above
+from featuredb.lidar.ortho import NadirOptions, seen_from_above
 
 OPTIONS = NadirOptions(spacing_m=0.4)
 

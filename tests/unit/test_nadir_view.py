@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.nadir_view import NadirOptions, point_spacing_m, seen_from_above
+from featuredb.lidar.ortho import NadirOptions, point_spacing_m, seen_from_above
 
 FAR = np.array([680_000.0, 5_334_000.0, 560.0])  # UTM: float32 would lose decimetres there
 
