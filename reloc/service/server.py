@@ -6,7 +6,7 @@ import threading
 import time
 from contextlib import ExitStack
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from typing import Self
 
 import zenoh
@@ -212,7 +212,7 @@ class Server:
         return StatusReply(
             database=self.database,
             server_id=self.server_id,
-            version=_software_version(),
+            version=version("featuredb"),
             wire_version=WIRE_VERSION,
             snapshot=area.snapshot,
             maps=len(area.maps),
@@ -344,10 +344,3 @@ class Server:
 
     def _log(self, event: str, **values: object) -> None:
         logger.info("%s %s", self.database, event, extra=fields(event, database=self.database, **values))
-
-
-def _software_version() -> str:
-    try:
-        return version("featuredb")
-    except PackageNotFoundError:  # run from a source tree
-        return "0+source"
