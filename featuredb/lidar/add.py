@@ -20,7 +20,7 @@ from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.levels import finest_level
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
-from featuredb.lidar.ortho import open_ortho
+from featuredb.lidar.ortho import LAID, open_ortho
 from featuredb.lidar.spill import Spill
 from featuredb.lidar.staged import BlockPlan, Staged, stretch_of
 from featuredb.lidar.work import WorkFolder, work_folder
@@ -98,8 +98,8 @@ def add_scan(
     with work_folder(database, work, f"lidar-{scan_id}", sum(f.points for f in opened)) as folder:
         plan = _read_all(folder, inputs, options, on_progress)
         colouring = None
-        if ortho is not None and image is not None:
-            colouring = Colouring.of_scan(image, ortho.colouring, inputs[0].to_utm.epsg, plan.spacing_m)
+        if image is not None:
+            colouring = Colouring(image=image, epsg=inputs[0].to_utm.epsg, spacing_m=plan.spacing_m)
         staged = _clean_all(folder, plan, options, colouring, on_progress)
         row = _row(scan_id, inputs, plan, staged, options, labels)
         if ortho is not None:
@@ -119,7 +119,7 @@ def _ortho_identity(ortho: OrthoChoice | None) -> list[str]:
     """What tells the ortho image and its use from others: name apart, so that a copy is the same."""
     if ortho is None:
         return []
-    return [file_sha256(ortho.path), ortho.crs or "", json.dumps(asdict(ortho.colouring), sort_keys=True)]
+    return [file_sha256(ortho.path), ortho.crs or "", json.dumps(LAID, sort_keys=True)]
 
 
 def _open_all(files: Sequence[Path]) -> list[ScanFile]:
