@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
-from featuredb.simworld.laser.scan_file import write_scan
+from featuredb.simworld.scan_world import write_scan
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from tools.commands import featuredb, newest_copy
 from tools.figures import study_parser, write_figures

@@ -15,13 +15,13 @@ from featuredb.errors import GeodesyError, InvalidValueError, ScanFileError
 from featuredb.geo.crs.scan import scan_crs
 from featuredb.geo.crs.utm_transform import utm_transform
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.formats.geotiff import write_geotiff
 from featuredb.lidar.ortho import colour_by_ortho, open_ortho
+from tests.support.geotiff import write_geotiff
 
 EPSG = 32632
 WEST, NORTH, PIXEL = 679_900.0, 5_334_500.0, 0.2
 SIZE = 300  # pixels, 60 m
-FINE = 100.0  # pixels per spacing: no averaging: colours can be compared one to one
+FINE = 100.0  # pixels per spacing, none averaged: colours can be compared one to one
 
 
 def picture(dtype: type = np.uint8, bands: int = 3, top: float = 250.0) -> NDArray[np.generic]:

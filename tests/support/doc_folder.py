@@ -27,7 +27,7 @@ from PIL import Image
 from featuredb.cli.main import main
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.laser.airborne import AirborneScan, AirborneScanOptions, scan_town
-from featuredb.simworld.laser.scan_file import write_scan
+from featuredb.simworld.scan_world import write_scan
 from featuredb.simworld.world import Truth, World, WorldOptions, town_of, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
