@@ -10,10 +10,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import CloudNodes, PointCloud
-from featuredb.render.compiled import compiled_module
+from featuredb.render.compiled import compiled_module, mapped, over_rows, thread_count
 from featuredb.render.rendering import Rendering
 from featuredb.render.splats import FINEST_PX, NEAR_M, BlockPlanes, Splats, draw_splats, project_points
-from featuredb.render.threads import mapped, over_rows, thread_count
 
 # Splats wider than this show which way they lie; then there are few, and drawing them again is cheap.
 _WORTH_REDRAWING_PX = 2.5

@@ -15,8 +15,8 @@ from PIL import ExifTags, Image
 
 from featuredb.errors import VideoError
 from featuredb.features.exif.angles import DJI_GIMBAL
+from featuredb.features.exif.read import UNNAMED_MAKE, shot_model, unnamed_model
 from featuredb.features.exif.write import gps_directory, with_properties
-from featuredb.features.film_lens import UNNAMED_MAKE, shot_model, unnamed_model
 from featuredb.features.shrink import shrunk
 from featuredb.file_digest import file_sha256
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions

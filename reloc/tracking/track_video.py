@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError, VideoError
-from featuredb.features.film_lens import unnamed_model
+from featuredb.features.exif.read import unnamed_model
 from featuredb.file_digest import file_sha256
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from featuredb.features.film_lens import is_of_film, shot_model, unnamed_model
+from featuredb.features.exif.read import is_of_film, shot_model, unnamed_model
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shot import look_pose

@@ -18,8 +18,7 @@ from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
-from featuredb.video.telemetry.formats.table_values import UNITS, column_name, number
-from featuredb.video.telemetry.formats.text import decode_text, parse_wall_clock
+from featuredb.video.telemetry.formats.text import UNITS, column_name, decode_text, number, parse_wall_clock
 from featuredb.video.telemetry.values import Clock, Telemetry
 
 # Quantity: its unit's kind, and the names under which it is found, best first. Of heights the one that says
