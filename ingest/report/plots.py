@@ -7,11 +7,10 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.text import OffsetFrom
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.plot_parts import nice_length, png_bytes, residual_exaggeration
+from ingest.plot_parts import png_bytes, residual_exaggeration
 from ingest.report.values import PlanView
 
 _DPI = 110
@@ -86,8 +85,6 @@ def _draw_plan(axes: Any, plan: PlanView, shown: FloatArray, colours: Normalize,
     axes.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=3, fontsize=8, frameon=False, borderaxespad=0.1
     )
-    _draw_north(axes, plan.convergence_deg)
-    _draw_scale_bar(axes, box)
     axes.set_title(f"EPSG:{plan.epsg}", fontsize=9, color=_INK, loc="left", pad=22)
     axes.set_xlabel("easting, m", fontsize=8)
     axes.set_ylabel("northing, m", fontsize=8)
@@ -115,56 +112,6 @@ def _draw_side(
     axes.set_xlabel("easting, m (seen from the south, residuals as they are)", fontsize=8)
     axes.set_ylabel("height, m", fontsize=8)
     _tidy(axes)
-
-
-def _draw_north(axes: Any, convergence_deg: float) -> None:
-    """An arrow to true north; the picture's own up is grid north."""
-    angle = math.radians(-convergence_deg)
-    x, y, length = 0.955, 0.86, 34.0
-    middle = OffsetFrom(axes.patch, (x, y))
-    axes.annotate(
-        "",
-        xy=(length * math.sin(angle), length * math.cos(angle)),
-        xytext=(0, 0),
-        xycoords=middle,
-        textcoords=middle,
-        arrowprops={"arrowstyle": "-|>", "color": _INK, "lw": 1.8},
-        zorder=8,
-    )
-    axes.annotate(
-        "true N",
-        (x, y),
-        xycoords="axes fraction",
-        xytext=(0, -5),
-        textcoords="offset points",
-        ha="center",
-        va="top",
-        fontsize=8,
-        color=_INK,
-        zorder=8,
-        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
-    )
-
-
-def _draw_scale_bar(axes: Any, box: NDArray[Any]) -> None:
-    width = float(box[1] - box[0])
-    length = nice_length(0.25 * width)
-    x0, y0 = box[1] - 0.03 * width - length, box[2] + 0.03 * (box[3] - box[2])
-    axes.plot([x0, x0 + length], [y0, y0], color=_INK, lw=4, solid_capstyle="butt", zorder=8)
-    axes.plot(
-        [x0 + 0.5 * length, x0 + length], [y0, y0], color="white", lw=2, solid_capstyle="butt", zorder=9
-    )
-    axes.annotate(
-        f"{length:g} m",
-        (x0 + length / 2, y0),
-        xytext=(0, 5),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-        color=_INK,
-        zorder=9,
-        bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.75},
-    )
 
 
 def _box(plan: PlanView) -> NDArray[Any]:
