@@ -72,7 +72,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> list[DemoAnswer]:
-    """Everything, into `out`: world/, db/, report/ (report.html, plan.png), overlay.png. Returns all answers.
+    """Everything, into `out`: world/, db/, report/, overlay.png. Returns all answers.
 
     Raises:
         FeatureDbError: a step could not be done.
@@ -132,7 +132,6 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
     from ingest.map_builder import MapOptions
     from ingest.pipeline import IngestOptions
     from ingest.reconstruction import MapMakingOptions
-    from ingest.report.plots import plan_png
 
     options = IngestOptions(
         gps_sigma_m=(_EXACT_SIGMA_M, _EXACT_SIGMA_M) if exact_gps else None,
@@ -141,11 +140,7 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
             extractor=ExtractorOptions(max_features=3000), maps=MapOptions(height_datum="ellipsoidal")
         ),
     )
-    report = ingest(database, world.folder / "drone", options, report=report_folder)
-    for outcome in report.maps[:1]:
-        if outcome.plan is not None:
-            (report_folder / "plan.png").write_bytes(plan_png(outcome.plan))
-    return report
+    return ingest(database, world.folder / "drone", options, report=report_folder)
 
 
 def ask_all(world: "World", client: "Client") -> list[DemoAnswer]:

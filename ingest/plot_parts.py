@@ -1,7 +1,6 @@
-"""What the pictures of reports share: a figure as PNG, scale bars, exaggerated residuals."""
+"""What the pictures of reports share: a figure as PNG, exaggerated residuals."""
 
 import io
-import math
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -16,12 +15,6 @@ def png_bytes(figure: Figure) -> bytes:
     FigureCanvasAgg(figure)
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
-
-
-def nice_length(metres: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not longer."""
-    power = 10.0 ** math.floor(math.log10(metres))
-    return next(m * power for m in (5.0, 2.0, 1.0) if m * power <= metres * (1 + 1e-9))
 
 
 def residual_exaggeration(residuals_m: FloatArray, extent_m: float) -> int:

@@ -86,13 +86,13 @@ class PhotoAnswer:
         return describe(self.name, self.reply, self.database)
 
     def _repr_html_(self) -> str:
-        """Text, the photo with its inliers, and where they lie in plan."""
+        """Text, and the photo with its inliers."""
         text = f"<pre>{escape(str(self))}</pre>"
         if self.reply.inlier_points is None or self.utm is None:
             return text
         small = shrunk(draw_overlay(self.photo, self.reply, self.other_points_utm), _SHOWN_PX)
         data = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode("ascii")
-        return f'{text}<img alt="inliers" src="data:image/jpeg;base64,{data}">{_plan_svg(self)}'
+        return f'{text}<img alt="inliers" src="data:image/jpeg;base64,{data}">'
 
 
 class PhotoAsker:
@@ -196,30 +196,3 @@ def _request(
         raise InvalidValueError(
             f"localise: expected a prior of latitude, longitude and metres, found {prior!r}"
         ) from error
-
-
-def _plan_svg(answer: PhotoAnswer, side_px: int = 360) -> str:
-    """The inliers' map points and the camera with its direction, grid north up."""
-    reply, camera = answer.reply, answer.utm
-    assert camera is not None
-    assert reply.inlier_points is not None
-    points = np.array(reply.inlier_points.utm).reshape(-1, 3)[:, :2] - camera[:2]
-    reach_m = max(float(np.abs(points).max(initial=1.0)), 1.0)
-    scale, middle = 0.46 * side_px / reach_m, side_px / 2
-    step = max(1, len(points) // 500)
-    dots = "".join(
-        f'<circle cx="{middle + scale * e:.1f}" cy="{middle - scale * n:.1f}" r="1.5" fill="#3cb043"/>'
-        for e, n in points[::step]
-    )
-    up = geopose_of(reply).true_enu_from_body
-    # Looking down, a camera has no direction in plan; its top has.
-    ahead = up[:2, 0] if abs(up[2, 0]) < 0.9 else up[:2, 2]
-    east, north = 0.12 * side_px * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
-    return (
-        f'<svg width="{side_px}" height="{side_px}" role="img" aria-label="plan">'
-        f'<rect width="100%" height="100%" fill="#f6f8fa"/>{dots}'
-        f'<line x1="{middle}" y1="{middle}" x2="{middle + east:.1f}" y2="{middle - north:.1f}" '
-        'stroke="#c62828" stroke-width="3"/>'
-        f'<circle cx="{middle}" cy="{middle}" r="5" fill="#c62828"/>'
-        f'<text x="8" y="{side_px - 8}" font-size="12">north up, {2 * reach_m:.0f} m across</text></svg>'
-    )

@@ -20,8 +20,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.truth import Truth
-from featuredb.simworld.world import World
+from featuredb.simworld.world import Truth, World
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, newest_copy
 from tools.figures import study_parser, write_figures

@@ -19,22 +19,104 @@ import argparse
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from featuredb.simworld.laser.airborne import scan_town
-from featuredb.simworld.laser.scan_file import write_scan
-from featuredb.simworld.laser.scan_options import AirborneScanOptions
+import numpy as np
+from scipy.stats import chi2
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
+from featuredb.simworld.scan_world import write_scan
 from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb, newest_copy
 from tools.figures import study_parser, write_figures
-from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth
+from tools.film_folder import FilmsTruth, FrameTruth, place_scene, write_films, write_truth
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
 from tools.film_scripts import six_films
-from tools.film_tracks import JudgedTrack, judge_track, track_figures
 from tools.growth_common import say
 from tools.picked import place_by_picks, read_scan
+from tools.track_evaluation import axis_errors
+
+_LEVEL = 0.95
+_AXES = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JudgedTrack:
+    """The track of a film against the truth.
+
+    Attributes:
+        film: name of its file. frames: that show the place. foreign: poses of frames that do not.
+        metres, degrees: (k,) errors of the place's frames that have a pose.
+        normalised: (k,) squared errors of all six axes by their covariance.
+    """
+
+    film: str
+    frames: int
+    foreign: int
+    metres: FloatArray
+    degrees: FloatArray
+    normalised: FloatArray
+
+    @property
+    def inside(self) -> int:
+        """Frames whose pose lies inside the region that its covariance gives 95 %."""
+        return int((self.normalised <= chi2.ppf(_LEVEL, _AXES)).sum())
+
+
+def judge_track(
+    film: str, trajectory: Trajectory, truth: Sequence[FrameTruth], frame: LocalFrame
+) -> JudgedTrack:
+    """Compare each frame that has a pose with the truth."""
+    poses = [one.pose for one in truth]
+    off = axis_errors(trajectory, frame, poses)
+    rows = np.flatnonzero(np.isfinite(off).all(axis=1))
+    normalised = []
+    for row in rows:
+        pose = trajectory.points[row].pose
+        assert pose is not None  # it has errors
+        normalised.append(float(off[row] @ np.linalg.solve(pose.covariance, off[row])))
+    tracked = sum(point.pose is not None for point in trajectory.points)
+    return JudgedTrack(
+        film=film,
+        frames=sum(pose is not None for pose in poses),
+        foreign=tracked - len(rows),
+        metres=np.linalg.norm(off[rows, 3:], axis=1),
+        degrees=np.degrees(np.linalg.norm(off[rows, :3], axis=1)),
+        normalised=np.array(normalised),
+    )
+
+
+def track_figures(tracks: Iterable[JudgedTrack]) -> dict[str, float]:
+    """Figures over all films."""
+    films = list(tracks)
+    nothing = np.array([np.nan])
+    metres, degrees, normalised = (
+        np.concatenate([getattr(track, name) for track in films] or [nothing])
+        for name in ("metres", "degrees", "normalised")
+    )
+    frames = sum(track.frames for track in films)
+    known = len(metres) > 0
+    return {
+        "place_frames": frames,
+        "tracked": len(metres),
+        "tracked_share": len(metres) / max(frames, 1),
+        "inside": sum(track.inside for track in films),
+        "inside_share": sum(track.inside for track in films) / max(frames, 1),
+        "foreign_tracked": sum(track.foreign for track in films),
+        "median_m": float(np.median(metres)) if known else np.nan,
+        "p95_m": float(np.quantile(metres, 0.95)) if known else np.nan,
+        "largest_m": float(metres.max()) if known else np.nan,
+        "median_deg": float(np.median(degrees)) if known else np.nan,
+        "largest_deg": float(degrees.max()) if known else np.nan,
+        "normalised_median": float(np.median(normalised) / _AXES) if known else np.nan,
+        "normalised_p95": float(np.quantile(normalised, 0.95) / _AXES) if known else np.nan,
+    }
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -35,8 +35,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.move import move_map
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.truth import TrueImage
-from featuredb.simworld.world import WorldOptions, open_world, write_world
+from featuredb.simworld.world import TrueImage, WorldOptions, open_world, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from ingest.register.anchor.anchor_map import AnchorOptions, place_map

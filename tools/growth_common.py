@@ -16,7 +16,7 @@ import numpy as np
 from featuredb.features.decode import decode_gray
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.truth import Truth, read_truth
+from featuredb.simworld.world import Truth, read_truth
 from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution, candidate_id_of

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image
 
-from featuredb.features.exif.write import gps_directory
-from featuredb.features.jpeg_segments import EXIF_PREFIX, with_app1
+from featuredb.features.exif.write import EXIF_PREFIX, gps_directory, with_app1
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera

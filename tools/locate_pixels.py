@@ -21,10 +21,9 @@ from featuredb.adjust.block import whole_camera
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from featuredb.simworld.laser.scan_options import AirborneScanOptions
+from featuredb.simworld.laser.airborne import AirborneScanOptions
 from featuredb.simworld.town.scene import Scene
-from featuredb.simworld.truth import TrueImage, Truth
-from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.simworld.world import TrueImage, Truth, WorldOptions, town_of
 from featuredb.store import Database
 from reloc.answered_view import AnsweredView
 from reloc.localiser import Localiser

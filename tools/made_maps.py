@@ -17,7 +17,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from featuredb.features.jpeg_segments import EXIF_PREFIX, with_app1
+from featuredb.features.exif.write import EXIF_PREFIX, with_app1
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
 from tools.commands import featuredb

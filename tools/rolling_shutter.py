@@ -26,7 +26,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.camera.exif import exif_of
+from featuredb.simworld.camera.photograph import exif_of
 from featuredb.simworld.camera.sensor import jpeg_bytes
 from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of

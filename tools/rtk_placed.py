@@ -19,14 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.features.exif.gps_write import with_gps
-from featuredb.features.exif.write import gps_directory
+from featuredb.features.exif.write import gps_directory, with_app1, with_gps
 from featuredb.features.image_header import read_header
-from featuredb.features.jpeg_segments import with_app1
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.truth import TrueImage, Truth
-from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
+from featuredb.simworld.world import TrueImage, Truth, World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database
 from tools.anchor_simworld import camera_errors
 from tools.commands import featuredb

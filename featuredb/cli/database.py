@@ -211,7 +211,7 @@ def run_compact(args: argparse.Namespace) -> int:
 
 
 def run_upgrade(args: argparse.Namespace) -> int:
-    from featuredb.store.durable.upgrade import upgrade
+    from featuredb.store.maintenance import upgrade
     from featuredb.store.tables import FORMAT_VERSION
 
     steps = upgrade(open_database(args))

@@ -25,7 +25,6 @@ logger = logging.getLogger(__name__)
 
 COMMAND_GROUP = "featuredb.commands"
 EXIT_ERROR, EXIT_DEFECT, EXIT_INTERRUPTED = 2, 70, 130  # 1: the command itself says no
-LOG_LEVELS = ("debug", "info", "warning", "error")
 
 Register = Callable[[Any], None]
 
@@ -39,13 +38,12 @@ def program() -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     common, rest = _common_parser().parse_known_args(sys.argv[1:] if argv is None else list(argv))
-    _configure_logging("debug" if common.debug else common.log_level)
+    _configure_logging("DEBUG" if common.debug else "WARNING")
     parser = build_parser(needed_for(rest, entry_points(group=COMMAND_GROUP)))
     try:
         args = parser.parse_args(rest)
     except SystemExit as stop:  # argparse has printed help or the error
         return int(stop.code or 0)
-    args.debug, args.log_level = common.debug, common.log_level
     return run_command(args.run, args)
 
 
@@ -104,7 +102,6 @@ def _common_parser() -> argparse.ArgumentParser:
     """Options that stand anywhere on the command line."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--debug", action="store_true", help="log everything, show tracebacks of errors")
-    parser.add_argument("--log-level", choices=LOG_LEVELS, default="warning", help="default: warning")
     return parser
 
 
@@ -114,4 +111,4 @@ def _configure_logging(level: str) -> None:
         stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s", level=logging.WARNING
     )
     for package in ("featuredb", "ingest", "reloc"):
-        logging.getLogger(package).setLevel(level.upper())
+        logging.getLogger(package).setLevel(level)

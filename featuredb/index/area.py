@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from featuredb.errors import IncompatibleExtractorError, InvalidValueError
-from featuredb.features.film_lens import is_of_film
+from featuredb.features.exif.read import is_of_film
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera

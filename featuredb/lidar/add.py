@@ -7,24 +7,26 @@ behind.
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from featuredb.errors import GeodesyError, ScanError
+from featuredb.errors import ConflictError, GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
 from featuredb.geo.crs.scan import ScanCrs, scan_crs
 from featuredb.geo.crs.utm_transform import UtmTransform, utm_transform
 from featuredb.lidar.clean import Colouring, clean_block
 from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
-from featuredb.lidar.intensity import stretch_of
 from featuredb.lidar.levels import finest_level
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
-from featuredb.lidar.ortho import open_ortho
+from featuredb.lidar.ortho import LAID, open_ortho
 from featuredb.lidar.spill import Spill
-from featuredb.lidar.staged import BlockPlan, Staged
-from featuredb.lidar.work import WorkFolder, work_folder
+from featuredb.lidar.staged import BlockPlan, Staged, stretch_of
 from featuredb.store import Database
 from featuredb.store.encode import Row
 from featuredb.store.scans import ScanSummary, commit_scan, find_scan, list_scans
@@ -32,6 +34,91 @@ from featuredb.store.scans import ScanSummary, commit_scan, find_scan, list_scan
 logger = logging.getLogger(__name__)
 
 _LARGEST_8_BIT = 255
+
+# Spilled and finished points take 36 and 55 bytes, and both lie here at the end.
+_BYTES_PER_POINT = 100
+
+
+@dataclass(slots=True)
+class WorkFolder:
+    """A job's folder.
+
+    Attributes:
+        path: of the folder.
+        keep: whether it stays when the job ends with an error; set when there is something to go on from.
+    """
+
+    path: Path
+    keep: bool = False
+
+    def read(self, name: str) -> Any | None:
+        """What `write` has written, or None."""
+        file = self.path / name
+        return json.loads(file.read_text()) if file.is_file() else None
+
+    def write(self, name: str, value: Any) -> None:
+        """Write JSON so that it is there whole or not at all."""
+        temporary = self.path / f"{name}.tmp"
+        temporary.write_text(json.dumps(value))
+        temporary.replace(self.path / name)
+
+
+@contextmanager
+def work_folder(database: Database, work: Path | None, name: str, points: int) -> Iterator[WorkFolder]:
+    """The folder of one job, locked; removed at the end unless `keep` is set.
+
+    Args:
+        work: where jobs have their folders; by default `_work` in a local database, or a cache folder.
+        name: of the job.
+        points: how many it has to hold.
+
+    Raises:
+        ConflictError: another process works on the same job.
+        ScanError: the folder cannot be made, or the disk is too small.
+    """
+    parent = work or _default_parent(database)
+    path = parent / name
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(path).free + sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
+    except OSError as error:
+        raise ScanError(f"cannot use the work folder {path} ({error}); choose another by --work") from error
+    folder = WorkFolder(path=path)
+    lock = _lock(path)
+    try:
+        if free < points * _BYTES_PER_POINT:
+            raise ScanError(
+                f"expected {points * _BYTES_PER_POINT / 1e9:.1f} GB free for the work folder {path}, found "
+                f"{free / 1e9:.1f} GB; choose another by --work"
+            )
+        folder.keep = (path / "spill.json").is_file()
+        yield folder
+    finally:
+        if not folder.keep:
+            shutil.rmtree(path, ignore_errors=True)
+            if work is None and parent.is_dir() and not any(parent.iterdir()):
+                parent.rmdir()
+        os.close(lock)
+
+
+def _default_parent(database: Database) -> Path:
+    if "://" not in database.url:
+        return Path(database.url) / "_work"
+    cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(cache) / "featuredb" / "lidar"
+
+
+def _lock(path: Path) -> int:
+    """A lock that the system gives up when the process ends, however it ends."""
+    import fcntl
+
+    lock = os.open(path / "lock", os.O_CREAT | os.O_RDWR)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(lock)
+        raise ConflictError(f"another process is adding the same scan, in {path}; wait for it") from error
+    return lock
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,8 +186,8 @@ def add_scan(
     with work_folder(database, work, f"lidar-{scan_id}", sum(f.points for f in opened)) as folder:
         plan = _read_all(folder, inputs, options, on_progress)
         colouring = None
-        if ortho is not None and image is not None:
-            colouring = Colouring.of_scan(image, ortho.colouring, inputs[0].to_utm.epsg, plan.spacing_m)
+        if image is not None:
+            colouring = Colouring(image=image, epsg=inputs[0].to_utm.epsg, spacing_m=plan.spacing_m)
         staged = _clean_all(folder, plan, options, colouring, on_progress)
         row = _row(scan_id, inputs, plan, staged, options, labels)
         if ortho is not None:
@@ -120,7 +207,7 @@ def _ortho_identity(ortho: OrthoChoice | None) -> list[str]:
     """What tells the ortho image and its use from others: name apart, so that a copy is the same."""
     if ortho is None:
         return []
-    return [file_sha256(ortho.path), ortho.crs or "", json.dumps(asdict(ortho.colouring), sort_keys=True)]
+    return [file_sha256(ortho.path), ortho.crs or "", json.dumps(LAID, sort_keys=True)]
 
 
 def _open_all(files: Sequence[Path]) -> list[ScanFile]:

@@ -1,13 +1,13 @@
 """One block of a scan: outliers out, colours and intensities as bytes, ordered by level and node."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.lidar.levels import order_by_level
-from featuredb.lidar.ortho import ColourOptions, OrthoImage, colour_by_ortho
+from featuredb.lidar.ortho import OrthoImage, colour_by_ortho, margin_m
 from featuredb.lidar.outliers import OutlierOptions, find_outliers
 from featuredb.lidar.spill import SPILLED, Spill, TileBlock
 from featuredb.lidar.staged import BlockPlan
@@ -16,17 +16,11 @@ from featuredb.store.scans import POINT_ROW
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Colouring:
-    """An ortho image and how it is laid on the points of a UTM zone."""
+    """An ortho image for the points of a UTM zone, with one spacing for all blocks: none hides more."""
 
     image: OrthoImage
-    options: ColourOptions
     epsg: int
-
-    @classmethod
-    def of_scan(cls, image: OrthoImage, options: ColourOptions, epsg: int, spacing_m: float) -> "Colouring":
-        """With one spacing for all blocks, so that they do not differ in what they take for hidden."""
-        nadir = options.nadir and replace(options.nadir, spacing_m=options.nadir.spacing_m or spacing_m)
-        return cls(image=image, options=replace(options, nadir=nadir), epsg=epsg)
+    spacing_m: float
 
 
 def clean_block(
@@ -45,7 +39,7 @@ def clean_block(
     rgb, has_rgb = _colours(rows, plan.colour_bits)
     if colouring is not None:
         # Where the image does not show a point, it keeps its colour, if it has one.
-        rgb, seen = colour_by_ortho(rows["utm"], colouring.epsg, rgb, colouring.image, colouring.options)
+        rgb, seen = colour_by_ortho(rows["utm"], colouring.epsg, rgb, colouring.image, colouring.spacing_m)
         has_rgb = has_rgb | seen
     rows, rgb, has_rgb = rows[:core], rgb[:core], has_rgb[:core]
     cleaned = np.zeros(core, POINT_ROW)
@@ -73,7 +67,7 @@ def _without_outliers(
 ) -> tuple[NDArray[Any], int, int]:
     """Points of a block and then around it; how many are the block's; how many outliers it had."""
     reach_m = 0.0 if outliers is None else outliers.margin_m(plan.spacing_m)
-    colour_m = 0.0 if colouring is None else colouring.options.margin_m
+    colour_m = 0.0 if colouring is None else margin_m(colouring.spacing_m)
     around = np.empty(0, SPILLED)
     core = spill.rows(block)
     if reach_m + colour_m > 0.0:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from featuredb.lidar.ortho import ColourOptions
 from featuredb.lidar.outliers import OutlierOptions
 
 
@@ -63,12 +62,10 @@ class OrthoChoice:
     Attributes:
         path: an image that GDAL reads.
         crs: its CRS in place of its own.
-        colouring: how it is laid on the points; the spacing is filled in from the scan.
     """
 
     path: Path
     crs: str | None = None
-    colouring: ColourOptions = field(default_factory=ColourOptions)
 
 
 _FORMAT = 1  # raised when the same files and options give other rows

@@ -5,9 +5,9 @@ with roof tiles; so only points that a nadir view of the scan shows take its col
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,26 +17,119 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.formats.ortho_image import OrthoImage as OrthoImage
 from featuredb.lidar.formats.ortho_image import open_ortho as open_ortho
 from featuredb.lidar.formats.ortho_image import sample_ortho
-from featuredb.lidar.nadir_view import NadirOptions, point_spacing_m, seen_from_above
+
+# Radius of the disc that a point covers, in spacings of the points. Points of a regular pattern leave no gap
+# from 0.71 on; scan lines are farther apart than points within them.
+SPLAT_SPACINGS = 1.2
+_STEEPEST_SLOPE = 1.2  # rise over run of a surface that does not hide itself: roofs reach 50 degrees
+STEP_M = 0.15  # a point may lie deeper on top of that: noise, roughness, strips that do not fit
+# A hole up to this width in what is above is taken as covered: crowns are not tight to a laser, and an image
+# shows leaves there. Shallower ones (gutters, furrows) are seen into.
+GAP_M, _GAP_DEPTH_M = 1.6, 1.5
+# The image is averaged to about so many pixels between neighbouring points, so that one line of paint does
+# not decide for half a square metre.
+_PIXELS_PER_SPACING = 2.0
+LAID = {  # what a scan's id says of how the image is laid on its points
+    "nadir": {
+        "splat_spacings": SPLAT_SPACINGS,
+        "steepest_slope": _STEEPEST_SLOPE,
+        "step_m": STEP_M,
+        "gap_m": GAP_M,
+        "gap_depth_m": _GAP_DEPTH_M,
+        "spacing_m": None,
+    },
+    "pixels_per_spacing": _PIXELS_PER_SPACING,
+}
+_EMPTY_M = np.float32(-1e9)
+_SPACING_CELL_M = 1.0  # cells in which the scan's area is counted
+_FINEST_M, _COARSEST_M = 0.03, 2.0
+_MAX_CELLS = 200_000_000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ColourOptions:
-    """How a scan is coloured from an ortho image.
+def margin_m(spacing_m: float) -> float:
+    """How far around a tile points must be known for its points to be judged as in the whole scan, metres."""
+    return GAP_M + 2.0 * SPLAT_SPACINGS * spacing_m
 
-    Attributes:
-        nadir: what counts as seen from above; None colours everything, as a plain lookup does.
-        pixels_per_spacing: the image is averaged to about so many pixels between neighbouring points, so that
-            one line of paint does not decide for half a square metre.
+
+def seen_from_above(xyz: FloatArray, spacing_m: float | None = None) -> NDArray[np.bool_]:
+    """Which points (n,) a nadir view of the scan shows.
+
+    Each point covers a disc; who lies clearly below such a disc, or in a narrow and deep hole of the surface
+    that they make, is hidden. Walls and eaves are hidden by the roof's edge.
+
+    Args:
+        xyz: (n, 3) float64 in metres, z up; outliers above the scene hide what is below them.
+        spacing_m: of the points, or None to measure it.
     """
+    if not len(xyz):
+        return np.zeros(0, dtype=bool)
+    spacing = spacing_m or point_spacing_m(xyz)
+    radius = float(np.clip(SPLAT_SPACINGS * spacing, _FINEST_M, _COARSEST_M))
+    local = (xyz - np.floor(xyz.min(axis=0))).astype(np.float32)
+    cell = np.floor(local[:, :2] / radius).astype(np.int64) + 1
+    columns, rows = (int(cell[:, k].max()) + 2 for k in (0, 1))
+    if columns * rows > _MAX_CELLS:
+        raise InvalidValueError(
+            f"seen_from_above: expected a tile, found points over {columns} x {rows} cells of "
+            f"{radius:.2f} m; call it by tiles with a margin"
+        )
+    at = cell[:, 1] * columns + cell[:, 0]
+    highest = _highest(at, local[:, 2], rows * columns)
+    return ~(
+        _below_neighbours(local, at, highest, columns, radius)
+        | _in_hole(local[:, 2], at, highest, (rows, columns), radius)
+    )
 
-    nadir: NadirOptions | None = field(default_factory=NadirOptions)
-    pixels_per_spacing: float = 2.0
 
-    @property
-    def margin_m(self) -> float:
-        """How far around a tile its neighbours' points are needed, metres."""
-        return 0.0 if self.nadir is None else self.nadir.margin_m
+def point_spacing_m(xyz: FloatArray) -> float:
+    """Root of the area per point, metres: of the cells of a square metre that hold points."""
+    cell = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / _SPACING_CELL_M).astype(np.int64)
+    occupied = len(np.unique(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]))
+    return float(np.clip(np.sqrt(occupied * _SPACING_CELL_M**2 / len(xyz)), _FINEST_M, _COARSEST_M))
+
+
+def _highest(at: NDArray[np.int64], z: NDArray[np.float32], cells: int) -> NDArray[np.int64]:
+    """Row of the highest point of each cell, -1 in empty ones."""
+    highest = np.full(cells, -1, dtype=np.int64)
+    order = np.argsort(z, kind="stable")
+    highest[at[order]] = order  # the last one written wins
+    return highest
+
+
+def _below_neighbours(
+    local: NDArray[np.float32],
+    at: NDArray[np.int64],
+    highest: NDArray[np.int64],
+    columns: int,
+    radius: float,
+) -> NDArray[np.bool_]:
+    """Which points lie below the disc of the highest point of a cell next to theirs."""
+    hidden = np.zeros(len(local), dtype=bool)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            other = highest[at + down * columns + right]
+            difference = local[other] - local  # row -1 is some point, and left out below
+            distance = np.hypot(difference[:, 0], difference[:, 1])
+            limit = STEP_M + _STEEPEST_SLOPE * distance
+            hidden |= (other >= 0) & (distance <= radius) & (difference[:, 2] > limit)
+    return hidden
+
+
+def _in_hole(
+    z: NDArray[np.float32],
+    at: NDArray[np.int64],
+    highest: NDArray[np.int64],
+    shape: tuple[int, int],
+    cell_m: float,
+) -> NDArray[np.bool_]:
+    """Which points lie deep in a narrow hole of the surface: below its morphological closing."""
+    reach = int(np.floor(0.5 * GAP_M / cell_m))
+    if reach < 1:
+        return np.zeros(len(z), dtype=bool)
+    surface = np.where(highest >= 0, z[highest], _EMPTY_M).reshape(shape)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    closed = np.asarray(cv2.morphologyEx(surface, cv2.MORPH_CLOSE, disc))
+    return np.asarray(closed.ravel()[at] - z > _GAP_DEPTH_M, dtype=bool)
 
 
 def colour_by_ortho(
@@ -44,17 +137,20 @@ def colour_by_ortho(
     epsg: int,
     own: NDArray[np.uint8] | None,
     ortho: OrthoImage,
-    options: ColourOptions | None = None,
+    spacing_m: float | None = None,
+    pixels_per_spacing: float = _PIXELS_PER_SPACING,
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colours of points, from the image where a nadir view shows them, their own elsewhere.
 
     Points hidden from above, outside the image, or where it has no data keep their own colour. Call it by
-    tiles, with the points up to `options.margin_m` around each, and keep the tile's.
+    tiles, with the points up to `margin_m` around each, and keep the tile's.
 
     Args:
         utm: (n, 3) float64 easting, northing, height, metres, without outliers.
         epsg: zone of `utm`.
         own: (n, 3) uint8 colours of the scan, or greys from its intensity, or None: black.
+        spacing_m: of the points, or None to measure it.
+        pixels_per_spacing: to which the image is averaged.
 
     Returns:
         rgb (n, 3) uint8, and (n,) bool: which points took their colour from the image.
@@ -63,7 +159,6 @@ def colour_by_ortho(
         GeodesyError: the image's reference system cannot be used.
         ScanFileError: the image cannot be read.
     """
-    options = options or ColourOptions()
     rgb = np.zeros((len(utm), 3), np.uint8) if own is None else own.copy()
     if rgb.shape != (len(utm), 3):
         raise InvalidValueError(f"colour_by_ortho: expected own colours ({len(utm)}, 3), found {rgb.shape}")
@@ -78,10 +173,10 @@ def colour_by_ortho(
     if not inside.any():
         return rgb, coloured
     # Visibility needs all points: one outside the image may hide one inside.
-    seen = inside if options.nadir is None else inside & seen_from_above(utm, options.nadir)
-    rows = np.flatnonzero(seen)
-    spacing = (options.nadir and options.nadir.spacing_m) or point_spacing_m(utm)
-    shrink = spacing / options.pixels_per_spacing / _pixel_size_m(utm[inside], pixel[inside])
+    rows = np.flatnonzero(inside & seen_from_above(utm, spacing_m))
+    shrink = (
+        (spacing_m or point_spacing_m(utm)) / pixels_per_spacing / _pixel_size_m(utm[inside], pixel[inside])
+    )
     found, valid = sample_ortho(ortho, pixel[rows], max(1.0, shrink))
     rgb[rows[valid]] = found[valid]
     coloured[rows[valid]] = True

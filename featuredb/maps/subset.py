@@ -11,14 +11,14 @@ from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.unplaced_map import MapKind
 
 
-def only_images(feature_map: MapKind, image_ids: Collection[int], min_views: int = 2) -> MapKind:
+def only_images(feature_map: MapKind, image_ids: Collection[int]) -> MapKind:
     """The map with some of its images, their cameras, observations and points.
 
     Image ids stay; cameras and points are numbered anew. Coordinates, covariances and reprojection errors of
     points stay what all images have made of them; `track_length` counts the images that are left.
 
     Args:
-        image_ids: of the images that stay. min_views: points that fewer of them see are left out.
+        image_ids: of the images that stay; points that fewer than two of them see are left out.
 
     Raises:
         InvalidValueError: an id that the map does not have, or broken `error_modes`.
@@ -47,7 +47,7 @@ def only_images(feature_map: MapKind, image_ids: Collection[int], min_views: int
         points=replace(feature_map.points, track_length=views),
         observations=seen.take(stays),
     )
-    return only_points(part, views >= min_views)
+    return only_points(part, views >= 2)
 
 
 def only_points(feature_map: MapKind, stays: NDArray[np.bool_]) -> MapKind:

@@ -12,40 +12,51 @@ were. `keep_points=False` removes it altogether (docs/measurements/growth.md has
 """
 
 import heapq
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.subset import only_points
-from featuredb.maps.thin_options import ThinOptions as ThinOptions
 from featuredb.maps.unplaced_map import AnyMap, MapKind
 
+# Localisation believes a pose from 15 inliers on, and a photo finds only a part of what is there.
+_LEAST_COVER = 15
+# Described observations that a chosen point keeps; more only repeat what the mean descriptor says already.
+_MAX_VIEWS = 8
 # The grid on which acceptance counts how much of a photo holds inliers.
 _GRID = 10
 _THINNED = "thinned"
 
 
-def thin_map(feature_map: MapKind, options: ThinOptions | None = None) -> MapKind:
+def thin_map(feature_map: MapKind, cover: int, *, keep_points: bool = True) -> MapKind:
     """The map with as few described points and observations as the cover asks for.
 
     Every image sees at least `cover` described points, or as many as before. Poses, placement, parents and
-    status stay. A map that was thinned by these very options comes back as it is.
+    status stay. A map that was thinned in this very way comes back as it is.
+
+    Args:
+        keep_points: points that are not chosen stay without descriptors.
+
+    Raises:
+        InvalidValueError: a cover of less than 15.
     """
-    options = options or ThinOptions()
-    note = asdict(options)
+    if cover < _LEAST_COVER:
+        raise InvalidValueError(f"cover: expected at least {_LEAST_COVER} points, found {cover}")
+    options = {"cover": cover, "keep_points": keep_points}
     earlier = feature_map.provenance.get(_THINNED)
-    if earlier is not None and earlier.get("options") == note:
+    if earlier is not None and earlier.get("options") == options:
         return feature_map
-    points = k_cover(feature_map, options.cover)
-    described = _thinned_views(feature_map, points, options)
+    points = k_cover(feature_map, cover)
+    described = _thinned_views(feature_map, points, cover)
     note = {
-        "options": note,
+        "options": options,
         "points_before": len(_described_points(feature_map)),
         "points": int(points.sum()),
     }
-    return with_descriptors(feature_map, described, options.keep_points, {_THINNED: note})
+    return with_descriptors(feature_map, described, keep_points, {_THINNED: note})
 
 
 def with_descriptors(
@@ -164,7 +175,7 @@ def _views(feature_map: AnyMap) -> tuple[FloatArray, FloatArray]:
     return toward / distance[:, None], distance
 
 
-def _thinned_views(feature_map: AnyMap, points: NDArray[np.bool_], options: ThinOptions) -> NDArray[np.bool_]:
+def _thinned_views(feature_map: AnyMap, points: NDArray[np.bool_], cover: int) -> NDArray[np.bool_]:
     """Observations (m,) of the chosen points that keep their descriptor.
 
     A point with too many views keeps those that are farthest apart, and those of images that would fall below
@@ -175,7 +186,7 @@ def _thinned_views(feature_map: AnyMap, points: NDArray[np.bool_], options: Thin
     image = feature_map.image_rows(seen.image_id)
     # An image may see a point twice, which counts once.
     pairs = np.unique(np.stack([image[kept], seen.point_index[kept]]), axis=1)
-    spare = np.bincount(pairs[0], minlength=len(feature_map.images)) - options.cover
+    spare = np.bincount(pairs[0], minlength=len(feature_map.images)) - cover
     direction, distance = _views(feature_map)
     # A factor of two in distance changes a descriptor about as much as half a radian in direction.
     place = np.hstack([direction, 0.5 * np.log2(distance)[:, None]])
@@ -183,9 +194,9 @@ def _thinned_views(feature_map: AnyMap, points: NDArray[np.bool_], options: Thin
     rows = rows[np.argsort(seen.point_index[rows], kind="stable")]
     starts = np.flatnonzero(np.diff(seen.point_index[rows], prepend=-1))
     for group in np.split(rows, starts[1:]):
-        if len(group) <= options.max_views:
+        if len(group) <= _MAX_VIEWS:
             continue
-        for row in reversed(group[_farthest_first(place[group])][options.max_views :]):
+        for row in reversed(group[_farthest_first(place[group])][_MAX_VIEWS:]):
             if spare[image[row]] > 0:
                 spare[image[row]] -= 1
                 kept[row] = False

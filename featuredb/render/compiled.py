@@ -1,13 +1,54 @@
-"""Numba at one place: the decorator of compiled loops, and the way to modules that need it."""
+"""Numba at one place: the decorator of compiled loops, the way to modules that need it, and their threads."""
 
 import importlib
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import Any, TypeVar
 
+from featuredb.errors import InvalidValueError
 from featuredb.extras import require
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_MOST = 4  # beyond this, merging the threads' buffers eats what they gain
+_BAND_ROWS = 16  # small bands even out the work between full and empty parts of a picture
+
+
+def thread_count(wanted: int) -> int:
+    """Threads to use: as wanted, or for 0 as many as the process may use, up to four.
+
+    Raises:
+        InvalidValueError: a negative number.
+    """
+    if wanted < 0:
+        raise InvalidValueError(f"threads: expected 0 or more, found {wanted}")
+    if wanted:
+        return wanted
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(usable, _MOST)
+
+
+def mapped(function: Callable[[T], R], items: Sequence[T], threads: int) -> list[R]:
+    """Results in order. Plain threads, since the loops hold no lock and OpenMP's threads forbid a fork."""
+    if threads == 1 or len(items) == 1:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, items))
+
+
+def over_rows(loop: Callable[[int, int], None], rows: int, threads: int) -> None:
+    """Call loop(first, end) so that all rows are covered once."""
+    if threads == 1:
+        loop(0, rows)
+        return
+    band = max(_BAND_ROWS, -(-rows // (4 * threads)))
+    bands = [(first, min(first + band, rows)) for first in range(0, rows, band)]
+    mapped(lambda ends: loop(*ends), bands, threads)
 
 
 def compiled(function: F) -> F:

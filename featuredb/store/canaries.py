@@ -51,8 +51,8 @@ class KnownPose:
     utm: FloatArray
     height_datum: str
     cam_from_utm_xyzw: FloatArray
-    tolerance_m: float
-    tolerance_deg: float
+    tolerance_m: float = 0.5
+    tolerance_deg: float = 1.0
 
     def __post_init__(self) -> None:
         zone_of(self.epsg)
@@ -81,7 +81,6 @@ class Canary:
         pose: the right answer; None: it must not be localised (a photo of another town).
         origin: "person": someone vouches for it; "answer": it is what `snapshot` answered.
         snapshot: that snapshot, or None.
-        note: where it comes from, in words.
     """
 
     canary_id: str
@@ -92,7 +91,6 @@ class Canary:
     origin: Origin
     snapshot: int | None = None
     request: Mapping[str, Any] = field(default_factory=dict)
-    note: str = ""
 
 
 def add_canary(
@@ -104,7 +102,6 @@ def add_canary(
     origin: Origin,
     snapshot: int | None = None,
     request: Mapping[str, Any] | None = None,
-    note: str = "",
 ) -> Canary:
     """Add a known query; adding the same again changes nothing. See `Canary`.
 
@@ -134,7 +131,7 @@ def add_canary(
         **_pose_columns(pose),
         "origin": origin,
         "snapshot": snapshot,
-        "note": note,
+        "note": "",
     }
     database.make(CANARIES)
 

@@ -8,16 +8,25 @@ import pyarrow.compute as pc
 
 from featuredb.store.candidates.upkeep import named_writes, superfluous_images
 from featuredb.store.changes import RETIRED, Change
-from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version
+from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, upgrade_metadata
 from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
 from featuredb.store.delta import Table
 from featuredb.store.durable.ages import store_time, write_times
 from featuredb.store.durable.filesystem import store_errors
 from featuredb.store.durable.log import list_entries
+from featuredb.store.encode import rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.scans import retired_since, scan_rows
-from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATES, CHILD_TABLES, LIDAR, LIDAR_POINTS, MAPS
+from featuredb.store.tables import (
+    CANDIDATE_IMAGES,
+    CANDIDATES,
+    CHILD_TABLES,
+    FORMAT_VERSION,
+    LIDAR,
+    LIDAR_POINTS,
+    MAPS,
+)
 from featuredb.store.vacuum_options import VacuumOptions as VacuumOptions
 
 
@@ -203,3 +212,35 @@ def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dr
         )
         files += [f"{name}/{path}" for path in removed]
     return files
+
+
+def upgrade(database: Database) -> list[str]:
+    """Bring all tables to the newest format.
+
+    All maps and snapshots stay as they are. `maps` comes last: until then the format is the old one.
+
+    Returns:
+        What was done, a sentence for each step; none where nothing was to be done.
+
+    Raises:
+        ConflictError: other writers were faster too many times.
+        StoreError: the store failed.
+    """
+    steps: list[str] = []
+    for name in reversed(database.tables()):
+        found = database.table(name).format
+        if found < FORMAT_VERSION:
+            _to_newest_format(database, name)
+            steps.append(f"{name}: format {found} became {FORMAT_VERSION}, which older releases cannot read")
+    return steps
+
+
+def _to_newest_format(database: Database, name: str) -> None:
+    def attempt() -> None:
+        table = database.table(name)
+        if name == MAPS:
+            table.upgrade(rows_table(MAPS, read_rows(table)), upgrade_metadata())
+        else:
+            table.upgrade()
+
+    retry_stale(f"upgrade of {name}", attempt)

@@ -2,7 +2,8 @@
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from fractions import Fraction
 from typing import Any, cast
 
@@ -20,7 +21,6 @@ from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, Vid
 from featuredb.video.opening import Opening, Source, coded_pixels, open_input, opening_of
 from featuredb.video.pixels import PixelReader
 from featuredb.video.rotation import clockwise_from_display_matrix
-from featuredb.video.tags import camera_tags
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +31,14 @@ _INDEXED = frozenset({"mov", "matroska", "avi"})
 _SEEK_MARGINS_S = (1.0, 10.0)
 # High-speed cameras write up to 1000 frames a second; what says more gives its tick, not its rate.
 _MAX_RATE_HZ = 1000.0
+# Phones, QuickTime's own atoms, and what libav makes of them; the most specific first.
+_MAKE = ("com.apple.quicktime.make", "com.android.manufacturer", "make", "manufacturer")
+_MODEL = ("com.apple.quicktime.model", "com.android.model", "model")
+# The first survives trimming and export on a phone, and names its time zone.
+_CREATION = ("com.apple.quicktime.creationdate", "creation_time", "date")
+# Action cameras and drones name themselves only in what they call their stream.
+_MAKER_WORDS = {"gopro": "GoPro", "dji": "DJI", "insta360": "Insta360"}
+_STREAM_NAMES = ("encoder", "handler_name", "comment")
 
 
 def open_container(source: Source, options: VideoOptions) -> "ContainerVideo":
@@ -292,3 +300,44 @@ def _rotation(first: av.VideoFrame, name: str) -> int:
         return clockwise_from_display_matrix(None if matrix is None else bytes(matrix))
     except VideoError as error:
         raise VideoError(f"{name}: {error}") from error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraTags:
+    """Make and model of the camera and the time of recording; each None if not said."""
+
+    make: str | None
+    model: str | None
+    creation_time: datetime | None
+
+
+def camera_tags(tags: Mapping[str, str]) -> CameraTags:
+    """Read the tags, whose names are in lower case."""
+    return CameraTags(
+        make=_first(tags, _MAKE) or _maker(tags),
+        model=_first(tags, _MODEL),
+        creation_time=_creation_time(tags),
+    )
+
+
+def _first(tags: Mapping[str, str], names: tuple[str, ...]) -> str | None:
+    for name in names:
+        value = tags.get(name, "").strip()
+        if value:
+            return value
+    return None
+
+
+def _maker(tags: Mapping[str, str]) -> str | None:
+    said = " ".join(tags.get(name, "") for name in _STREAM_NAMES).lower()
+    return next((make for word, make in _MAKER_WORDS.items() if word in said), None)
+
+
+def _creation_time(tags: Mapping[str, str]) -> datetime | None:
+    for name in _CREATION:
+        try:
+            time = datetime.fromisoformat(tags.get(name, "").strip())
+        except ValueError:
+            continue
+        return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
+    return None

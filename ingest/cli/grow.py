@@ -31,9 +31,7 @@ def _register_grow(subparsers: Any) -> None:
         description="Place the photos that wait, and the maps without a place, by the maps there are. New "
         "maps stay in quarantine until photos of someone else confirm them; see docs/growth.md.",
     )
-    when = grow.add_mutually_exclusive_group()
-    when.add_argument("--once", action="store_true", help="one run (the default)")
-    when.add_argument("--watch", action="store_true", help="run whenever photos arrive, until Ctrl-C")
+    grow.add_argument("--watch", action="store_true", help="run whenever photos arrive, until Ctrl-C")
     grow.add_argument("--poll", type=float, default=30.0, metavar="SECONDS", help="of --watch; default 30")
     grow.add_argument("--budget", type=float, metavar="M", help="drift from the anchors; default: 0.5")
     grow.add_argument(
@@ -81,9 +79,6 @@ def _register_canary(subparsers: Any) -> None:
         "what the database answers now",
     )
     what.add_argument("--elsewhere", action="store_true", help="of another place: it must not be localised")
-    add.add_argument("--tolerance-m", type=float, default=0.5, help="default: 0.5")
-    add.add_argument("--tolerance-deg", type=float, default=1.0, help="default: 1")
-    add.add_argument("--note", default="", help="where it comes from")
     add.set_defaults(run=run_canary_add)
     listing = kinds.add_parser("list", help="list them")
     listing.set_defaults(run=run_canary_list)
@@ -160,14 +155,14 @@ def run_canary_add(args: argparse.Namespace) -> int:
     if args.pose is not None:
         pose = _pose(args)
     elif not args.elsewhere:
-        pose, snapshot = answer_now(database, image, args.tolerance_m, args.tolerance_deg)
+        pose, snapshot = answer_now(database, image)
         if pose is None:
             raise InvalidValueError(
                 f"{args.image}: the database does not localise it; give --pose, or --elsewhere where it "
                 "must not"
             )
     origin: Origin = "person" if snapshot is None else "answer"
-    add_canary(database, name, image, pose, origin=origin, snapshot=snapshot, note=args.note)
+    add_canary(database, name, image, pose, origin=origin, snapshot=snapshot)
     sys.stdout.write(f"canary {name}: {'not to be localised' if pose is None else f'known by {origin}'}\n")
     return 0
 
@@ -185,8 +180,6 @@ def _pose(args: argparse.Namespace) -> "KnownPose":
             utm=np.asarray(value["utm"], dtype=np.float64),
             height_datum=str(value.get("height_datum", "unknown")),
             cam_from_utm_xyzw=np.asarray(value["cam_from_utm_xyzw"], dtype=np.float64),
-            tolerance_m=args.tolerance_m,
-            tolerance_deg=args.tolerance_deg,
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InvalidValueError(f"{args.pose}: expected the JSON of a pose, {error!r}") from error
@@ -198,11 +191,11 @@ def run_canary_list(args: argparse.Namespace) -> int:
     rows = [
         (
             c.name, "not localised" if c.pose is None else "localised", c.origin,
-            "" if c.pose is None else c.pose.tolerance_m, c.created_at, c.note,
+            c.created_at,
         )
         for c in list_canaries(open_database(args))
     ]  # fmt: skip
-    sys.stdout.write(format_table(("name", "expected", "known by", "tolerance_m", "added", "note"), rows))
+    sys.stdout.write(format_table(("name", "expected", "known by", "added"), rows))
     return 0
 
 

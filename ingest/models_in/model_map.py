@@ -4,12 +4,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from featuredb.errors import IngestError
+from featuredb.export.formats.colmap import DATABASE
 from featuredb.export.georeference import GEOREFERENCE
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.file_digest import file_sha256
@@ -19,6 +21,8 @@ from featuredb.maps.unplaced_map import AnyMap, MapKind, NoPlace
 from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.map_builder import MapIdentity, MapOptions, build_map, build_unplaced_map
+from ingest.models_in.colmap_folder import model_folder, open_keypoints, read_colmap
+from ingest.models_in.opensfm_folder import opensfm_folder, read_opensfm
 from ingest.models_in.place import (
     Place,
     Stated,
@@ -27,13 +31,60 @@ from ingest.models_in.place import (
     place_by_photos,
     place_of_georeference,
 )
-from ingest.models_in.source import NAMES, open_model
-from ingest.models_in.stored import ModelFeatures, ModelSource
+from ingest.models_in.stored import ModelFeatures, ModelFormat, ModelSource
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.sfm.extract import PhotoFeatures
 
 Descriptors = Literal["stored", "photos"]
+
+NAMES: dict[ModelFormat, str] = {"colmap": "COLMAP", "opensfm": "OpenSfM"}
+
+
+def open_model(folder: Path, colmap_database: Path | None, reconstruction: int | None) -> ModelSource:
+    """The model in a folder, of whatever format.
+
+    Args:
+        colmap_database: of a COLMAP model; None: in its folder.
+        reconstruction: which of OpenSfM's.
+
+    Raises:
+        IngestError: there is none, or it cannot be read, or an option belongs to another format.
+    """
+    place = opensfm_folder(folder)
+    if place is None and reconstruction is not None:
+        raise IngestError(
+            "--reconstruction: expected OpenSfM's reconstruction.json, found none; leave it out"
+        )
+    if place is None:
+        return _colmap(folder, colmap_database)
+    if colmap_database is not None:
+        raise IngestError(
+            f"--database: expected a COLMAP model, found one of OpenSfM in {folder}; leave it out"
+        )
+    return _opensfm(folder, place, reconstruction)
+
+
+def _colmap(folder: Path, database: Path | None) -> ModelSource:
+    stored, place = read_colmap(folder), model_folder(folder)
+    path = database or folder / DATABASE
+    return ModelSource(
+        format="colmap",
+        place=place,
+        stored=stored,
+        files=(*sorted(place.glob("*.bin")), *sorted(place.glob("*.txt"))),
+        feature_files=(path,) if path.is_file() else (),
+        open_keypoints=partial(open_keypoints, path, stored),
+    )
+
+
+def _opensfm(folder: Path, place: Path, reconstruction: int | None) -> ModelSource:
+    folders = (place / "images", folder / "images", place.absolute().parent / "images")
+    return replace(
+        read_opensfm(place, reconstruction),
+        photos=next((path for path in folders if path.is_dir()), None),
+        choice="" if reconstruction is None else f"reconstruction {reconstruction}",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

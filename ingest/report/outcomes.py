@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geo.utm import meridian_convergence_deg, utm_from_geodetic
+from featuredb.geo.utm import utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.place_bounds import PlaceBounds
@@ -197,14 +197,12 @@ def _outcome(
 def _plan(component: Component, feature_map: FeatureMap) -> PlanView:
     centers, gps, _ = _centers_and_gps(component, feature_map)
     used = _gps_used(component)
-    frame = feature_map.frame
     return PlanView(
         points=feature_map.points.utm,
         cameras=centers,
         gps=gps,
         names=tuple(image.name for image in feature_map.images),
         gps_used=np.array([used.get(k, False) for k in range(len(component.photos))]),
-        convergence_deg=meridian_convergence_deg(frame.latitude_deg, frame.longitude_deg, feature_map.epsg),
         epsg=feature_map.epsg,
     )
 

@@ -1,14 +1,17 @@
 """The report as one page: no network, no scripts, pictures inside."""
 
 import math
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
 from ingest.register.control.report import control_html
 from ingest.report.films import films_html
-from ingest.report.gps_figures import figure_rows
-from ingest.report.plots import histograms_png, plan_png
+from ingest.report.plots import plan_png
 from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, report_json
 from ingest.workspace import atomic_file, write_json
 
@@ -25,6 +28,27 @@ _MAP_PILLS = {
     "already_there": ("good", "was there already"),
     "unplaced": ("fair", "kept without a place"),
     "refused": ("bad", "refused"),
+}
+# As `ingest.register.gps` names them; those of `angles` stand below it there. What has no line is not shown.
+FIGURES = {
+    "photos_with_gps": "photos that have a position",
+    "inliers": "photos whose position agrees; others are far out. Of more than 400 as many, evenly in time, "
+    "place the map",
+    "rms_horizontal_m": "distance of used positions from the photos' places in the map (RMS), metres",
+    "rms_vertical_m": "the same in height",
+    "noise_m": "estimated noise of one position, horizontally and in height, metres",
+    "drift_m": "estimated drift of the receiver from the first photo to the last, the same way",
+    "lag_s": "by how many seconds positions are late; 0 where that is not known",
+    "bias_sigma_m": "by what all positions may be wrong together (68 % an axis: east, north, up), metres",
+    "scale_sigma": "what the scale is known to (68 %), as a share",
+    "turn_sigma_deg": "what the turn is known to about its worst axis (68 %), degrees",
+    "checked_turn_sigma_deg": "the same if nothing were assumed of how the photos are held",
+    "log10_chance": "how often positions of other photos would fit as well, as a power of ten",
+    "told": "whether photos tell their own angles; if not, they are taken to be held level",
+    "tilt_off_deg": "median angle in the map between photos and what they tell, or level",
+    "tilt_contradicts": "whether that is more than such angles are ever wrong by",
+    "yaw_off_deg": "median angle in the map between the photos' compass or gimbal and north",
+    "yaw_contradicts": "whether that is more than such angles are ever wrong by",
 }
 
 
@@ -83,6 +107,7 @@ def _map(outcome: MapOutcome) -> str:
         ("photos", str(outcome.photos)),
         ("points", f"{outcome.points:,}"),
         ("observations", f"{outcome.observations:,}, {outcome.descriptors:,} with descriptors"),
+        ("reprojection error", _error_words(outcome)),
         (f"residual to {method}", number(outcome.residual_rms_m, "{:.2f} m root mean square")),
         *(words.split(": ", 1) for words in outcome.place_words),
         ("scale", number(outcome.scale, "{:.4g} m per unit of the reconstruction")),
@@ -95,9 +120,7 @@ def _map(outcome: MapOutcome) -> str:
     notes = "".join(note(warning) for warning in outcome.warnings)
     pictures = ""
     if outcome.plan is not None:
-        pictures += picture(plan_png(outcome.plan), "Plan view and side view of the map")
-    if len(outcome.errors_px):
-        pictures += picture(histograms_png(outcome), "Reprojection errors and track lengths")
+        pictures = picture(plan_png(outcome.plan), "Plan view and side view of the map")
     return (
         f"<h2>Map {escape(outcome.name)} {pill(*_MAP_PILLS[outcome.status])}</h2><section>{reason}{notes}"
         + table((), facts, names=(0,))
@@ -107,6 +130,15 @@ def _map(outcome: MapOutcome) -> str:
         + _gates(outcome)
         + "</section>"
     )
+
+
+def _error_words(outcome: MapOutcome) -> str:
+    """Of its points; nothing where there are none."""
+    if not len(outcome.errors_px):
+        return ""
+    median, most = np.percentile(outcome.errors_px, (50, 99))
+    views = np.median(outcome.track_lengths)
+    return f"median {median:.2f} px, 99 % below {most:.2f} px; a point is seen by {views:.0f} photos (median)"
 
 
 def _gates(outcome: MapOutcome) -> str:
@@ -209,3 +241,21 @@ def _file_row(photo: PhotoOutcome) -> str:
 
 def _count(value: int | None) -> str:
     return "" if value is None else f"{value:,}"
+
+
+def figure_rows(figures: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Name, value and meaning of each figure, in the order above."""
+    known = {**figures, **figures.get("angles", {})}
+    return [
+        (name, _value(known[name]), what) for name, what in FIGURES.items() if known.get(name) is not None
+    ]
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return "not known"
+    if isinstance(value, list | tuple):
+        return ", ".join(_value(one) for one in value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

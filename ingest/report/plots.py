@@ -7,13 +7,11 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.text import OffsetFrom
 from numpy.typing import NDArray
 
-from featuredb.geo.tiles import TILE_SIZE_M, tile_of
 from featuredb.geometry.arrays import FloatArray
-from ingest.plot_parts import nice_length, png_bytes, residual_exaggeration
-from ingest.report.values import MapOutcome, PlanView
+from ingest.plot_parts import png_bytes, residual_exaggeration
+from ingest.report.values import PlanView
 
 _DPI = 110
 _MAX_POINTS = 40_000  # more only hide each other and cost seconds
@@ -22,7 +20,7 @@ _INK, _GPS, _BAD, _FAINT = "#1b2733", "#1565c0", "#c62828", "#9aa7b4"
 
 
 def plan_png(plan: PlanView) -> bytes:
-    """Plan view (points by height, cameras, GPS with residual vectors, tiles) above a side view."""
+    """Plan view (points by height, cameras, GPS with residual vectors) above a side view."""
     plan_box = _box(plan)
     width_m, height_m = plan_box[1] - plan_box[0], plan_box[3] - plan_box[2]
     side_low, side_high = _heights(plan)
@@ -55,41 +53,10 @@ def plan_png(plan: PlanView) -> bytes:
     return png_bytes(figure)
 
 
-def histograms_png(outcome: MapOutcome) -> bytes:
-    """Histograms of the points' reprojection errors and track lengths, side by side."""
-    figure = Figure(figsize=(9.2, 2.7), dpi=_DPI, facecolor="white", layout="constrained")
-    left, right = figure.subplots(1, 2)
-    errors, tracks = outcome.errors_px, outcome.track_lengths
-    limit = max(float(np.percentile(errors, 99)), 0.1) if len(errors) else 1.0
-    left.hist(np.minimum(errors, limit), bins=40, range=(0, limit), color="#3f7fbf")
-    left.set_xlabel("mean reprojection error of a point, pixels (last bar: and more)")
-    if len(errors):
-        median = float(np.median(errors))
-        left.axvline(median, color=_BAD, lw=1.2)
-        left.annotate(
-            f"median {median:.2f} px",
-            (median, 1),
-            xycoords=("data", "axes fraction"),
-            xytext=(5, -11),
-            textcoords="offset points",
-            fontsize=8,
-            color=_BAD,
-        )
-    most = int(min(max(tracks.max(initial=2), 4), 30))
-    right.hist(np.minimum(tracks, most), bins=np.arange(1.5, most + 1), color="#4f9d69", rwidth=0.85)
-    right.set_xlabel("photos that see a point" + (" (last bar: and more)" if most == 30 else ""))
-    right.xaxis.get_major_locator().set_params(integer=True)
-    for axes in (left, right):
-        axes.set_ylabel("points")
-        _tidy(axes)
-    return png_bytes(figure)
-
-
 def _draw_plan(axes: Any, plan: PlanView, shown: FloatArray, colours: Normalize, box: NDArray[Any]) -> None:
     axes.set_xlim(box[0], box[1])
     axes.set_ylim(box[2], box[3])
     axes.set_aspect("equal", adjustable="box")
-    _draw_tiles(axes, box)
     axes.scatter(shown[:, 0], shown[:, 1], c=shown[:, 2], cmap="viridis", norm=colours, s=3, lw=0, zorder=2)
     residuals = (plan.gps - plan.cameras)[:, :2]
     factor = residual_exaggeration(residuals[plan.gps_used], float(max(box[1] - box[0], box[3] - box[2])))
@@ -118,9 +85,7 @@ def _draw_plan(axes: Any, plan: PlanView, shown: FloatArray, colours: Normalize,
     axes.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=3, fontsize=8, frameon=False, borderaxespad=0.1
     )
-    _draw_north(axes, plan.convergence_deg)
-    _draw_scale_bar(axes, box)
-    axes.set_title(f"EPSG:{plan.epsg}, {_tile_words(box)}", fontsize=9, color=_INK, loc="left", pad=22)
+    axes.set_title(f"EPSG:{plan.epsg}", fontsize=9, color=_INK, loc="left", pad=22)
     axes.set_xlabel("easting, m", fontsize=8)
     axes.set_ylabel("northing, m", fontsize=8)
     _tidy(axes)
@@ -147,71 +112,6 @@ def _draw_side(
     axes.set_xlabel("easting, m (seen from the south, residuals as they are)", fontsize=8)
     axes.set_ylabel("height, m", fontsize=8)
     _tidy(axes)
-
-
-def _draw_tiles(axes: Any, box: NDArray[Any]) -> None:
-    for low, high, draw in ((box[0], box[1], axes.axvline), (box[2], box[3], axes.axhline)):
-        for line in np.arange(math.ceil(low / TILE_SIZE_M), math.floor(high / TILE_SIZE_M) + 1) * TILE_SIZE_M:
-            draw(line, color=_INK, lw=1.0, ls=(0, (6, 4)), alpha=0.7, zorder=3)
-
-
-def _tile_words(box: NDArray[Any]) -> str:
-    corners = np.array([[box[0], box[2], 0.0], [box[1], box[3], 0.0]])
-    first, last = (str(name) for name in tile_of(corners))
-    return f"tile {first}" if first == last else f"tiles {first} to {last} (dashed)"
-
-
-def _draw_north(axes: Any, convergence_deg: float) -> None:
-    """An arrow to true north; the picture's own up is grid north."""
-    angle = math.radians(-convergence_deg)
-    x, y, length = 0.955, 0.86, 34.0
-    axes.annotate(
-        "",
-        xy=(length * math.sin(angle), length * math.cos(angle)),
-        xytext=(0, 0),
-        xycoords=_offset_from(axes, x, y),
-        textcoords=_offset_from(axes, x, y),
-        arrowprops={"arrowstyle": "-|>", "color": _INK, "lw": 1.8},
-        zorder=8,
-    )
-    axes.annotate(
-        "true N",
-        (x, y),
-        xycoords="axes fraction",
-        xytext=(0, -5),
-        textcoords="offset points",
-        ha="center",
-        va="top",
-        fontsize=8,
-        color=_INK,
-        zorder=8,
-        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
-    )
-
-
-def _offset_from(axes: Any, x: float, y: float) -> Any:
-    return OffsetFrom(axes.patch, (x, y))
-
-
-def _draw_scale_bar(axes: Any, box: NDArray[Any]) -> None:
-    width = float(box[1] - box[0])
-    length = nice_length(0.25 * width)
-    x0, y0 = box[1] - 0.03 * width - length, box[2] + 0.03 * (box[3] - box[2])
-    axes.plot([x0, x0 + length], [y0, y0], color=_INK, lw=4, solid_capstyle="butt", zorder=8)
-    axes.plot(
-        [x0 + 0.5 * length, x0 + length], [y0, y0], color="white", lw=2, solid_capstyle="butt", zorder=9
-    )
-    axes.annotate(
-        f"{length:g} m",
-        (x0 + length / 2, y0),
-        xytext=(0, 5),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-        color=_INK,
-        zorder=9,
-        bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.75},
-    )
 
 
 def _box(plan: PlanView) -> NDArray[Any]:

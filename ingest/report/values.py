@@ -122,7 +122,6 @@ class PlanView:
         gps: (k, 3) their GPS positions, NaN where there is none.
         names: k names.
         gps_used: (k,) bool.
-        convergence_deg: angle from true north to grid north, clockwise.
         epsg: of the zone.
     """
 
@@ -131,7 +130,6 @@ class PlanView:
     gps: FloatArray
     names: tuple[str, ...]
     gps_used: NDArray[np.bool_]
-    convergence_deg: float
     epsg: int
 
 

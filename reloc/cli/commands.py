@@ -44,9 +44,6 @@ def register(subparsers: Any) -> None:
     )
     query.add_argument("--credit", metavar="NAME", help="whom to name with them")
     query.add_argument("--licence", metavar="TERMS", help="under what terms they are given, e.g. CC-BY-4.0")
-    query.add_argument(
-        "--client-id", metavar="NAME", help="what this client calls itself; kept with the photos"
-    )
     _add_query_arguments(query)
     query.set_defaults(run=_query)
 
@@ -153,7 +150,6 @@ def _query(args: argparse.Namespace) -> int:
                 contribute=args.contribute and not first,
                 credit=args.credit,
                 licence=args.licence,
-                client_id=args.client_id,
             )
 
         return _answer_all(args, ask, client.database)

@@ -58,10 +58,10 @@ def register(subparsers: Any) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from reloc.tracking.trajectory.read import read_trajectory_csv
+    from reloc.viewer.page import DEFAULT_POINTS as STATIC_POINTS
+    from reloc.viewer.page import write_static_page
     from reloc.viewer.photos import Pictures
     from reloc.viewer.scene import DEFAULT_POINTS, ViewerSceneOptions, build_scene
-    from reloc.viewer.static_page import DEFAULT_POINTS as STATIC_POINTS
-    from reloc.viewer.static_page import write_static_page
 
     if args.static is None:
         require("http", "The viewer (but not `--static OUT.html`)", "fastapi", "uvicorn")

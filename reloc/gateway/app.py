@@ -3,13 +3,18 @@
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from importlib import resources
 from typing import Any, TypeVar
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4 as METRICS_TYPE
+from prometheus_client.registry import Collector
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
@@ -29,19 +34,16 @@ from reloc.gateway.failures import (
     status_of,
 )
 from reloc.gateway.geopose import NotLocalisedError, check_version, parse, question_of, response_of
-from reloc.gateway.intake import Intake
+from reloc.gateway.intake import Intake, read_form
 from reloc.gateway.link import Link
-from reloc.gateway.metrics import MEDIA_TYPE as METRICS_TYPE
-from reloc.gateway.metrics import GatewayMetrics
-from reloc.gateway.multipart import read_form
 from reloc.gateway.options import GatewayOptions
-from reloc.gateway.phone import add_phone_page
 from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
 from reloc.gateway.protocol import VERSION as GEOPOSE_VERSION
 from reloc.gateway.protocol import GeoPoseResp
 from reloc.service.logs import fields
 from reloc.wire.query import ErrorCode, LocaliseReply, LocaliseWireRequest
 from reloc.wire.server import MapsReply, StatusReply
+from reloc.wire.status_metrics import status_metrics
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +54,81 @@ _STATUS_TIMEOUT_S = 2.0  # what a health check or a scrape may take; the server 
 _DEADLINE_MARGIN_S = 0.2
 # Of a client that has gone; nobody reads it, but the count of requests shows it (nginx's custom).
 _CLIENT_GONE = 499
+
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {
+    "Content-Security-Policy": _POLICY,
+    "Permissions-Policy": "camera=(self), geolocation=(self)",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+_MEDIA_TYPES = {"css": "text/css", "html": "text/html", "js": "text/javascript"}
+
+_NAME = "featuredb_gateway_"
+# A query takes 0.2 s and at most the timeout of 10 s; health and maps take milliseconds.
+_BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
+
+
+class GatewayMetrics:
+    """Counters that threads share."""
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry()
+        self._requests = Counter(
+            f"{_NAME}requests", "HTTP requests answered.", ("route", "status"), registry=self._registry
+        )
+        self._seconds = Histogram(
+            f"{_NAME}request_seconds",
+            "Time to the answer.",
+            ("route",),
+            buckets=_BUCKETS_S,
+            registry=self._registry,
+        )
+
+    def observe(self, route: str, status: int, seconds: float) -> None:
+        """A request was answered."""
+        self._requests.labels(route, str(status)).inc()
+        self._seconds.labels(route).observe(seconds)
+
+    def text(self, in_flight: int, sessions: int, server: StatusReply | None) -> bytes:
+        """The whole page; `server` is what the server says of itself, None if it does not answer."""
+        moment = CollectorRegistry()
+        moment.register(_Moment(in_flight, sessions, server))
+        return generate_latest(self._registry) + generate_latest(moment)
+
+
+class _Moment(Collector):
+    """What is so when the page is asked for."""
+
+    def __init__(self, in_flight: int, sessions: int, server: StatusReply | None) -> None:
+        self._in_flight, self._sessions, self._server = in_flight, sessions, server
+
+    def collect(self) -> Iterator[Metric]:
+        yield GaugeMetricFamily(f"{_NAME}in_flight", "Photos in hand.", value=self._in_flight)
+        yield CounterMetricFamily(f"{_NAME}sessions", "Zenoh sessions opened.", value=self._sessions)
+        yield from status_metrics(self._server)
+
+
+def add_phone_page(app: FastAPI, prefix: str) -> None:
+    """`prefix`/phone, and its script and style below it; it asks `prefix`/localise as any client does."""
+    root = resources.files("reloc.gateway") / "assets"
+    files = {file.name: file.read_bytes() for file in root.iterdir()}
+
+    @app.get(f"{prefix}/phone", include_in_schema=False)
+    async def page() -> Response:
+        return _file("phone.html")
+
+    @app.get(f"{prefix}/phone/{{name}}", include_in_schema=False)
+    async def asset(name: str) -> Response:
+        return _file(name)
+
+    def _file(name: str) -> Response:
+        if name not in files:
+            raise HTTPException(404, f"no file {name[:100]!r}")
+        return Response(files[name], media_type=_MEDIA_TYPES[name.rsplit(".", 1)[-1]], headers=_HEADERS)
 
 
 class Gateway:

@@ -13,16 +13,20 @@ from numpy.typing import NDArray
 
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.area import Area
+from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.stage_clock import StageClock
 from reloc.localise.acceptance import confidence, prior_tells, verdict
-from reloc.localise.answer import make_answer
+from reloc.localise.answer import make_answer, placement_covariance
 from reloc.localise.candidates import IndexedArea, usable_areas
 from reloc.localise.lens_prior import seen_by_a_map
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.pose import PoseUncertainty, pose_uncertainty
-from reloc.localise.prior import contradicts_prior, distance_from, weakened
 from reloc.localise.result import (
+    LocalisedPose,
     LocaliseRequest,
     LocaliseResult,
     OwnPosition,
@@ -30,8 +34,13 @@ from reloc.localise.result import (
     Reason,
     RunnerUp,
 )
-from reloc.localise.rivals import runner_up
 from reloc.localise.search import PoseCandidate, Search, pairs, search
+
+# Chi-square with two degrees of freedom is above this once in 10,000 answers if the prior's sigma is honest.
+_CHI_SQUARE_LIMIT = 18.42
+
+# Phones between houses are off by tens of metres, whatever accuracy they write into a photo.
+_OWN_POSITION_SIGMA_M = 20.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -213,3 +222,102 @@ def _decide(
         runner_up=rival,
     )
     return Localised(result=result, best=best, uncertainty=uncertainty)
+
+
+def weakened(position: GeoPrior) -> GeoPrior:
+    """A photo's own position as a prior, not believed more closely than phones deserve."""
+    sigma_m = max(position.sigma_horizontal_m, _OWN_POSITION_SIGMA_M)
+    return replace(position, sigma_horizontal_m=sigma_m)
+
+
+def distance_from(answer: LocalisedPose, prior: GeoPrior) -> float:
+    """Horizontal distance of the camera from the prior, metres."""
+    return float(np.linalg.norm(_offset(answer, prior)))
+
+
+def _offset(answer: LocalisedPose, prior: GeoPrior) -> FloatArray:
+    """(2,) metres from the camera to the prior, along true east and north."""
+    height = answer.geopose.height_m
+    place = answer.frame.enu_from_geodetic(np.array([prior.latitude_deg, prior.longitude_deg, height]))
+    to_true = answer.frame.true_enu_from_enu(answer.cam_from_local.center)
+    return np.asarray((to_true @ (place - answer.cam_from_local.center))[:2], dtype=np.float64)
+
+
+def contradicts_prior(answer: LocalisedPose, prior: GeoPrior | None) -> str | None:
+    """A sentence with the figures if the answer is too far from the prior for both to be right, else None.
+
+    Horizontal only: heights of photos are rarely in a known datum.
+    """
+    if prior is None:
+        return None
+    offset = _offset(answer, prior)
+    covariance = answer.covariance[3:5, 3:5] + np.eye(2) * prior.sigma_horizontal_m**2
+    chi_square = float(offset @ np.linalg.solve(covariance, offset))
+    if chi_square <= _CHI_SQUARE_LIMIT:
+        return None
+    return (
+        f"the pose lies {np.linalg.norm(offset):.1f} m from the prior, whose standard deviation is "
+        f"{prior.sigma_horizontal_m:.1f} m; chi-square {chi_square:.1f}, limit {_CHI_SQUARE_LIMIT}"
+    )
+
+
+def runner_up(best: PoseCandidate, others: list[PoseCandidate]) -> RunnerUp | None:
+    """The pose of another place with most inliers.
+
+    Another place is further than 2 m or 5 degrees from the winner. Where two maps gave the poses, three
+    standard deviations of their placements come on top: two maps of one place, each placed by GPS, show it
+    metres apart. Heights of different datums are not compared.
+    """
+    winner = best.pose.cam_from_local
+    found: list[RunnerUp] = []
+    for other in others:
+        pose = _in_frame_of(best.area, other)
+        offset = pose.center - winner.center
+        if best.main_map.height_datum != other.main_map.height_datum:
+            offset[2] = 0.0
+        distance_m = float(np.linalg.norm(offset))
+        angle_deg = pose.angle_to_deg(winner)
+        apart_m, apart_deg = 2.0, 5.0
+        if best.main_map.map_id != other.main_map.map_id:
+            placed = placement_covariance(best.area, best.main_map, winner.center) + placement_covariance(
+                other.area, other.main_map, other.pose.cam_from_local.center
+            )
+            apart_m += 3.0 * float(np.sqrt(np.linalg.eigvalsh(placed[3:, 3:])[-1]))
+            apart_deg += 3.0 * float(np.degrees(np.sqrt(np.linalg.eigvalsh(placed[:3, :3])[-1])))
+        inliers = _support_beside(best, other)
+        if inliers and (distance_m > apart_m or angle_deg > apart_deg):
+            lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center)
+            found.append(
+                RunnerUp(
+                    inliers=inliers,
+                    distance_m=distance_m,
+                    angle_deg=angle_deg,
+                    latitude_deg=float(lat),
+                    longitude_deg=float(lon),
+                )
+            )
+    return max(found, key=lambda rival: rival.inliers, default=None)
+
+
+def _support_beside(best: PoseCandidate, other: PoseCandidate) -> int:
+    """Inliers of the other pose that are not inliers of the best one as well.
+
+    Where a photo leaves the pose soft, as a flat place does with an unknown lens, a second estimate comes to
+    lie metres away on the very same matches: it speaks of the covariance, not of another place.
+    """
+    if best.area is not other.area:
+        return other.evidence.inliers
+    shared = np.isin(_pair_numbers(other), _pair_numbers(best))
+    return int(np.count_nonzero(~shared))
+
+
+def _pair_numbers(candidate: PoseCandidate) -> NDArray[np.int64]:
+    """One number for each inlier's pair of feature and point."""
+    matches, rows = candidate.matches, candidate.rows
+    return matches.feature[rows] * len(candidate.area.points) + matches.point[rows]
+
+
+def _in_frame_of(area: Area, candidate: PoseCandidate) -> Rigid3:
+    if candidate.area is area:
+        return candidate.pose.cam_from_local
+    return candidate.pose.cam_from_local @ candidate.area.frame.enu_from(area.frame)

@@ -42,7 +42,7 @@ class LocaliseRequest:
             pose within what the map's own lenses leave open, which has bent the map.
         camera_key: EXIF make/model/size/focal key (featuredb.features.exif); a map's camera with the same
             key lends its calibrated intrinsics.
-        film: of a film that does not name its camera, `featuredb.features.film_lens.unnamed_model`; the
+        film: of a film that does not name its camera, `featuredb.features.exif.read.unnamed_model`; the
             lenses that maps have of its shots are tried.
         exif_focal_px: focal length from EXIF in pixels, a start for the estimate; None: unknown.
         prior: where the photo may have been taken; None: anywhere in the database.

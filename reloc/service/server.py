@@ -6,23 +6,28 @@ import threading
 import time
 from contextlib import ExitStack
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from typing import Self
 
 import zenoh
 
 from reloc.service.contributions.inbox import Inbox
-from reloc.service.exposure import authenticates, check_exposure
 from reloc.service.live.follower import Follower
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
-from reloc.service.session import ServiceStartError, bind_free_port, open_server_session, server_config
-from reloc.service.source import DatabaseSource, ServedArea
+from reloc.service.session import (
+    ServiceStartError,
+    authenticates,
+    bind_free_port,
+    check_exposure,
+    open_server_session,
+    server_config,
+)
+from reloc.service.source import AreaWatcher, DatabaseSource, ServedArea
 from reloc.service.tally import Tally
-from reloc.service.watcher import AreaWatcher
 from reloc.service.workers.pool import WorkerPool
 from reloc.service.workers.process import prepare_workers
 from reloc.wire.keys import Keys, client_of
@@ -207,7 +212,7 @@ class Server:
         return StatusReply(
             database=self.database,
             server_id=self.server_id,
-            version=_software_version(),
+            version=version("featuredb"),
             wire_version=WIRE_VERSION,
             snapshot=area.snapshot,
             maps=len(area.maps),
@@ -339,10 +344,3 @@ class Server:
 
     def _log(self, event: str, **values: object) -> None:
         logger.info("%s %s", self.database, event, extra=fields(event, database=self.database, **values))
-
-
-def _software_version() -> str:
-    try:
-        return version("featuredb")
-    except PackageNotFoundError:  # run from a source tree
-        return "0+source"

@@ -2,23 +2,75 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.tracking.flow import follow
 from reloc.tracking.ground import Keyframe, Unmatched
-from reloc.tracking.landmarks import Landmarks
 from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose, fit_pose
 from reloc.tracking.recent import RecentFrame
 
 _INSTANT_S = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landmarks:
+    """Known points with the pixels in which the last frame shows them.
+
+    Attributes:
+        rows: (n,) of the area's points, none twice.
+        points: (n, 3) metres in the area's frame.
+        pixels: (n, 2) in the last frame.
+        born: (n,) number of the keyframe that matched them.
+    """
+
+    rows: NDArray[np.int64]
+    points: FloatArray
+    pixels: FloatArray
+    born: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Landmarks":
+        """Some of them."""
+        return Landmarks(
+            rows=self.rows[chosen],
+            points=self.points[chosen],
+            pixels=self.pixels[chosen],
+            born=self.born[chosen],
+        )
+
+    def joined(self, newer: "Landmarks") -> "Landmarks":
+        """Both; of a point that is in both the newer one, whose pixel is a fresh match."""
+        old = self.take(~np.isin(self.rows, newer.rows))
+        return Landmarks(
+            rows=np.concatenate([newer.rows, old.rows]),
+            points=np.concatenate([newer.points, old.points]),
+            pixels=np.concatenate([newer.pixels, old.pixels]),
+            born=np.concatenate([newer.born, old.born]),
+        )
+
+    def spread(self, count: int, columns: int, rows: int, width: int, height: int) -> "Landmarks":
+        """At most `count`, in turns from the cells of a grid, the newest of a cell first."""
+        if len(self) <= count:
+            return self
+        column = np.clip((self.pixels[:, 0] * columns / width).astype(np.int64), 0, columns - 1)
+        row = np.clip((self.pixels[:, 1] * rows / height).astype(np.int64), 0, rows - 1)
+        cell = row * columns + column
+        order = np.lexsort((np.arange(len(self)), -self.born, cell))
+        starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
+        turn = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
+        chosen = order[np.argsort(turn, kind="stable")[:count]]
+        return self.take(np.sort(chosen))
 
 
 class FlowTrack:
@@ -128,14 +180,14 @@ class FlowTrack:
 
     def _fitted(self, marks: Landmarks, predicted: Rigid3) -> FittedPose | None:
         """The pose of landmarks, with the focal length where it was not given."""
-        fit, lens = self._options.fit, self._lens
+        lens = self._lens
         if lens is None:
-            return fit_pose(self._given, marks.pixels, marks.points, predicted, fit)
-        fitted = fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.doubt)
+            return fit_pose(self._given, marks.pixels, marks.points, predicted)
+        fitted = fit_pose(lens.camera, marks.pixels, marks.points, predicted, lens.doubt)
         if lens.zooming or (fitted is not None and not lens.surprised(fitted.focal_px, fitted.focal_rel)):
             return fitted
         lens.zooms()
-        return fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.doubt)
+        return fit_pose(lens.camera, marks.pixels, marks.points, predicted, lens.doubt)
 
     def _predicted(self, time_s: float) -> Rigid3:
         """The last pose, moved on as it moved before."""

@@ -10,8 +10,23 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from featuredb.geometry.camera import Camera
-from reloc.tracking.options import LensWalkOptions
+from reloc.localise.lens_prior import LensPriors
 from reloc.tracking.pose_fit import LensSigmas
+
+# How a focal length is followed; shares of it are standard deviations of its logarithm.
+_ESTIMATED_REL = 0.2  # of a lens that the first frame was localised with
+_PRIORS = (
+    LensPriors()
+)  # of its principal point and first radial coefficient, as one frame tells little of them
+# Of one that the map lends, whose points agree with it; and of many frames, which share their errors and do
+# not tell more than this.
+_FLOOR_REL = 0.001
+_ZOOM_REL = 0.03  # from one frame to the next; quick ones go through two to one in a second, 3 % a frame
+# Times its standard deviation by which a frame's focal length may differ from what was known; beyond the lens
+# is zooming. One of sixteen thousand frames differs by more by chance, and then has a pose that is less sure,
+# no wrong one.
+_SURPRISE = 4.0
+STILL_S = 1.0  # a lens that has not changed for so long is not zooming
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -26,15 +41,19 @@ class LensWalk:
     camera: Camera
     rel: float
     lent: bool
-    options: LensWalkOptions
     zooming: bool = False
     _seen: deque[tuple[float, float, float]] = field(default_factory=deque)
+
+    @classmethod
+    def begun(cls, camera: Camera, *, lent: bool) -> "LensWalk":
+        """With the lens of the first frame."""
+        return cls(camera=camera, rel=_FLOOR_REL if lent else _ESTIMATED_REL, lent=lent)
 
     @property
     def before_rel(self) -> float:
         """How sure the next frame's focal length is before it is looked at."""
-        walk = self.options.zoom_rel if self.zooming else 0.0
-        return float(np.hypot(max(self.rel, self.options.floor_rel), walk))
+        walk = _ZOOM_REL if self.zooming else 0.0
+        return float(np.hypot(max(self.rel, _FLOOR_REL), walk))
 
     @property
     def doubt(self) -> LensSigmas:
@@ -44,8 +63,8 @@ class LensWalk:
         longer = max(self.camera.width, self.camera.height)
         return LensSigmas(
             focal_rel=self.before_rel,
-            center_px=self.options.center_rel * longer,
-            radial=self.options.radial,
+            center_px=_PRIORS.center_rel * longer,
+            radial=_PRIORS.radial,
         )
 
     def surprised(self, focal_px: float, focal_rel: float) -> bool:
@@ -53,7 +72,7 @@ class LensWalk:
         if self.zooming:
             return False
         spread = np.sqrt(max(self.before_rel**2 - focal_rel**2, 1e-12))
-        return bool(abs(np.log(focal_px / self.camera.focal_px)) > self.options.surprise * spread)
+        return bool(abs(np.log(focal_px / self.camera.focal_px)) > _SURPRISE * spread)
 
     def zooms(self) -> None:
         """From now on the focal length may change."""
@@ -66,15 +85,15 @@ class LensWalk:
         if not self.zooming:
             return
         self._seen.append((time_s, float(np.log(focal_px)), focal_rel))
-        while self._seen[-1][0] - self._seen[0][0] > 2.0 * self.options.still_s:
+        while self._seen[-1][0] - self._seen[0][0] > 2.0 * STILL_S:
             self._seen.popleft()
-        if time_s - self._seen[0][0] < self.options.still_s:
+        if time_s - self._seen[0][0] < STILL_S:
             return
-        recent = np.array([one for one in self._seen if time_s - one[0] <= self.options.still_s])
+        recent = np.array([one for one in self._seen if time_s - one[0] <= STILL_S])
         half = len(recent) // 2
         if not half:  # frames are that far apart
             return
         change = abs(recent[:half, 1].mean() - recent[half:, 1].mean())
-        if change < 0.5 * self.options.surprise * recent[:, 2].mean():
+        if change < 0.5 * _SURPRISE * recent[:, 2].mean():
             self.zooming = False
             self._seen.clear()

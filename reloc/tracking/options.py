@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
-from reloc.localise.lens_prior import LensPriors
 from reloc.localise.options import LocaliseOptions
 
 
@@ -26,57 +25,10 @@ class FlowOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PoseFitOptions:
-    """The pose of a frame, at 1280 px.
-
-    Attributes:
-        loss_px: scale of the Cauchy loss. tolerance_px: beyond it a landmark does not agree with the pose.
-        iterations: at most.
-    """
-
-    loss_px: float = 1.0
-    tolerance_px: float = 4.0
-    iterations: int = 10
-    reference_side_px: int = 1280
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LensWalkOptions:
-    """How a focal length is followed; shares of it are standard deviations of its logarithm.
-
-    Attributes:
-        estimated_rel: of a lens that the first frame was localised with; center_rel, of the longer side, and
-            radial: of its principal point and first radial coefficient, as lenses are (`LensPriors`), since
-            one frame tells little of them.
-        floor_rel: of one that the map lends, whose points agree with it; and of many frames, which share
-            their errors and do not tell more than this.
-        zoom_rel: what a zoom changes from one frame to the next; quick ones go through two to one in a
-            second, 3 % a frame.
-        surprise: times its standard deviation by which a frame's focal length may differ from what was
-            known; beyond the lens is zooming. One of sixteen thousand frames differs by more by chance, and
-            then has a pose that is less sure, no wrong one.
-        still_s: a lens that has not changed for so long is not zooming.
-    """
-
-    estimated_rel: float = 0.2
-    center_rel: float = LensPriors().center_rel
-    radial: float = LensPriors().radial
-    floor_rel: float = 0.001
-    zoom_rel: float = 0.03
-    surprise: float = 4.0
-    still_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.floor_rel <= self.estimated_rel:
-            raise InvalidValueError(f"LensWalkOptions: expected 0 < floor_rel <= estimated_rel, found {self}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class TrackOptions:
     """From frames to poses.
 
     Attributes:
-        lens: how the focal length of a lens that nobody gave is followed.
         landmarks: that are followed; more sharpen the pose as their root, and cost in proportion.
         columns, rows: of the grid over which they are spread.
         min_landmarks: that agree with a pose; fewer are a lost track. On the simulated flights the mean error
@@ -111,8 +63,6 @@ class TrackOptions:
     """
 
     flow: FlowOptions = field(default_factory=FlowOptions)
-    fit: PoseFitOptions = field(default_factory=PoseFitOptions)
-    lens: LensWalkOptions = field(default_factory=LensWalkOptions)
     landmarks: int = 220
     columns: int = 16
     rows: int = 9

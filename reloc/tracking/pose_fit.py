@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from reloc.tracking.options import PoseFitOptions
 
+_REFERENCE_SIDE_PX = 1280  # of the frames that these are for: lengths grow with them
+_LOSS_PX, _TOLERANCE_PX = 1.0, 4.0  # of the Cauchy loss; beyond which a landmark does not agree with the pose
+_ITERATIONS = 10
 _STILL = 1e-6  # radians, and metres over distance: a thousandth of a pixel
 # Least eigenvalue of scaled normal equations that have no one solution: one or two points over and over and
 # points on a line have 2e-15 and less; a patch of 10 cm, seen from 50 m, still has 2e-7.
@@ -59,7 +61,6 @@ def fit_pose(
     pixels: FloatArray,
     points: FloatArray,
     start: Rigid3,
-    options: PoseFitOptions,
     doubt: LensSigmas = GIVEN,
 ) -> FittedPose | None:
     """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it.
@@ -71,16 +72,16 @@ def fit_pose(
     if len(pixels) < 4:
         return None
     focal_rel = doubt.focal_rel
-    scale = max(camera.width, camera.height) / options.reference_side_px
+    scale = max(camera.width, camera.height) / _REFERENCE_SIDE_PX
     seen = camera.unproject(pixels)
-    focal, loss = camera.focal_px, options.loss_px * scale
+    focal, loss = camera.focal_px, _LOSS_PX * scale
     pose, zoom = start, 0.0
     depth = max(float(np.median(start.act(points)[:, 2])), 1e-6)
     still = np.array([1.0, 1.0, 1.0, *[1.0 / depth] * 3, 1.0])
     # What was known of the focal length weighs as much as pixels that are off by half the loss's scale.
     known_focal = (0.5 * loss / focal_rel) ** 2 if focal_rel > 0.0 else 0.0
     count = 7 if focal_rel > 0.0 else 6
-    for _ in range(options.iterations):
+    for _ in range(_ITERATIONS):
         residual, jacobian = _linearised(pose, points, seen, focal, zoom, count)
         squared = (residual * residual).sum(axis=0)
         known = np.isfinite(squared)
@@ -99,7 +100,7 @@ def fit_pose(
             break
     residual, jacobian = _linearised(pose, points, seen, focal, zoom, count)
     distance = np.hypot(*residual)
-    inlier = np.asarray(distance < options.tolerance_px * scale)
+    inlier = np.asarray(distance < _TOLERANCE_PX * scale)
     if inlier.sum() < 4:
         return None
     variance = float((distance[inlier] ** 2).sum()) / max(2 * int(inlier.sum()) - count, 1)

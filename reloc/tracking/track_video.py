@@ -1,25 +1,28 @@
 """A whole video: frames in, a trajectory out, and a film with the track drawn over it on request."""
 
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Self
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
-from featuredb.errors import VideoError
-from featuredb.features.film_lens import unnamed_model
+from featuredb.errors import InvalidValueError, VideoError
+from featuredb.features.exif.read import unnamed_model
 from featuredb.file_digest import file_sha256
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
-from featuredb.video.ahead import ReadAhead
-from featuredb.video.film import VideoInfo, VideoOptions
+from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions
 from featuredb.video.frames import Source, open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.film_end import until_it_ends
-from reloc.tracking.film_overlay import draw_frame
 from reloc.tracking.ground import Finder
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracked_frame import TrackedFrame
@@ -28,6 +31,131 @@ from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_
 
 # Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
 _READ_ON = 4
+
+# Of pictures that wait, for their greys and, as 4:2:0, their colours: at 3840x2160 ten frames.
+_MOST_BYTES = 1 << 27
+
+_LANDMARK_RGB, _OTHER_RGB = (60, 220, 60), (40, 160, 240)
+_STATE_RGB = {"tracking": (60, 220, 60), "relocalised": (250, 210, 40), "lost": (240, 40, 40)}
+
+
+def draw_frame(rgb: NDArray[np.uint8], frame: TrackedFrame, point: TrajectoryPoint) -> NDArray[np.uint8]:
+    """A copy of the frame (h, w, 3) uint8, red first, drawn over.
+
+    Circles are landmarks where the flow has them; dots are points of the map where the pose says they are.
+    """
+    picture = np.ascontiguousarray(rgb).copy()
+    scale = max(picture.shape[:2]) / 1280
+    if frame.cam_from_local is not None and frame.ground is not None and frame.camera is not None:
+        for x, y in frame.ground.visible(frame.camera, frame.cam_from_local):
+            cv2.circle(picture, (round(x), round(y)), max(1, round(scale)), _OTHER_RGB, -1, cv2.LINE_AA)
+        for x, y in frame.pixels if frame.pixels is not None else ():
+            cv2.circle(picture, (round(x), round(y)), round(4 * scale) + 1, _LANDMARK_RGB, 1, cv2.LINE_AA)
+    words = _words(point)
+    box = picture[: round((14 + 26 * len(words)) * scale), : round(640 * scale)]
+    box //= 3
+    for row, text in enumerate(words):
+        place = (round(12 * scale), round((28 + 26 * row) * scale))
+        cv2.putText(
+            picture,
+            text,
+            place,
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.6 * scale,
+            _STATE_RGB[point.state],
+            1,
+            cv2.LINE_AA,
+        )
+    return picture
+
+
+def _words(point: TrajectoryPoint) -> list[str]:
+    head = f"frame {point.index}  {point.time_s:.2f} s  {point.state}"
+    if point.in_map is not None:
+        x, y, z = point.in_map.cam_from_map.center
+        unit = "m" if point.in_map.frame.metric else "units"
+        return [
+            f"{head}  {point.inliers} landmarks",
+            f"map {point.in_map.map_id[:12]}, no place on Earth",
+            f"x {x:.3f}  y {y:.3f}  z {z:.3f} {unit} in its frame",
+        ]
+    if point.pose is None:
+        return [head, point.detail[:80]]
+    east, north, up = point.pose.utm
+    sigma = float(np.sqrt(np.diag(point.pose.covariance)[3:].sum()))
+    heading, pitch, _ = point.pose.geopose.heading_pitch_roll_deg
+    return [
+        f"{head}  {point.inliers} landmarks",
+        f"EPSG:{point.pose.epsg}  {east:.2f} {north:.2f} {up:.2f}  sigma {sigma:.2f} m",
+        f"heading {heading:.1f}  pitch {pitch:.1f}",
+    ]
+
+
+class ReadAhead:
+    """The frames of an open film, in order; what goes wrong as they are read is raised at its frame.
+
+    A context manager, to be left before the film is closed; to be used from one thread. The film's `report`
+    knows of frames that were read ahead. Live sources are not: what they show now is wanted.
+    """
+
+    def __init__(self, video: Video, most: int = 24) -> None:
+        """
+        Args:
+            most: frames that are decoded before they are used; fewer of large films, for their memory.
+        """
+        if most < 1:
+            raise InvalidValueError(f"most: expected 1 frame or more to be read ahead, found {most}")
+        self._frames: Iterator[VideoFrame] | None = None
+        self._video, self._most = video, 0 if video.info.live else min(most, _fitting(video.info))
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="decoding")
+        self._ahead: deque[Future[VideoFrame | None]] = deque()
+        self._seconds = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *failed: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def seconds(self) -> float:
+        """That decoding has taken, ahead or not."""
+        return self._seconds
+
+    def read_on(self, frames: int) -> None:
+        """Decode so many more frames in the background, up to `most` not yet used; none before the first."""
+        if self._frames is None:
+            return
+        for _ in range(min(frames, self._most - len(self._ahead))):
+            self._ahead.append(self._pool.submit(self._next))
+
+    def __iter__(self) -> Iterator[VideoFrame]:
+        """The film's frames; once, as of the film itself.
+
+        Raises:
+            VideoError, InvalidValueError: see `Video.__iter__`.
+        """
+        self._frames = iter(self._video)
+        while True:
+            # Nothing is decoded elsewhere where nothing is waited for: frames stay in order.
+            frame = self._ahead.popleft().result() if self._ahead else self._next()
+            if frame is None:
+                return
+            yield frame
+
+    def _next(self) -> VideoFrame | None:
+        assert self._frames is not None
+        began = time.perf_counter()
+        try:
+            return next(self._frames, None)
+        finally:
+            self._seconds += time.perf_counter() - began
+
+
+def _fitting(info: VideoInfo) -> int:
+    """Frames that fit into the memory that they may take, one at least."""
+    each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
+    return max(1, _MOST_BYTES // each)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

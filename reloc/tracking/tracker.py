@@ -281,9 +281,7 @@ class Tracker:
         if self._given is not None:
             return FlowTrack(found, frame, self._given, options)
         self._camera = found.camera
-        lent, walk = found.camera_source == "map", options.lens
-        rel = walk.floor_rel if lent else walk.estimated_rel
-        lens = LensWalk(camera=found.camera, rel=rel, lent=lent, options=walk)
+        lens = LensWalk.begun(found.camera, lent=found.camera_source == "map")
         return FlowTrack(found, frame, found.camera, options, lens)
 
     def _caught_up_by(self, most: int) -> FittedPose | None:

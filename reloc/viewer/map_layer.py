@@ -1,5 +1,7 @@
 """One map as the page shows it: what is known of it, its photos, what it covers."""
 
+import shlex
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +14,10 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.lineage import MapLineage, describe_lineage
-from featuredb.maps.unplaced_map import AnyMap
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store import MapSummary, UnplacedSummary
 from reloc.viewer.places import Spot
-from reloc.viewer.points import DrawnPoints
+from reloc.viewer.points import DrawnPoints, drawn_points, sampled
 from reloc.viewer.poses import drawn_pose, worded_place, worded_sigmas
 
 _CELLS = 60  # along the longer side of the drawn points; smaller cells would fall into specks
@@ -132,3 +134,63 @@ def _round_length(length: float) -> float:
     """1, 2 or 5 times a power of ten, at least `length`."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(next(f * power for f in (1.0, 2.0, 5.0, 10.0) if f * power >= length - 1e-12))
+
+
+def own_points(unplaced: UnplacedMap, wanted: int) -> DrawnPoints:
+    """At most `wanted` points of the map, own units."""
+    rows = sampled(len(unplaced.points), wanted)
+    return drawn_points(unplaced.points.xyz[rows], unplaced.points.rgb[rows], len(unplaced.points))
+
+
+def describe_own_place(
+    summary: UnplacedSummary,
+    unplaced: UnplacedMap,
+    drawn: DrawnPoints,
+    buffer: dict[str, Any],
+    command: str,
+) -> dict[str, Any]:
+    """The map as a place of the page with no place on Earth: `frame`, `epsg` and what hangs on them are None.
+
+    Args:
+        command: that opens the page of picks.
+    """
+    frame, why = unplaced.frame, unplaced.no_place
+    told = {
+        **as_stored(summary),
+        "no_place": {"reason": why.reason, "ways": list(why.ways), "command": command},
+        **dict.fromkeys(("method", "drift_m", "budget_m", "residual_rms_m", "epsg", "height_datum", "under")),
+        "generation": 0,
+        "parents": [],
+        "chain": [summary.map_id],
+        "lineage": "",
+        "points": len(unplaced.points),
+        "photos": _photos(unplaced),
+        "coverage": coverage(drawn),
+        "buffer": buffer,
+    }
+    return {
+        "name": f"{summary.name or summary.map_id}, no place on Earth",
+        "own": {"metric": frame.metric, "upright": frame.upright},
+        "frame": None,
+        "epsg": None,
+        "height_datums": [],
+        "maps": [told],
+        "scans": [],
+        "trajectories": [],
+    }
+
+
+def picks_command(url: str, map_id: str, photos: Path | None) -> str:
+    """What a person types to place the map by picks in a page."""
+    folder = "FOLDER" if photos is None else shlex.quote(str(photos))
+    return f"featuredb anchor {shlex.quote(url)} {shlex.quote(map_id)} --photos {folder} --page"
+
+
+def _photos(unplaced: UnplacedMap) -> list[dict[str, Any]]:
+    """The photos, poses in the own frame."""
+    photos = []
+    for image in unplaced.images:
+        pose, camera = image.cam_from_local, unplaced.cameras[image.camera_id]
+        drawn = drawn_pose(pose.center, np.asarray(pose.rotation.T), camera)
+        photos.append(described_photo(image, unplaced, {**drawn, "utm": None, "ellipse": None}))
+    return photos

@@ -10,6 +10,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
+
+from featuredb.export.job import whole_or_nothing
+from reloc.viewer.photos import THUMBNAIL_PX, Pictures
+from reloc.viewer.query import data_url
+from reloc.viewer.scene import ViewerScene
 
 _MEDIA_TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "json": "application/json"}
 _TEMPLATE = "index.html"
@@ -111,3 +117,37 @@ def _filled(*, imports: Mapping[str, str], style: str, values: str, main: str) -
         assert template.count(mark) == 1, mark
         template = template.replace(mark, text)
     return template
+
+
+# A third of a megabyte of JPEG is a lot to send, and ten thousand photos are many of those.
+DEFAULT_POINTS = 250_000
+
+
+def write_static_page(out: Path, scene: ViewerScene, pictures: Pictures) -> int:
+    """Write the page to a new file; returns its size in bytes.
+
+    Raises:
+        ExportError: there is something at `out`, or its folder is missing.
+    """
+    with whole_or_nothing(out) as part:
+        shown: dict[str, str] = {}
+        missing: dict[str, str] = {}
+        for (map_id, image_id), image in scene.images.items():
+            data, reason = pictures.jpeg(image, THUMBNAIL_PX)
+            key = f"{image_id} {map_id}"
+            if data is None:
+                missing[key] = reason
+            else:
+                shown[key] = data_url("image/jpeg", data)
+        values = {
+            "scene": _json({**scene.document, "queries": False, "placing": False}),
+            "pictures": _json({"shown": shown, "missing": missing}),
+        }
+        for place, data in enumerate(scene.points):
+            values[f"points-{place}"] = base64.b64encode(data).decode()
+        part.write_text(page_in_one(values), encoding="utf-8")
+        return part.stat().st_size
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))

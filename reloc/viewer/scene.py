@@ -19,11 +19,18 @@ from featuredb.maps.feature_map import MAP_STATUSES, MapImage
 from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import ScanSummary, count_points, list_scans
 from reloc.tracking.trajectory.values import Trajectory
-from reloc.viewer.map_layer import coverage, describe_map, describe_photos, spot_of_map
-from reloc.viewer.own_layer import describe_own_place, own_points, picks_command
+from reloc.viewer.map_layer import (
+    coverage,
+    describe_map,
+    describe_own_place,
+    describe_photos,
+    own_points,
+    picks_command,
+    spot_of_map,
+)
 from reloc.viewer.places import Spot, group, scan_box, spot_of
 from reloc.viewer.points import DrawnPoints, map_points, scan_points_in, shares
-from reloc.viewer.trajectories import describe_trajectory, spot_of_trajectory
+from reloc.viewer.poses import describe_trajectory, spot_of_trajectory
 
 DEFAULT_POINTS = 1_000_000
 

@@ -15,10 +15,10 @@ from playwright.sync_api import Browser, sync_playwright
 
 from featuredb.store import Database
 from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.viewer.page import write_static_page
 from reloc.viewer.photos import Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import ViewerSceneOptions, build_scene
-from reloc.viewer.static_page import write_static_page
 from tests.support.datasets import varied_database
 from tests.support.maps import random_map, random_unplaced_map
 from tests.support.seen_page import Seen, coloured, reddish

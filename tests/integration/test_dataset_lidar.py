@@ -13,12 +13,12 @@ import pyproj
 import pytest
 
 from featuredb.errors import MissingExtraError
+from featuredb.export.dataset import lidar_part as tile_files
 from featuredb.export.dataset.contents import entry_of
 from featuredb.export.dataset.lidar_part import touched_tiles
 from featuredb.export.selection import Selection
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.tiles import tile_of
-from featuredb.lidar import tile_files
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.options import AddOptions, ScanLabels
 from featuredb.maps.feature_map import FeatureMap

@@ -12,7 +12,7 @@ import pyproj
 import pytest
 from referencing import Registry, Resource
 
-from featuredb.export.dataset.footprint import footprint_of
+from featuredb.export.dataset.contents import footprint_of
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.store import Database

@@ -23,7 +23,7 @@ def demo() -> Command:
 def run_in(folder: Path) -> None:
     with inside(folder), PageRun(folder) as run:
         run.run(demo())
-    made = ("db", "world/truth.json", "report/report.html", "report/plan.png", "overlay.png")
+    made = ("db", "world/truth.json", "report/report.html", "overlay.png")
     assert [name for name in made if not (folder / "featuredb-demo" / name).exists()] == []
 
 

@@ -236,8 +236,6 @@ def test_the_datasheet_has_the_figures(database: Database, folder: Path) -> None
     assert "| `rootsift-test` | 10 |" in text
     for column in ("earth_covariance", "cov_ee", "descriptor", "placement_evidence"):
         assert f"| `{column}` |" in text
-    for name in (m.map_id for m in summaries):
-        assert f"| {name} |" in text
 
 
 def test_the_picture_shows_every_place(folder: Path) -> None:

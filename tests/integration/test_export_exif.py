@@ -25,11 +25,9 @@ from featuredb.export.formats.exif import with_pose, write_exif
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.features.exif.gps_write import with_gps
 from featuredb.features.exif.read import parse_exif, read_exif
 from featuredb.features.exif.tiff_ifd import TiffReader
-from featuredb.features.exif.write import gps_directory
-from featuredb.features.exif.xmp_write import with_properties
+from featuredb.features.exif.write import gps_directory, with_gps, with_properties
 from featuredb.features.image_header import read_header
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database

@@ -327,7 +327,7 @@ def test_trusted_owners_and_commands(given: Path, tmp_path: Path, capsys: pytest
     url, report = str(tmp_path / "db"), tmp_path / "report.json"
     photo = tmp_path / "known.jpg"
     photo.write_bytes(step_of(WEST_M, owners=("x",), each=1)[0].data)
-    assert main(["canary", url, "add", str(photo), "--note", "over the survey"]) == 0
+    assert main(["canary", url, "add", str(photo)]) == 0
     assert main(["canary", url, "list"]) == 0
     assert "known.jpg" in capsys.readouterr().out
     assert main(["grow", url, "--trust", "anna", "--max-features", "1000", "--report", str(report)]) == 0

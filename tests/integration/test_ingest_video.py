@@ -17,7 +17,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database
 from featuredb.video.telemetry.read import read_telemetry
 from featuredb.video.writer import VideoWriter
-from ingest.video import keyframe_files
+from ingest.video import stills as keyframe_files
 from ingest.video.film_time import film_start
 from ingest.video.keyframes import KeyframeOptions
 from ingest.video.stills import StillsOptions, make_stills

@@ -73,12 +73,12 @@ def test_what_known_queries_are_worth(database: Database) -> None:
     assert checks["off"].error_m == pytest.approx(3.0, abs=0.2)
     assert checks["off"].regression == ""  # it was wrong before: nobody's fault now
     assert checks["nowhere"].after == "not_found"
-    known, snapshot = answer_now(database, _photo(), 0.5, 1.0)
+    known, snapshot = answer_now(database, _photo())
     assert known is not None
     assert snapshot == database.poll_version()
     assert right.pose is not None
     np.testing.assert_allclose(known.utm[:2], right.pose.utm[:2], atol=1.0)  # its lens is estimated
-    assert answer_now(database, _photo(texture=7), 0.5, 1.0)[0] is None
+    assert answer_now(database, _photo(texture=7))[0] is None
 
 
 def test_a_known_query_stops_a_wrong_anchor(database: Database, tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ from featuredb.errors import (
     ScanFileError,
 )
 from featuredb.lidar.add import add_scan
-from featuredb.lidar.formats.geotiff import write_geotiff
 from featuredb.lidar.options import AddOptions, OrthoChoice
 from featuredb.store import Database
+from tests.support.geotiff import write_geotiff
 from tests.support.las_files import SOUTH, WEST, grid_points, write_scan
 from tests.support.stored_scans import sorted_rows, stored
 

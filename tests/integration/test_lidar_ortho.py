@@ -15,14 +15,13 @@ from featuredb.errors import GeodesyError, InvalidValueError, ScanFileError
 from featuredb.geo.crs.scan import scan_crs
 from featuredb.geo.crs.utm_transform import utm_transform
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.formats.geotiff import write_geotiff
-from featuredb.lidar.nadir_view import NadirOptions
-from featuredb.lidar.ortho import ColourOptions, colour_by_ortho, open_ortho
+from featuredb.lidar.ortho import colour_by_ortho, open_ortho
+from tests.support.geotiff import write_geotiff
 
 EPSG = 32632
 WEST, NORTH, PIXEL = 679_900.0, 5_334_500.0, 0.2
 SIZE = 300  # pixels, 60 m
-FINE = ColourOptions(pixels_per_spacing=100.0)  # no averaging: colours can be compared one to one
+FINE = 100.0  # pixels per spacing, none averaged: colours can be compared one to one
 
 
 def picture(dtype: type = np.uint8, bands: int = 3, top: float = 250.0) -> NDArray[np.generic]:
@@ -59,7 +58,7 @@ def write(path: Path, image: NDArray[np.generic], **more: object) -> Path:
 def test_colours_come_from_the_right_pixels(tmp_path: Path) -> None:
     utm = points()
     ortho = open_ortho(write(tmp_path / "o.tif", picture()))
-    rgb, coloured = colour_by_ortho(utm, EPSG, None, ortho, FINE)
+    rgb, coloured = colour_by_ortho(utm, EPSG, None, ortho, pixels_per_spacing=FINE)
     assert coloured.all()
     np.testing.assert_allclose(rgb[:, 0], expected_red(utm), atol=1.0)
     np.testing.assert_allclose(rgb[:, 1], expected_green(utm), atol=1.0)
@@ -78,7 +77,7 @@ def test_under_a_roof_a_tree_and_at_walls_points_keep_their_own(tmp_path: Path) 
     utm = np.concatenate([ground, roof, crown, wall])
     own = np.tile(np.array([1, 2, 3], np.uint8), (len(utm), 1))
     ortho = open_ortho(write(tmp_path / "o.tif", picture()))
-    rgb, coloured = colour_by_ortho(utm, EPSG, own, ortho, FINE)
+    rgb, coloured = colour_by_ortho(utm, EPSG, own, ortho, pixels_per_spacing=FINE)
     parts = np.split(np.arange(len(utm)), np.cumsum([len(ground), len(roof), len(crown)]))
     under = (np.abs(ground[:, :2] - [WEST + 20, NORTH - 30]) < 5.8).all(axis=1)
     under |= np.hypot(*(ground[:, :2] - [WEST + 45, NORTH - 30]).T) < 3.8
@@ -92,8 +91,6 @@ def test_under_a_roof_a_tree_and_at_walls_points_keep_their_own(tmp_path: Path) 
     assert coloured[parts[0]][far].all()
     np.testing.assert_array_equal(rgb[~coloured], own[~coloured])
     np.testing.assert_allclose(rgb[coloured, 0], expected_red(utm[coloured]), atol=1.0)
-    # A plain lookup paints them all.
-    assert colour_by_ortho(utm, EPSG, own, ortho, ColourOptions(nadir=None))[1].all()
 
 
 @pytest.mark.parametrize("epsg", [3857, 4326, 25832, 31468, 32633])
@@ -112,7 +109,7 @@ def test_images_in_other_systems(tmp_path: Path, epsg: int) -> None:
         transform=Affine(step_x, 0.0, west, 0.0, -step_y, north),
     ) as file:  # fmt: skip
         file.write(np.moveaxis(image, -1, 0))
-    rgb, coloured = colour_by_ortho(utm, EPSG, None, open_ortho(path), FINE)
+    rgb, coloured = colour_by_ortho(utm, EPSG, None, open_ortho(path), pixels_per_spacing=FINE)
     assert coloured.all()
     # Datum shifts of a metre or two (DHDN) may differ by operation; else it is one grey value, 0.3 m.
     tolerance = 5.0 if epsg == 31468 else 1.0
@@ -126,7 +123,7 @@ def test_smaller_images_and_gaps_leave_points_alone(tmp_path: Path) -> None:
     image[100:140] = 0
     ortho = open_ortho(write(tmp_path / "o.tif", image, nodata=0))
     own = np.full((len(utm), 3), 7, np.uint8)
-    rgb, coloured = colour_by_ortho(utm, EPSG, own, ortho, FINE)
+    rgb, coloured = colour_by_ortho(utm, EPSG, own, ortho, pixels_per_spacing=FINE)
     row, column = (NORTH - utm[:, 1]) / PIXEL, (utm[:, 0] - WEST) / PIXEL
     gap = (row >= 100) & (row < 140)
     np.testing.assert_array_equal(coloured, (column < SIZE) & ~gap)
@@ -169,7 +166,7 @@ def test_one_four_and_sixteen_bit_images(tmp_path: Path, make: Callable[[Path], 
     utm = points()
     path = tmp_path / "o.tif"
     make(path)
-    rgb, coloured = colour_by_ortho(utm, EPSG, None, open_ortho(path), FINE)
+    rgb, coloured = colour_by_ortho(utm, EPSG, None, open_ortho(path), pixels_per_spacing=FINE)
     red = expected_red(utm)
     if make is _grey:
         assert coloured.all()
@@ -197,16 +194,16 @@ def test_fine_images_are_averaged_to_the_scan(tmp_path: Path) -> None:
     rgb, _ = colour_by_ortho(utm, EPSG, None, ortho)
     assert rgb.mean() == pytest.approx(100, abs=4)
     assert rgb.std() < 15
-    sharp, _ = colour_by_ortho(utm, EPSG, None, ortho, FINE)
+    sharp, _ = colour_by_ortho(utm, EPSG, None, ortho, pixels_per_spacing=FINE)
     assert sharp.std() > 2 * rgb.std() + 15
 
 
 def test_large_images_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     utm = points()
     ortho = open_ortho(write(tmp_path / "o.tif", picture()))
-    whole = colour_by_ortho(utm, EPSG, None, ortho, FINE)
+    whole = colour_by_ortho(utm, EPSG, None, ortho, pixels_per_spacing=FINE)
     monkeypatch.setattr("featuredb.lidar.formats.ortho_image._MAX_READ_PX", 5000)
-    parts = colour_by_ortho(utm, EPSG, None, ortho, FINE)
+    parts = colour_by_ortho(utm, EPSG, None, ortho, pixels_per_spacing=FINE)
     np.testing.assert_array_equal(parts[1], whole[1])
     np.testing.assert_allclose(parts[0].astype(int), whole[0], atol=1)
 
@@ -250,7 +247,7 @@ def test_a_real_scan_takes_the_colours_that_it_was_given(shared_data: Path) -> N
     utm = to_utm.apply(np.asarray(las.xyz)[part])
     own = np.stack([las.red, las.green, las.blue], axis=1)[part].astype(np.uint8)
     ortho = open_ortho(shared_data / "autzen" / "stadium_ortho.tif")
-    rgb, coloured = colour_by_ortho(utm, to_utm.epsg, None, ortho, FINE)
+    rgb, coloured = colour_by_ortho(utm, to_utm.epsg, None, ortho, pixels_per_spacing=FINE)
     difference = np.abs(rgb.astype(int) - own)[coloured].mean(axis=1)
     print(
         f"{len(utm)} points, {coloured.mean():.1%} coloured; difference from the file's colours: median "
@@ -259,7 +256,3 @@ def test_a_real_scan_takes_the_colours_that_it_was_given(shared_data: Path) -> N
     assert 0.85 < coloured.mean() < 0.99
     assert np.median(difference) < 2.0
     assert np.percentile(difference, 95) < 10.0
-    plain, everywhere = colour_by_ortho(utm, to_utm.epsg, None, ortho, ColourOptions(nadir=None))
-    assert everywhere.mean() > 0.99
-    assert NadirOptions().margin_m > 3.0
-    assert plain.shape == rgb.shape

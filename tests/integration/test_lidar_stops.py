@@ -11,10 +11,9 @@ from featuredb.errors import (
     ConflictError,
     ScanError,
 )
-from featuredb.lidar.add import add_scan
+from featuredb.lidar.add import add_scan, work_folder
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.lidar.options import AddOptions
-from featuredb.lidar.work import work_folder
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from featuredb.store.verify import verify

@@ -12,7 +12,7 @@ from reloc.client import Client
 from tests.support.service import photo
 from tests.support.strangers import config_of, free_port, guarded_wire
 from tools.attacks import STRANGER, client_hello, connected
-from tools.proxy_process import proxied
+from tools.service_world import proxied
 
 _CONNECTIONS = 120  # Zenoh's listener is behind for 12 s
 _CLIENT = "alice"

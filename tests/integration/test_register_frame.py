@@ -14,8 +14,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.camera.photograph import render_view
-from featuredb.simworld.laser.airborne import scan_town
-from featuredb.simworld.laser.scan_options import AirborneScanOptions
+from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
 from featuredb.simworld.town.town import make_town
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame

@@ -18,10 +18,10 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.place_bounds import PlaceBounds
 from ingest.api.ingesting import summary
-from ingest.plot_parts import nice_length, residual_exaggeration
+from ingest.plot_parts import residual_exaggeration
 from ingest.report.outcomes import _gps_used
 from ingest.report.page import write_report
-from ingest.report.plots import histograms_png, plan_png
+from ingest.report.plots import plan_png
 from ingest.report.values import (
     CameraOutcome,
     IngestReport,
@@ -70,7 +70,6 @@ def plan(k: int = 5, n: int = 2000, seed: int = 1) -> PlanView:
         gps=gps,
         names=tuple(f"{i}.jpg" for i in range(k)),
         gps_used=np.arange(k) != 2,
-        convergence_deg=0.7,
         epsg=32615,
     )
 
@@ -182,15 +181,25 @@ def test_the_schema_wants_a_reason_or_a_map(photo: PhotoOutcome) -> None:
 def test_page_is_self_contained_and_escaped(tmp_path: Path) -> None:
     _, html_path = write_report(tmp_path, report())
     page = html_path.read_text(encoding="utf-8")
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/png;base64,") == 1
     parser = _Links()
     parser.feed(page)
     assert "script" not in parser.tags
     assert all(link.startswith("data:image/png;base64,") for link in parser.links)
-    assert len(parser.links) == 2
+    assert len(parser.links) == 1
     assert HOSTILE in parser.texts  # seen as it is called, and as text only
     without_pictures = re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", page)
-    for word in ("a.jpg", "b.jpg", "alone", "TOO_FEW", "2 photos have GPS", "0.50", "+1.0 %", "3 of 7"):
+    for word in (
+        "a.jpg",
+        "b.jpg",
+        "alone",
+        "TOO_FEW",
+        "2 photos have GPS",
+        "0.50",
+        "+1.0 %",
+        "3 of 7",
+        "median 1.00 px",
+    ):
         assert word in without_pictures
     assert {path.name for path in tmp_path.iterdir()} == {"report.html", "report.json"}
 
@@ -253,10 +262,6 @@ def test_plan_shows_cameras_where_they_are(tmp_path: Path) -> None:
     assert 0 < np.count_nonzero(one != two) < 0.02 * one.size  # the names only
 
 
-def test_histograms_of_an_empty_map() -> None:
-    assert histograms_png(MapOutcome(map_id="m", name="n", status="committed"))[:4] == b"\x89PNG"
-
-
 def test_changed_focal_lengths_are_warned_about() -> None:
     outcome = report().maps[0]
     assert outcome.warnings == ()
@@ -274,15 +279,12 @@ def test_values_validate_themselves() -> None:
         report(photos=(twice, twice))
 
 
-def test_exaggeration_and_scale_bar() -> None:
+def test_exaggeration() -> None:
     # 3 % of 100 m over a median of 0.4 m is 7.5; 15 % over the longest of 1 m is 15.
     residuals = np.array([[0.4, 0.0], [0.0, 0.4], [1.0, 0.0], [np.nan, np.nan], [0.0, -0.3]])
     assert residual_exaggeration(residuals, 100.0) == 5
     assert residual_exaggeration(residuals * 100, 100.0) == 1
     assert residual_exaggeration(np.full((2, 2), np.nan), 100.0) == 1
-    assert [nice_length(x) for x in (0.3, 1.0, 4.9, 27.0, 999.0)] == pytest.approx(
-        [0.2, 1.0, 2.0, 20.0, 500.0]
-    )
 
 
 def _file(folder: Path, data: bytes) -> Path:

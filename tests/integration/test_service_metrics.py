@@ -8,8 +8,8 @@ import requests
 from prometheus_client.parser import text_string_to_metric_families as families
 
 from reloc.service import serve as serving
-from reloc.service.metrics import metrics_page
 from reloc.service.options import ServeOptions
+from reloc.service.serve import metrics_page
 from reloc.service.session import ServiceStartError, bind_free_port
 from tests.support.gateway import running_gateway
 from tests.support.live import LENS, localiser, wait_until

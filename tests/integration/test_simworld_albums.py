@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from featuredb.errors import InvalidValueError
 from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.truth import read_truth
+from featuredb.simworld.world import read_truth
 from ingest.photos.table import read_table
 from tools.worlds.album import TABLE_FILE, read_facts, write_album
 from tools.worlds.community import CommunityOptions, community_album

@@ -18,9 +18,7 @@ from featuredb.geo.crs.scan import scan_crs
 from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.simworld import scan_world
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.laser.airborne import scan_town
-from featuredb.simworld.laser.scan_file import write_scan
-from featuredb.simworld.laser.scan_options import AirborneScanOptions
+from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
 from featuredb.simworld.ortho import Ortho, OrthoOptions, make_ortho
 from featuredb.simworld.scan_world import (
     ORTHO_FILE,
@@ -29,6 +27,7 @@ from featuredb.simworld.scan_world import (
     SCAN_FILE,
     other_town_here,
     write_lidar,
+    write_scan,
 )
 from featuredb.simworld.town.days import DayOptions
 from featuredb.simworld.town.ground import paint_ground

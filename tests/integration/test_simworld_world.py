@@ -16,8 +16,7 @@ from featuredb.geo.utm import utm_from_geodetic
 from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.negatives import NEGATIVE_KINDS
-from featuredb.simworld.truth import TrueImage
-from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
+from featuredb.simworld.world import TrueImage, World, WorldOptions, open_world, town_of, write_world
 
 OPTIONS = WorldOptions(
     seed=5,

@@ -12,9 +12,8 @@ from featuredb.errors import MapNotFoundError, StoreError, UnplacedMapError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
-from featuredb.store.durable.upgrade import upgrade
 from featuredb.store.encode import content_digest
-from featuredb.store.maintenance import compact
+from featuredb.store.maintenance import compact, upgrade
 from featuredb.store.sql import SqlSession
 from featuredb.store.verify import verify
 from reloc.localise.result import LocaliseRequest

@@ -12,8 +12,8 @@ from featuredb.store.canaries import list_canaries, load_canary_image
 from featuredb.store.candidates.photos import list_candidates, load_images
 from featuredb.store.delta import Table
 from featuredb.store.durable import making
-from featuredb.store.durable.upgrade import upgrade
 from featuredb.store.encode import content_digest
+from featuredb.store.maintenance import upgrade
 from featuredb.store.tables import FORMAT_VERSION
 from featuredb.store.verify import verify
 from tests.support.command_line import only_command

@@ -9,7 +9,7 @@ import pytest
 from featuredb.cli.main import main
 from featuredb.errors import ConflictError, StoreError
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.thin import ThinOptions, described_points_of_images, thin_map
+from featuredb.maps.thin import described_points_of_images, thin_map
 from featuredb.store import Database
 from featuredb.store.verify import verify
 from tests.support.maps import assert_same_map, random_map
@@ -29,7 +29,7 @@ def test_thinned_map_stands_where_it_stood_and_its_children_too(
 ) -> None:
     before = database.snapshot()
     whole = before.load_map("parent")
-    assert main(["thin", database.url, "par", "--cover", "20", "--max-views", "4"]) == 0
+    assert main(["thin", database.url, "par", "--cover", "20"]) == 0
     assert f"rollback {database.url} {before.version}" in capsys.readouterr().out
     after = database.snapshot()
     assert {m.map_id: m.status for m in after.maps()} == {"parent": "active", "child": "active"}
@@ -80,7 +80,7 @@ def test_a_state_that_moved_is_not_taken_for_one_that_did_not(database: Database
 def test_a_map_placed_anew_meanwhile_is_not_thinned_over(database: Database) -> None:
     summary = database.snapshot().get("parent")
     whole = database.snapshot().load_map("parent")
-    thin = thin_map(whole, ThinOptions(cover=20))
+    thin = thin_map(whole, 20)
     moved = replace(whole, placement=replace(whole.placement, local_from_sfm=Sim3.identity()))
     database.commit_map(moved, replaces="parent")
     with pytest.raises(ConflictError):

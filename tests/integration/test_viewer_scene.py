@@ -16,10 +16,10 @@ from featuredb.lidar.options import ScanLabels
 from featuredb.store import Database
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.viewer.page import write_static_page
 from reloc.viewer.photos import Pictures
 from reloc.viewer.scene import ViewerScene, ViewerSceneOptions, build_scene
 from reloc.viewer.server import listen
-from reloc.viewer.static_page import write_static_page
 from tests.support.datasets import varied_database, varied_maps
 from tests.support.las_files import grid_points, write_scan
 from tests.support.maps import random_map
@@ -184,7 +184,7 @@ def test_a_file_is_whole_or_not_there(
     scene = scene_of(varied)
     out = tmp_path / "sent.html"
     with monkeypatch.context() as patched:
-        patched.setattr("reloc.viewer.static_page.page_in_one", lambda values: 1 / 0)
+        patched.setattr("reloc.viewer.page.page_in_one", lambda values: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             write_static_page(out, scene, Pictures(None))
     assert list(tmp_path.iterdir()) == []

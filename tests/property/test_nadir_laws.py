@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.nadir_view import NadirOptions, seen_from_above
+from featuredb.lidar.ortho import GAP_M, SPLAT_SPACINGS, STEP_M, seen_from_above
 
-OPTIONS = NadirOptions(spacing_m=0.4)
+SPACING_M = 0.4
 
 
 def scene(seed: int) -> FloatArray:
@@ -25,13 +25,13 @@ def scene(seed: int) -> FloatArray:
 @given(st.integers(0, 10_000))
 def test_the_highest_point_around_is_seen(seed: int) -> None:
     xyz = scene(seed)
-    seen = seen_from_above(xyz, OPTIONS)
+    seen = seen_from_above(xyz, SPACING_M)
     assert seen[xyz[:, 2].argmax()]
     # Whatever is hidden has something above it within the reach of a splat or a gap.
-    reach = OPTIONS.gap_m + 2 * OPTIONS.splat_spacings * 0.4
+    reach = GAP_M + 2 * SPLAT_SPACINGS * SPACING_M
     for i in np.flatnonzero(~seen)[:20]:
         near = np.hypot(*(xyz[:, :2] - xyz[i, :2]).T) < reach * np.sqrt(2)
-        assert xyz[near, 2].max() > xyz[i, 2] + OPTIONS.step_m
+        assert xyz[near, 2].max() > xyz[i, 2] + STEP_M
 
 
 @settings(deadline=None, max_examples=25)
@@ -41,8 +41,8 @@ def test_what_is_below_everything_hides_nothing(seed: int, other: int) -> None:
     cellar = np.column_stack([np.random.default_rng(other).uniform(0, 20, (500, 2)), np.full(500, -4.0)])
     # The corners stay, so that the cells lie as before.
     frame = np.array([[0.0, 0.0, -4.0], [20.0, 20.0, -4.0]])
-    before = seen_from_above(np.concatenate([xyz, frame]), OPTIONS)[: len(xyz)]
-    after = seen_from_above(np.concatenate([xyz, frame, cellar]), OPTIONS)[: len(xyz)]
+    before = seen_from_above(np.concatenate([xyz, frame]), SPACING_M)[: len(xyz)]
+    after = seen_from_above(np.concatenate([xyz, frame, cellar]), SPACING_M)[: len(xyz)]
     assert not (before & ~after).any()
 
 
@@ -51,6 +51,6 @@ def test_what_is_below_everything_hides_nothing(seed: int, other: int) -> None:
 def test_the_view_does_not_depend_on_where_the_scene_is(seed: int, east: int, north: int, up: float) -> None:
     xyz = scene(seed)
     moved = xyz + np.array([680_000.0 + east, 5_334_000.0 + north, float(round(up))])
-    same = seen_from_above(moved, OPTIONS) == seen_from_above(xyz, OPTIONS)
+    same = seen_from_above(moved, SPACING_M) == seen_from_above(xyz, SPACING_M)
     # Coordinates are kept to float32 within a tile: a point at a limit may fall to the other side.
     assert same.mean() > 0.999

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from featuredb.features.selection import spread_strongest
+from featuredb.features.extractor import spread_strongest
 
 WIDTH, HEIGHT, COLUMNS, ROWS = 480, 360, 24, 18
 

@@ -26,11 +26,9 @@ from PIL import Image
 
 from featuredb.cli.main import main
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.laser.airborne import AirborneScan, scan_town
-from featuredb.simworld.laser.scan_file import write_scan
-from featuredb.simworld.laser.scan_options import AirborneScanOptions
-from featuredb.simworld.truth import Truth
-from featuredb.simworld.world import World, WorldOptions, town_of, write_world
+from featuredb.simworld.laser.airborne import AirborneScan, AirborneScanOptions, scan_town
+from featuredb.simworld.scan_world import write_scan
+from featuredb.simworld.world import Truth, World, WorldOptions, town_of, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from tools.worlds.film_frame import Exposure

@@ -201,7 +201,6 @@ class DecisionsSuite(GrowthSuite):
             origin="answer",
             snapshot=4,
             request={"prior": None},
-            note="day one",
         )
         add_canary(database, "another town", b"elsewhere", None, origin="person")
         assert (
@@ -213,7 +212,6 @@ class DecisionsSuite(GrowthSuite):
                 origin="answer",
                 snapshot=4,
                 request={"prior": None},
-                note="day one",
             ).created_at
             == first.created_at
         )
@@ -226,7 +224,7 @@ class DecisionsSuite(GrowthSuite):
         np.testing.assert_array_equal(gate.pose.cam_from_utm_xyzw, pose.cam_from_utm_xyzw)
         assert (gate.pose.epsg, gate.pose.height_datum) == (pose.epsg, pose.height_datum)
         assert (gate.pose.tolerance_m, gate.pose.tolerance_deg) == (0.3, 0.5)
-        assert (gate.request, gate.note) == ({"prior": None}, "day one")
+        assert gate.request == {"prior": None}
         assert load_canary_image(database, gate) == b"photo"
         for image, expected, word in (
             (b"photo 2", pose, "sha256"),
@@ -235,7 +233,6 @@ class DecisionsSuite(GrowthSuite):
             with pytest.raises(StoreError, match=word):
                 add_canary(
                     database, "gate", image, expected, origin="answer", snapshot=4, request={"prior": None},
-                    note="day one",
                 )  # fmt: skip
         compact(database)
         assert verify(database).canaries == 2

@@ -10,8 +10,7 @@ import scipy.spatial.transform as sst
 
 from featuredb.errors import ExportError, GeodesyError, InvalidValueError, StoreError
 from featuredb.export.dataset import columns, layout
-from featuredb.export.dataset.contents import Contents, entry_of
-from featuredb.export.dataset.footprint import Footprint, footprint_of
+from featuredb.export.dataset.contents import Contents, Footprint, entry_of, footprint_of
 from featuredb.export.dataset.geoparquet import point_columns, wkb_of
 from featuredb.export.dataset.sums import check_sums, write_sums
 from featuredb.export.shots import pose_covariance

@@ -15,8 +15,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area, build_area
 from featuredb.maps.error_modes import ErrorModes, without_modes
 from featuredb.maps.subset import only_images
+from reloc.localise.answer import shape_covariance
 from reloc.localise.lens_prior import lens_of
-from reloc.localise.map_shape import shape_covariance
 from reloc.localise.pose import PoseHypothesis
 from tests.support.scenes import box_points, looking_at, random_descriptors, ring, scene_map
 

@@ -2,8 +2,7 @@
 
 from dataclasses import replace
 
-from featuredb.export.forget import forget, names_of
-from featuredb.export.selection import licensed
+from featuredb.export.selection import forget, licensed, names_of
 from tests.support.maps import random_map
 
 

@@ -7,10 +7,9 @@ import zenoh
 
 from reloc.gateway.options import GatewayOptions
 from reloc.gateway.serve import GatewayStartError, listen
-from reloc.service.exposure import authenticates, check_exposure
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
-from reloc.service.session import ServiceStartError
+from reloc.service.session import ServiceStartError, authenticates, check_exposure
 from tests.support.service import MemorySource, ScriptedLocaliser, area_of
 
 _TLS = {"transport": {"link": {"tls": {"enable_mtls": True}}}}

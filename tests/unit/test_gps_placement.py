@@ -15,7 +15,7 @@ from featuredb.geometry.similarity import similarity_closed_form
 from ingest.own_frame import held_of
 from ingest.positions.position_noise import Held
 from ingest.register.gps import GpsPlacement, place_by_gps
-from ingest.report.gps_figures import FIGURES, figure_rows
+from ingest.report.page import FIGURES, figure_rows
 from tests.support.gps_flights import OPTIONS, TRUE, flight, place
 
 

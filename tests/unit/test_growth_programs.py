@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.simworld.truth import Truth
+from featuredb.simworld.world import Truth
 from tools import growth_community, growth_poison, growth_walk
 from tools.growth_common import Album, Registered, Verdict, world_told
 from tools.growth_poison import PoisonOutcome

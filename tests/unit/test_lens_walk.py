@@ -1,20 +1,16 @@
 """The focal length of a film's lens, estimated with every frame's pose."""
 
 import numpy as np
-import pytest
 
-from featuredb.errors import InvalidValueError
-from featuredb.features.film_lens import is_of_film, shot_model, unnamed_model
+from featuredb.features.exif.read import is_of_film, shot_model, unnamed_model
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shot import look_pose
-from reloc.tracking.lens_walk import LensWalk
-from reloc.tracking.options import LensWalkOptions, PoseFitOptions
+from reloc.tracking.lens_walk import STILL_S, LensWalk
 from reloc.tracking.pose_fit import FittedPose, LensSigmas, fit_pose
 
 CAMERA = Camera(model="RADIAL", width=1280, height=720, params=(970.0, 641.0, 359.0, -0.03, 0.01))
 POSE = look_pose([3.0, -2.0, 50.0], 40.0, -55.0)
-OPTIONS = LensWalkOptions()
 
 
 def points_in_view(rng: np.random.Generator, count: int = 150) -> np.ndarray:
@@ -26,7 +22,7 @@ def points_in_view(rng: np.random.Generator, count: int = 150) -> np.ndarray:
 def fitted(camera: Camera, start: Camera, rng: np.random.Generator, doubt: LensSigmas) -> FittedPose:
     points = points_in_view(np.random.default_rng(7))
     pixels = camera.project(POSE.act(points)) + rng.normal(0, 0.4, (len(points), 2))
-    found = fit_pose(start, pixels, points, POSE, PoseFitOptions(), doubt)
+    found = fit_pose(start, pixels, points, POSE, doubt)
     assert found is not None
     return found
 
@@ -57,7 +53,7 @@ def test_a_given_lens_is_left_as_it_is() -> None:
 
 def test_a_zoom_is_followed_and_a_lens_that_stands_still_is_known_better() -> None:
     rng = np.random.default_rng(3)
-    lens = LensWalk(camera=CAMERA, rel=0.005, lent=True, options=OPTIONS)
+    lens = LensWalk(camera=CAMERA, rel=0.005, lent=True)
     ramp = np.clip((np.arange(150) - 50) / 50.0, 0.0, 1.0)
     zooming, off, rel = [], [], []
     for frame, share in enumerate(ramp):
@@ -78,16 +74,11 @@ def test_a_zoom_is_followed_and_a_lens_that_stands_still_is_known_better() -> No
 
 
 def test_frames_that_are_far_apart_say_nothing_of_whether_a_zoom_has_ended() -> None:
-    lens = LensWalk(camera=CAMERA, rel=0.005, lent=True, options=OPTIONS)
+    lens = LensWalk(camera=CAMERA, rel=0.005, lent=True)
     lens.zooms()
     for frame in range(4):
-        lens.take(CAMERA.focal_px, 0.005, frame * 1.5 * OPTIONS.still_s)
+        lens.take(CAMERA.focal_px, 0.005, frame * 1.5 * STILL_S)
     assert lens.zooming
-
-
-def test_options_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(InvalidValueError, match="floor_rel"):
-        LensWalkOptions(floor_rel=0.5)
 
 
 def test_the_lenses_of_a_film_are_told_by_its_bytes_whatever_the_shot() -> None:

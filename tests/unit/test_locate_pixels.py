@@ -16,8 +16,7 @@ from featuredb.render.cloud import PointCloud
 from reloc.answered_view import AnsweredView
 from reloc.pixels.boxes import geojson, read_coco
 from reloc.pixels.locate import locate
-from reloc.pixels.patch import fit_patch
-from reloc.pixels.surfaces import MapSurface, ScanSurface, resampled, window_camera
+from reloc.pixels.surfaces import MapSurface, ScanSurface, fit_patch, resampled, window_camera
 from tests.support.scanned_map import EPSG, FRAME
 from tools.worlds.clouds import build_cloud
 

@@ -35,7 +35,6 @@ def test_an_image_that_sees_a_point_twice_counts_once() -> None:
     seen = whole.observations
     twice = replace(seen, point_index=np.zeros_like(seen.point_index), image_id=np.ones_like(seen.image_id))
     assert len(only_images(replace(whole, observations=twice), [1, 2]).points) == 0
-    assert len(only_images(replace(whole, observations=twice), [1, 2], min_views=1).points) == 1
 
 
 def test_all_images_are_the_map_itself_and_unknown_ones_an_error() -> None:

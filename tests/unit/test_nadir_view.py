@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.nadir_view import NadirOptions, point_spacing_m, seen_from_above
+from featuredb.lidar.ortho import margin_m, point_spacing_m, seen_from_above
 
 FAR = np.array([680_000.0, 5_334_000.0, 560.0])  # UTM: float32 would lose decimetres there
 
@@ -21,8 +21,8 @@ def sheet(
     return np.column_stack([grid, np.full(len(grid), z) + rng.normal(0, 0.02, len(grid))])
 
 
-def seen(*parts: FloatArray, options: NadirOptions | None = None) -> list[NDArray[np.bool_]]:
-    answer = seen_from_above(np.concatenate(parts) + FAR, options)
+def seen(*parts: FloatArray) -> list[NDArray[np.bool_]]:
+    answer = seen_from_above(np.concatenate(parts) + FAR)
     return np.split(answer, np.cumsum([len(p) for p in parts])[:-1])
 
 
@@ -65,7 +65,9 @@ def test_roofs_and_slopes_do_not_hide_themselves(rng: np.random.Generator, pitch
     assert on_slope.mean() > 0.995
 
 
-def test_lawns_under_trees_stay_hidden_though_lasers_reach_them(rng: np.random.Generator) -> None:
+def test_lawns_under_trees_stay_hidden_though_lasers_reach_them(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A crown with holes of a metre: an image shows leaves there; around the tree the lawn is seen."""
     ground = sheet(rng, (0, 30), (0, 30), 0.0)
     crown = sheet(rng, (0, 30), (0, 30), 0.0, per_m2=4.0)
@@ -78,8 +80,8 @@ def test_lawns_under_trees_stay_hidden_though_lasers_reach_them(rng: np.random.G
     distance = np.hypot(ground[:, 0] - 15, ground[:, 1] - 15)
     assert on_ground[distance < 3.0].mean() < 0.06
     assert on_ground[distance > 5.0].all()
-    without = NadirOptions(gap_m=0.0)
-    splats_only, _ = seen(ground, crown, options=without)
+    monkeypatch.setattr("featuredb.lidar.ortho.GAP_M", 0.0)
+    splats_only, _ = seen(ground, crown)
     assert splats_only[distance < 3.0].mean() > 2 * on_ground[distance < 3.0].mean() + 0.05
 
 
@@ -87,11 +89,11 @@ def test_a_tile_with_its_margin_answers_as_the_whole(rng: np.random.Generator) -
     ground = sheet(rng, (0, 60), (0, 60), 0.0)
     roof = sheet(rng, (28, 33), (5, 55), 5.0)
     points = np.concatenate([ground, roof]) + FAR
-    options = NadirOptions(spacing_m=point_spacing_m(points))
-    whole = seen_from_above(points, options)
+    spacing_m = point_spacing_m(points)
+    whole = seen_from_above(points, spacing_m)
     core = points[:, 0] < FAR[0] + 30
-    near = points[:, 0] < FAR[0] + 30 + options.margin_m
-    tile = seen_from_above(points[near], options)
+    near = points[:, 0] < FAR[0] + 30 + margin_m(spacing_m)
+    tile = seen_from_above(points[near], spacing_m)
     # Cells start elsewhere in another tile: a point here and there is judged by another neighbour.
     assert (tile[core[near]] == whole[core]).mean() > 0.999
 
@@ -109,6 +111,4 @@ def test_hostile_input() -> None:
     stacked = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 5.0], [0.0, 0.0, 5.0]])
     assert seen_from_above(stacked).tolist() == [False, True, True]
     with pytest.raises(InvalidValueError, match="tile"):
-        seen_from_above(np.array([[0.0, 0.0, 0.0], [5e5, 5e5, 0.0]]), NadirOptions(spacing_m=0.1))
-    with pytest.raises(InvalidValueError, match="NadirOptions"):
-        NadirOptions(splat_spacings=0.0)
+        seen_from_above(np.array([[0.0, 0.0, 0.0], [5e5, 5e5, 0.0]]), 0.1)

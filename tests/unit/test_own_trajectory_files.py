@@ -16,9 +16,9 @@ from featuredb.maps.unplaced_map import OwnFrame
 from featuredb.store import Database
 from ingest.track.finders import FilmGround, finder_for
 from reloc.localise.result import OwnPose
-from reloc.tracking.film_overlay import _words
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
+from reloc.tracking.track_video import _words
 from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.trajectory.files import CSV_COLUMNS, check_format, write_trajectory
 from reloc.tracking.trajectory.outputs import exit_code, write_outputs

@@ -7,7 +7,7 @@ import pyproj
 import pytest
 
 from featuredb.maps.feature_map import GeoPrior
-from reloc.localise.prior import contradicts_prior
+from reloc.localise.localise import contradicts_prior
 from reloc.localise.result import LocalisedPose
 from tests.unit.test_answer import POSE, a_map, answer_of
 

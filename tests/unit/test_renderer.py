@@ -14,12 +14,10 @@ from featuredb.geometry.rays import pixel_rays
 from featuredb.render import renderer, shading, splats
 from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
-from featuredb.render.culling import visible_nodes
-from featuredb.render.lens import lens_numbers
 from featuredb.render.loops.draw_loops import project
-from featuredb.render.renderer import RenderOptions, render
+from featuredb.render.renderer import RenderOptions, render, visible_nodes
 from featuredb.render.shading import shaded_relief
-from featuredb.render.splats import BlockPlanes
+from featuredb.render.splats import BlockPlanes, lens_numbers
 from featuredb.simworld.camera.raster import render as cast_rays
 from featuredb.simworld.camera.shot import look_pose
 from featuredb.simworld.town.scene import Ellipsoids, Faces

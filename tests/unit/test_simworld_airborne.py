@@ -7,10 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.laser import strip as classes
-from featuredb.simworld.laser.airborne import AirborneScan, scan_town
+from featuredb.simworld.laser import airborne as classes
+from featuredb.simworld.laser.airborne import AirborneScan, AirborneScanOptions, scan_town
 from featuredb.simworld.laser.echoes import RANGE_RESOLUTION_M
-from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.town.days import DayOptions, another_day
 from featuredb.simworld.town.reflectance import scene_reflectance
 from featuredb.simworld.town.scene import Faces, Scene, texture_index

@@ -9,8 +9,7 @@ from PIL import ExifTags
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.utm import meridian_convergence_deg
-from featuredb.simworld.camera.exif import exif_of
-from featuredb.simworld.camera.photograph import moving_cars
+from featuredb.simworld.camera.photograph import exif_of, moving_cars
 from featuredb.simworld.camera.sensor import SensorOptions, expose
 from featuredb.simworld.flight import (
     FlightOptions,

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from featuredb.errors import TelemetryError
 from featuredb.video.telemetry.formats.csv_table import read_csv
-from featuredb.video.telemetry.formats.table_values import column_name, number
+from featuredb.video.telemetry.formats.text import column_name, number
 
 LAWS = settings(deadline=None, max_examples=150, derandomize=True)
 NOON = 1717156800.0  # 2024-05-31T12:00:00Z, by `date -u +%s`

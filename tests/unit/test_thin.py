@@ -14,7 +14,6 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
 from featuredb.maps.thin import (
-    ThinOptions,
     described_points_of_images,
     k_cover,
     thin_map,
@@ -62,10 +61,10 @@ def seen_map(
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 10_000), cover=st.integers(15, 60), views=st.integers(2, 6))
-def test_every_image_keeps_the_cover_or_all_it_had(seed: int, cover: int, views: int) -> None:
+@given(seed=st.integers(0, 10_000), cover=st.integers(15, 60))
+def test_every_image_keeps_the_cover_or_all_it_had(seed: int, cover: int) -> None:
     before = random_map(seed, points=120, images=5, observations=600)
-    after = thin_map(before, ThinOptions(cover=cover, max_views=views))
+    after = thin_map(before, cover)
     had, has = described_points_of_images(before), described_points_of_images(after)
     assert (has >= np.minimum(had, cover)).all()
     assert (has <= had).all()
@@ -94,11 +93,12 @@ def test_a_precise_point_goes_before_a_vague_one() -> None:
     assert np.flatnonzero(chosen).tolist() == list(range(1, 40, 2))
 
 
-def test_views_that_stay_are_the_outermost_ones() -> None:
+def test_views_that_stay_are_the_outermost_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("featuredb.maps.thin._MAX_VIEWS", 3)
     # Images 0 and 1 see 20 points each and need them all; the ten others see all 40 and can spare half.
     sightings = [(p, p // 20, 20.0 * p, 500.0) for p in range(40)]
     sightings += [(p, i, 20.0 * p, 500.0) for p in range(40) for i in range(2, 12)]
-    thin = thin_map(seen_map(sightings), ThinOptions(cover=20, max_views=3))
+    thin = thin_map(seen_map(sightings), 20)
     seen = thin.observations
     kept = seen.image_id[seen.has_descriptor & (seen.point_index == 0)]
     assert len(kept) == 3
@@ -113,7 +113,7 @@ def field() -> FeatureMap:
 
 def test_nothing_moves_and_the_area_holds_the_chosen_points_only(field: FeatureMap) -> None:
     before = field
-    after = thin_map(before, ThinOptions(cover=40))
+    after = thin_map(before, 40)
     np.testing.assert_array_equal(after.points.utm, before.points.utm)
     np.testing.assert_array_equal(after.observations.xy, before.observations.xy)
     assert after.placement is before.placement
@@ -129,8 +129,8 @@ def test_nothing_moves_and_the_area_holds_the_chosen_points_only(field: FeatureM
 
 def test_points_can_go_altogether_and_answers_see_the_same(field: FeatureMap) -> None:
     before = field
-    kept = thin_map(before, ThinOptions(cover=40))
-    gone = thin_map(before, ThinOptions(cover=40, keep_points=False))
+    kept = thin_map(before, 40)
+    gone = thin_map(before, 40, keep_points=False)
     assert len(gone.points) == gone.provenance["thinned"]["points"] < len(kept.points)
     a, b = build_area([kept]), build_area([gone])
     np.testing.assert_array_equal(a.points, b.points)
@@ -149,14 +149,12 @@ def test_points_without_descriptors_stay_when_others_are_dropped() -> None:
 
 
 def test_thinning_again_changes_nothing_and_thinner_does(field: FeatureMap) -> None:
-    once = thin_map(field, ThinOptions(cover=60))
-    assert thin_map(once, ThinOptions(cover=60)) is once
-    thinner = thin_map(once, ThinOptions(cover=20))
+    once = thin_map(field, 60)
+    assert thin_map(once, 60) is once
+    thinner = thin_map(once, 20)
     assert thinner.observations.has_descriptor.sum() < once.observations.has_descriptor.sum()
 
 
-def test_covers_that_could_never_answer_are_refused() -> None:
+def test_covers_that_could_never_answer_are_refused(field: FeatureMap) -> None:
     with pytest.raises(InvalidValueError, match="at least 15"):
-        ThinOptions(cover=10)
-    with pytest.raises(InvalidValueError, match="max_views"):
-        ThinOptions(max_views=1)
+        thin_map(field, 10)

@@ -10,13 +10,13 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from featuredb.simworld.camera.shot import look_pose
 from reloc.tracking.flow import follow
-from reloc.tracking.landmarks import Landmarks
-from reloc.tracking.options import FlowOptions, PoseFitOptions, TrackOptions
+from reloc.tracking.flow_track import Landmarks
+from reloc.tracking.options import FlowOptions, TrackOptions
 from reloc.tracking.pose_fit import fit_pose
 
 CAMERA = Camera(model="RADIAL", width=1280, height=720, params=(970.0, 641.0, 359.0, -0.03, 0.01))
 POSE = look_pose([3.0, -2.0, 50.0], 40.0, -60.0)
-FLOW, FIT = FlowOptions(), PoseFitOptions()
+FLOW = FlowOptions()
 
 
 def scene(rng: np.random.Generator, count: int = 200) -> tuple[np.ndarray, np.ndarray]:
@@ -37,7 +37,7 @@ def test_the_pose_is_found_from_nearby_in_spite_of_outliers() -> None:
     points, pixels = scene(rng)
     pixels[:60] += rng.uniform(-80, 80, (60, 2))
     start = Rigid3.exp([0.02, -0.03, 0.05, 0.6, -0.5, 0.8]) @ POSE
-    fitted = fit_pose(CAMERA, pixels, points, start, FIT)
+    fitted = fit_pose(CAMERA, pixels, points, start)
     assert fitted is not None
     assert np.linalg.norm(off(fitted.cam_from_local)[3:]) < 0.01
     assert fitted.inlier[60:].all()
@@ -50,7 +50,7 @@ def test_the_covariance_is_that_of_many_runs() -> None:
     points, pixels = scene(rng, 80)
     errors = []
     for _ in range(300):
-        fitted = fit_pose(CAMERA, pixels + rng.normal(0, 0.3, pixels.shape), points, POSE, FIT)
+        fitted = fit_pose(CAMERA, pixels + rng.normal(0, 0.3, pixels.shape), points, POSE)
         assert fitted is not None
         error = off(fitted.cam_from_local)
         errors.append(float(error @ np.linalg.solve(fitted.covariance, error)))
@@ -61,7 +61,7 @@ def test_points_behind_the_camera_do_not_count() -> None:
     rng = np.random.default_rng(3)
     points, pixels = scene(rng)
     points[:30] = 2.0 * POSE.center - points[:30]
-    fitted = fit_pose(CAMERA, pixels, points, POSE, FIT)
+    fitted = fit_pose(CAMERA, pixels, points, POSE)
     assert fitted is not None
     assert not fitted.inlier[:30].any()
     assert fitted.inlier[30:].all()
@@ -70,7 +70,7 @@ def test_points_behind_the_camera_do_not_count() -> None:
 @pytest.mark.parametrize("count", [0, 3])
 def test_too_few_points_give_no_pose(count: int) -> None:
     points, pixels = scene(np.random.default_rng(4))
-    assert fit_pose(CAMERA, pixels[:count], points[:count], POSE, FIT) is None
+    assert fit_pose(CAMERA, pixels[:count], points[:count], POSE) is None
 
 
 def test_points_that_do_not_determine_a_pose_give_none() -> None:
@@ -81,10 +81,10 @@ def test_points_that_do_not_determine_a_pose_give_none() -> None:
         np.repeat(points[:2], 20, axis=0),
         points[0] + along * (points[1] - points[0]),
     ):
-        assert fit_pose(CAMERA, CAMERA.project(POSE.act(few)), few, POSE, FIT) is None
+        assert fit_pose(CAMERA, CAMERA.project(POSE.act(few)), few, POSE) is None
     # A patch of ten centimetres, fifty metres away, does.
     small = points.mean(axis=0) + np.random.default_rng(5).uniform(-0.05, 0.05, (50, 3))
-    assert fit_pose(CAMERA, CAMERA.project(POSE.act(small)), small, POSE, FIT) is not None
+    assert fit_pose(CAMERA, CAMERA.project(POSE.act(small)), small, POSE) is not None
 
 
 def picture(rng: np.random.Generator) -> np.ndarray:

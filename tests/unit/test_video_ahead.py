@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from featuredb.errors import InvalidValueError, VideoError
-from featuredb.video.ahead import ReadAhead
 from featuredb.video.film import Video, VideoFrame, VideoReport
 from featuredb.video.frames import open_video
+from reloc.tracking.track_video import ReadAhead
 from tests.support.films import film, read
 
 

@@ -17,13 +17,12 @@ from typing import Any, Literal, Protocol
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
-from featuredb.simworld.camera.exif import exif_of
-from featuredb.simworld.camera.photograph import take_photo
+from featuredb.simworld.camera.photograph import exif_of, take_photo
 from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
-from featuredb.simworld.truth import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
+from featuredb.simworld.world import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
 from tools.worlds.edits import Edit, edited, edited_camera
 from tools.worlds.film_frame import in_order, process_count
 from tools.worlds.indoors import indoor_photo, portrait_photo

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.look import scene_look
-from featuredb.simworld.camera.photograph import moving_cars
+from featuredb.simworld.camera.photograph import moving_cars, scene_look
 from featuredb.simworld.camera.raster import render
 from featuredb.simworld.camera.sensor import SensorOptions, expose
 from featuredb.simworld.town.scene import Faces, Scene

@@ -5,7 +5,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.look import scene_look
+from featuredb.simworld.camera.photograph import scene_look
 from featuredb.simworld.camera.raster import render
 from featuredb.simworld.camera.sensor import SensorOptions, expose
 from featuredb.simworld.camera.shot import Device, look_pose

@@ -14,7 +14,6 @@ from featuredb.export.dataset.sums import SUMS
 from featuredb.geo.crs.wkt import utm_projjson
 
 _WIDTH = 110
-_LONGEST_LIST = 200  # maps; maps.parquet has all of them
 _METHODS = {
     "gps": "by the photos' GPS",
     "lidar": "on a LiDAR scan",
@@ -78,21 +77,6 @@ def _places(contents: Contents) -> str:
         name = utm_projjson(partition.epsg, partition.height_datum)["name"]
         counts = [f"{sum(int(e.row[c]) for e in here):,}" for c in ("images", "points")]
         rows.append((f"EPSG:{partition.epsg}", partition.height_datum, name, f"{len(here):,}", *counts))
-    shown = contents.maps[:_LONGEST_LIST]
-    maps = [
-        (
-            *(_plain(e.map_id), _plain(e.row["name"]), e.row["status"], e.row["method"]),
-            *(f"EPSG:{e.partition.epsg}", e.partition.height_datum),
-            *(f"{e.row[c]:,}" for c in ("images", "points")),
-            ", ".join(f"{v:.5f}" for v in e.footprint.bbox),
-        )
-        for e in shown
-    ]
-    more = len(contents.maps) - len(shown)
-    about = (
-        *("map", "name", "status", "placed", "zone", "heights", "images", "points"),
-        "west, south, east, north",
-    )
     return _section(
         "Where",
         _prose(
@@ -100,8 +84,6 @@ def _places(contents: Contents) -> str:
             "counted from what is named here, and nothing has been converted."
         ),
         _table(("zone", "heights", "CRS of the files", "maps", "images", "points"), rows),
-        _table(about, maps),
-        *([f"and {more:,} more, in `{layout.MAPS}`.\n"] if more else []),
     )
 
 

@@ -14,11 +14,8 @@ from featuredb.export.formats.colmap import image_names
 from featuredb.export.job import Exported, ExportJob, folder_name, whole_or_nothing, write_csv
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
 from featuredb.features.exif.gps import RADIUS_68
-from featuredb.features.exif.gps_write import with_gps
-from featuredb.features.exif.write import gps_directory
-from featuredb.features.exif.xmp_write import with_properties
+from featuredb.features.exif.write import gps_directory, with_app1, with_gps, with_properties
 from featuredb.features.image_header import read_header
-from featuredb.features.jpeg_segments import with_app1
 from featuredb.file_digest import file_sha256
 
 FILES_TABLE = "files.csv"

@@ -1,18 +1,22 @@
 """Takes one planned photo of a scene: moving things, light, lens, file."""
 
-import numpy as np
-from PIL import Image
+from functools import lru_cache
 
+import numpy as np
+from PIL import ExifTags, Image
+
+from featuredb.features.exif.write import gps_directory, rational
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.exif import exif_of
-from featuredb.simworld.camera.look import scene_look
 from featuredb.simworld.camera.raster import Rendered, render
 from featuredb.simworld.camera.sensor import SensorOptions, expose, jpeg_bytes
+from featuredb.simworld.camera.shading import Look
 from featuredb.simworld.camera.shot import Shot
-from featuredb.simworld.town.scene import Faces, Scene
+from featuredb.simworld.town.ground import paint_ground
+from featuredb.simworld.town.materials import town_textures, water_texture
+from featuredb.simworld.town.scene import TEXTURES, Faces, GroundPlan, Scene
 from featuredb.simworld.town.solids import car
-from featuredb.simworld.town.texture import Image8
+from featuredb.simworld.town.texture import Image8, Texture
 
 _SUPERSAMPLE = 2  # rays per pixel and direction; with one, thin things flicker and edges are jagged
 _CAR_SPACING_M = 70.0  # moving cars along a lane, on average
@@ -80,3 +84,48 @@ def gps_geodetic(scene: Scene, shot: Shot) -> tuple[float, float, float] | None:
         return None
     latitude, longitude, height = scene.frame.geodetic_from_enu(shot.gps_enu)
     return float(latitude), float(longitude), float(height)
+
+
+def exif_of(shot: Shot, lat_lon_h: tuple[float, float, float] | None) -> Image.Exif:
+    """The EXIF block of a shot; GPS only where `lat_lon_h` (degrees, degrees, metres) is given.
+
+    The altitude is written with reference 0 or 1 as is; this world's receivers count from the ellipsoid.
+    """
+    exif = Image.Exif()
+    base, time = ExifTags.Base, shot.time
+    stamp = time.strftime("%Y:%m:%d %H:%M:%S")
+    offset = time.strftime("%z")
+    exif[base.Make.value], exif[base.Model.value] = shot.device.make, shot.device.model
+    exif[base.Orientation.value] = 1
+    exif[base.Software.value] = "featuredb simworld"
+    exif[base.DateTime.value] = stamp
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    details[base.DateTimeOriginal.value] = stamp
+    details[base.OffsetTimeOriginal.value] = f"{offset[:3]}:{offset[3:]}"
+    details[base.SubsecTimeOriginal.value] = f"{time.microsecond // 1000:03d}"
+    details[base.FocalLength.value] = rational(shot.device.focal_mm, 100)
+    details[base.FocalLengthIn35mmFilm.value] = shot.device.focal_35mm
+    details[base.ExifImageWidth.value] = shot.device.camera.width
+    details[base.ExifImageHeight.value] = shot.device.camera.height
+    if lat_lon_h is not None:
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps_directory(lat_lon_h))
+    return exif
+
+
+def scene_look(scene: Scene, water_seed: int = 0) -> Look:
+    """Textures and light of a scene; the water is that of the moment `water_seed`."""
+    still = _materials(scene.seed, scene.pieces)
+    painted = {"water": water_texture(water_seed), "ground": _ground(scene.plan, scene.texel_m)}
+    textures = tuple(painted.get(name) or still[name] for name in TEXTURES)
+    to_sun = scene.enu_from_town @ np.asarray(scene.plan.to_sun)
+    return Look(textures=textures, detail=still["detail"], to_sun=to_sun)
+
+
+@lru_cache(maxsize=4)
+def _materials(seed: int, pieces: int) -> dict[str, Texture]:
+    return town_textures(seed, pieces)
+
+
+@lru_cache(maxsize=2)
+def _ground(plan: GroundPlan, texel_m: float) -> Texture:
+    return paint_ground(plan, texel_m)

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.interpolate import wrap_degrees
-from featuredb.video.telemetry.values import Clock, Telemetry
+from featuredb.video.telemetry.values import Clock, Telemetry, wrap_degrees
 
 # Nine hours at 60 samples a second: longer than any battery or memory card lasts.
 MAX_SAMPLES = 2_000_000

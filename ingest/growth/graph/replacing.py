@@ -67,7 +67,6 @@ class Replacement:
         reason: None, the pose graph's, or CANARY; `message` for people. Nothing was committed where there
             is one.
         version: of the database since, or -1. moved: all maps that were committed anew.
-        measured: what was said of each new overlap, "map - anchor: ...".
         left_out: overlaps that contradict the rest.
         flagged: maps that are quarantined now, because they hang on a moved one by no overlap that holds.
     """
@@ -76,7 +75,6 @@ class Replacement:
     message: str
     version: int = -1
     moved: tuple[MovedMap, ...] = ()
-    measured: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     flagged: tuple[str, ...] = ()
 
@@ -93,7 +91,7 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
     """
     snapshot = database.snapshot()
     maps = placed_maps(snapshot)
-    edges, notes = _measured(snapshot, maps, overlaps_to_measure(maps), work)
+    edges = _measured(snapshot, maps, overlaps_to_measure(maps), work)
     if not edges:
         return None
     pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges if holds(maps, e)]
@@ -106,7 +104,6 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
     told = Replacement(
         reason=solution.reason,
         message=solution.message,
-        measured=notes,
         left_out=tuple(map(str, solution.left_out)),
     )
     if solution.reason is not None:
@@ -154,8 +151,8 @@ def _touch(a: PlacedMap, b: PlacedMap) -> bool:
 
 def _measured(
     snapshot: Snapshot, maps: Mapping[str, PlacedMap], wanted: Sequence[tuple[str, str]], work: Path
-) -> tuple[Edges, tuple[str, ...]]:
-    """New overlaps, and a note on each that was looked for; kept in the work folder."""
+) -> Edges:
+    """New overlaps; what was looked for is kept in the work folder."""
     loaded: dict[str, FeatureMap] = {}
     edges: dict[str, list[Edge]] = {}
     notes: list[str] = []
@@ -178,7 +175,7 @@ def _measured(
             edges.setdefault(map_id, []).append(Edge.from_json(said["edge"]))
     if notes:
         _LOG.info("overlaps: %s", "; ".join(notes))
-    return edges, tuple(notes)
+    return edges
 
 
 def _moved(

@@ -151,9 +151,7 @@ def check_known(database: Database, canary: Canary, before: Localiser, after: Lo
     return _checked(canary.name, verdicts, misses, results[1])
 
 
-def answer_now(
-    database: Database, image: bytes, tolerance_m: float, tolerance_deg: float
-) -> tuple[KnownPose | None, int]:
+def answer_now(database: Database, image: bytes) -> tuple[KnownPose | None, int]:
     """What the active maps answer to a photo, as what is known of it; None where they do not localise it.
 
     Raises:
@@ -169,8 +167,6 @@ def answer_now(
         utm=result.pose.utm,
         height_datum=result.pose.height_datum,
         cam_from_utm_xyzw=result.pose.cam_from_utm_xyzw,
-        tolerance_m=tolerance_m,
-        tolerance_deg=tolerance_deg,
     )
     return known, localiser.snapshot
 

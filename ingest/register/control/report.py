@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from featuredb.geometry.arrays import FloatArray
 from ingest.html_parts import note, page, picture, table
-from ingest.plot_parts import nice_length, png_bytes, residual_exaggeration
+from ingest.plot_parts import png_bytes, residual_exaggeration
 from ingest.register.control.maps import remarks
 from ingest.register.control.marks import Control
 from ingest.register.control.placement import GcpPlacement
@@ -63,11 +63,6 @@ def control_png(placement: GcpPlacement) -> bytes:
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
     axes.set_aspect("equal")
-    length = nice_length(0.25 * extent)
-    axes.plot([low[0], low[0] + length], [low[1] - margin / 2] * 2, color=_INK, lw=4)
-    axes.annotate(
-        f"{length:g} m", (low[0], low[1] - margin / 2), xytext=(0, 5), textcoords="offset points", fontsize=8
-    )
     axes.set_xlabel("east, m", fontsize=8)
     axes.set_ylabel("north, m", fontsize=8)
     axes.tick_params(labelsize=8)

@@ -10,8 +10,7 @@ from functools import partial
 
 from featuredb.stage_clock import StageClock
 from featuredb.store.candidates.states import ANONYMOUS, candidate_id_of
-from reloc.service.contributions.contribution import contribution_of
-from reloc.service.contributions.inbox import Inbox
+from reloc.service.contributions.inbox import Inbox, contribution_of
 from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions

@@ -9,8 +9,7 @@ from xml.parsers import expat
 
 from featuredb.errors import TelemetryError
 from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
-from featuredb.video.telemetry.formats.table_values import number
-from featuredb.video.telemetry.formats.text import parse_wall_clock
+from featuredb.video.telemetry.formats.text import number, parse_wall_clock
 from featuredb.video.telemetry.values import Telemetry
 
 # Elements of a point whose text counts. `fix` is "none", "2d", "3d", "dgps" or "pps".

@@ -1,4 +1,4 @@
-"""Writes pictures with their place on Earth. Needs the extra `lidar`."""
+"""Pictures with their place on Earth, as files."""
 
 from pathlib import Path
 
