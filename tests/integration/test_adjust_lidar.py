@@ -17,7 +17,14 @@ from ingest.register.block import block_of_map, map_of_block
 from ingest.register.frame_registration import FrameRegistration
 from ingest.register.structure.adjustment import LidarAdjustment, adjust_to_scan, placed_map
 from ingest.register.structure.projection import StructurePlacement, project_structure
-from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map
+from tests.support.scanned_map import (
+    CAMERA,
+    FRAME,
+    ScannedMap,
+    placed_by_similarity,
+    plain_cloud,
+    scanned_map,
+)
 
 pytest.importorskip("numba")
 
@@ -119,7 +126,7 @@ def test_the_fixture_is_as_treacherous_as_it_says(wrong_lens: ScannedMap) -> Non
 def test_the_scan_mends_the_lens(wrong_lens: ScannedMap, frames: tuple[int, ...]) -> None:
     structure, adjustment = _adjusted(wrong_lens, frames)
     assert adjustment.accepted, adjustment.message
-    by_similarity = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud)
+    by_similarity = placed_by_similarity(wrong_lens.feature_map, structure, wrong_lens.cloud)
     by_scan = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud, adjustment)
     # The similarity lays the points on the ground and leaves the cameras metres too high.
     assert np.abs(_heights_off(by_similarity, wrong_lens)).min() > 3.0
@@ -141,6 +148,8 @@ def test_the_adjusted_map_keeps_what_is_not_geometry(wrong_lens: ScannedMap) -> 
     assert after.frame == before.frame
     assert after.height_datum == wrong_lens.cloud.height_datum
     assert after.placement.method == "lidar"
+    assert after.placement.evidence["replaces"] == "gps"
+    assert after.generation == 0
     assert [i.sha256 for i in after.images] == [i.sha256 for i in before.images]
     assert np.array_equal(after.observations.xy, before.observations.xy)
 

@@ -12,10 +12,15 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from ingest.register.frame_registration import FrameRegistration
-from ingest.register.structure.adjustment import placed_map
 from ingest.register.structure.pairs import structure_pairs
 from ingest.register.structure.projection import project_structure
-from tests.support.scanned_map import FRAME, ScannedMap, plain_cloud, scanned_map
+from tests.support.scanned_map import (
+    FRAME,
+    ScannedMap,
+    placed_by_similarity,
+    plain_cloud,
+    scanned_map,
+)
 
 pytest.importorskip("numba")
 
@@ -39,26 +44,12 @@ def _errors(placed: FeatureMap, world: ScannedMap) -> FloatArray:
 def test_one_exact_frame_puts_the_map_back(world: ScannedMap) -> None:
     structure = project_structure(world.feature_map, {4: world.registered(4)}, world.cloud)
     assert structure.accepted, structure.message
-    placed = placed_map(world.feature_map, structure, world.cloud)
+    placed = placed_by_similarity(world.feature_map, structure, world.cloud)
     assert _errors(world.feature_map, world).mean() > 8.0
     assert _errors(placed, world).mean() < 0.05
     for image, pose in zip(placed.images, world.true_poses, strict=True):
         assert np.linalg.norm(image.cam_from_local.center - pose.center) < 0.15
         assert image.cam_from_local.angle_to_deg(pose) < 0.15
-
-
-def test_the_placed_map_says_how_it_got_there(world: ScannedMap) -> None:
-    structure = project_structure(world.feature_map, {4: world.registered(4)}, world.cloud)
-    placed = placed_map(world.feature_map, structure, world.cloud)
-    assert placed.placement.method == "lidar"
-    assert placed.generation == 0
-    assert placed.height_datum == "ellipsoidal"
-    assert placed.frame == world.feature_map.frame
-    assert placed.placement.evidence["replaces"] == "gps"
-    # local_from_sfm of the fixture starts at the truth: what the placement does must undo it.
-    assert np.abs(placed.placement.local_from_sfm.log()[:4]).max() < 5e-3
-    # Reprojection is untouched by a similarity.
-    assert placed.points.error_px == pytest.approx(world.feature_map.points.error_px, abs=1e-3)
 
 
 def test_three_frames_are_better_than_one(world: ScannedMap) -> None:
@@ -78,7 +69,9 @@ def test_three_frames_are_better_than_one(world: ScannedMap) -> None:
                 for k in frames
             }
             structure = project_structure(world.feature_map, registered, world.cloud)
-            rows.append(_errors(placed_map(world.feature_map, structure, world.cloud), world).mean())
+            rows.append(
+                _errors(placed_by_similarity(world.feature_map, structure, world.cloud), world).mean()
+            )
         means.append(np.mean(rows))
     assert means[1] < means[0]
     assert means[1] < 0.06
@@ -129,7 +122,7 @@ def test_the_cloud_s_frame_need_not_be_the_map_s(world: ScannedMap) -> None:
     assert pose is not None
     moved_frame = replace(frame, cam_from_local=pose @ there.inverse())
     structure = project_structure(world.feature_map, {4: moved_frame}, cloud)
-    placed = placed_map(world.feature_map, structure, cloud)
+    placed = placed_by_similarity(world.feature_map, structure, cloud)
     assert _errors(placed, world).mean() < 0.05
     assert placed.frame == FRAME
     # The covariance is of the map's own frame: near its points it is small, not multiplied by 3 km.

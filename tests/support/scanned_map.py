@@ -15,9 +15,11 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
+from featuredb.maps.move import move_map
 from featuredb.render.cloud import CloudNodes, PointCloud
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.frame_registration import FrameRegistration
+from ingest.register.structure.projection import StructurePlacement
 
 EPSG = 32632
 FRAME = LocalFrame(latitude_deg=48.1, longitude_deg=11.5, height_m=520.0)
@@ -195,4 +197,18 @@ def _observations(
         angle=np.zeros(m, np.float32),
         has_descriptor=np.zeros(m, dtype=bool),
         descriptors=np.zeros((m, 128), np.uint8),
+    )
+
+
+def placed_by_similarity(
+    feature_map: FeatureMap, structure: StructurePlacement, cloud: PointCloud
+) -> FeatureMap:
+    """The map where an accepted structure projection alone puts it."""
+    assert structure.new_from_old is not None
+    assert structure.covariance is not None
+    map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
+    return move_map(
+        feature_map,
+        map_from_cloud @ structure.new_from_old @ map_from_cloud.inverse(),
+        covariance=map_from_cloud.carried(structure.covariance),
     )

@@ -140,7 +140,7 @@ def placed_map(
     feature_map: FeatureMap,
     structure: StructurePlacement,
     cloud: PointCloud,
-    adjustment: LidarAdjustment | None = None,
+    adjustment: LidarAdjustment,
 ) -> FeatureMap:
     """The map at its new place: same ids, descriptors and local frame; the scan's height datum.
 
@@ -148,30 +148,23 @@ def placed_map(
     left over is the adjustment itself.
 
     Args:
-        structure, adjustment: accepted ones; without an adjustment the map follows the similarity.
+        structure: an accepted one. adjustment: with a block.
     """
     assert structure.new_from_old is not None
     assert structure.covariance is not None  # accepted
+    assert adjustment.block is not None
     map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
     move = map_from_cloud @ structure.new_from_old @ map_from_cloud.inverse()
     covariance = map_from_cloud.carried(structure.covariance)
-    if adjustment is None:
-        block = block_of_map(feature_map).moved(move)
-        rms_m, evidence = structure.figures["residual_rms_m"], {"structure": structure.figures}
-    else:
-        assert adjustment.block is not None  # accepted
-        block = adjustment.block.moved(map_from_cloud)
-        rms_m, evidence = adjustment.figures["after"]["surface_rms_m"], {"adjustment": adjustment.figures}
     placement = Placement(
         method="lidar",
         local_from_sfm=move @ feature_map.placement.local_from_sfm,
         covariance=(covariance + covariance.T) / 2,
-        residual_rms_m=float(rms_m),
-        evidence=evidence | {"replaces": feature_map.placement.method},
+        residual_rms_m=float(adjustment.figures["after"]["surface_rms_m"]),
+        evidence={"adjustment": adjustment.figures, "replaces": feature_map.placement.method},
     )
+    block = adjustment.block.moved(map_from_cloud)
     placed = map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
-    if adjustment is None:
-        return placed
     images = zip(placed.images, adjustment.poses, strict=True)
     uncertainty = {} if adjustment.lenses is None else adjustment.lenses.as_provenance()
     return replace(
