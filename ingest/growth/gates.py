@@ -21,8 +21,7 @@ _AGREEING_SHARE = 0.66
 # Distance of centres over the viewing distance. Models of few photos, bent and with a lens not their own,
 # reached 0.4 %; a placement by a look-alike shows in pixels long before.
 _MAX_RESIDUAL = 0.01
-# Chi-square with two degrees of freedom is above this once in 10,000 honest positions
-# (as in reloc.localise.prior).
+# Chi-square with two degrees of freedom is above this once in 10,000 honest positions.
 _GPS_LIMIT = 18.42
 # Share of positions that are wrong by accident, with a margin over the tenth that communities have; as many
 # wrong ones as come about less often than that are no accident.

@@ -221,7 +221,6 @@ def test_an_adjustment_that_does_not_gain_is_refused(
     high = {k: replace(r, points_local=r.points_local + up) for k, r in registered.items()}
     monkeypatch.setattr(f"{_ADJUSTMENT}._REACH_M", 5.0)
     monkeypatch.setattr(f"{_ADJUSTMENT}._MIN_SURFACE_M", 5.0)
-    monkeypatch.setattr(f"{_ADJUSTMENT}._CONTROL_RATE", 1e-300)
     assert adjust_to_scan(world.feature_map, structure, high, world.cloud).reason == "SURFACE"
 
 

@@ -142,22 +142,24 @@ def try_frames(
     order = [ranked.get(i) or _unranked(images[i], prior) for i, prior in starts.items()]
     order += [p for p in ranking if p.image.image_id not in starts]
     tried: list[TriedFrame] = []
+    vouched: list[TriedFrame] = []
     least = max(max_tries, len(starts))
     ask = together and not starts
+    if ask and cloud.rgb is None:
+        ask, vouched = False, _tried_together(feature_map, cloud, ranking, read_gray, wanted)
     for number, proposal in enumerate(order[: max(least, _MORE_TRIES)]):
         accepted = sum(frame.registration.accepted for frame in tried)
-        if accepted >= wanted or (number >= least and not accepted):
+        if vouched or accepted >= wanted or (number >= least and not accepted):
             break
-        if ask and (cloud.rgb is None or accepted < len(tried)):
-            ask = False
-            found = _tried_together(feature_map, cloud, ranking, read_gray, wanted)
-            if len(found) >= min(wanted, _LEAST_TOGETHER):
-                tried = found
-                break
         frame = _try(feature_map, cloud, proposal, reader)
-        if frame is not None:
-            tried.append(frame)
-        progress("register", sum(f.registration.accepted for f in tried), wanted)
+        if frame is None:
+            continue
+        tried.append(frame)
+        progress("register", accepted + frame.registration.accepted, wanted)
+        if ask and not frame.registration.accepted:
+            ask, vouched = False, _tried_together(feature_map, cloud, ranking, read_gray, wanted)
+    by_others = {frame.image.image_id for frame in vouched}
+    tried = [frame for frame in tried if frame.image.image_id not in by_others] + vouched
     return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(tried), unreadable=reader.unreadable)
 
 
@@ -168,13 +170,13 @@ def _tried_together(
     read_gray: PhotoReader,
     wanted: int,
 ) -> list[TriedFrame]:
-    """The frames that all photos together register; none where they do not tell where the map is."""
+    """The frames that all photos together register; none where these do not tell, or too few."""
     start, cpu = time.perf_counter(), time.process_time()
     proposals = {p.image.image_id: p for p in ranking}
     found = register_together(feature_map, [p.image for p in ranking], cloud, read_gray, wanted)
-    if found is None or not found.registrations:
+    count = 0 if found is None else len(found.registrations)
+    if found is None or count < min(wanted, _LEAST_TOGETHER):
         return []
-    count = len(found.registrations)
     seconds, cpu_s = (time.perf_counter() - start) / count, (time.process_time() - cpu) / count
     return [
         TriedFrame(proposal=proposals[i], registration=registration, seconds=seconds, cpu_s=cpu_s)

@@ -142,13 +142,12 @@ def _frame(
     last = result.rounds[-1].frames if result and result.rounds else ()
     again = {frame.image.image_id: frame for frame in last}
     registration = again.get(tried.image.image_id, tried).registration
-    pose, lenses = registration.cam_from_local, old.cameras
+    pose, lens = registration.cam_from_local, registration.camera or old.cameras[tried.image.camera_id]
     if pose is None:
         pose = tried.proposal.prior.cam_from_local
         kind, details = "bad", ""
         headline = f"{registration.reason}: {registration.message}. Shown from where its search started."
     else:
-        lenses = result.feature_map.cameras if result and result.feature_map else lenses
         kind, details = "good", f"<p class='soft'>{escape(_evidence_line(registration.evidence))}</p>"
         headline = f"registered by {registration.source} with {len(registration.pixels)} correspondences"
         if result is None:
@@ -156,7 +155,7 @@ def _frame(
             details += (
                 f'<p>If the edges lie on the photo, confirm it:</p><pre class="command">{escape(line)}</pre>'
             )
-    view = scan_view(cloud, lenses[tried.image.camera_id], pose)
+    view = scan_view(cloud, lens, pose)
     stage = (
         picture(jpeg(resized(read_rgb(tried.image), view.camera)), "photo", "jpeg", "photo")
         + picture(jpeg(view_rgb(view)), "scan", "jpeg", "scan")

@@ -54,7 +54,8 @@ def place_in_rounds(
     A frame registered with a wrong lens finds matches that fit the wrong lens: the adjustment moves it part
     of the way, and the next registration finds others. Each round places the map as it was. A map of which no
     adjustment is accepted has no place: the similarity would lay its points on the ground and leave its
-    cameras where the wrong lens has them. Frames may contradict the map (CONTROL) until its lens is found.
+    cameras where the wrong lens has them. Frames may contradict the map until its lens is found; then the
+    last word counts.
     """
     placed: FeatureMap | None = None
     latest: FeatureMap | None = None
@@ -76,7 +77,7 @@ def place_in_rounds(
         if adjustment.block is None:
             break
         latest = placed_map(feature_map, structure, cloud, adjustment)
-        placed = latest if adjustment.accepted else placed
+        placed = latest if adjustment.accepted else None
         rounds.append(
             PlaceRound(
                 frames=tuple(frames),
@@ -86,7 +87,7 @@ def place_in_rounds(
                 focal_px=tuple(camera.focal_px for camera in latest.cameras),
                 figures={
                     "structure": structure.figures,
-                    "adjustment": adjustment.figures,
+                    "adjustment": adjustment.figures | {"reason": adjustment.reason},
                 },
             )
         )

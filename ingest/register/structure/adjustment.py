@@ -52,13 +52,17 @@ _REACH_M = 1.0  # a plane further from a point says nothing of it
 # against that about each frame's own best pose, by F. How far they miss by itself says nothing: where the
 # scan has two points in a metre and the photo 30 pixels, honest ones miss by five.
 _CONTROL_RATE = 1e-4
+# And so much of the photo's longer side is no contradiction (7 pixels in 4000): strips of a scan, lens and
+# shutter displace a frame as a whole, which its own pose takes up. Chosen; it has no rate.
+_CONTROL_REL = 0.0017
 _MAD_EFFICIENCY = 0.37  # of a spread by the median, of normal residuals (Rousseeuw and Croux 1993)
 _OWN_ROUNDS = 8  # of a frame's own pose
-# Of the median reprojection error, or of _REPROJECTION_FLOOR_REL of the longer side where it is smaller (half
-# a pixel in 4000).
+# Of the median reprojection error, or of that share of the longer side where it is smaller: to less, tracks
+# are not trusted.
 _MAX_REPROJECTION_GROWTH = 0.1
+_REPROJECTION_FLOOR_REL = 0.00025
 _MAX_SURFACE_POINTS = 250_000  # finer than for the similarity, since single points are moved
-_REPROJECTION_FLOOR_REL = 0.000125
+_LEAST_FURTHER_M = 0.03  # medians are of the points next to the scan, which are not the same before and after
 
 AdjustReason = Literal["NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
 
@@ -69,8 +73,8 @@ class LidarAdjustment:
 
     Attributes:
         reason: gate that refused it, or None; `message` says it for people.
-        block: the map in the cloud's local frame; None when refused, but for CONTROL: frames that were
-            registered with a wrong lens may contradict the right one.
+        block: the map in the cloud's local frame; None without a scan or a lens. A refused one may be the
+            start of another round: frames that were registered with a wrong lens contradict the right one.
         poses: (6, 6) of each pose, with all that points and lenses leave open; none without a block.
         lenses: what is left open of the lenses; None without a block, or where no lens has OPENCV's
             parameters.
@@ -123,7 +127,7 @@ def adjust_to_scan(
         "own": _own_spread(block, control),
     }
     reason, message = _gate(block, figures)
-    if reason not in (None, "CONTROL"):
+    if reason == "LENS":
         return LidarAdjustment(reason=reason, message=message, figures=figures)
     poses, lenses = _left_open(block, control, surface, structure, start)
     return LidarAdjustment(
@@ -278,20 +282,30 @@ def _state(block: Block, control: Marks, surface: Surface) -> dict[str, Any]:
 
 
 def _own_spread(block: Block, control: Marks) -> dict[str, float]:
-    """Spread of the correspondences about the map and about each frame's own best pose, and what is allowed.
+    """Spread of a frame's correspondences about the map and about its own best pose, and what is allowed.
 
-    Where map, scan and frames contradict each other, robust weights put the frames aside.
+    Of the frame that contradicts the map most. Where map, scan and frames contradict each other, robust
+    weights put the frames aside.
     """
-    alone = replace(
-        block, cam_from_block=tuple(_own_pose(block, control, k) for k in range(len(block.names)))
+    photos = np.unique(control.photo_of).tolist()
+    poses = list(block.cam_from_block)
+    for photo in photos:
+        poses[photo] = _own_pose(block, control, photo)
+    own, in_map = (
+        _control_residuals(found, control) for found in (replace(block, cam_from_block=tuple(poses)), block)
     )
-    own = _control_residuals(alone, control)
-    longer = longest_side(block.cameras)
-    own_px = max(_spread(own[0]), _MIN_SIGMA_REL * longer)
-    shared = design_effect(*own, longer)
-    free = _MAD_EFFICIENCY * own[0].size / shared
-    allowed_px = own_px * float(f_distribution.isf(_CONTROL_RATE, free, free)) ** 0.5
-    in_map_px = _spread(_control_residuals(block, control)[0])
+    shared = design_effect(*own, longest_side(block.cameras))
+    frames = []
+    for photo in photos:
+        side_px = longest_side([block.camera(photo)])
+        of_own, of_map = (residuals[photo_of == photo] for residuals, _, photo_of in (own, in_map))
+        seen = 2 * len(of_map) >= np.count_nonzero(control.photo_of == photo)
+        in_map_px = _spread(of_map) if seen else float("inf")
+        own_px = min(max(_spread(of_own), _MIN_SIGMA_REL * side_px), in_map_px)
+        free = max(_MAD_EFFICIENCY * of_own.size / shared, 1.0)
+        by_chance = own_px * float(f_distribution.isf(_CONTROL_RATE / len(photos), free, free)) ** 0.5
+        frames.append((in_map_px, own_px, max(by_chance, _CONTROL_REL * side_px)))
+    in_map_px, own_px, allowed_px = max(frames, key=lambda one: one[0] / one[2])
     return {"own_px": own_px, "in_map_px": in_map_px, "allowed_px": allowed_px}
 
 
@@ -327,10 +341,10 @@ def _gate(block: Block, figures: dict[str, Any]) -> tuple[AdjustReason | None, s
     if after["surface_median_m"] is None or _further(before, after):
         return "SURFACE", "the adjustment brings the map no closer to the scan"
     own = figures["own"]
-    if not own["in_map_px"] <= own["allowed_px"]:  # nor where nothing is seen any more
+    if not own["in_map_px"] <= own["allowed_px"]:
         return "CONTROL", (
-            f"what the frames see of the scan misses the map by {own['in_map_px']:.1f} pixels, and their own "
-            f"best poses by {own['own_px']:.1f}; at most {own['allowed_px']:.1f} are believed"
+            f"what a frame sees of the scan misses the map by {own['in_map_px']:.1f} pixels, and its own "
+            f"best pose by {own['own_px']:.1f}; at most {own['allowed_px']:.1f} are believed"
         )
     return None, "adjusted to the scan"
 
@@ -346,8 +360,9 @@ def _folds_inside(camera: Camera) -> bool:
 
 
 def _further(before: dict[str, Any], after: dict[str, Any]) -> bool:
-    """Whether the median distance grew by more than three standard errors of two normal medians."""
+    """Whether the median distance grew by more than three standard errors of two normal medians, and more."""
     if before["surface_median_m"] is None:
         return False
     errors = [1.858 * s["surface_median_m"] / np.sqrt(s["surface_points"]) for s in (before, after)]
-    return bool(after["surface_median_m"] - before["surface_median_m"] > 3.0 * np.hypot(*errors))
+    allowed = max(3.0 * float(np.hypot(*errors)), _LEAST_FURTHER_M)
+    return bool(after["surface_median_m"] - before["surface_median_m"] > allowed)

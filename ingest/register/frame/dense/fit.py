@@ -35,6 +35,7 @@ _WINDOW_PX = 12  # radius of the score map against whose spread a place is judge
 _MIN_SCORE = 1.5
 _TOLERANCE_PX = 4.0  # of an inlier, in the render
 _MAX_PIECES = 400  # per round
+_LEAST_ACROSS = 8  # pieces that are made larger still leave so many along the picture's longer side
 
 
 def near_places(
@@ -93,7 +94,8 @@ def dense_fitted(
     """
     found: FrameHypothesis | None = start
     rounds = list(zip(options.spacing_px, options.piece_px, options.near_px, strict=True))
-    for sizes in rounds[1:] if start.log_nfa >= DECISIVE_LOG_NFA else rounds:
+    decided = start.kind == "features" and start.log_nfa >= DECISIVE_LOG_NFA
+    for sizes in rounds[1:] if decided else rounds:
         found = found and _fit_round(views, prior, found, *sizes)
     # A pose that is still on its way may look right already: the pieces that lie near have made it.
     for _ in range(options.more_rounds):
@@ -110,7 +112,7 @@ def searched_again(views: FrameViews, prior: FramePrior, found: FrameHypothesis)
     near = searched_near(views.gray, found.pose.camera, pose, prior, views.cloud, found.source)
     if near is None:
         return None
-    return replace(found, pose=replace(found.pose, cam_from_local=near.cam_from_local))
+    return replace(found, kind="dense", pose=replace(found.pose, cam_from_local=near.cam_from_local))
 
 
 def _fit_round(
@@ -126,7 +128,8 @@ def _fit_round(
     if not renderings:
         return None
     between_px = views.spacing_full_px * side_px / max(views.camera.width, views.camera.height)
-    piece_px = max(piece_px, 2 * round(0.5 * views.options.dense_fit.piece_points * between_px))
+    wanted_px = min(views.options.dense_fit.piece_points * between_px, side_px / _LEAST_ACROSS)
+    piece_px = max(piece_px, 2 * round(0.5 * wanted_px))
     matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px)
     if len(matches) < _MIN_PLACES:
         return None
