@@ -34,7 +34,7 @@ from ingest.workspace import Workspace, default_root, remove_leftovers
 logger = logging.getLogger(__name__)
 
 # Part of every map id; raised when the same photos and options would give another map.
-_MAP_VERSION = "photos-5"
+_MAP_VERSION = "photos-6"
 # Some hundred megabytes as rows of the tables; what a folder of a few hundred photos makes is one commit.
 _OBSERVATIONS_PER_COMMIT = 1_000_000
 _MOST_NOTES = 20

@@ -26,7 +26,8 @@ from ingest.photos.photo import CameraSharing, Photo, gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions
 from ingest.sfm.extract import FeatureFiles, extract_photos, features_key, read_keypoints
 from ingest.sfm.mapper import SfmOptions, SfmView
-from ingest.sfm.matching import Matched, MatchOptions, PhotoView, match_pairs
+from ingest.sfm.matching import Matched, PhotoView, match_pairs
+from ingest.sfm.pair_geometry import MatchOptions
 from ingest.sfm.pairs import Pair, PairOptions, aggregate_photos, choose_pairs, more_pairs
 from ingest.sfm.zoomed_lenses import zoomed_keys
 from ingest.workspace import Workspace

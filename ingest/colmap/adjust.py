@@ -32,9 +32,10 @@ _MAX_ERROR_OVER_SCALE = 8.0
 _MIN_ANGLE_DEG = 1.5
 _FOCAL_OVER_SIDE, _MAX_DISTORTION = (0.1, 10.0), 1.0  # COLMAP's own for bogus lenses
 _MIN_OBSERVATIONS = 15
-_ROUNDS = 2  # of noise of positions and adjustment: how far positions are off follows from the shape
 _LEAST_PX2 = 1e-6  # of a variance: exact observations
-_FUNCTION_TOLERANCE = 1e-6  # relative; what is left is below micrometres
+# Of costs, relative. What is left of the last is below micrometres; before it the noise of positions and new
+# points are asked of the shape alone.
+_ROUGH, _FINE = 1e-4, 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,27 +158,37 @@ def _adjusted(
     options: AdjustOptions,
 ) -> Any:
     if options.whole_lens and options.refine_focal:
-        _bundle(reconstruction, known, loss_scale_px, options)
+        _bundle(reconstruction, known, loss_scale_px, options, (_ROUGH,))
         reconstruction = _triangulated_anew(reconstruction, database, folder)
-    _bundle(reconstruction, known, loss_scale_px, options)
+    _bundle(reconstruction, known, loss_scale_px, options, (_ROUGH, _FINE))
     return reconstruction
 
 
-def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: AdjustOptions) -> None:
-    """Adjust everything."""
+def _bundle(
+    reconstruction: Any,
+    known: Known,
+    loss_scale_px: float,
+    options: AdjustOptions,
+    tolerances: Sequence[float],
+) -> None:
+    """Adjust everything.
+
+    Args:
+        tolerances: of rounds of noise of positions and adjustment: how far positions are off follows from the
+            shape. Without positions the last is all there is.
+    """
     model = whole_model_of(reconstruction)
     image_ids = (model.rows + 1).tolist()
     camera_ids = sorted({reconstruction.image(i).camera_id for i in image_ids})
     point_ids = sorted(reconstruction.point3D_ids())
-    keypoints = [np.array([p.xy for p in reconstruction.image(i).points2D]).reshape(-1, 2) for i in image_ids]
-    block = model.block(model.pixels(keypoints))
+    block = model.block(model.pixels([known.photos[i - 1].keypoints for i in image_ids]))
     if options.whole_lens and options.refine_focal:
         block = whole_lens(block)
     lenses = [
         lens_prior_of(camera, known.focal_px.get(camera_id), options)
         for camera, camera_id in zip(block.cameras, camera_ids, strict=True)
     ]
-    for _ in range(_ROUNDS):
+    for tolerance in tolerances:
         centers = _center_priors(block, image_ids, known.photos)
         terms = Terms(
             keypoint_px=loss_scale_px,
@@ -187,7 +198,7 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
             held_photos=() if centers is not None else (0,),
         )
         problem = Problem(block, terms, options.threads)
-        problem.solve(options.max_iterations, _FUNCTION_TOLERANCE)
+        problem.solve(options.max_iterations, tolerance if centers is not None else tolerances[-1])
         block = problem.block()
         if centers is None:
             break

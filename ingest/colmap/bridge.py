@@ -134,16 +134,19 @@ def verify_pair(
     *,
     focal_known: bool,
     max_error_px: float,
+    least_inliers: int = 15,
     seed: int,
 ) -> TwoView:
     """Two-view geometry of putative matches (m, 2) by COLMAP's LO-RANSAC, with a fixed seed.
 
     Args:
         focal_known: both cameras have a focal length to be trusted, so an essential matrix is tried.
+        least_inliers: with fewer there is no geometry; COLMAP's 15.
     """
     geometry = pycolmap.TwoViewGeometry()
     if len(matches) >= 8:  # the fundamental matrix needs eight
         options = pycolmap.TwoViewGeometryOptions()
+        options.min_num_inliers = least_inliers
         options.ransac.max_error = max_error_px
         options.ransac.random_seed = seed
         a, b = camera_a.to_pycolmap(1), camera_b.to_pycolmap(2)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom, chi2
+from scipy.special import bdtrc, chdtrc, chdtri
 
 from featuredb.geo.words import way_words
 from featuredb.geometry.arrays import FloatArray
@@ -63,7 +63,7 @@ def first_refusal(gates: Iterable[Gate]) -> Gate | None:
 
 def sigmas_limit(degrees: int) -> float:
     """Chi-square that is exceeded as seldom as a single normal figure exceeds `SIGMAS`."""
-    return float(chi2.isf(chi2.sf(SIGMAS**2, 1), degrees))
+    return float(chdtri(degrees, chdtrc(1, SIGMAS**2)))
 
 
 def agreement(agreeing: int, disagreeing: int) -> Gate:
@@ -117,7 +117,7 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gat
         if against:
             way = way_words(*np.median(offsets_m[contradict], axis=0))
             where = f" by {by}" * bool(by) + f", which is {way} of them"
-    chance = float(binom.sf(against - 1, len(offsets_m), _WRONG_TAGS)) if against else 1.0
+    chance = float(bdtrc(against - 1, len(offsets_m), _WRONG_TAGS)) if against else 1.0
     return Gate(
         name="geotags",
         reason="CONTRADICTS_GPS",

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
-from scipy.stats import chi2
+from scipy.special import chdtri, gammaln
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
@@ -235,7 +234,7 @@ def fit_noisy(
             break
     used = np.zeros((len(centers), 2), dtype=np.bool_)
     for _ in range(_ROUNDS):  # then normal ones, without what is far out
-        again = _squared(data, state, weights, theta) <= chi2.ppf(_INSIDE, _SIZES)
+        again = _squared(data, state, weights, theta) <= chdtri(_SIZES, 1.0 - _INSIDE)
         again |= (again & (taken > 0)).sum(axis=0) < _LEAST_PHOTOS
         if (again == used).all():
             break
@@ -359,7 +358,7 @@ def _relative(data: _Data, residual: FloatArray) -> FloatArray:
 def _start_weights(data: _Data, state: _State) -> FloatArray:
     """As if all were noise of the size that residuals have at the median."""
     squared = _relative(data, state.residual(data))
-    return _weights(squared / np.maximum(np.median(squared, axis=0) / chi2.ppf(0.5, _SIZES), _LEAST_M))
+    return _weights(squared / np.maximum(np.median(squared, axis=0) / chdtri(_SIZES, 0.5), _LEAST_M))
 
 
 def _weights(squared: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.geometry.arrays import FloatArray
@@ -188,7 +188,7 @@ def _judged(
     rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]
     usual = np.maximum(stated, _PLAIN_M)[known.any(axis=0)] * NOISE_SHARE
     above = float(np.log(rms / usual).max())  # standard deviations of a receiver's noise
-    refused = norm.isf(options.wrong if chance <= np.log(options.no_place) else options.no_place)
+    refused = -ndtri(options.wrong if chance <= np.log(options.no_place) else options.no_place)
     if above > refused or inliers.sum() < _LEAST_PHOTOS:
         height = f" and {rms[2]:.0f} m in height" if len(rms) == 3 else ""
         return outcome(

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import f, norm
+from scipy.special import fdtr, ndtri
 
 from ingest.colmap.adjust import residuals_of
 from ingest.colmap.bridge import Model
@@ -25,7 +25,7 @@ _RATE = 0.001  # of such focal lengths are further off; of attempts that are as 
 def impossible(found_px: ArrayLike, exif_px: ArrayLike) -> NDArray[np.bool_]:
     """Which focal lengths (n,) cannot be, by those of EXIF; NaN where EXIF says none."""
     off = np.abs(np.log(np.asarray(found_px, np.float64) / np.asarray(exif_px, np.float64)))
-    return np.asarray(off > norm.isf(_RATE / 2.0) * _EXIF_SPREAD)
+    return np.asarray(off > -ndtri(_RATE / 2.0) * _EXIF_SPREAD)
 
 
 def mostly_impossible(models: Sequence[Model], exif_px: Sequence[float | None]) -> bool:
@@ -69,7 +69,7 @@ def better_supported(
     of_free = free_sum + (most - free_checks) * limit_px**2 / 2.0
     ratio = of_held / max(of_free, 1e-12)
     logger.info("variance with the lens held over that of a free one: %.3f, of %d checks", ratio, most)
-    return bool(f.cdf(ratio, most / dilution, most / dilution) < _RATE)
+    return bool(fdtr(most / dilution, most / dilution, ratio) < _RATE)
 
 
 def _squares_and_redundancy(

@@ -29,7 +29,7 @@ from ingest.workspace import atomic_folder
 
 logger = logging.getLogger(__name__)
 
-_VERSION = 2  # raised when the same task would give other models
+_VERSION = 3  # raised when the same task would give other models
 _MANY_PHOTOS = 8  # of one lens: a film's keyframes, not a visitor's photos
 _MOSTLY = 0.5  # of the photos; fewer with a lens that people have, and the start is to blame
 
@@ -269,6 +269,12 @@ def mapping_settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
         "num_threads": options.threads,
         "extract_colors": False,
         "ba_refine_focal_length": options.refine_focal,
+        # By default everything is adjusted at a tenth more photos or points, and to the last digit; the final
+        # adjustment does that.
+        "ba_global_frames_ratio": 1.2,
+        "ba_global_points_ratio": 1.2,
+        "ba_global_function_tolerance": 1e-5,
+        "ba_local_function_tolerance": 1e-4,
         "min_num_matches": options.min_inliers,
         "min_model_size": options.min_model_photos,
         # Bounds the trials of photos that see few points (decision 3): those of a generalised relative pose,

@@ -5,51 +5,18 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
-from featuredb.index.descriptor_index import use_threads
-from featuredb.index.nearest import nearest
-from ingest.colmap.bridge import TwoView, verify_pair
+from ingest.colmap.bridge import TwoView
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.sfm.extract import read_features
-from ingest.sfm.overlays import is_copy, without_overlay
+from ingest.sfm.overlays import is_copy
+from ingest.sfm.pair_geometry import MatchOptions, pair_geometry
 from ingest.sfm.pairs import Pair
 from ingest.workspace import Workspace, read_array, read_arrays, write_arrays
-
-_DESCRIPTOR_LENGTH = 512.0  # of 8-bit RootSIFT
-# The box holds 99.0 % of the verified matches of `seneca`, and takes 42 % of the time.
-_OUTSIDE = (0.05, 0.95)  # of the first matches, along each axis: some are wrong
-_MARGIN = 0.15  # of the longer side
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatchOptions:
-    """How pairs are matched and verified.
-
-    Attributes:
-        max_ratio: angle to the nearest descriptor over angle to the second nearest (Lowe's 0.8),
-            below it in both directions.
-        max_angle_rad: no match between descriptors further apart (COLMAP's 0.7).
-        max_error_px: of the two-view geometry, at `error_reference_side_px`, growing with the image.
-        error_reference_side_px: keypoints are located on images of about this size.
-        first_features: strongest features of each photo, which are matched first.
-        least_first: a pair with fewer matches among them is not matched further.
-        min_inliers: pairs with fewer verified matches do not count. Pairs of `brighton` and `lewis` had
-            none at all; repeated structure gives more, and two good photos hundreds.
-        seed: of RANSAC.
-    """
-
-    max_ratio: float = 0.8
-    max_angle_rad: float = 0.7
-    max_error_px: float = 2.0
-    error_reference_side_px: int = 1600
-    first_features: int = 3000
-    least_first: int = 6
-    min_inliers: int = 20
-    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,56 +138,6 @@ def match_pairs(
     )
 
 
-def pair_matches(a: Features, b: Features, options: MatchOptions) -> NDArray[np.uint32]:
-    """Mutual matches of two photos, strongest features first: rows (m, 2) of a and b.
-
-    The strongest tell whether two photos show the same at all, for a sixteenth of the time, and where in each
-    photo the other's part of the scene is; only there the rest is matched.
-    """
-    count = options.first_features
-    if max(len(a), len(b)) <= count:
-        return mutual_matches(a.descriptors, b.descriptors, options)
-    first = mutual_matches(a.descriptors[:count], b.descriptors[:count], options)
-    if len(first) < options.least_first:
-        return first[:0]
-    in_a, in_b = _around(a, first[:, 0]), _around(b, first[:, 1])
-    found = mutual_matches(a.descriptors[in_a], b.descriptors[in_b], options)
-    return np.stack([in_a[found[:, 0]], in_b[found[:, 1]]], axis=1).astype(np.uint32)
-
-
-def _around(photo: Features, rows: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Rows of the features in the box that the middle of these spans, made larger on each side."""
-    low, high = np.quantile(photo.xy[rows], _OUTSIDE, axis=0)
-    margin = _MARGIN * max(photo.width, photo.height)
-    return np.flatnonzero(((photo.xy >= low - margin) & (photo.xy <= high + margin)).all(axis=1))
-
-
-def mutual_matches(
-    descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], options: MatchOptions
-) -> NDArray[np.uint32]:
-    """Mutual nearest neighbours that pass the ratio test in both directions: rows (m, 2) of a and b."""
-    if len(descriptors_a) < 2 or len(descriptors_b) < 2:
-        return np.zeros((0, 2), np.uint32)
-    nearest_b = _distinct_nearest(descriptors_a, descriptors_b, options)
-    rows = np.flatnonzero(nearest_b >= 0)
-    candidates, place = np.unique(nearest_b[rows], return_inverse=True)
-    nearest_a = _distinct_nearest(descriptors_b[candidates], descriptors_a, options)
-    mutual = nearest_a[place] == rows
-    return np.stack([rows[mutual], nearest_b[rows[mutual]]], axis=1).astype(np.uint32)
-
-
-def _distinct_nearest(
-    queries: NDArray[np.uint8], base: NDArray[np.uint8], options: MatchOptions
-) -> NDArray[np.int64]:
-    """Row of base (n,) nearest to each query, -1 where it is too far or the second nearest is as near."""
-    if not len(queries):
-        return np.zeros(0, np.int64)
-    squared, rows = nearest(queries, base, 2)
-    angles = 2.0 * np.arcsin(np.clip(np.sqrt(squared) / (2.0 * _DESCRIPTOR_LENGTH), 0.0, 1.0))
-    good = (angles[:, 0] < options.max_ratio * angles[:, 1]) & (angles[:, 0] <= options.max_angle_rad)
-    return np.where(good, rows[:, 0], -1)
-
-
 _Outcome = tuple[int, bool]
 """Number of verified matches of a pair, and whether its photos are copies."""
 
@@ -232,29 +149,18 @@ def _outcome(file: Path) -> _Outcome:
 
 def _match_one(task: MatchTask) -> list[_Outcome]:
     """Match one photo with its others and write a file for each; what became of each pair."""
-    use_threads(1)
-    features = read_features(task.photo.features).features
-    return [_match_pair(task, features, other, target) for other, target in task.others]
+    with threadpool_limits(1):  # several wait for each other, and the products are small
+        features = read_features(task.photo.features).features
+        return [_match_pair(task, features, other, target) for other, target in task.others]
 
 
 def _match_pair(task: MatchTask, a: Features, other: PhotoView, target: Path) -> _Outcome:
     if target.exists():  # a worker that died had come so far
         return _outcome(target)
     b = read_features(other.features).features
-    options, sizes = task.options, ((a.width, a.height), (b.width, b.height))
-    matches = pair_matches(a, b, options)
-    matches = without_overlay(a.xy, b.xy, *sizes, matches)
-    side = max(a.width, a.height, b.width, b.height)
-    view = verify_pair(
-        task.photo.camera,
-        a.xy,
-        other.camera,
-        b.xy,
-        matches,
-        focal_known=task.photo.focal_known and other.focal_known,
-        max_error_px=options.max_error_px * max(1.0, side / options.error_reference_side_px),
-        seed=options.seed,
-    )
+    sizes = (a.width, a.height), (b.width, b.height)
+    focal_known = task.photo.focal_known and other.focal_known
+    view = pair_geometry(a, b, (task.photo.camera, other.camera), focal_known, task.options)
     if view.is_watermark:
         view = replace(view, inliers=view.inliers[:0])
     pixels = a.xy[view.inliers[:, 0]], b.xy[view.inliers[:, 1]]

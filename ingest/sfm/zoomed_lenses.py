@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
@@ -161,13 +161,13 @@ def _equal(values: FloatArray, covariance: FloatArray) -> bool:
     differences = np.diff(np.eye(len(values)), axis=0)
     off = differences @ values
     squared = off @ np.linalg.solve(differences @ covariance @ differences.T, off)
-    return bool(chi2.sf(squared, len(off)) >= _RATE)
+    return bool(chdtrc(len(off), squared) >= _RATE)
 
 
 def _runs(values: FloatArray, covariance: FloatArray) -> NDArray[np.int64]:
     """(k,) a number for each value; a new one where it differs from the mean of those with the last one."""
     runs, first = np.zeros(len(values), dtype=np.int64), 0
-    limit = float(norm.isf(0.5 * _RATE))
+    limit = float(-ndtri(0.5 * _RATE))
     for k in range(1, len(values)):
         weights = np.zeros(len(values))
         weights[first:k], weights[k] = -1.0 / (k - first), 1.0

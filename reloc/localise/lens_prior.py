@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from featuredb.adjust.block import whole_camera
 from featuredb.errors import InvalidValueError
@@ -142,7 +142,7 @@ def is_lens_of_a_map(camera: Camera, of_map: Camera, lenses: LensUncertainty) ->
     if seen is None or own.model != "OPENCV" or (own.width, own.height) != (camera.width, camera.height):
         return False
     off = (lens_of(own) - seen[1].mean) / seen[1].sigma
-    return bool(np.abs(off).max() <= norm.isf(0.5 * _SAME_LENS_RATE / len(off)))
+    return bool(np.abs(off).max() <= -ndtri(0.5 * _SAME_LENS_RATE / len(off)))
 
 
 def lens_of(camera: Camera) -> FloatArray:

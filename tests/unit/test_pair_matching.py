@@ -1,13 +1,18 @@
-"""Photos matched with each other: the strongest features first, the others where both show the same."""
+"""Photos matched with each other: the strongest features first, the others along their epipolar lines."""
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.features.features import Features
-from ingest.sfm.matching import MatchOptions, mutual_matches, pair_matches
+from featuredb.geometry.camera import Camera
+from ingest.colmap.bridge import TwoView
+from ingest.sfm.pair_geometry import MatchOptions, guided_matches, mutual_matches, pair_geometry
 
 OPTIONS = MatchOptions(first_features=300)
 SIDE = (1600, 1200)
+CAMERA = Camera.from_focal(*SIDE, 1500.0)
 
 
 def descriptors(count: int, seed: int) -> NDArray[np.uint8]:
@@ -49,23 +54,33 @@ def overlapping(common: int, others: int) -> tuple[Features, Features]:
     return found[0], found[1]
 
 
+def pairs_of(view: TwoView) -> set[tuple[int, int]]:
+    return {(int(i), int(j)) for i, j in view.inliers}
+
+
+def verified(a: Features, b: Features) -> TwoView:
+    return pair_geometry(a, b, (CAMERA, CAMERA), True, OPTIONS)
+
+
 def test_what_all_features_have_in_common_is_found_where_both_photos_show_it() -> None:
     a, b = overlapping(common=500, others=1500)
     everything = mutual_matches(a.descriptors, b.descriptors, OPTIONS)
-    found = pair_matches(a, b, OPTIONS)
     assert len(everything) >= 490
-    assert {tuple(row) for row in found.tolist()} == {tuple(row) for row in everything.tolist()}
+    assert pairs_of(verified(a, b)) == {tuple(row) for row in everything.tolist()}
 
 
-def test_the_rest_is_looked_for_in_the_common_part_only() -> None:
+def test_the_rest_is_looked_for_along_the_epipolar_lines_of_the_first() -> None:
     a, b = overlapping(common=500, others=1500)
-    far = int(np.flatnonzero(a.xy[:, 0] < 400)[-1])  # shown by the other photo in the place of something else
-    near = int(np.flatnonzero(b.xy[:, 0] > 1300)[-1])
-    drawn = b.descriptors.copy()
-    drawn[near] = a.descriptors[far]
-    b = photo(b.xy, drawn)
-    assert [far, near] in mutual_matches(a.descriptors, b.descriptors, OPTIONS).tolist()
-    assert [far, near] not in pair_matches(a, b, OPTIONS).tolist()
+    first = pair_geometry(a, b, (CAMERA, CAMERA), True, replace(OPTIONS, first_features=2000))
+    shared = first.inliers[b.xy[first.inliers[:, 1], 1] < 300][-1]
+    moved = b.xy.copy()
+    moved[shared[1]] += [0.0, 600.0]  # across its line, which is a row of pixels
+    b = replace(b, xy=moved)
+    assert shared.tolist() in mutual_matches(a.descriptors, b.descriptors, OPTIONS).tolist()
+    assert shared.tolist() not in guided_matches(a, b, first, (CAMERA, CAMERA), OPTIONS).tolist()
+    moved[shared[1]] -= [0.0, 590.0]  # within the band
+    b = replace(b, xy=moved)
+    assert shared.tolist() in guided_matches(a, b, first, (CAMERA, CAMERA), OPTIONS).tolist()
 
 
 def test_photos_whose_strongest_features_have_nothing_in_common_are_not_matched_further() -> None:
@@ -73,11 +88,11 @@ def test_photos_whose_strongest_features_have_nothing_in_common_are_not_matched_
     weak, xy = descriptors(500, 7), scattered(500, 8)
     a, b = (photo(np.concatenate([p.xy, xy]), np.concatenate([p.descriptors, weak])) for p in strong)
     assert len(mutual_matches(a.descriptors, b.descriptors, OPTIONS)) >= 490
-    assert pair_matches(a, b, OPTIONS).shape == (0, 2)
+    assert not pairs_of(verified(a, b))
 
 
 def test_few_features_are_all_matched() -> None:
-    a, b = overlapping(common=5, others=200)  # fewer than would be matched further
-    found = pair_matches(a, b, OPTIONS)
-    assert found.tolist() == mutual_matches(a.descriptors, b.descriptors, OPTIONS).tolist()
-    assert len(found) == 5
+    a, b = overlapping(common=30, others=200)  # fewer than would be matched further
+    everything = mutual_matches(a.descriptors, b.descriptors, OPTIONS)
+    assert pairs_of(verified(a, b)) == {tuple(row) for row in everything.tolist()}
+    assert len(everything) == 30

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from featuredb.errors import FeatureDbError
 from featuredb.geo.words import way_words
@@ -106,7 +106,7 @@ def chance_of_offset(offset_m: FloatArray, covariance: FloatArray) -> float:
     """
     squared = float(offset_m @ np.linalg.solve(covariance, offset_m))
     nodes, weights = np.polynomial.hermite_e.hermegauss(64)
-    chances = chi2.sf(squared / np.exp(2.0 * NOISE_SPREAD * nodes), 2)
+    chances = chdtrc(2, squared / np.exp(2.0 * NOISE_SPREAD * nodes))
     return float(weights @ chances / weights.sum())
 
 

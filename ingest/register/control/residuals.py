@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
@@ -165,13 +165,13 @@ def gps_offset(
     }
     notes = []
     flat, up = median[:2], median[2]
-    if flat @ np.linalg.solve(spread[:2, :2], flat) > chi2.isf(_TOLD, 2):
+    if flat @ np.linalg.solve(spread[:2, :2], flat) > chdtri(2, _TOLD):
         notes.append(
             f"the photos' GPS is {np.linalg.norm(flat):.2f} m from where the control points put them "
             f"({flat[0]:+.2f} east, {flat[1]:+.2f} north; {np.sqrt(np.trace(spread[:2, :2])):.2f} m are "
             "noise): another reference system, or a base station at wrong coordinates; the points count"
         )
-    if up**2 / spread[2, 2] > chi2.isf(_TOLD, 1):
+    if up**2 / spread[2, 2] > chdtri(1, _TOLD):
         notes.append(
             f"the photos' GPS heights are {abs(up):.2f} m {'above' if up > 0 else 'below'} those of the "
             f"control points ({np.sqrt(spread[2, 2]):.2f} m are noise): they count from different datums, or "

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
@@ -101,8 +101,8 @@ def chance_of(residuals: Whitened, rows: NDArray[np.int64]) -> tuple[FloatArray,
     if freedom < 1.0:
         return alone, 1.0  # nothing is left to judge by
     variance = max(float((others.residual**2).sum()) / freedom, 1e-9)
-    statistic = float(alone @ residuals.residual[rows, 0]) / len(rows)
-    return alone, float(f_distribution.sf(statistic / variance, len(rows), freedom))
+    statistic = max(float(alone @ residuals.residual[rows, 0]), 0.0) / len(rows)
+    return alone, float(fdtrc(len(rows), freedom, statistic / variance))
 
 
 def _mark_sigma(adjusted: Adjusted) -> float:
@@ -159,7 +159,7 @@ def _fitting(adjusted: Adjusted, control: Control, freedom: float) -> NDArray[np
         rest = (control.surveyed[point] - adjusted.control_xyz[point])[known]
         variance = np.diag(weights.control_m[known] ** 2) + adjusted.spread[point][np.ix_(known, known)]
         statistic, axes = float(rest @ np.linalg.solve(variance, rest)), int(known.sum())
-        chance = float(f_distribution.sf(statistic / axes, axes, max(freedom, 1.0)))
+        chance = float(fdtrc(axes, max(freedom, 1.0), statistic / axes))
         fitting[point] = chance > _READMISSION or np.linalg.norm(rest) <= _MIN_POINT_M
     return fitting
 
