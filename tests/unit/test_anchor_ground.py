@@ -147,11 +147,11 @@ def test_a_street_is_found_within_its_covariance(cloud: PointCloud) -> None:
 
 def test_its_mirror_image_is_refused(cloud: PointCloud) -> None:
     found = place_on_outlines(_street_map(mirrored=True), cloud)
-    assert found.reason in ("CHANCE", "AMBIGUOUS", "FEW_PHOTOS"), found.message
+    assert found.reason in ("STRUCTURE", "AMBIGUOUS", "TOO_FEW_FRAMES"), found.message
 
 
 def test_it_is_refused_on_another_scan(cloud: PointCloud) -> None:
     xyz = cloud.xyz.astype(np.float64)
     turned = plain_cloud(np.column_stack([xyz[:, 1] * 0.8 + 9.0, -xyz[:, 0] * 1.3, xyz[:, 2]]))
     found = place_on_outlines(_street_map(mirrored=False), turned)
-    assert found.reason in ("CHANCE", "AMBIGUOUS", "FEW_PHOTOS"), found.message
+    assert found.reason in ("STRUCTURE", "AMBIGUOUS", "TOO_FEW_FRAMES"), found.message

@@ -37,10 +37,10 @@ class SolidFit:
 
 def distances(shape: ScanShape, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Signed distances (n,) from the planes next to points (n, 3), from their points, and their normals."""
-    near_m, index = shape.tree.query(points)
+    near_m, index = (np.asarray(found) for found in shape.tree.query(points))
     normals = shape.normals[index]
     off = np.einsum("ij,ij->i", normals, points - shape.points[index])
-    return off, near_m, normals
+    return np.asarray(off), near_m, np.asarray(normals)
 
 
 def fitted(

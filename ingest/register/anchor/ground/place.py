@@ -41,6 +41,7 @@ _START_SIGMA = (0.1, 0.03, 0.03, 0.1)  # of size and angles of a start
 _AGAIN_M, _AGAIN_SIZE = 2.0, 0.05  # from so far around the best place it is fitted again
 _AROUND_M = 100.0  # of the geotags' middle: what people see from where they may be
 _APART_M = 3.0  # of a map's points, in the median: another place
+_ALIKE = 0.4  # logarithm: sizes that are compared point by point; a small map agrees within any wall
 _ELSEWHERE_M = 8.0  # likewise: a place that shares nothing with the best
 _ROUNDS = 3  # of photos left out and the fit
 _TIED = 0.5  # of a photo's points that others see which stay
@@ -50,7 +51,12 @@ _LEAST_TRIES = 20  # elsewhere: fewer do not tell what chance gives
 _WALL_SIGMA_M = 0.15  # of all outlines together, outwards: eaves, and a laser's footprint
 _LEAST_SIGMA_M = 0.05  # of a point
 
-GroundReason = Literal["NO_FRONTS", "NO_SCAN", "CHANCE", "AMBIGUOUS", "FEW_PHOTOS"]
+GroundReason = Literal[
+    "NO_SCAN",  # it shows nothing that stands
+    "STRUCTURE",  # the map shows no fronts, or they agree no better than chance
+    "TOO_FEW_FRAMES",  # of its photos lie on the scan
+    "AMBIGUOUS",  # another place agrees nearly as well
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,13 +104,13 @@ def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud) -> GroundPlace:
     around = None if tags is None else tags.around(_AROUND_M)
     plan, shape = street_plan(unplaced), shape_of(cloud, around)
     if plan is None:
-        return GroundPlace(reason="NO_FRONTS", message="it shows no fronts")
+        return GroundPlace(reason="STRUCTURE", message="it shows no fronts")
     if shape is None or not len(shape.walls):
         return GroundPlace(reason="NO_SCAN", message="the scan shows no fronts")
     search = PlanSearch(shape)
     there = _tried(plan, shape, search, tags)
     if len(there) < _LEAST_TRIES:
-        return GroundPlace(reason="CHANCE", message="it fits hardly anywhere on the scan")
+        return GroundPlace(reason="STRUCTURE", message="it fits hardly anywhere on the scan")
     rate = float(np.mean([t.evidence.agreeing / max(t.evidence.places, 1) for t in there]))
     best = max(there, key=lambda one: one.over(rate))
     return _judged(unplaced, plan, shape, best, there, rate)
@@ -181,13 +187,19 @@ def _judged(
     figures: dict[str, Any] = {"photos": int(kept.sum()), "of": len(kept), "rate": rate}
     if kept.sum() < _LEAST_PHOTOS:
         return GroundPlace(
-            reason="FEW_PHOTOS", message=f"{int(kept.sum())} of its photos lie on the scan", figures=figures
+            reason="TOO_FEW_FRAMES",
+            message=f"{int(kept.sum())} of its photos lie on the scan",
+            figures=figures,
         )
     rows = _rows_seen(unplaced, plan, kept)
     away = [_away_m(plan, rows, sim, one.fit.local_from_own) for one in there]
     over = np.array([one.over(rate) for one, far in zip(there, away, strict=True) if far > _ELSEWHERE_M])
     log_nfa = _log_nfa(best.over(rate), over)
-    others = [one for one, far in zip(there, away, strict=True) if far > _APART_M]
+    others = [
+        one
+        for one, far in zip(there, away, strict=True)
+        if far > _APART_M and abs(np.log(one.fit.local_from_own.scale / sim.scale)) < _ALIKE
+    ]
     rivals = [
         _rival_p(plan, shape, rows, sim, one.fit.local_from_own)
         for one in sorted(others, key=lambda one: one.over(rate))[-_RIVALS:]
@@ -218,7 +230,7 @@ def _judged(
         figures=figures,
     )
     if log_nfa < _LOG_RATE:
-        return _refused(found, "CHANCE", f"{words}, which chance gives, too")
+        return _refused(found, "STRUCTURE", f"{words}, which chance gives, too")
     if max(rivals, default=0.0) > _RIVAL_RATE:
         return _refused(found, "AMBIGUOUS", f"{words}, and nearly as many at another place")
     return found

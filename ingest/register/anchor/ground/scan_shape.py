@@ -133,7 +133,8 @@ def _surfaces(
 
 def _walls(top: FloatArray, known: NDArray[np.bool_], corner: FloatArray, xyz: FloatArray) -> FloatArray:
     """(k, 6): place in plan, way out, lower and upper height, between cells whose heights jump."""
-    up, across = np.gradient(gaussian_filter(top, _SMOOTH_CELLS))
+    smooth = gaussian_filter(top, _SMOOTH_CELLS)
+    up, across = (np.asarray(np.gradient(smooth, axis=axis)) for axis in (0, 1))
     found = []
     for axis in (0, 1):
         step = np.diff(top, axis=axis)
@@ -141,12 +142,8 @@ def _walls(top: FloatArray, known: NDArray[np.bool_], corner: FloatArray, xyz: F
         rows, columns = np.nonzero((np.abs(step) > _JUMP_M) & both)
         next_row, next_column = (rows + 1, columns) if axis == 0 else (rows, columns + 1)
         middle = 0.5 * np.column_stack([columns + next_column, rows + next_row]) + 0.5
-        out = -np.column_stack(
-            [
-                across[rows, columns] + across[next_row, next_column],
-                up[rows, columns] + up[next_row, next_column],
-            ]
-        )
+        here, there = (rows, columns), (next_row, next_column)
+        out = -np.column_stack([across[here] + across[there], up[here] + up[there]])
         heights = np.sort(np.column_stack([top[rows, columns], top[next_row, next_column]]), axis=1)
         found.append(np.column_stack([corner + middle * CELL_M, out, heights]))
     walls = np.vstack(found)

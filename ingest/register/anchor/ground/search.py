@@ -21,6 +21,7 @@ TURN_STEP, SIZE_STEP = np.radians(6.0), 0.1  # of the heading, of the size's log
 _PEAKS = 3  # of each heading and size
 _OF_SIZE = 10  # kept of each size: the smaller a plan, the more places agree with it
 _LOOSE = 1.5  # of the mean of geotags: those of one visit err together
+_WRONG = 9.0  # squared sigmas from which on a geotag says nothing; a third of them may be so
 _SIGMAS = 4.0  # of the geotags within which a place is looked for
 _NEAR_M, _NEAR_TURN, _NEAR_SIZE = 4.0, np.radians(10.0), 0.15  # tries that are one
 
@@ -49,9 +50,8 @@ class Geotags:
     def cost(self, plan: StreetPlan, size: float, turn: float) -> float:
         """Squared sigmas that a size and heading leave, each tag's bounded: some are wrong."""
         off = self._offsets(plan, size, turn)
-        middle = np.average(off, axis=0, weights=self.sigma_m**-2.0)
-        squared = np.square((off - middle) / self.sigma_m[:, None]).sum(axis=1)
-        return float(np.minimum(squared, _SIGMAS**2).sum())
+        squared = np.square((off - np.median(off, axis=0)) / self.sigma_m[:, None]).sum(axis=1)
+        return float(np.minimum(squared, _WRONG).sum())
 
     def circle(self, plan: StreetPlan, size: float, turn: float) -> tuple[float, float, float]:
         """x, y and radius of where the middle of the plan's cameras may be."""
@@ -106,7 +106,7 @@ class PlanSearch:
         found: list[PlanTry] = []
         ways = [(size, turn) for size in sizes for turn in turns]
         costs = [0.0 if tags is None else tags.cost(plan, size, turn) for size, turn in ways]
-        allowed = min(costs) + _SIGMAS**2
+        allowed = min(costs) + (0.0 if tags is None else _WRONG * max(2.0, len(tags.rows) / 3.0))
         cells = {size: _cells(plan, size) for size in sizes}
         for size in sizes:
             at_size: list[PlanTry] = []
@@ -202,8 +202,8 @@ def _cells(plan: StreetPlan, size: float) -> tuple[FloatArray, FloatArray]:
     _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     group = group.reshape(-1)
     sums = [np.bincount(group, of) for of in (xy[:, 0], xy[:, 1], out[:, 0], out[:, 1])]
-    way = np.column_stack(sums[2:])
-    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    way = np.column_stack(sums[2:]).astype(np.float64)
+    way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
     fronts = np.column_stack([sums[0] / count, sums[1] / count, way, np.minimum(count / 3.0, 1.0)])
     near = np.hypot(fronts[:, 0], fronts[:, 1]) < _REACH_CELLS * _CELL_M
     start, end = size * plan.free[:, :2], size * plan.free[:, 2:]

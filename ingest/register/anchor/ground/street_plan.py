@@ -111,7 +111,7 @@ def _one_each(xyz: FloatArray, side: float) -> NDArray[np.int64]:
     return np.unique(cells, axis=0, return_index=True)[1]
 
 
-def _planes(xyz: FloatArray, eye: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _planes(xyz: FloatArray, eye: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Normals (n, 3) towards those who see the points (n, 3), and which lie on planes."""
     near = np.asarray(cKDTree(xyz).query(xyz, _NEIGHBOURS)[1])
     patch = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
