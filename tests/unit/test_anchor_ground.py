@@ -155,3 +155,13 @@ def test_it_is_refused_on_another_scan(cloud: PointCloud) -> None:
     turned = plain_cloud(np.column_stack([xyz[:, 1] * 0.8 + 9.0, -xyz[:, 0] * 1.3, xyz[:, 2]]))
     found = place_on_outlines(_street_map(mirrored=False), turned)
     assert found.reason in ("STRUCTURE", "AMBIGUOUS", "TOO_FEW_FRAMES"), found.message
+
+
+def test_photos_that_look_down_are_not_asked() -> None:
+    street = _street_map(mirrored=False)
+    centers = [image.cam_from_local.center for image in street.images]
+    down = [
+        replace(image, cam_from_local=look_pose(center, 20.0 * k, -85.0))
+        for k, (image, center) in enumerate(zip(street.images, centers, strict=True))
+    ]
+    assert not looks_level(replace(street, images=tuple(down)))

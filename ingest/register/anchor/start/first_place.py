@@ -208,8 +208,11 @@ def first_place(
     ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
     started: list[StartedImage] = []
     by_look = on_outlines = False
+    placed = None
     if files.near is not None and looks_level(unplaced):
-        feature_map, note = _on_outlines(database, unplaced, files.near, ids)
+        placed = _on_outlines(database, unplaced, files.near, ids)
+    if placed is not None:
+        feature_map, note = placed
         notes: tuple[str, ...] = (note,)
         on_outlines = True
     elif files.near is not None:
@@ -235,11 +238,16 @@ def first_place(
 
 def _on_outlines(
     database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...]
-) -> tuple[FeatureMap, str]:
-    """The map of street photos where its fronts and the scan's outlines agree, and a line on it."""
+) -> tuple[FeatureMap, str] | None:
+    """The map of street photos where its fronts and the scan's outlines agree, and a line on it.
+
+    None where they do not, and its photos may look down as well: nothing tells which way is up.
+    """
     cloud = _cloud_near(database, near, scan_ids)
     found = place_on_outlines(unplaced, cloud)
     if found.local_from_own is None or found.covariance is None or found.reason is not None:
+        if not unplaced.frame.upright:
+            return None
         raise RegistrationError(
             f"map {unplaced.map_id} is not placed within {near.radius_m:.0f} m of {near.lat:.6f}, "
             f"{near.lon:.6f} by what its photos see of fronts: {found.reason}: {found.message}; say where "
