@@ -23,7 +23,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import list_scans
 from ingest.executor import Progress, no_progress
-from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, place_map
+from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, on_outlines, place_map
 from ingest.register.anchor.files import PhotoFiles, find_photos, load_proposals, save_proposals
 from ingest.register.anchor.frames import TriedFrames, try_frames
 from ingest.register.anchor.page import write_anchor_report
@@ -40,6 +40,7 @@ from ingest.register.anchor.start.priors import image_named
 from ingest.register.frame_registration import FramePrior
 
 _CONFIRM = "--confirm"
+_BY_OUTLINES = "placed by outlines of a scan; nothing has confirmed it"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,9 +127,14 @@ def anchor(
         ConflictError: someone else placed the map anew meanwhile.
     """
     job = _load(database, request, _with_frames(options or AnchorOptions(), request.frames))
+    result: AnchorResult | None
     if request.confirm:
         tried = _confirmed(job)
         notes = [f"confirmed by a person: {', '.join(f.image.name for f in tried.accepted)}"]
+    elif job.first is not None and job.first.on_outlines:
+        tried, notes = TriedFrames(shift=None, ranking=(), tried=()), list(job.first.notes)
+        result = on_outlines(job.feature_map, job.cloud) if request.auto else None
+        return _finished(database, job, tried, result, notes)
     else:
         starts, notes = _starts(job)
         tried = try_frames(
@@ -143,7 +149,7 @@ def anchor(
             progress=progress,
         )
     notes += _about_photos(job, tried)
-    result: AnchorResult | None = None
+    result = None
     if request.auto or request.confirm:
         supervised = bool(request.confirm or request.start.pose or request.start.picks)
         result = place_map(
@@ -170,19 +176,26 @@ def _finished(
         result=result,
         notes=tuple(notes),
     )
-    command = _confirm_command(database, job)
+    on_fronts = job.first is not None and job.first.on_outlines
+    command = _confirm_command(database, job, "--auto" if on_fronts else f"{_CONFIRM} {{image}}")
     page = write_anchor_report(job.out, report, job.feature_map, job.cloud, job.rgb, command)
     done = Anchoring(report=report, page=page)
     if result is None:
         saved = {f.image.image_id: f.registration for f in tried.accepted}
         save_proposals(job.out, _state(job), saved)
+        if on_fronts:
+            return replace(done, proposed=tuple(i.name for i in job.feature_map.images), command=command)
         names = tuple(f.image.name for f in tried.accepted)
         confirmed = f" {_CONFIRM} ".join(shlex.quote(name) for name in names)
         return replace(done, proposed=names, command=command.replace("{image}", confirmed))
     if result.feature_map is None:
         return done
-    committed = database.commit_map(
-        result.feature_map, replaces=job.summary.map_id, based_on=job.summary.write_id
+    map_id = job.summary.map_id
+    (committed,) = database.commit_maps(
+        [result.feature_map],
+        replaces=(map_id,),
+        based_on={map_id: job.summary.write_id},
+        reasons={map_id: _BY_OUTLINES} if on_fronts else None,
     )
     return replace(
         done,
@@ -193,8 +206,8 @@ def _finished(
     )
 
 
-def _confirm_command(database: Database, job: _Job) -> str:
-    """What a person runs to confirm a frame; its name goes in the place of {image}."""
+def _confirm_command(database: Database, job: _Job, decision: str) -> str:
+    """What a person runs to confirm a frame, whose name goes in the place of {image}, or the map."""
     words = ["featuredb", "anchor", database.url, job.summary.map_id, "--photos", str(job.files.folder)]
     for option in job.request.storage_options:
         words += ["--storage-option", option]
@@ -203,7 +216,7 @@ def _confirm_command(database: Database, job: _Job) -> str:
     for scan_id in job.request.scan_ids:
         words += ["--scan", scan_id]
     words += ["--out", str(job.out)]
-    return f"{shlex.join(words)} {_CONFIRM} {{image}}"
+    return f"{shlex.join(words)} {decision}"
 
 
 def _load(database: Database, request: AnchorRequest, options: AnchorOptions) -> _Job:

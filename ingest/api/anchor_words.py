@@ -15,7 +15,14 @@ def anchoring_text(done: Anchoring, database: str) -> str:
     if rows:
         lines.append(format_table(FRAME_HEADER, rows).rstrip())
     lines.extend(f"{name}: {seconds:.2f} s" for name, seconds in report.times_s().items())
-    if done.placed and result is not None and result.before is not None and result.after is not None:
+    if done.placed and result is not None and "outlines" in result.checks:
+        where = shlex.quote(database)
+        lines.append(
+            f"map {report.map_id} is placed by the outlines of its scan: version {done.version}. It answers "
+            f"once somebody has looked at it: featuredb promote {where} {report.map_id}"
+        )
+        lines.append(f"without a place: featuredb rollback {shlex.quote(database)} {done.version_before}")
+    elif done.placed and result is not None and result.before is not None and result.after is not None:
         move = result.checks["move"]
         lines.append(
             f"map {report.map_id} is placed by its scan: version {done.version}; moved "

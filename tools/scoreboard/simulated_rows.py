@@ -194,6 +194,18 @@ SIMULATED: tuple[Row, ...] = (
         minutes=120,
     ),
     _row(
+        name="street-on-scan",
+        claim="ten towns, 60 street photos each by ten people, a third with geotags of 10 m: maps of ten "
+        "photos and more placed on scans with intensities alone by fronts and ground; on another town's scan",
+        commands=f"tools.street_on_scan --work {{work}}/towns --inputs {{cache}} {OUT}",
+        text="{right_share:.0%} of {photos} photos in {maps} maps within 0.5 m and 0.5 degrees, of {placed} "
+        "placed {outside} more than a metre outside 99.9 %, median {median_m:.2f} m, largest {largest_m:.2f} "
+        "m; elsewhere {elsewhere_placed} of {elsewhere} maps",
+        limits="0.6 <= right_share, outside <= 0, elsewhere_placed <= 0",
+        resumes=True,
+        minutes=120,
+    ),
+    _row(
         name="film-near",
         claim="a film of 1,200 frames without telemetry, looked for within 250 m of a point 100 m off on a "
         "scan with intensities alone; ten points, and ten on the scan of another town",

@@ -164,7 +164,7 @@ class Building:
             equal looks.
         tint: factors on red, green, blue of the facade.
         back_u: how much further along its texture opposite walls and slopes start than the first ones; 0
-            makes them alike.
+            makes them alike. side_u: the same of neighbouring walls.
     """
 
     x: float
@@ -182,6 +182,7 @@ class Building:
     roof_u: float
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     back_u: float = 0.0
+    side_u: float = 9.0
 
     def footprint(self) -> FloatArray:
         """Corners (4, 2), counter-clockwise, from the front left one, town axes, metres."""

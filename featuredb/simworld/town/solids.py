@@ -80,7 +80,7 @@ def house(building: Building, ground: float, object_id: int) -> Faces:
         edge = corners[(i + 1) % 4] - corners[i]
         length, height = float(np.linalg.norm(edge)), b.eaves - b.base
         # Opposite walls look alike unless the building says otherwise, neighbouring ones do not.
-        u = b.facade_u + (0.0 if i % 2 == 0 else 9.0) + (b.back_u if i >= 2 else 0.0)
+        u = b.facade_u + (0.0 if i % 2 == 0 else b.side_u) + (b.back_u if i >= 2 else 0.0)
         uv = (u, b.base - ground, length, 0.0, 0.0, height)
         detail = (b.detail_u + 14.3 * i, 0.37 * b.detail_u)
         parts.append(
@@ -110,7 +110,7 @@ def _gabled_roof(b: Building, top: FloatArray, ground: float, object_id: int) ->
         parts.append(face(start, edge, rise, b.roof, object_id, detail=detail))
     for start, end, apex, shift in ((top[1], top[2], ridge1, 1), (top[3], top[0], ridge0, 3)):
         edge = end - start
-        u, v = b.facade_u + 9.0 + (b.back_u if shift == 3 else 0.0), b.eaves - ground
+        u, v = b.facade_u + b.side_u + (b.back_u if shift == 3 else 0.0), b.eaves - ground
         length = float(np.linalg.norm(edge))
         parts.append(
             face(

@@ -27,6 +27,7 @@ TOWN_PLACE = (48.1374, 11.4162, 552.0, 32632)
 OTHER_TOWN_PLACE = (-33.4512, -70.6215, 611.0, 32719)
 
 GROUND_ID, WATER_ID, BRIDGE_ID = 1, 2, 3
+_OWN_SIDES = 8  # pieces of walls, from which on neighbouring walls of a house share none
 _LAND_M = 1500.0  # how far the land goes on around the town
 _ROAD_M = 6.5
 BUILDING_ID, TREE_ID = 10_000, 20_000
@@ -95,6 +96,7 @@ def _individual(buildings: tuple[Building, ...], seed: int, pieces: int) -> tupl
                 facade_u=b.facade_u + FACADE_LENGTH_M * wall,
                 roof_u=b.roof_u + ROOF_LENGTH_M * roof,
                 back_u=FACADE_LENGTH_M * (pieces // 2),
+                side_u=FACADE_LENGTH_M * (pieces // 4) if pieces >= _OWN_SIDES else b.side_u,
             )
         )
     return tuple(found)

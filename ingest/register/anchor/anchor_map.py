@@ -151,6 +151,26 @@ def place_map(
     return _judged(feature_map, placed, cloud, found, supervised=supervised or confirmed)
 
 
+def on_outlines(feature_map: FeatureMap, cloud: PointCloud) -> AnchorResult:
+    """A map that outlines have placed (`ingest.register.anchor.ground`), with its evidence.
+
+    It waits in quarantine: how often outlines place a map wrongly is not known yet. How far its points lie
+    from the scan's is told, not judged: a laser in the air sees hardly any fronts.
+    """
+    residual, _ = map_residuals(feature_map, feature_map, cloud)
+    return AnchorResult(
+        reason=None,
+        message="",
+        feature_map=replace(feature_map, generation=0, parents=(), status="quarantined"),
+        before=residual,
+        after=residual,
+        checks={
+            "move": asdict(map_move(feature_map, feature_map)),
+            "outlines": feature_map.placement.evidence["outlines"],
+        },
+    )
+
+
 def _nothing_registered(tried: TriedFrames) -> AnchorResult:
     if not tried.tried:
         return AnchorResult(

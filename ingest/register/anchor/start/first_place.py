@@ -13,11 +13,14 @@ from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import chosen_scans, load_cloud
 from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
 from featuredb.maps.move import placed_map
+from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary
 from ingest.register.anchor.files import PhotoFiles
+from ingest.register.anchor.ground.place import place_on_outlines
+from ingest.register.anchor.ground.street_plan import looks_level
 from ingest.register.anchor.start.files import RoughPose, read_picks, read_pose
 from ingest.register.anchor.start.from_above import FoundFromAbove, found_from_above
 from ingest.register.anchor.start.from_ortho import FoundByOrtho, found_by_ortho
@@ -128,6 +131,7 @@ class FirstPlace:
         feature_map: the map there; a start, not a placement. cloud: the scan around it, in its frame.
         starts: priors of the person's photos by image id. notes: a line on each, or on how it was found.
         by_look: it was put where its picture from above is most like the scan's, which chance may be.
+        on_outlines: it was placed by what street photos and the scan have in common; its frames need none.
     """
 
     feature_map: FeatureMap
@@ -136,6 +140,7 @@ class FirstPlace:
     starts: Mapping[int, FramePrior]
     notes: tuple[str, ...]
     by_look: bool = False
+    on_outlines: bool = False
 
 
 def started_images(
@@ -202,9 +207,14 @@ def first_place(
     scans = scans_of_one_zone(database, scan_ids)
     ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
     started: list[StartedImage] = []
-    by_look = False
+    by_look = on_outlines = False
     if files.near is not None:
-        feature_map, note, by_look = _found_near(database, unplaced, files.near, ids, photos)
+        placed = _on_outlines(database, unplaced, files.near, ids) if looks_level(unplaced) else ""
+        on_outlines = not isinstance(placed, str)
+        if isinstance(placed, str):
+            feature_map, note, by_look = _found_near(database, unplaced, files.near, ids, photos, placed)
+        else:
+            feature_map, note = placed
         notes: tuple[str, ...] = (note,)
     else:
         told = files.read()
@@ -220,13 +230,36 @@ def first_place(
         starts={s.image.image_id: s.prior for s in started},
         notes=notes,
         by_look=by_look,
+        on_outlines=on_outlines,
     )
 
 
-def _found_near(
-    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...], photos: PhotoFiles
-) -> tuple[FeatureMap, str, bool]:
-    """The map where the scans near a place show the same, a line on it, and whether it was only its look."""
+def _on_outlines(
+    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...]
+) -> tuple[FeatureMap, str] | str:
+    """The map of street photos where its fronts and the scan's outlines agree, with a line; or why not."""
+    cloud = _cloud_near(database, near, scan_ids)
+    found = place_on_outlines(unplaced, cloud)
+    if found.local_from_own is None or found.covariance is None or found.reason is not None:
+        return f"; by what its photos see of fronts: {found.reason}: {found.message}"
+    placement = Placement(
+        method="lidar",
+        local_from_sfm=found.local_from_own,
+        covariance=found.covariance,
+        residual_rms_m=found.residual_rms_m,
+        evidence={"outlines": {"near": str(near), "words": found.message, **found.figures}},
+    )
+    kept = only_images(unplaced, found.image_ids)
+    placed = placed_map(kept, placement, cloud.frame, cloud.height_datum)
+    return placed, f"placed by outlines: {found.message}"
+
+
+def _cloud_near(database: Database, near: Circle, scan_ids: tuple[str, ...]) -> PointCloud:
+    """The scans within a circle.
+
+    Raises:
+        RegistrationError: there are none.
+    """
     frame = LocalFrame(latitude_deg=near.lat, longitude_deg=near.lon, height_m=0.0)
     reach = near.radius_m
     cloud = load_cloud(database, frame, (-reach, -reach, reach, reach), scan_ids=scan_ids)
@@ -235,6 +268,23 @@ def _found_near(
             f"no scan of {database.url} lies within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}; "
             "`featuredb lidar list` tells where scans lie"
         )
+    return cloud
+
+
+def _found_near(
+    database: Database,
+    unplaced: UnplacedMap,
+    near: Circle,
+    scan_ids: tuple[str, ...],
+    photos: PhotoFiles,
+    before: str,
+) -> tuple[FeatureMap, str, bool]:
+    """The map where the scans near a place show the same, a line on it, and whether it was only its look.
+
+    Args:
+        before: what was tried in vain, for the message.
+    """
+    cloud, reach = _cloud_near(database, near, scan_ids), near.radius_m
     if cloud.rgb is None and cloud.intensity is None:
         raise RegistrationError(
             f"scan {', '.join(scan_ids)} has neither colours nor intensities, and nothing is looked for by "
@@ -250,8 +300,8 @@ def _found_near(
             words = f"{by_features.words()}, which chance gives, too"
         raise RegistrationError(
             f"map {unplaced.map_id} is not found within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}: "
-            f"{words}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show more "
-            "than intensities; or say where one photo is: --page, --picks FILE, --pose FILE"
+            f"{words}{before}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show "
+            "more than intensities; or say where one photo is: --page, --picks FILE, --pose FILE"
         )
     placement = Placement(
         method="lidar",

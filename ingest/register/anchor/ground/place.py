@@ -1,0 +1,351 @@
+"""A map of street photos placed on a scan by its fronts, the ground and what it sees of roofs.
+
+Search in plan, then points to planes of the solid that the scan shows. Photos whose points lie elsewhere are
+left out: maps of fronts that look alike are joined wrongly. Other places of the same search say how often as
+many points agree by chance.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom, norm
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import so3_exp
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.unplaced_map import UnplacedMap
+from featuredb.render.cloud import PointCloud
+from ingest.register.anchor.ground.fit import SolidFit, fitted
+from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, shape_of
+from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
+from ingest.register.anchor.ground.street_plan import StreetPlan, street_plan
+from ingest.register.anchor.together.evidence import JointEvidence
+
+_LOG = logging.getLogger(__name__)
+
+_LOG_RATE = 3.0  # one map of a thousand that lies elsewhere is placed wrongly
+_RIVAL_RATE = 1e-3  # how often another place that is as good would agree in so many fewer blocks
+_AGREE_M, _NEAR_M = 0.3, 1.0  # of a point from the solid: across its plane, and from what is known of it
+_ABOVE_M = 1.0  # over the ground: the ground agrees everywhere
+_PLACE_M, _BLOCK_M = 1.0, 3.0  # sides of what counts as one place, and of what errs together
+_EYE_M = 1.6  # of people over the ground, from which a fit starts
+_NEAREST_M, _FURTHEST_M = 5.0, 40.0  # medians from which people take photos of fronts
+_COARSE, _FINE = 400, 4000  # points of a fit
+_COARSE_WIDTHS_M = (2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5)
+_FINE_WIDTHS_M = (1.5, 1.0, 0.7, 0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3)
+_START_SIGMA = (0.1, 0.03, 0.03, 0.1)  # of size and angles of a start
+_AGAIN_M, _AGAIN_SIZE = 2.0, 0.05  # from so far around the best place it is fitted again
+_AROUND_M = 100.0  # of the geotags' middle: what people see from where they may be
+_APART_M = 3.0  # of a map's points, in the median: another place
+_ALIKE = 0.4  # logarithm: sizes that are compared point by point; a small map agrees within any wall
+_ELSEWHERE_M = 8.0  # likewise: a place that shares nothing with the best
+_ROUNDS = 3  # of photos left out and the fit
+_TIED = 0.5  # of a photo's points that others see which stay
+_LEAST_PHOTOS = 10  # of two maps of eight one was accepted outside its 99.9 % bound
+_RIVALS = 20  # the best of other places that are compared one by one
+_LEAST_TRIES = 20  # elsewhere: fewer do not tell what chance gives
+_WALL_SIGMA_M = 0.15  # of all outlines together, outwards: eaves, and a laser's footprint
+_LEAST_SIGMA_M = 0.05  # of a point
+
+GroundReason = Literal[
+    "NO_SCAN",  # it shows nothing that stands
+    "STRUCTURE",  # the map shows no fronts, or they agree no better than chance
+    "TOO_FEW_FRAMES",  # of its photos lie on the scan
+    "AMBIGUOUS",  # another place agrees nearly as well
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GroundPlace:
+    """Where a map lies, or why that is not known.
+
+    Attributes:
+        reason, message: of the refusal; None and words on the evidence where it is placed.
+        local_from_own: similarity. covariance: (7, 7) of its left perturbation.
+        image_ids: of the photos that lie there. residual_rms_m: of the points that agree.
+        figures: JSON-able.
+    """
+
+    reason: GroundReason | None
+    message: str
+    local_from_own: Sim3 | None = None
+    covariance: FloatArray | None = None
+    image_ids: tuple[int, ...] = ()
+    residual_rms_m: float = 0.0
+    figures: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Tried:
+    """A fitted place, and which of the plan's points agree there: those above the ground count."""
+
+    fit: SolidFit
+    agrees: NDArray[np.bool_]
+    above: NDArray[np.bool_]
+    evidence: JointEvidence
+
+    def over(self, rate: float) -> float:
+        """By how many deviations more agree than chance gives."""
+        expected = rate * self.evidence.places
+        return float((self.evidence.agreeing - expected) / np.sqrt(max(expected * (1.0 - rate), 1.0)))
+
+
+def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud) -> GroundPlace:
+    """Place a map of street photos on a scan.
+
+    Args:
+        cloud: all of the scan on which the map may lie.
+    """
+    tags = geotags_of(unplaced, cloud)
+    around = None if tags is None else tags.around(_AROUND_M)
+    plan, shape = street_plan(unplaced), shape_of(cloud, around)
+    if plan is None:
+        return GroundPlace(reason="STRUCTURE", message="it shows no fronts")
+    if shape is None or not len(shape.walls):
+        return GroundPlace(reason="NO_SCAN", message="the scan shows no fronts")
+    search = PlanSearch(shape)
+    there = _tried(plan, shape, search, tags)
+    if len(there) < _LEAST_TRIES:
+        return GroundPlace(reason="STRUCTURE", message="it fits hardly anywhere on the scan")
+    rate = float(np.mean([t.evidence.agreeing / max(t.evidence.places, 1) for t in there]))
+    best = max(there, key=lambda one: one.over(rate))
+    return _judged(unplaced, plan, shape, best, there, rate)
+
+
+def geotags_of(unplaced: UnplacedMap, cloud: PointCloud) -> Geotags | None:
+    """Where the map's photos say they were taken; None where fewer than two do."""
+    rows = [k for k, image in enumerate(unplaced.images) if image.gps is not None]
+    tags = [image.gps for image in unplaced.images if image.gps is not None]
+    if len(tags) < 2:
+        return None
+    geodetic = np.array([(tag.latitude_deg, tag.longitude_deg, cloud.frame.height_m) for tag in tags])
+    return Geotags(
+        rows=np.array(rows),
+        xy=cloud.frame.enu_from_geodetic(geodetic)[:, :2],
+        sigma_m=np.array([max(tag.sigma_horizontal_m, 5.0) for tag in tags]),
+    )
+
+
+def _tried(plan: StreetPlan, shape: ScanShape, search: PlanSearch, tags: Geotags | None) -> list[_Tried]:
+    sizes = np.exp(np.arange(np.log(_NEAREST_M), np.log(_FURTHEST_M), SIZE_STEP)) / plan.distance
+    turns = np.arange(0.0, 2.0 * np.pi, TURN_STEP)
+    rows = np.random.default_rng(0).permutation(len(plan.points))[:_COARSE]
+    found = search.tries(plan, sizes.tolist(), turns.tolist(), tags)
+    fits = [_fitted(plan, shape, _start(plan, shape, one), rows, _COARSE_WIDTHS_M) for one in found]
+    return [_asked(shape, fit) for fit in fits]
+
+
+def _start(plan: StreetPlan, shape: ScanShape, one: PlanTry) -> Sim3:
+    """The plan there, its cameras at the eyes of people who stand on the scan's ground."""
+    rotation = so3_exp([0.0, 0.0, one.turn])
+    centers = one.size * plan.centers @ rotation.T + np.array([one.x, one.y, 0.0])
+    up = float(np.median(shape.ground[shape.cells(centers[:, :2])] + _EYE_M - centers[:, 2]))
+    return Sim3(scale=one.size, rotation=rotation, translation=np.array([one.x, one.y, up]))
+
+
+def _fitted(
+    plan: StreetPlan, shape: ScanShape, start: Sim3, rows: NDArray[np.int64], widths: tuple[float, ...]
+) -> SolidFit:
+    information = np.diag([*(len(rows) * 0.1 / np.square(_START_SIGMA)), 1e-3, 1e-3, 1e-3])
+    return fitted(shape, plan.points[rows], np.ones(len(rows)), start, prior=information, widths=widths)
+
+
+def _asked(shape: ScanShape, fit: SolidFit) -> _Tried:
+    placed = fit.placed
+    agrees = (np.abs(fit.off_m) < _AGREE_M) & (fit.near_m < _NEAR_M)
+    above = (placed[:, 2] - shape.ground[shape.cells(placed[:, :2])] > _ABOVE_M) & shape.inside(placed[:, :2])
+    cells = np.unique(np.floor(placed[above] / _PLACE_M).astype(np.int64), axis=0, return_inverse=True)[1]
+    count = np.bincount(cells.reshape(-1))
+    share = np.bincount(cells.reshape(-1), agrees[above]) / np.maximum(count, 1)
+    evidence = JointEvidence(places=len(count), agreeing=float(share.sum()))
+    return _Tried(fit=fit, agrees=agrees, above=above, evidence=evidence)
+
+
+def _judged(
+    unplaced: UnplacedMap,
+    plan: StreetPlan,
+    shape: ScanShape,
+    best: _Tried,
+    there: Sequence[_Tried],
+    rate: float,
+) -> GroundPlace:
+    """The photos that lie there, fitted, and whether another place explains them as well."""
+    kept = np.ones(len(unplaced.images), dtype=bool)
+    final = _best_around(plan, shape, best, rate)
+    sim = final.fit.local_from_own
+    for _ in range(_ROUNDS):
+        rows = _rows_seen(unplaced, plan, kept)
+        if len(rows) < _COARSE // 10:
+            break
+        final = _asked(shape, _fitted(plan, shape, sim, rows, _FINE_WIDTHS_M))
+        sim = final.fit.local_from_own
+        kept = _lie_there(unplaced, plan, shape, sim, rate)
+    figures: dict[str, Any] = {"photos": int(kept.sum()), "of": len(kept), "rate": rate}
+    if kept.sum() < _LEAST_PHOTOS:
+        return GroundPlace(
+            reason="TOO_FEW_FRAMES",
+            message=f"{int(kept.sum())} of its photos lie on the scan",
+            figures=figures,
+        )
+    rows = _rows_seen(unplaced, plan, kept)
+    away = [_away_m(plan, rows, sim, one.fit.local_from_own) for one in there]
+    over = np.array([one.over(rate) for one, far in zip(there, away, strict=True) if far > _ELSEWHERE_M])
+    log_nfa = _log_nfa(best.over(rate), over)
+    others = [
+        one
+        for one, far in zip(there, away, strict=True)
+        if far > _APART_M and abs(np.log(one.fit.local_from_own.scale / sim.scale)) < _ALIKE
+    ]
+    rivals = [
+        _rival_p(plan, shape, rows, sim, one.fit.local_from_own)
+        for one in sorted(others, key=lambda one: one.over(rate))[-_RIVALS:]
+    ]
+    figures |= {
+        "places": final.evidence.places,
+        "agreeing": final.evidence.agreeing,
+        "log_nfa": log_nfa,
+        "over_chance": best.over(rate),
+        "elsewhere": len(over),
+        "elsewhere_over_chance": float(over.max(initial=-np.inf)),
+        "rival": max(rivals, default=0.0),
+        "camera_height_m": float(_eye_heights(shape, sim.act(plan.centers[kept])).mean()),
+    }
+    local_from_own = sim @ plan.upright_from_own
+    words = (
+        f"{int(kept.sum())} of {len(kept)} photos lie on the scan's outlines: "
+        f"{final.evidence.agreeing:.0f} of {final.evidence.places} places agree"
+    )
+    covariance, rms_m = _covariance(final.fit)
+    found = GroundPlace(
+        reason=None,
+        message=words,
+        local_from_own=local_from_own,
+        covariance=covariance,
+        image_ids=tuple(i.image_id for i, stays in zip(unplaced.images, kept, strict=True) if stays),
+        residual_rms_m=rms_m,
+        figures=figures,
+    )
+    if log_nfa < _LOG_RATE:
+        return _refused(found, "STRUCTURE", f"{words}, which chance gives, too")
+    if max(rivals, default=0.0) > _RIVAL_RATE:
+        return _refused(found, "AMBIGUOUS", f"{words}, and nearly as many at another place")
+    return found
+
+
+def _log_nfa(best: float, elsewhere: FloatArray) -> float:
+    """-log10 of how many of so many places elsewhere would agree as well: normal, by their upper half."""
+    if len(elsewhere) < _LEAST_TRIES:
+        return 0.0
+    middle = float(np.median(elsewhere))
+    spread = float(np.sqrt(np.mean(np.square(elsewhere[elsewhere >= middle] - middle))))
+    deviations = (best - middle) / max(spread, 1.0)
+    return float(max(-norm.logsf(deviations) / np.log(10.0) - np.log10(len(elsewhere)), 0.0))
+
+
+def _refused(found: GroundPlace, reason: GroundReason, message: str) -> GroundPlace:
+    return GroundPlace(
+        reason=reason,
+        message=message,
+        local_from_own=found.local_from_own,
+        covariance=found.covariance,
+        image_ids=found.image_ids,
+        figures=found.figures,
+    )
+
+
+def _eye_heights(shape: ScanShape, centers: FloatArray) -> FloatArray:
+    return np.asarray(centers[:, 2] - shape.ground[shape.cells(centers[:, :2])])
+
+
+def _best_around(plan: StreetPlan, shape: ScanShape, best: _Tried, rate: float) -> _Tried:
+    """The best of fits from around a place: along a street it may have caught on a wrong corner."""
+    rows = np.random.default_rng(1).permutation(len(plan.points))[: 2 * _COARSE]
+    sim = best.fit.local_from_own
+    starts = [sim]
+    for turn in np.arange(8) * np.pi / 4:
+        shift = _AGAIN_M * np.array([np.cos(turn), np.sin(turn), 0.0])
+        starts.append(Sim3(scale=1.0, rotation=np.eye(3), translation=shift) @ sim)
+    for size in (-_AGAIN_SIZE, _AGAIN_SIZE):
+        about = Sim3(scale=1.0, rotation=np.eye(3), translation=best.fit.middle)
+        starts.append(about @ Sim3.exp([size, *[0.0] * 6]) @ about.inverse() @ sim)
+    tried = [_asked(shape, _fitted(plan, shape, start, rows, _COARSE_WIDTHS_M)) for start in starts]
+    return max(tried, key=lambda one: one.over(rate))
+
+
+def _rows_seen(unplaced: UnplacedMap, plan: StreetPlan, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Rows of the plan's points that photos see which stay."""
+    observations = unplaced.observations
+    stays = kept[unplaced.image_rows(observations.image_id)]
+    seen = np.zeros(len(unplaced.points.xyz), dtype=bool)
+    seen[observations.point_index[stays]] = True
+    rows = np.flatnonzero(seen[plan.rows])
+    return np.asarray(np.random.default_rng(0).permutation(rows)[:_FINE], dtype=np.int64)
+
+
+def _lie_there(
+    unplaced: UnplacedMap, plan: StreetPlan, shape: ScanShape, sim: Sim3, rate: float
+) -> NDArray[np.bool_]:
+    """Which photos lie where the similarity puts them: their points agree, and others that stay see them."""
+    asked = _asked(shape, _only_asked(plan, shape, sim, np.arange(len(plan.points))))
+    point_of = np.full(len(unplaced.points.xyz), -1)
+    point_of[plan.rows] = np.arange(len(plan.rows))
+    observations = unplaced.observations
+    row, image = point_of[observations.point_index], unplaced.image_rows(observations.image_id)
+    row, image = row[row >= 0], image[row >= 0]
+    counted = asked.above[row]
+    count = np.bincount(image[counted], minlength=len(unplaced.images))
+    agreeing = np.bincount(image[counted], asked.agrees[row[counted]], minlength=len(unplaced.images))
+    share = agreeing / np.maximum(count, 1)
+    usual = float(np.average(share, weights=share * count)) if agreeing.sum() > 0 else 0.0
+    stays = (share >= 0.5 * (usual + rate)) & (count > 0)
+    while stays.any():
+        views = np.bincount(row[stays[image]], minlength=len(plan.rows))
+        others = views[row] - stays[image] >= 1
+        tied = np.bincount(image, others, minlength=len(stays)) / np.maximum(
+            np.bincount(image, minlength=len(stays)), 1
+        )
+        left = stays & (tied >= _TIED)
+        if (left == stays).all():
+            break
+        stays = left
+    return stays
+
+
+def _only_asked(plan: StreetPlan, shape: ScanShape, sim: Sim3, rows: NDArray[np.int64]) -> SolidFit:
+    return fitted(shape, plan.points[rows], np.ones(len(rows)), sim, widths=())
+
+
+def _away_m(plan: StreetPlan, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:
+    """How far another similarity takes the map's points from where this one does, in the median."""
+    points = plan.points[rows]
+    return float(np.median(np.linalg.norm(sim.act(points) - other.act(points), axis=1)))
+
+
+def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:
+    """How often a place as good as another would agree in so many more blocks of the map."""
+    own, rival = (_asked(shape, _only_asked(plan, shape, of, rows)) for of in (sim, other))
+    counted = own.above
+    block = np.floor(sim.act(plan.points[rows[counted]]) / _BLOCK_M).astype(np.int64)
+    group = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
+    more = np.bincount(group, own.agrees[counted]) - np.bincount(group, (rival.agrees & rival.above)[counted])
+    size = np.bincount(group)
+    wins, losses = int((more > 0.25 * size).sum()), int((more < -0.25 * size).sum())
+    return float(binom.sf(wins - 1, wins + losses, 0.5)) if wins + losses else 1.0
+
+
+def _covariance(fit: SolidFit) -> tuple[FloatArray, float]:
+    """(7, 7) of the left perturbation: neighbours err together, outlines by one offset, all within a cell."""
+    agrees = (np.abs(fit.off_m) < _AGREE_M) & (fit.near_m < _NEAR_M)
+    rms_m = float(np.sqrt(np.mean(np.square(fit.off_m[agrees])))) if agrees.any() else _AGREE_M
+    blocks = len(np.unique(np.floor(fit.placed[agrees] / _BLOCK_M).astype(np.int64), axis=0))
+    factor = max(1.0, np.count_nonzero(agrees) / max(blocks, 1))
+    inverse = np.linalg.inv(fit.normal + np.diag([1e-6] * 7))
+    offset = inverse @ fit.by_walls * _WALL_SIGMA_M
+    covariance = factor * max(rms_m, _LEAST_SIGMA_M) ** 2 * inverse + np.outer(offset, offset)
+    covariance[4:, 4:] += np.eye(3) * CELL_M**2 / 12.0
+    about = Sim3(scale=1.0, rotation=np.eye(3), translation=fit.middle)
+    return about.carried(covariance), rms_m

@@ -1,0 +1,201 @@
+"""A scan as a solid: ground, roofs, and the walls that stand where its heights jump.
+
+A laser in the air sees hardly any walls. Where the heights of neighbouring cells differ by a storey,
+something stands upright between them, and that is what a photo from the street shows.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, grey_opening, median_filter, minimum_filter
+from scipy.spatial import cKDTree
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.render.cloud import PointCloud
+
+CELL_M = 0.5
+_VEGETATION = (3, 4, 5)  # ASPRS: crowns are no fronts, and people stand under them
+_WIDEST_M = 30.0  # of a building across: ground is what is left of heights that are narrower
+_JUMP_M = 2.0  # between cells, of a wall
+_STEP_M = 0.5  # between points of a wall
+_WALL_REACH_M, _LEAST_WALL = 1.5, 3  # neighbours that give a wall its line
+_LAST = 4  # points of a roof that tell where it ends
+_SMOOTH_CELLS = 1.5  # of the heights whose gradient says where a wall looks
+_SLOPE_CELLS = 0.7  # of the heights whose gradient is a surface's normal
+_FLAT_M = 0.5  # between cells of one surface
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScanShape:
+    """Rows northwards: the middle of cell (row, column) lies (column + 0.5, row + 0.5) cells from `corner`.
+
+    Attributes:
+        corner: (2,) metres, in the cloud's frame.
+        ground, top: (h, w) heights, metres. known: (h, w), where the scan has points near.
+        points, normals: (n, 3) of ground, roofs and walls. tree: of the points.
+        walls: (k, 4) of wall cells: x, y, and the way out of the wall.
+    """
+
+    corner: FloatArray
+    ground: FloatArray
+    top: FloatArray
+    known: NDArray[np.bool_]
+    points: FloatArray
+    normals: FloatArray
+    tree: cKDTree
+    walls: FloatArray
+
+    def cells(self, xy: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of places (n, 2), those outside at the border."""
+        at = np.floor((xy - self.corner) / CELL_M).astype(np.int64)
+        return np.clip(at[:, 1], 0, self.top.shape[0] - 1), np.clip(at[:, 0], 0, self.top.shape[1] - 1)
+
+    def inside(self, xy: FloatArray) -> NDArray[np.bool_]:
+        """Whether the scan shows places (n, 2)."""
+        at = (xy - self.corner) / CELL_M
+        there = ((at >= 0) & (at < np.array(self.top.shape[::-1]))).all(axis=1)
+        return np.asarray(there & self.known[self.cells(xy)])
+
+
+def shape_of(cloud: PointCloud, circle: tuple[float, float, float] | None = None) -> ScanShape | None:
+    """The solid that a scan shows; None where it shows no surface.
+
+    Args:
+        circle: x, y, radius of what is asked for.
+    """
+    shown = ~np.isin(cloud.classification, _VEGETATION)
+    if circle is not None:
+        shown &= np.hypot(cloud.xyz[:, 0] - circle[0], cloud.xyz[:, 1] - circle[1]) < circle[2]
+    xyz = cloud.xyz[shown].astype(np.float64)
+    if len(xyz) < 100:
+        return None
+    corner = np.floor(xyz[:, :2].min(axis=0))
+    size = np.ceil((xyz[:, :2].max(axis=0) - corner) / CELL_M).astype(np.int64) + 1
+    at = np.floor((xyz[:, :2] - corner) / CELL_M).astype(np.int64)
+    flat = at[:, 1] * size[0] + at[:, 0]
+    top = np.full(size[0] * size[1], -np.inf)
+    np.maximum.at(top, flat, xyz[:, 2])
+    low = np.full(size[0] * size[1], np.inf)
+    np.minimum.at(low, flat, xyz[:, 2])
+    shape = (int(size[1]), int(size[0]))
+    top, low = top.reshape(shape), low.reshape(shape)
+    seen = np.isfinite(top)
+    top, known = _filled(top, seen)
+    top = median_filter(top, 3)
+    low = minimum_filter(_filled(low, seen)[0], 3)
+    low = median_filter(low, 5)
+    window = int(_WIDEST_M / CELL_M) | 1
+    ground = gaussian_filter(grey_opening(low, (window, window)), 4.0)
+    surface, surface_normals = _surfaces(xyz, flat, top, seen)
+    walls = _walls(top, known, corner, xyz)
+    upright, upright_normals = _standing(walls)
+    points = np.vstack([surface, upright])
+    return ScanShape(
+        corner=corner,
+        ground=ground,
+        top=top,
+        known=known,
+        points=points,
+        normals=np.vstack([surface_normals, upright_normals]),
+        tree=cKDTree(points),
+        walls=walls[:, :4],
+    )
+
+
+def _filled(heights: FloatArray, seen: NDArray[np.bool_]) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Gaps filled from the nearest cell with points, and which cells have one within 2 m."""
+    away, (row, column) = distance_transform_edt(~seen, return_indices=True)
+    return heights[row, column], np.asarray(away * CELL_M <= 2.0)
+
+
+def _surfaces(
+    xyz: FloatArray, cell_of: NDArray[np.int64], top: FloatArray, seen: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray]:
+    """Middles of the points of cells that lie on ground or roofs and are no edge, and their normals."""
+    count = np.maximum(np.bincount(cell_of, minlength=top.size), 1)
+    middle = np.column_stack([np.bincount(cell_of, xyz[:, k], top.size) / count for k in range(3)])
+    steps = [np.abs(np.diff(top, axis=axis)) < _FLAT_M for axis in (0, 1)]
+    smooth = seen.copy()
+    smooth[:-1] &= steps[0]
+    smooth[1:] &= steps[0]
+    smooth[:, :-1] &= steps[1]
+    smooth[:, 1:] &= steps[1]
+    low = np.full(top.size, np.inf)
+    np.minimum.at(low, cell_of, xyz[:, 2])
+    smooth &= (top.ravel() - low < 2.0 * _FLAT_M).reshape(top.shape)
+    up, across = np.gradient(
+        gaussian_filter(np.where(seen, middle[:, 2].reshape(top.shape), top), 0.7), CELL_M
+    )
+    normals = np.column_stack([-across[smooth], -up[smooth], np.ones(np.count_nonzero(smooth))])
+    return middle[smooth.ravel()], normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _walls(top: FloatArray, known: NDArray[np.bool_], corner: FloatArray, xyz: FloatArray) -> FloatArray:
+    """(k, 6): place in plan, way out, lower and upper height, between cells whose heights jump."""
+    smooth = gaussian_filter(top, _SMOOTH_CELLS)
+    up, across = (np.asarray(np.gradient(smooth, axis=axis)) for axis in (0, 1))
+    found = []
+    for axis in (0, 1):
+        step = np.diff(top, axis=axis)
+        both = known[:-1] & known[1:] if axis == 0 else known[:, :-1] & known[:, 1:]
+        rows, columns = np.nonzero((np.abs(step) > _JUMP_M) & both)
+        next_row, next_column = (rows + 1, columns) if axis == 0 else (rows, columns + 1)
+        middle = 0.5 * np.column_stack([columns + next_column, rows + next_row]) + 0.5
+        here, there = (rows, columns), (next_row, next_column)
+        out = -np.column_stack([across[here] + across[there], up[here] + up[there]])
+        heights = np.sort(np.column_stack([top[rows, columns], top[next_row, next_column]]), axis=1)
+        found.append(np.column_stack([corner + middle * CELL_M, out, heights]))
+    walls = np.vstack(found)
+    walls[:, 2:4] /= np.maximum(np.linalg.norm(walls[:, 2:4], axis=1, keepdims=True), 1e-9)
+    return _straightened(walls, xyz)
+
+
+def _straightened(walls: FloatArray, xyz: FloatArray) -> FloatArray:
+    """Walls on the lines through their neighbours, cells make stairs of them, as far out as the roof goes."""
+    if not len(walls):
+        return walls
+    tree = cKDTree(walls[:, :2])
+    around = cKDTree(xyz[:, :2]).query_ball_point(walls[:, :2], _WALL_REACH_M)
+    kept, result = [], walls.copy()
+    for k, near in enumerate(tree.query_ball_point(walls[:, :2], _WALL_REACH_M)):
+        rows = np.array(near)
+        rows = rows[walls[rows, 2:4] @ walls[k, 2:4] > 0.8]
+        if len(rows) < _LEAST_WALL:
+            continue
+        patch = walls[rows, :2]
+        middle = patch.mean(axis=0)
+        normal = np.linalg.eigh((patch - middle).T @ (patch - middle))[1][:, 0]
+        normal *= np.sign(normal @ walls[k, 2:4]) or 1.0
+        if normal @ walls[k, 2:4] < 0.8:
+            continue
+        near_by = xyz[around[k]]
+        out = (near_by[:, :2] - middle) @ normal
+        edge = _edge(out[near_by[:, 2] > 0.5 * (walls[k, 4] + walls[k, 5])])
+        if edge is None:
+            continue
+        result[k, :2] = walls[k, :2] - normal * (normal @ (walls[k, :2] - middle) - edge)
+        result[k, 2:4] = normal
+        kept.append(k)
+    return result[kept]
+
+
+def _edge(out: FloatArray) -> float | None:
+    """Where a roof ends by how far out (n,) its points lie: past the last ones by their mean distance.
+
+    The very last one may be a bird.
+    """
+    if len(out) < 2 * _LAST:
+        return None
+    last = np.sort(out)[-_LAST:-1]
+    apart = float(np.median(last) - np.median(out)) / (0.5 * len(out))
+    return float(last.mean() + apart * (0.5 * _LAST + 0.5))
+
+
+def _standing(walls: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points one above the other on walls, and their normals."""
+    counts = np.maximum(((walls[:, 5] - walls[:, 4]) / _STEP_M).astype(np.int64), 1)
+    of = np.repeat(np.arange(len(walls)), counts)
+    within = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
+    heights = walls[of, 4] + (within + 0.5) * _STEP_M
+    return np.column_stack([walls[of, :2], heights]), np.column_stack([walls[of, 2:4], np.zeros(len(of))])

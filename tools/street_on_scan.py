@@ -1,0 +1,125 @@
+"""Maps of street photos placed on the scan of their town by its outlines: how many, how right?
+
+    python -m tools.street_on_scan --work DIR [--inputs DIR] [--towns 306 307 ...]
+
+Of each town, 60 photos by ten people, a third of them with geotags of 10 m (`tools.worlds.street_people`),
+are ingested, and each map of ten photos and more is placed by `featuredb anchor --near --auto` on the town's
+scan; then the same on the scan of another town, where nothing may be placed.
+What is found of a town is kept in DIR.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.stats import chi2
+
+from featuredb.geometry.sim3 import point_jacobian
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.simworld.truth import Truth, read_truth
+from featuredb.store import Database
+from tools.commands import anchor, featuredb, newest_copy
+from tools.figures import study_parser, write_figures
+from tools.made_maps import make
+from tools.worlds.album import TABLE_FILE
+from tools.worlds.scan_world import make_scan_world
+from tools.worlds.street_people import StreetOptions, write_street_album
+
+_TOWNS = tuple(range(306, 316))
+_LEAST_PHOTOS = 10
+_RIGHT_M, _RIGHT_DEG, _OUTSIDE_M = 0.5, 0.5, 1.0
+_BOUND = float(chi2.isf(1e-3, 3))
+_RADIUS_M = 200.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = study_parser(__doc__, "--work", "--inputs")
+    parser.add_argument("--towns", type=int, nargs="+", default=_TOWNS, help="seeds")
+    args = parser.parse_args(argv)
+    cv2.setNumThreads(1)
+    args.work.mkdir(parents=True, exist_ok=True)
+    towns = [_town(seed, args.inputs or args.work, args.work) for seed in args.towns]
+    here = [one for town in towns for one in town["here"]]
+    placed = [one for one in here if one["off"]]
+    off = np.array([pair for one in placed for pair in one["off"]]).reshape(-1, 3)
+    photos = sum(one["photos"] for one in here)
+    right = int(((off[:, 0] <= _RIGHT_M) & (off[:, 1] <= _RIGHT_DEG)).sum())
+    write_figures(
+        args.json,
+        {
+            "towns": len(towns),
+            "maps": len(here),
+            "photos": photos,
+            "maps_placed": len(placed),
+            "placed": len(off),
+            "right": right,
+            "right_share": right / max(photos, 1),
+            "outside": int((off[:, 2] > _OUTSIDE_M).sum()),
+            "median_m": float(np.median(off[:, 0])) if len(off) else float("nan"),
+            "largest_m": float(off[:, 0].max(initial=0.0)),
+            "elsewhere": sum(len(town["elsewhere"]) for town in towns),
+            "elsewhere_placed": sum(bool(one["off"]) for town in towns for one in town["elsewhere"]),
+        },
+    )
+    return 0
+
+
+def _town(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
+    """What is found of one town, made once."""
+    path = work / f"town-{seed}.json"
+    if not path.exists():
+        world = make_scan_world(inputs, seed)
+        album = write_street_album(inputs / f"street-{seed}", StreetOptions(seed=seed))
+        made = work / f"made-{seed}"
+        if not made.exists():
+            make(work / "making", "photos", album / TABLE_FILE)
+            (work / "making").rename(made)
+        found = {
+            kind: _placed(made, scan, album, work)
+            for kind, scan in (("here", world.scan), ("elsewhere", world.other_scan))
+        }
+        path.write_text(json.dumps(found))
+        sys.stdout.write(f"town {seed}: {found}\n")
+        sys.stdout.flush()
+    return dict(json.loads(path.read_text()))
+
+
+def _placed(made: Path, scan: Path, album: Path, work: Path) -> list[dict[str, Any]]:
+    """Of each map of enough photos: how many these are, and how far off they are where it is placed."""
+    database = newest_copy(made, work / "placed")
+    featuredb("lidar", "add", str(database), str(scan), "--quiet")
+    truth = read_truth(album)
+    near = f"{truth.frame.latitude_deg!r},{truth.frame.longitude_deg!r},{_RADIUS_M!r}"
+    found = []
+    for one in Database.open(database).snapshot().unplaced_maps():
+        if one.images < _LEAST_PHOTOS:
+            continue
+        off: list[tuple[float, float, float]] = []
+        if anchor(database, one.map_id, album, work / "anchor", f"--near={near}", refusals=(1, 2)):
+            off = _off(Database.open(database).snapshot().load_map(one.map_id), truth)
+        found.append({"photos": one.images, "off": off})
+    return found
+
+
+def _off(placed: FeatureMap, truth: Truth) -> list[tuple[float, float, float]]:
+    """Of each photo: metres and degrees off, and by how many metres that is outside of its 99.9 %."""
+    here = truth.frame.enu_from(placed.frame)
+    found = []
+    for image in placed.images:
+        true = truth.images[image.name].cam_from_local @ here
+        off = image.cam_from_local.center - true.center
+        jacobian = point_jacobian(image.cam_from_local.center)
+        covariance = jacobian @ placed.placement.covariance @ jacobian.T
+        metres = float(np.linalg.norm(off))
+        squared = float(off @ np.linalg.solve(covariance, off))
+        bound = metres * float(np.sqrt(_BOUND / squared)) if squared > 0.0 else np.inf
+        found.append((metres, image.cam_from_local.angle_to_deg(true), max(metres - bound, 0.0)))
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())
