@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.truth import Truth, read_truth
+from featuredb.simworld.world import Truth, read_truth
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, newest_copy
 from tools.figures import study_parser, write_figures
