@@ -19,9 +19,10 @@ def anchoring_text(done: Anchoring, database: str) -> str:
         where = shlex.quote(database)
         lines.append(
             f"map {report.map_id} is placed by the outlines of its scan: version {done.version}. It answers "
-            f"once somebody has looked at it: featuredb promote {where} {report.map_id}"
+            "once somebody has looked at it:"
         )
-        lines.append(f"without a place: featuredb rollback {shlex.quote(database)} {done.version_before}")
+        lines.append(f"  featuredb promote {where} {report.map_id} --reason 'looked at it'")
+        lines.append(f"without a place: featuredb rollback {where} {done.version_before}")
     elif done.placed and result is not None and result.before is not None and result.after is not None:
         move = result.checks["move"]
         lines.append(

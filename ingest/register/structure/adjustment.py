@@ -49,8 +49,9 @@ _STEPS = 8  # of the solver in each round
 _SETTLED_M = 1e-3  # see above; far below a scan's noise
 _REACH_M = 1.0  # a plane further from a point says nothing of it
 # How often correspondences that agree with the map would be refused: their spread about the adjusted map
-# against that about each frame's own best pose, by F. How far they miss by itself says nothing: where the
-# scan has two points in a metre and the photo 30 pixels, honest ones miss by five.
+# against that about each frame's own best pose, by F, as if the two had no residuals in common. How far they
+# miss by itself says nothing: where the scan has two points in a metre and the photo 30 pixels, honest ones
+# miss by five.
 _CONTROL_RATE = 1e-4
 # And so much of the photo's longer side is no contradiction (7 pixels in 4000): strips of a scan, lens and
 # shutter displace a frame as a whole, which its own pose takes up. Chosen; it has no rate.
