@@ -72,7 +72,7 @@ def _pairs_of_frame(
     assert camera is not None  # accepted
     width = min(_RENDER_WIDTH_PX, camera.width)
     small = camera.scaled_to(width, round(camera.height * width / camera.width))
-    rendering = render(cloud, small, pose, RenderOptions(attributes=False))
+    rendering = render(cloud, small, pose, RenderOptions(threads=1, attributes=False))
     observations = feature_map.observations
     mine = observations.image_id == image.image_id
     points = observations.point_index[mine]
