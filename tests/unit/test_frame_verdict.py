@@ -8,7 +8,7 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from ingest.register.frame.dense.confirmation import PictureConfirmation
+from ingest.register.frame.dense.confirmation import PictureConfirmation, log_nfa_of
 from ingest.register.frame.prior_fit import prior_sigmas
 from ingest.register.frame.register import left_perturbation
 from ingest.register.frame.verdict import (
@@ -57,7 +57,7 @@ def test_each_gate_fires(change: dict[str, object], reason: str) -> None:
     assert refusal[0] == reason
 
 
-MIDDLING = replace(GOOD, log_nfa=0.0, confirmation=replace(CONFIRMED, log_nfa=9.0))
+MIDDLING = replace(GOOD, log_nfa=0.0, confirmation=replace(CONFIRMED, agreeing=38, log_nfa=9.0))
 
 
 def test_middling_evidence_is_believed_where_other_places_show_much_less() -> None:
@@ -84,14 +84,30 @@ def test_features_and_pictures_add_up() -> None:
 
 
 def test_middling_evidence_far_from_the_prior_is_refused() -> None:
-    asked = replace(MIDDLING, places_elsewhere=5, confirmation=replace(CONFIRMED, log_nfa=7.7))
+    asked = replace(MIDDLING, places_elsewhere=5)
     assert verdict(replace(asked, prior_sigmas=2.4)) is None
-    assert weighed_log_nfa(replace(asked, prior_sigmas=2.4)) == 7.7
-    refusal = verdict(replace(asked, prior_sigmas=4.7))
+    assert weighed_log_nfa(asked) == log_nfa_of(38, 150)
+    refusal = verdict(replace(asked, prior_sigmas=5.5))
     assert refusal is not None
     assert refusal[0] == "NOT_CONFIRMED"
-    assert "4.7 deviations" in refusal[1]
-    assert verdict(replace(GOOD, prior_sigmas=4.7)) is None  # features speak for it
+    assert "5.5 deviations" in refusal[1]
+    assert verdict(replace(GOOD, prior_sigmas=5.5)) is None  # features speak for it
+
+
+def test_middling_evidence_is_refused_where_houses_stand_elsewhere() -> None:
+    asked = replace(
+        MIDDLING, places_elsewhere=5, confirmation=replace(CONFIRMED, agreeing=26, pieces=79, log_nfa=6.5)
+    )
+    assert verdict(asked) is None
+    relief = replace(CONFIRMED, confirmed=False, agreeing=1, pieces=78, log_nfa=0.0)
+    refusal = verdict(replace(asked, relief=relief))
+    assert refusal is not None
+    assert refusal[0] == "NOT_CONFIRMED"
+    assert verdict(replace(asked, relief=replace(relief, agreeing=9))) is None
+    assert (
+        verdict(replace(asked, relief=replace(relief, agreeing=0, pieces=20))) is None
+    )  # too few to be asked
+    assert verdict(replace(GOOD, relief=relief)) is None  # features speak for it
 
 
 def test_elsewhere_is_asked_only_where_it_decides() -> None:

@@ -14,7 +14,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.candidates import Judged, best_candidate, by_agreement, polished
-from ingest.register.frame.dense.fit import dense_fitted
+from ingest.register.frame.dense.fit import confirmed, dense_fitted
 from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.features.search import FrameHypothesis, pose_options, unmatched
 from ingest.register.frame.options import FrameOptions
@@ -26,6 +26,7 @@ from ingest.register.frame.verdict import (
     MIN_INLIERS,
     FrameEvidence,
     asks_elsewhere,
+    beyond_doubt,
     cells_with_inliers,
     highest_elsewhere,
     verdict,
@@ -219,6 +220,9 @@ def _evidence(
     share = np.inf
     if covariance is not None:
         share = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])) / views.look.depth_m
+    by_relief, relief = found.source == "shaded", None
+    if not by_relief and not beyond_doubt(found.log_nfa, judged.confirmation):
+        relief = confirmed(views, replace(found, source="shaded"))
     return FrameEvidence(
         inliers=len(found.inliers),
         candidates=found.candidates,
@@ -229,7 +233,8 @@ def _evidence(
         rival_share=found.rival_share,
         prior_sigmas=prior_sigmas(prior, found.pose.cam_from_local),
         position_sigma_share=share,
-        relief_only=found.source == "shaded",
+        relief=relief,
+        relief_only=by_relief,
     )
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from ingest.register.frame.dense.confirmation import MIN_PIECES, PictureConfirmation
+from ingest.register.frame.dense.confirmation import MIN_PIECES, PictureConfirmation, log_nfa_of
 from ingest.register.frame_registration import FrameReason
 
 # Where the line is, by right and wrong registrations of the simulated town:
@@ -35,10 +35,9 @@ _SURE_JOINT_LOG_NFA = 30.0
 _MIN_CONFIRMATION_RATIO = 6.0
 MAX_PLACES_ELSEWHERE = 5
 _MIN_PLACES_ELSEWHERE = 1
-# And so much evidence with the prior counted in (`weighed_log_nfa`): what the pictures must say anyway.
-# Blocks of streets alike, 117 m from the photo, agreed with 10^-7.7 at 4.7 deviations from the prior, which
-# leaves 4.3; right poses had 5.3 and more.
-_MIN_WEIGHED_LOG_NFA = 5.0
+# And so much evidence with relief and prior counted in (`weighed_log_nfa`): some ten poses of a frame are
+# looked into, and one wrong frame of a thousand is borne.
+_MIN_WEIGHED_LOG_NFA = 4.0
 _RIVAL_SHARE = 0.5  # a pose elsewhere with this share of the inliers makes the registration ambiguous
 # Largest distance from the prior, in its own standard deviations over all six axes together. Generous: people
 # and devices understate their errors.
@@ -55,7 +54,8 @@ class FrameEvidence:
     Attributes:
         inliers: independent correspondences that agree with the pose.
         candidates, log_nfa: matches of the first round and the evidence among them.
-        confirmation: what the pictures say.
+        confirmation: what the pictures say. relief: what they say of shaded relief at the same pose; None
+            where the pose needs no more, or was found by relief itself.
         cells: parts of the photo (of a hundred) that hold inliers. agreement: their share of those where the
             scan is seen.
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
@@ -77,6 +77,7 @@ class FrameEvidence:
     position_sigma_share: float
     places_elsewhere: int = 0
     elsewhere_log_nfa: float = 0.0
+    relief: PictureConfirmation | None = None
     relief_only: bool = False
 
 
@@ -87,13 +88,19 @@ def asks_elsewhere(evidence: FrameEvidence) -> bool:
 
 
 def weighed_log_nfa(evidence: FrameEvidence) -> float:
-    """Evidence of the pictures less what the distance from the prior speaks against the pose.
+    """Evidence of the pictures and of relief, less what the distance from the prior speaks against the pose.
+
+    Crossings of streets look alike wherever they are; houses stand elsewhere around another one. So pieces of
+    both pictures are counted together.
 
     Right poses scatter about the prior, normally; poses that repeat the right one lie anywhere within reach.
     -log10 of the density, from that at the mean squared distance of six axes on: nearer ones gain nothing.
     """
-    against = max(0.0, evidence.prior_sigmas**2 - 6.0) / (2.0 * math.log(10.0))
-    return evidence.confirmation.log_nfa - against
+    asked = [evidence.confirmation]
+    if evidence.relief is not None and evidence.relief.pieces >= MIN_PIECES:
+        asked.append(evidence.relief)
+    both = log_nfa_of(sum(one.agreeing for one in asked), sum(one.pieces for one in asked))
+    return both - max(0.0, evidence.prior_sigmas**2 - 6.0) / (2.0 * math.log(10.0))
 
 
 def highest_elsewhere(log_nfa: float) -> float:
@@ -159,8 +166,9 @@ def _against_elsewhere(e: FrameEvidence) -> tuple[FrameReason, str] | None:
     if weighed < _MIN_WEIGHED_LOG_NFA:
         return (
             "NOT_CONFIRMED",
-            f"the pictures agree with 10^-{e.confirmation.log_nfa:.1f}, {e.prior_sigmas:.1f} deviations from "
-            f"the prior, which leaves 10^-{weighed:.1f}; 10^-{_MIN_WEIGHED_LOG_NFA:g} needed",
+            f"the pictures agree with 10^-{e.confirmation.log_nfa:.1f}; with relief, and "
+            f"{e.prior_sigmas:.1f} deviations from the prior, 10^-{weighed:.1f} is left, "
+            f"10^-{_MIN_WEIGHED_LOG_NFA:g} needed",
         )
     if e.elsewhere_log_nfa > highest_elsewhere(e.confirmation.log_nfa):
         return (

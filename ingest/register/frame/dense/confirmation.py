@@ -139,9 +139,7 @@ def confirm_pose(
             message=f"only {n} pieces of the picture have structure, {MIN_PIECES} are needed",
         )
     agreeing = int(near.sum())
-    # Six parameters can bring three pieces into place whatever they show.
-    free, total = max(agreeing // _OVERLAP - 3, 0), n // _OVERLAP - 3
-    log_nfa = float(-binom.logsf(free - 1, total, CHANCE) / np.log(10.0))
+    log_nfa = log_nfa_of(agreeing, n)
     cells = len(np.unique(np.clip((found.pixels[near] * 4).astype(int), 0, 3) @ (4, 1)))
     layers = _layers(found.points_local[:, 2], near)
     message = _objection(agreeing / n, log_nfa, cells, layers, options)
@@ -153,6 +151,13 @@ def confirm_pose(
         cells=cells,
         message=message,
     )
+
+
+def log_nfa_of(agreeing: int, pieces: int) -> float:
+    """-log10 of the probability that chance puts as many of so many pieces where they belong."""
+    # Six parameters can bring three pieces into place whatever they show.
+    free, total = max(agreeing // _OVERLAP - 3, 0), pieces // _OVERLAP - 3
+    return float(-binom.logsf(free - 1, total, CHANCE) / np.log(10.0))
 
 
 def compared_pieces(
