@@ -9,7 +9,6 @@ from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents
 from featuredb.export.dataset.own_frame import FOLDER
-from featuredb.export.dataset.picture import places_of
 from featuredb.export.dataset.sums import SUMS
 from featuredb.geo.crs.wkt import utm_projjson
 
@@ -67,7 +66,7 @@ def _title(contents: Contents, description: Mapping[str, Any]) -> str:
         f"format {description['format']} {description['format_version']}."
     )
     title = f"# {_plain(description['name'])}\n\n{about}\n"
-    return f"{title}{_table(('', ''), rows)}\n![coverage]({layout.PICTURE})\n"
+    return f"{title}{_table(('', ''), rows)}"
 
 
 def _places(contents: Contents) -> str:
@@ -80,8 +79,8 @@ def _places(contents: Contents) -> str:
     return _section(
         "Where",
         _prose(
-            f"Places: {len(places_of(contents))}. Coordinates are UTM on WGS84, in metres; heights are "
-            "counted from what is named here, and nothing has been converted."
+            "Coordinates are UTM on WGS84, in metres; heights are counted from what is named here, and "
+            "nothing has been converted."
         ),
         _table(("zone", "heights", "CRS of the files", "maps", "images", "points"), rows),
     )

@@ -32,7 +32,6 @@ from featuredb.export.dataset.geoparquet import GeoFile, TableFile, wkb_of
 from featuredb.export.dataset.lidar_part import check_lidar, write_scans
 from featuredb.export.dataset.own_frame import OwnFrameFiles
 from featuredb.export.dataset.partitions import PartitionFiles
-from featuredb.export.dataset.picture import write_picture
 from featuredb.export.dataset.sums import write_sums
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_json
 from featuredb.geo.crs.wkt import utm_projjson
@@ -64,13 +63,12 @@ def write_catalogue(contents: Contents, description: Mapping[str, Any], folder: 
     """
     time = datetime.fromisoformat(description["snapshot_time"])
     assets = {
-        name: _asset(f"../{name}", title, kind, "thumbnail" if kind == "image/png" else "metadata")
+        name: _asset(f"../{name}", title, kind, "metadata")
         for name, title, kind in (
             (layout.MAPS, "the maps", _PARQUET),
             (layout.CAMERAS, "the cameras", _PARQUET),
             (ATTRIBUTION, "owner and licence of every photo", "text/csv"),
             (layout.DATASHEET, "datasheet", "text/markdown"),
-            (layout.PICTURE, "coverage", "image/png"),
         )
     }
     for tile in (tile for scan in contents.scans for tile in scan["tiles"]):
@@ -172,7 +170,6 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
             contents.scans.extend(write_scans(job, contents, folder))
         description = _description(job, contents, own)
         write_json(folder / layout.DESCRIPTION, description)
-        write_picture(contents, folder / layout.PICTURE)
         write_datasheet(contents, description, folder)
         write_catalogue(contents, description, folder)
         write_sums(folder)
