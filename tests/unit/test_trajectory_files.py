@@ -8,7 +8,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import cv2
 import jsonschema
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_
 from featuredb.video.telemetry.read import read_telemetry
 from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import CSV_COLUMNS, check_format, write_trajectory
-from reloc.tracking.trajectory.plot import plot_png
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from schemas import load_schema
 from tests.support.planar_map import view
@@ -219,21 +217,3 @@ def test_a_track_without_poses_is_a_table_of_reasons_and_nothing_else(
             write_trajectory(tmp_path / name, lost)
     assert not list(tmp_path.iterdir())
     assert _written(tmp_path, "t.csv", lost).count("\n") == 2
-
-
-def test_a_drawing_shows_where_the_track_is_lost(trajectory: Trajectory, tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "t.png", trajectory)
-    picture = cv2.imread(str(tmp_path / "t.png"))
-    assert picture is not None
-    assert picture.shape[0] > 500
-    pink = (picture == (0xD6, 0xD6, 0xF3)).all(axis=2)
-    columns = np.flatnonzero(pink.any(axis=0))
-    # One frame of six is lost, the third: a sixth of the width of the axes on the right.
-    assert len(columns) > 50
-    assert columns.min() > 0.5 * picture.shape[1]
-    whole = replace(trajectory, points=tuple(p for p in trajectory.points if p.pose is not None))
-    plain = cv2.imdecode(np.frombuffer(plot_png(whole), np.uint8), cv2.IMREAD_COLOR)
-    assert not (plain == (0xD6, 0xD6, 0xF3)).all(axis=2).any()
-    lost = replace(trajectory, points=trajectory.points[2:3])
-    with pytest.raises(InvalidValueError, match="found none; write CSV"):
-        plot_png(lost)

@@ -1,4 +1,4 @@
-"""A trajectory as a file: CSV, TUM, GeoJSON, KML, OGC GeoPose series, DJI's subtitles, or a drawing.
+"""A trajectory as a file: CSV, TUM, GeoJSON, KML, OGC GeoPose series, or DJI's subtitles.
 
 The suffix chooses. Frames whose track is lost are rows without a pose in CSV, and gaps in all others. A file
 appears whole or not at all.
@@ -30,7 +30,7 @@ CSV_COLUMNS = columns_of(_POSE)
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series), `.srt`, `.png`.
+    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series), `.srt`.
 
     One in the frame of a map without a place: `.csv`, `.json`, see `own_frame_files`.
 
@@ -38,12 +38,11 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
         InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
     """
     own = next((point.in_map.map_id for point in trajectory.points if point.in_map is not None), None)
-    made = _format(path, own)(trajectory)
-    content = made if isinstance(made, bytes) else made.encode()
+    text = _format(path, own)(trajectory)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
-        temporary.write_bytes(content)
+        temporary.write_text(text, encoding="utf-8")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -204,25 +203,17 @@ def srt_text(trajectory: Trajectory) -> str:
     return "\n".join(blocks)
 
 
-def png(trajectory: Trajectory) -> bytes:
-    """From above, and the bounds of each axis over time."""
-    from reloc.tracking.trajectory.plot import plot_png  # matplotlib takes a second to load
-
-    return plot_png(trajectory)
-
-
-_FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {
+_FORMATS: dict[str, Callable[[Trajectory], str]] = {
     ".csv": csv_text,
     ".tum": tum_text,
     ".geojson": geojson_text,
     ".kml": kml_text,
     ".json": geopose_text,
     ".srt": srt_text,
-    ".png": png,
 }
 
 
-def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str | bytes]:
+def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str]:
     suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else OWN_FORMATS
     if suffix in formats:
         return formats[suffix]

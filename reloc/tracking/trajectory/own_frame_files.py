@@ -84,7 +84,7 @@ def own_json_text(trajectory: Trajectory) -> str:
     return json.dumps(about | {"frames": frames}, indent=1) + "\n"
 
 
-OWN_FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {".csv": own_csv_text, ".json": own_json_text}
+OWN_FORMATS: dict[str, Callable[[Trajectory], str]] = {".csv": own_csv_text, ".json": own_json_text}
 
 
 def _cells(pose: OwnPose) -> list[str]:
