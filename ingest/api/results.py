@@ -14,7 +14,7 @@ from ingest.api.registering import ControlledMap
 from ingest.api.tracking import TrackedFilm
 from ingest.growth.growth_report import GrowthReport
 from ingest.html_parts import picture
-from ingest.report.plots import plan_png
+from ingest.plot_parts import plan_png
 from ingest.report.values import IngestReport
 
 
