@@ -27,7 +27,7 @@ def register(subparsers: Any) -> None:
         type=Path,
         required=True,
         metavar="FILE",
-        help="trajectory: .csv (every frame), .tum, .geojson, .kml, .json (OGC GeoPose series) or .srt; "
+        help="trajectory: .csv (every frame), .tum, .geojson, .kml or .json (OGC GeoPose series); "
         "may be repeated",
     )
     parser.add_argument(

@@ -78,7 +78,7 @@ def test_the_json_says_that_it_is_not_on_earth(tmp_path: Path) -> None:
     assert "no place on Earth" in _words(_TRACK.points[0])[1]
 
 
-@pytest.mark.parametrize("suffix", [".tum", ".geojson", ".kml", ".srt"])
+@pytest.mark.parametrize("suffix", [".tum", ".geojson", ".kml"])
 def test_formats_of_places_on_earth_refuse(suffix: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidValueError, match="needs places on Earth, and map film-0 has none"):
         check_format(tmp_path / f"t{suffix}", "film-0")

@@ -1,4 +1,4 @@
-"""A trajectory as a file: CSV, TUM, GeoJSON, KML, OGC GeoPose series, or DJI's subtitles.
+"""A trajectory as a file: CSV, TUM, GeoJSON, KML, or OGC GeoPose series.
 
 The suffix chooses. Frames whose track is lost are rows without a pose in CSV, and gaps in all others. A file
 appears whole or not at all.
@@ -8,7 +8,6 @@ import json
 import os
 import secrets
 from collections.abc import Callable, Sequence
-from datetime import timedelta
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -30,7 +29,7 @@ CSV_COLUMNS = columns_of(_POSE)
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series), `.srt`.
+    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series).
 
     One in the frame of a map without a place: `.csv`, `.json`, see `own_frame_files`.
 
@@ -173,43 +172,12 @@ def geopose_text(trajectory: Trajectory) -> str:
     return json.dumps(irregular_series(poses), indent=1) + "\n"
 
 
-def srt_text(trajectory: Trajectory) -> str:
-    """Subtitles in the manner of DJI's newer drones, which map programs and players read.
-
-    abs_alt is the height as the maps have it; angles are those of the camera.
-    """
-    found = _known(trajectory, "SRT")
-    times = [point.time_s for point in trajectory.points]
-    usual_s = float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
-    ends_s = [*times[1:], times[-1] + usual_s]
-    end_of = {point.index: end_s for point, end_s in zip(trajectory.points, ends_s, strict=True)}
-    blocks: list[str] = []
-    for point, pose in found:
-        if point.time_s < 0:
-            continue  # subtitles begin with the film
-        number, end_s = len(blocks) + 1, end_of[point.index]
-        heading, pitch, roll = pose.geopose.heading_pitch_roll_deg
-        clock = ""
-        if trajectory.start is not None:
-            when = trajectory.start + timedelta(seconds=point.time_s)
-            clock = f"{when:%Y-%m-%d %H:%M:%S}.{when.microsecond // 1000:03d}\n"
-        shown = f"{_srt_time(point.time_s)} --> {_srt_time(end_s)}"
-        blocks.append(
-            f"{number}\n{shown}\nFrameCnt: {point.index + 1}\n{clock}"
-            f"[latitude: {pose.geopose.latitude_deg:.8f}] [longitude: {pose.geopose.longitude_deg:.8f}] "
-            f"[abs_alt: {pose.utm[2]:.3f}] [gb_yaw: {(heading + 180.0) % 360.0 - 180.0:.3f} "
-            f"gb_pitch: {pitch:.3f} gb_roll: {roll:.3f}]\n"
-        )
-    return "\n".join(blocks)
-
-
 _FORMATS: dict[str, Callable[[Trajectory], str]] = {
     ".csv": csv_text,
     ".tum": tum_text,
     ".geojson": geojson_text,
     ".kml": kml_text,
     ".json": geopose_text,
-    ".srt": srt_text,
 }
 
 
@@ -253,10 +221,3 @@ def _place(pose: EarthPose) -> list[float]:
         round(pose.geopose.latitude_deg, 10),
         round(float(pose.utm[2]), 4),
     ]
-
-
-def _srt_time(time_s: float) -> str:
-    milliseconds = round(1000.0 * max(time_s, 0.0))
-    minutes, rest = divmod(milliseconds, 60_000)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours:02d}:{minutes:02d}:{rest // 1000:02d},{rest % 1000:03d}"
