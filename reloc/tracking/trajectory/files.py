@@ -16,7 +16,7 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose_documents import irregular_series
 from reloc.tracking.ground import EarthPose
-from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS, UPPER, columns_of, csv_table
+from reloc.tracking.trajectory.own_frame_files import UPPER, columns_of, csv_table, own_csv_text
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 
 _AXES = ("re", "rn", "ru", "e", "n", "u")
@@ -31,7 +31,7 @@ CSV_COLUMNS = columns_of(_POSE)
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series).
 
-    One in the frame of a map without a place: `.csv`, `.json`, see `own_frame_files`.
+    One in the frame of a map without a place: `.csv`, see `own_frame_files`.
 
     Raises:
         InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
@@ -182,7 +182,7 @@ _FORMATS: dict[str, Callable[[Trajectory], str]] = {
 
 
 def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str]:
-    suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else OWN_FORMATS
+    suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else {".csv": own_csv_text}
     if suffix in formats:
         return formats[suffix]
     if own_map is None:
@@ -190,8 +190,8 @@ def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str]:
             f"{path.name}: expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
         )
     raise InvalidValueError(
-        f"{path.name}: needs places on Earth, and map {own_map} has none: expected {' or '.join(formats)}, "
-        "with poses in the map's own frame; or place the map first: `featuredb maps` says how"
+        f"{path.name}: needs places on Earth, and map {own_map} has none: expected .csv, with "
+        "poses in the map's own frame; or place the map first: `featuredb maps` says how"
     )
 
 
