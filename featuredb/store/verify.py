@@ -10,7 +10,6 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 
 from featuredb.errors import FeatureDbError, StoreError
-from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.photos import count_candidates
@@ -243,18 +242,14 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
     """Do the points of a scan agree with its row, and are they those that were committed?"""
     where = f"scan {scan.scan_id}"
     levels, coordinates = np.zeros(len(scan.level_points), np.int64), PointsChecksum()
-    low, high = np.array([[scan.row[b] for b in BOUNDS[:3]], [scan.row[b] for b in BOUNDS[3:]]])
-    elsewhere = outside = 0
     try:
-        for batch in scan_batches(database, scan, ("easting", "northing", "height", "tile", "level")):
+        for batch in scan_batches(database, scan, (*UTM_COORDINATES, "level")):
             utm = _utm(batch)
             coordinates.add(utm)
             levels += np.bincount(batch["level"].to_numpy(), minlength=len(levels))[: len(levels)]
             if not np.isfinite(utm).all():
                 yield where, "coordinates that are not finite"
                 return
-            elsewhere += int((tile_of(utm) != batch["tile"].to_numpy(zero_copy_only=False)).sum())
-            outside += int((~((utm >= low) & (utm <= high)).all(axis=1)).sum())
     except (OSError, pa.ArrowException) as error:
         yield where, f"cannot read its points: {one_line(error)[:300]}"
         return
@@ -262,10 +257,6 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
         yield where, f"expected {list(scan.level_points)} points by level, found {levels.tolist()}"
     elif coordinates.text() != scan.row["points_checksum"]:
         yield where, "its points are not those that were committed: checksums differ"
-    if elsewhere:
-        yield where, f"{elsewhere} points in another tile than their coordinates'"
-    if outside:
-        yield where, f"{outside} points outside the scan's box"
 
 
 def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
