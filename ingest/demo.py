@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import format_table
 from featuredb.errors import FeatureDbError
 
 if TYPE_CHECKING:
@@ -37,12 +38,6 @@ def register(subparsers: Any) -> None:
     demo.add_argument("--out", type=Path, default=Path("featuredb-demo"), help="default: ./featuredb-demo")
     demo.add_argument("--size", choices=("short", "full"), default="short", help="default: short")
     demo.add_argument("--seed", type=int, default=1, help="of the town and of everything in it")
-    demo.add_argument(
-        "--gps",
-        choices=("exact", "realistic"),
-        default="exact",
-        help="position tags of the drone's photos: survey-grade, or metres off like a consumer drone's",
-    )
     demo.set_defaults(run=_run)
 
 
@@ -67,11 +62,11 @@ def _run(args: argparse.Namespace) -> int:
         sys.stdout.write(line + "\n")
         sys.stdout.flush()
 
-    answers = run_demo(args.out, size=args.size, seed=args.seed, exact_gps=args.gps == "exact", say=say)
+    answers = run_demo(args.out, size=args.size, seed=args.seed, say=say)
     return 0 if demo_holds(answers) else 1
 
 
-def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> list[DemoAnswer]:
+def run_demo(out: Path, *, size: str, seed: int, say: Say) -> list[DemoAnswer]:
     """Everything, into `out`: world/, db/, report/, overlay.png. Returns all answers.
 
     Raises:
@@ -85,11 +80,11 @@ def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> l
     start = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     _tell(say, start, "drawing the town and its photos, a minute or two ...")
-    world = make_world(out / "world", size=size, seed=seed, exact_gps=exact_gps)
+    world = make_world(out / "world", size=size, seed=seed, exact_gps=True)
     _tell(say, start, f"simulated town: {len(world.images('drone'))} drone photos in {world.folder}")
     _tell(say, start, "making a map of them; each stage is told when it is done ...")
     database = Database.create(out / "db")
-    report = ingest_world(world, database, out / "report", exact_gps=exact_gps)
+    report = ingest_world(world, database, out / "report", exact_gps=True)
     made = next((m for m in report.maps if m.status != "refused"), None)
     if made is None:
         raise FeatureDbError(
@@ -171,26 +166,19 @@ def table(answers: Sequence[DemoAnswer]) -> str:
     """Errors by group, as text."""
     from featuredb.simworld.scoring import summarise
 
-    head = (
-        f"{'photos':<10}{'asked':>6}{'answered':>10}{'position m':>20}{'angle deg':>18}{'wrong':>7}{'ms':>7}"
-    )
-    lines = [head, f"{'':<26}{'median   95 %':>20}{'median   95 %':>18}{'> 5 m':>7}{'median':>7}"]
+    rows: list[tuple[object, ...]] = []
     for group in dict.fromkeys(answer.group for answer in answers):
         mine = [answer for answer in answers if answer.group == group]
         answered = sum(a.reply.status == "localised" for a in mine)
-        errors = [a.error for a in mine]
-        wall = sorted(a.wall_ms for a in mine)[len(mine) // 2]
+        wall_ms = sorted(a.wall_ms for a in mine)[len(mine) // 2]
+        figures: tuple[object, ...] = (None, None, None, None, answered)  # no true place
         if group in ("drone", "street"):
-            s = summarise(errors)
-            figures = "".join(
-                f"{'-':>{w}}" if s.localised == 0 else f"{m:>{w - 9}.3f}{p:>9.3f}"
-                for (m, p), w in ((s.position_m, 20), (s.angle_deg, 18))
-            )
-            wrong = s.wrong
-        else:
-            figures, wrong = f"{'no true place':>38}", answered
-        lines.append(f"{group:<10}{len(mine):>6}{answered:>10}{figures}{wrong:>7}{wall:>7.0f}")
-    return "\n".join(lines)
+            found = summarise([a.error for a in mine])
+            figures = (*found.position_m, *found.angle_deg, found.wrong)
+        shown = (f"{f:.3f}" if isinstance(f, float) else f for f in figures)
+        rows.append((group, len(mine), answered, *shown, round(wall_ms)))
+    head = ("photos", "asked", "answered", "median_m", "95%_m", "median_deg", "95%_deg", "wrong", "median_ms")
+    return format_table(head, rows)
 
 
 def demo_holds(answers: Sequence[DemoAnswer]) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.datum import HEIGHT_DATUMS
-from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
+from featuredb.index.vocabulary import shipped_vocabulary
 from featuredb.plain_json import plain
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database, Snapshot
@@ -57,7 +57,6 @@ class IngestOptions:
         stop_after: end after that stage and keep its results for the next run.
         survey: control points, which place the maps instead of the photos' GPS. A map's id does not depend
             on them: it is the photos' and the options', wherever it is placed.
-        vocabulary: for retrieval, instead of the one that comes with featuredb.
     """
 
     scan: ScanOptions = field(default_factory=ScanOptions)
@@ -69,7 +68,6 @@ class IngestOptions:
     work: Path | None = None
     stop_after: Stage | None = None
     survey: Survey | None = None
-    vocabulary: Vocabulary | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -88,7 +86,7 @@ class IngestOptions:
     def fingerprint(self) -> str:
         """Digest of what a map depends on besides the photos; not of the number of workers."""
         parts = [_MAP_VERSION, options_fingerprint(self.making), repr(self.gps_sigma_m)]
-        return digest(*parts, (self.vocabulary or shipped_vocabulary()).digest)[:16]
+        return digest(*parts, shipped_vocabulary().digest)[:16]
 
 
 def ingest_photos(
@@ -129,7 +127,6 @@ def ingest_photos(
                 progress=progress,
                 clock=clock,
                 stop_after=options.stop_after,
-                vocabulary=options.vocabulary,
             )
     with clock.stage("build"):
         outcomes, registered, quarantined = _place_and_commit(
@@ -145,7 +142,7 @@ def ingest_photos(
         database=database.url,
         folder=str(folder),
         started=started,
-        options=dataclasses.asdict(dataclasses.replace(options, survey=None, vocabulary=None)),
+        options=dataclasses.asdict(dataclasses.replace(options, survey=None)),
         versions=library_versions(),
         pairs=len(result.matched.files),
         verified_pairs=len(result.matched.inliers),
@@ -231,7 +228,7 @@ def _identity(folder: Path, options: IngestOptions, job_id: str, number: int) ->
             "job": job_id,
             "component": number,
             "versions": library_versions(),
-            "vocabulary": (options.vocabulary or shipped_vocabulary()).digest,
+            "vocabulary": shipped_vocabulary().digest,
             "options": plain(dataclasses.asdict(options.making)),
         },
     )
@@ -287,7 +284,7 @@ def _beside_others(component: Component, there: Snapshot, work: Path, options: I
     feature_map = component.feature_map
     if feature_map is None or feature_map.placement.method != "gps":
         return component
-    found = same_scene_elsewhere(feature_map, there, work, options.vocabulary or shipped_vocabulary())
+    found = same_scene_elsewhere(feature_map, there, work, shipped_vocabulary())
     if found is None:
         return component
     reason = "; ".join(filter(None, (component.reason, found.message)))

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
+from featuredb.index.vocabulary import shipped_vocabulary
 from featuredb.stage_clock import StageClock
 from ingest.clusters.graph import ClusterOptions, find_clusters
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
@@ -100,14 +100,12 @@ def reconstruct_photos(
     progress: Progress = no_progress,
     clock: StageClock | None = None,
     stop_after: Stage | None = None,
-    vocabulary: Vocabulary | None = None,
 ) -> Reconstructed:
     """Features, pairs, matches, clusters and models of photos.
 
     Args:
         photos: usable ones, in a fixed order.
         stop_after: end there; what is done is kept for the next run.
-        vocabulary: for retrieval; the one that comes with featuredb if None.
     """
     clock = clock or StageClock()
     with clock.stage("extract") as counts:
@@ -125,7 +123,7 @@ def reconstruct_photos(
         PhotoView(sha256=photo.sha256, features=path, camera=cameras[row][0], focal_known=cameras[row][1])
         for photo, path, row in zip(usable, features.paths, camera_rows, strict=True)
     ]
-    words = vocabulary or shipped_vocabulary()
+    words = shipped_vocabulary()
     with clock.stage("pairs"):
         vectors = None
         if options.pairs.needs_vectors(len(usable)):

@@ -68,8 +68,8 @@ def film_of(photos: Path, names: Sequence[str], folder: Path) -> Path:
         link = folder / name
         if not link.is_symlink():
             link.symlink_to((photos / name).resolve())
-    lines = [f"{i:.3f}" for i in range(len(names))]
-    (folder / "times.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    lines = ["file,time_s", *(f"{name},{i}" for i, name in enumerate(names))]
+    (folder / "timestamps.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
 
 

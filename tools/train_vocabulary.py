@@ -5,7 +5,7 @@
         --out featuredb/index/data/vocabulary.npz
 
 made the one that comes with featuredb: of photos that everybody can make again, by fixed seeds and on one
-thread. Others are used with `featuredb ingest photos --vocabulary FILE`.
+thread.
 
     uv run python tools/train_vocabulary.py brighton/images lewis/images seneca/images copr/images \\
         reichstag/images sacre_coeur/mapping --lists 2048 --out featuredb/index/data/list_centers.npz
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"{args.out}: {args.lists} lists from {len(photos)} photos\n")
         return 0
     vocabulary = train_vocabulary(descriptors)
-    args.out.write_bytes(vocabulary.to_bytes())
+    np.savez(args.out, **{name: getattr(vocabulary, name) for name in ("mean", "projection", "words")})
     sys.stdout.write(f"{args.out}: {len(photos)} photos, digest {vocabulary.digest}\n")
     return 0
 

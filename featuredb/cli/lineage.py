@@ -1,7 +1,6 @@
 """`featuredb lineage`: which map stands on which, how far from its anchors, and why some do not count."""
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -14,7 +13,6 @@ if TYPE_CHECKING:
     from featuredb.store import MapSummary, Snapshot
 
 _OF_SUMMARY = ("name", "status", "status_reason", "method", "generation", "parents")
-_DOT_STYLE = {"active": "solid", "quarantined": "dashed", "retired": "dotted"}
 
 
 def register(subparsers: Any) -> None:
@@ -32,9 +30,7 @@ def register(subparsers: Any) -> None:
     )
     parser.add_argument("--all", action="store_true", help="retired maps, too (with MAP they always show)")
     add_as_of_argument(parser)
-    form = parser.add_mutually_exclusive_group()
-    form.add_argument("--json", action="store_true", help="as JSON")
-    form.add_argument("--dot", action="store_true", help="as a graph for Graphviz: ... --dot | dot -Tsvg")
+    parser.add_argument("--json", action="store_true", help="as JSON")
 
 
 def run_lineage(args: argparse.Namespace) -> int:
@@ -49,8 +45,6 @@ def run_lineage(args: argparse.Namespace) -> int:
             for map_id, summary in maps.items()
         ]
         write_json({"snapshot": snapshot.version, "maps": told})
-    elif args.dot:
-        sys.stdout.writelines(f"{line}\n" for line in draw_dot(maps, lineages))
     else:
         sys.stdout.writelines(f"{line}\n" for line in draw_tree(maps, lineages, args.map_id))
     return 0
@@ -83,20 +77,6 @@ def draw_tree(
             stack.append((child, under + ("`- " if last else "|- "), under + ("   " if last else "|  ")))
 
 
-def draw_dot(maps: Mapping[str, "MapSummary"], lineages: Mapping[str, MapLineage]) -> Iterator[str]:
-    """Lines of a Graphviz digraph, parents above the maps that they placed."""
-    yield "digraph lineage {"
-    yield "  node [shape=box, fontname=sans];"
-    for map_id, summary in maps.items():
-        label = f"{map_id}\n{summary.name}\n{describe_lineage(lineages[map_id])}"
-        yield f"  {_quoted(map_id)} [label={_quoted(label)}, style={_DOT_STYLE[summary.status]}];"
-    for map_id, summary in maps.items():
-        for parent in dict.fromkeys(summary.parents):
-            if parent in maps:
-                yield f"  {_quoted(parent)} -> {_quoted(map_id)};"
-    yield "}"
-
-
 def _wanted(snapshot: "Snapshot", map_id: str | None, *, include_retired: bool) -> "dict[str, MapSummary]":
     every = {m.map_id: m for m in snapshot.maps(include_retired=True)}
     if map_id is not None:
@@ -125,8 +105,3 @@ def _line(summary: "MapSummary", lineage: MapLineage, drawn_under: str | None) -
     if summary.status != "active":
         parts.append(summary.status + (f": {summary.status_reason}" if summary.status_reason else ""))
     return "; ".join(parts)
-
-
-def _quoted(text: str) -> str:
-    """A string of the DOT language, which JSON's strings are as far as quotes and backslashes go."""
-    return json.dumps(text, ensure_ascii=False)

@@ -29,11 +29,6 @@ def register(subparsers: Any) -> None:
         metavar="K",
         help="described points that every image keeps seeing (default: %(default)s)",
     )
-    parser.add_argument(
-        "--drop-points",
-        action="store_true",
-        help="remove the other points altogether; by default they stay as geometry without descriptors",
-    )
     parser.add_argument("--dry-run", action="store_true", help="only say what would become of the map")
 
 
@@ -49,7 +44,6 @@ def run_thin(args: argparse.Namespace) -> int:
     from featuredb.maps.thin import thin_map
     from featuredb.store import UnplacedSummary
 
-    keep_points = not args.drop_points
     database = open_database(args)
     snapshot = database.snapshot()
     summary = _thinnable(snapshot, args.map_id)
@@ -57,10 +51,10 @@ def run_thin(args: argparse.Namespace) -> int:
     after: AnyMap
     if isinstance(summary, UnplacedSummary):
         before = unplaced = snapshot.load_unplaced(summary.map_id)
-        after = thin_map(unplaced, args.cover, keep_points=keep_points)
+        after = thin_map(unplaced, args.cover)
     else:
         before = placed = snapshot.load_map(summary.map_id)
-        after = thin_map(placed, args.cover, keep_points=keep_points)
+        after = thin_map(placed, args.cover)
     sys.stdout.write(f"map {summary.map_id}: {_figures(before)} -> {_figures(after)}\n")
     if args.dry_run:
         return 0

@@ -1,4 +1,4 @@
-"""OGC GeoPose 1.0 (21-056r11) as JSON documents: Basic-YPR, Advanced, Irregular Series.
+"""OGC GeoPose 1.0 (21-056r11) as JSON documents: Basic-YPR, Irregular Series.
 
 They have the members that the schemas of OGC's compliance suite ask for; earlier drafts had a word for the
 transition model, the standard has a frame-like object.
@@ -24,16 +24,6 @@ def basic_ypr(pose: GeoPose) -> dict[str, Any]:
     return {
         "position": {"lat": pose.latitude_deg, "lon": pose.longitude_deg, "h": pose.height_m},
         "angles": {"yaw": yaw, "pitch": pitch, "roll": roll},
-    }
-
-
-def advanced(pose: GeoPose, unix_ms: int) -> dict[str, Any]:
-    """An Advanced GeoPose: Unix milliseconds, the frame east-north-up at the body, its quaternion."""
-    x, y, z, w = pose.quaternion_xyzw
-    return {
-        "validTime": unix_ms,
-        "frameSpecification": _tangent(_frame_at(pose)),
-        "quaternion": {"x": x, "y": y, "z": z, "w": w},
     }
 
 

@@ -9,9 +9,6 @@ import hashlib
 from dataclasses import dataclass
 from importlib import resources
 from io import BytesIO
-from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,38 +66,12 @@ class Vocabulary:
         vector = _unit(total).ravel()
         return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12), dtype=np.float32)
 
-    def to_bytes(self) -> bytes:
-        """As an npz file."""
-        buffer = BytesIO()
-        np.savez(buffer, **{name: getattr(self, name) for name in _ARRAYS})
-        return buffer.getvalue()
-
 
 def shipped_vocabulary() -> Vocabulary:
     """The one that comes with featuredb; tools/train_vocabulary.py made it."""
     data = resources.files("featuredb.index").joinpath("data", _SHIPPED).read_bytes()
-    return _read(data, _SHIPPED)
-
-
-def read_vocabulary(path: Path) -> Vocabulary:
-    """A vocabulary that `to_bytes` wrote.
-
-    Raises:
-        InvalidValueError: the file cannot be read or is something else.
-    """
-    try:
-        return _read(path.read_bytes(), str(path))
-    except OSError as error:
-        raise InvalidValueError(f"{path}: expected a vocabulary, found: {error.strerror or error}") from error
-
-
-def _read(data: bytes, name: str) -> Vocabulary:
-    try:
-        with np.load(BytesIO(data), allow_pickle=False) as archive:
-            arrays: dict[str, Any] = {key: archive[key] for key in _ARRAYS}
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
-        raise InvalidValueError(f"{name}: expected a vocabulary (npz), found: {error}") from error
-    return Vocabulary(**arrays)
+    with np.load(BytesIO(data), allow_pickle=False) as archive:
+        return Vocabulary(**{name: archive[name] for name in _ARRAYS})
 
 
 def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:

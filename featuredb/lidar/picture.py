@@ -16,20 +16,22 @@ from featuredb.store.scans import ScanSummary
 
 _LONGEST_SIDE_PX = 1400
 _LARGEST_POINTS = 4_000_000  # more do not show in a picture of that size
-_BORDER_PX, _FOOT_PX = 12, 56
+_DPI, _AXES_PX = 100, 120
 _GAP_PX, _BACKGROUND = 3, 255
 _LIGHT = np.array([-0.5, 0.5, 0.7071])  # from the north-west, 45 degrees up, as maps are shaded
 _REACH_PX = 4  # a spot in a gap takes the nearest point within
 
 
 def write_plan_view(database: Database, scan: ScanSummary, path: Path) -> None:
-    """Write a PNG of a scan: its colours, else its intensities, else shaded heights; north up, with a scale
-    bar.
+    """Write a PNG of a scan: its colours, else its intensities, else shaded heights; north up, axes in
+    metres.
 
     Raises:
         ScanError: the file cannot be written.
         StoreError: the points cannot be read.
     """
+    from matplotlib.figure import Figure  # takes a second to load
+
     cloud = load_cloud(
         database,
         scan_frame(scan),
@@ -38,15 +40,16 @@ def write_plan_view(database: Database, scan: ScanSummary, path: Path) -> None:
     )
     ground = ground_of(cloud, scan.spacing_m, _LONGEST_SIDE_PX, _GAP_PX, _BACKGROUND)
     shown = "colours" if cloud.rgb is not None else "intensity" if cloud.intensity is not None else "heights"
-    picture = _framed(
-        ground.rgb, ground.pixel_m, f"{scan.name}  EPSG:{scan.epsg}  {scan.points:,} points  {shown}"
-    )
+    height, width = ground.height.shape
+    inches = (width + _AXES_PX) / _DPI, (height + _AXES_PX) / _DPI
+    figure = Figure(figsize=inches, dpi=_DPI, layout="constrained")
+    axes = figure.add_subplot()
+    axes.imshow(ground.rgb, extent=(0.0, width * ground.pixel_m, 0.0, height * ground.pixel_m))
+    axes.set(xlabel="east, m", ylabel="north, m")
+    axes.set_title(f"{scan.name}  EPSG:{scan.epsg}  {scan.points:,} points  {shown}", fontsize=9, loc="left")
     path.parent.mkdir(parents=True, exist_ok=True)
-    done, data = cv2.imencode(".png", np.ascontiguousarray(picture[:, :, ::-1]))
-    if not done:
-        raise ScanError(f"cannot encode the plan view {path}")
     try:
-        path.write_bytes(data.tobytes())
+        figure.savefig(path, format="png")
     except OSError as error:
         raise ScanError(f"cannot write the plan view {path} ({error}); choose another place") from error
 
@@ -131,23 +134,3 @@ def _shaded(height: NDArray[np.float32], pixel_m: float) -> NDArray[np.uint8]:
     normal = np.stack([-east, south, np.ones_like(east)], axis=2)
     light = (normal @ _LIGHT) / np.linalg.norm(normal, axis=2)
     return np.repeat(np.clip(255.0 * light, 0.0, 255.0).astype(np.uint8)[:, :, None], 3, axis=2)
-
-
-def _framed(image: NDArray[np.uint8], pixel_m: float, title: str) -> NDArray[np.uint8]:
-    """The image with a border, a scale bar and a line of text."""
-    h, w = image.shape[:2]
-    width = max(w, 480) + 2 * _BORDER_PX
-    picture = np.full((h + 2 * _BORDER_PX + _FOOT_PX, width, 3), _BACKGROUND, np.uint8)
-    picture[_BORDER_PX : _BORDER_PX + h, _BORDER_PX : _BORDER_PX + w] = image
-    longest = 0.3 * w * pixel_m
-    power = 10.0 ** np.floor(np.log10(longest))
-    bar_m = power * max(f for f in (1, 2, 5) if f * power <= longest or f == 1)
-    y = h + 2 * _BORDER_PX + 8
-    cv2.rectangle(picture, (_BORDER_PX, y), (_BORDER_PX + round(bar_m / pixel_m), y + 6), (0, 0, 0), -1)
-    font = cv2.FONT_HERSHEY_SIMPLEX
-    label = (_BORDER_PX + round(bar_m / pixel_m) + 8, y + 9)
-    cv2.putText(picture, f"{bar_m:g} m", label, font, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-    # OpenCV's letters are ASCII.
-    text = title.encode("ascii", "replace").decode()
-    cv2.putText(picture, text, (_BORDER_PX, y + 36), font, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-    return picture

@@ -8,7 +8,7 @@ is chosen, so a heap of old gains finds the greatest one without computing the o
 A point that is not chosen loses its descriptors and stays as geometry. Answers read described points only,
 so the index, its memory and a query's time shrink as if the point were gone; what stays serves what works on
 tracks (placing a map on a scan, adjusting its lens, exports) and leaves the numbers of all points as they
-were. `keep_points=False` removes it altogether (docs/measurements/growth.md has the bytes of both).
+were.
 """
 
 import heapq
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.subset import only_points
 from featuredb.maps.unplaced_map import AnyMap, MapKind
 
 # Localisation believes a pose from 15 inliers on, and a photo finds only a part of what is there.
@@ -31,58 +30,34 @@ _GRID = 10
 _THINNED = "thinned"
 
 
-def thin_map(feature_map: MapKind, cover: int, *, keep_points: bool = True) -> MapKind:
+def thin_map(feature_map: MapKind, cover: int) -> MapKind:
     """The map with as few described points and observations as the cover asks for.
 
     Every image sees at least `cover` described points, or as many as before. Poses, placement, parents and
     status stay. A map that was thinned in this very way comes back as it is.
-
-    Args:
-        keep_points: points that are not chosen stay without descriptors.
 
     Raises:
         InvalidValueError: a cover of less than 15.
     """
     if cover < _LEAST_COVER:
         raise InvalidValueError(f"cover: expected at least {_LEAST_COVER} points, found {cover}")
-    options = {"cover": cover, "keep_points": keep_points}
     earlier = feature_map.provenance.get(_THINNED)
-    if earlier is not None and earlier.get("options") == options:
+    if earlier is not None and earlier["options"]["cover"] == cover:
         return feature_map
     points = k_cover(feature_map, cover)
-    described = _thinned_views(feature_map, points, cover)
+    seen = feature_map.observations
+    kept = _thinned_views(feature_map, points, cover)
     note = {
-        "options": options,
+        "options": {"cover": cover},
         "points_before": len(_described_points(feature_map)),
         "points": int(points.sum()),
     }
-    return with_descriptors(feature_map, described, keep_points, {_THINNED: note})
-
-
-def with_descriptors(
-    feature_map: MapKind,
-    described: NDArray[np.bool_],
-    keep_points: bool,
-    provenance: dict[str, object] | None = None,
-) -> MapKind:
-    """The map with descriptors at some of its observations only.
-
-    Args:
-        described: (m,) observations that keep theirs; those that have none are left without.
-        keep_points: else points that lost all their descriptors go, with their observations.
-        provenance: added to the map's.
-    """
-    seen = feature_map.observations
-    kept = seen.has_descriptor & described
-    noted = feature_map.provenance | (provenance or {})
-    observations = replace(
-        seen, has_descriptor=kept, descriptors=np.where(kept[:, None], seen.descriptors, np.uint8(0))
+    descriptors = np.where(kept[:, None], seen.descriptors, np.uint8(0))
+    return replace(
+        feature_map,
+        observations=replace(seen, has_descriptor=kept, descriptors=descriptors),
+        provenance=feature_map.provenance | {_THINNED: note},
     )
-    if keep_points:
-        return replace(feature_map, observations=observations, provenance=noted)
-    had, has = (_has_any(feature_map, which) for which in (seen.has_descriptor, kept))
-    stays = has | ~had
-    return only_points(replace(feature_map, observations=observations, provenance=noted), stays)
 
 
 def k_cover(feature_map: AnyMap, cover: int) -> NDArray[np.bool_]:
@@ -222,10 +197,3 @@ def _farthest_first(place: FloatArray) -> NDArray[np.intp]:
 def _described_points(feature_map: AnyMap) -> NDArray[np.int64]:
     seen = feature_map.observations
     return np.unique(seen.point_index[seen.has_descriptor])
-
-
-def _has_any(feature_map: AnyMap, which: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Points (n,) with at least one observation of `which` (m,)."""
-    found = np.zeros(len(feature_map.points), dtype=np.bool_)
-    found[feature_map.observations.point_index[which]] = True
-    return found

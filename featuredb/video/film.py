@@ -92,17 +92,6 @@ class VideoInfo:
     focal_px: float | None = None
     live: bool = False
 
-    def __post_init__(self) -> None:
-        sides = (self.width, self.height, self.frame_width, self.frame_height)
-        if min(sides) < 1:
-            raise InvalidValueError(f"expected sides of at least one pixel, found {sides}")
-        if self.rotation_deg not in (0, 90, 180, 270):
-            raise InvalidValueError(f"rotation_deg: expected 0, 90, 180 or 270, found {self.rotation_deg}")
-        for name in ("duration_s", "frame_count"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < math.inf:
-                raise InvalidValueError(f"{name}: expected a positive number or None, found {value}")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class VideoFrame:

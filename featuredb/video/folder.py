@@ -1,9 +1,7 @@
 """A film as a folder of pictures, in the natural order of their names, with times from a file or a rate.
 
-Times come from one of two files in the folder:
-
-- `timestamps.csv`, with a heading and at least the columns `file` and `time_s`, a line for each picture;
-- `times.txt`, one time in seconds on each line, in the natural order of the pictures; `#` begins a comment.
+Times come from `timestamps.csv` in the folder, with a heading and at least the columns `file` and `time_s`, a
+line for each picture.
 
 Pixels come as stored, as of every other picture file: EXIF orientation is not applied.
 """
@@ -27,7 +25,7 @@ from featuredb.features.shrink import fitted_size
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".heic", ".heif", ".avif", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-_CSV_NAME, _TXT_NAME = "timestamps.csv", "times.txt"
+_CSV_NAME = "timestamps.csv"
 _MAX_BYTES = 1 << 30  # of one picture: an uncompressed TIFF of the most pixels has 400 MB
 
 
@@ -161,22 +159,15 @@ class FolderVideo(Video):
 
 def _timed(folder: Path, names: list[str], fps: float | None) -> list[tuple[float, str]]:
     """(time in seconds, name) in order of time, which must be that of the names unless a table says more."""
-    table, lines = folder / _CSV_NAME, folder / _TXT_NAME
-    if table.is_file() and lines.is_file():
-        raise VideoError(
-            f"{folder}: expected one file of times, found {_CSV_NAME} and {_TXT_NAME}; remove one"
-        )
+    table = folder / _CSV_NAME
     if table.is_file():
         timed = sorted(_from_table(table, names))
-    elif lines.is_file():
-        timed = _from_lines(lines, names)
     elif fps is not None:
         return [(index / fps, name) for index, name in enumerate(names)]
     else:
         raise VideoError(
             f"{folder}: expected the times of its {len(names)} pictures, found none; put a {_CSV_NAME} "
-            f"(columns file,time_s) or a {_TXT_NAME} (a time on each line) beside them, or give their "
-            "rate by --fps"
+            "(columns file,time_s) beside them, or give their rate by --fps"
         )
     for (before_s, before), (time_s, name) in pairwise(timed):
         if time_s <= before_s:
@@ -207,14 +198,6 @@ def _from_table(path: Path, names: list[str]) -> list[tuple[float, str]]:
             f"{_some(without)}; not in the folder: {_some(unknown)}"
         )
     return [(times[name], name) for name in names]
-
-
-def _from_lines(path: Path, names: list[str]) -> list[tuple[float, str]]:
-    lines = [(number, line.partition("#")[0]) for number, line in enumerate(_text(path).splitlines(), 1)]
-    times = [_seconds(path, number, line) for number, line in lines if line.strip()]
-    if len(times) != len(names):
-        raise VideoError(f"{path}: expected {len(names)} times, one for each picture, found {len(times)}")
-    return list(zip(times, names, strict=True))
 
 
 def _text(path: Path) -> str:

@@ -221,7 +221,7 @@ class FeatureDatabase:
 
         Args:
             film: a file, a folder of pictures, or an address.
-            out: trajectories to write, by their suffix: .csv, .tum, .geojson, .kml, .json, .srt, .png.
+            out: trajectories to write, by their suffix: .csv, .tum, .geojson, .kml, .json.
             overlay: an mp4 with the track drawn over the film.
             by: maps, a scan, or both. maps, scans: ids; None: all.
             pose: file of the first frame's rough pose. prior: where the film begins.

@@ -8,7 +8,6 @@ from typing import Any, Literal, TypedDict, Unpack
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.index.vocabulary import read_vocabulary
 from featuredb.store import Database
 from ingest.api.progress_bars import progress_bars
 from ingest.map_builder import MapOptions
@@ -35,7 +34,7 @@ class IngestChoices(TypedDict, total=False):
     max_side: pixels. min_track_length: photos that see a point with descriptors. height_datum: of the
     positions. gps_sigma: metres, horizontal and vertical. gcp: a file of control points, with gcp_crs,
     gcp_sigma (m), ground_height (m and its sigma). work: folder of unfinished work. stop_after: a stage.
-    dask: address of a scheduler. vocabulary: a file. workers: processes.
+    dask: address of a scheduler. workers: processes.
     """
 
     exclude: Sequence[str]
@@ -58,7 +57,6 @@ class IngestChoices(TypedDict, total=False):
     work: Path | None
     stop_after: Stage | None
     dask: str | None
-    vocabulary: Path | None
     workers: int | None
 
 
@@ -104,7 +102,8 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
     of_points = [name for name in ("gcp_crs", "gcp_sigma", "ground_height") if asked.get(name) is not None]
     if of_points and asked.get("gcp") is None:
         raise InvalidValueError(f"ingest: {', '.join(of_points)}: expected gcp beside it, control points")
-    asked |= {name: Path(asked[name]) for name in ("work", "vocabulary") if asked.get(name) is not None}
+    if asked.get("work") is not None:
+        asked["work"] = Path(asked["work"])
 
     def given(**names: str) -> dict[str, Any]:
         return {name: asked[choice] for name, choice in names.items() if asked.get(choice) is not None}
@@ -121,12 +120,10 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
         films=films,
         **given(owner="owner", licence="licence", trust_geotags="trust_geotags"),
     )
-    words = asked.get("vocabulary")
     return IngestOptions(
         scan=scan,
         making=making,
         survey=_survey(asked, keep_focal),
-        vocabulary=None if words is None else read_vocabulary(words),
         **given(
             gps_sigma_m="gps_sigma", name="name", work="work", stop_after="stop_after", dask="dask",
             workers="workers",

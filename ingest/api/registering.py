@@ -66,7 +66,7 @@ def place_by_control(
     Args:
         gcp: control points, OpenDroneMap's gcp_list.txt. crs: instead of the file's first line.
         height_datum: of the surveyed heights, where their reference system does not say it.
-        report: folder for control.html, .json and .png.
+        report: folder for control.html and .json.
 
     Raises:
         ControlFileError, MapNotFoundError, InvalidValueError, StoreError, ConflictError

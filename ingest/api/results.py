@@ -14,9 +14,8 @@ from ingest.api.registering import ControlledMap
 from ingest.api.tracking import TrackedFilm
 from ingest.growth.growth_report import GrowthReport
 from ingest.html_parts import picture
-from ingest.report.plots import plan_png
+from ingest.plot_parts import plan_png
 from ingest.report.values import IngestReport
-from reloc.tracking.trajectory.plot import plot_png
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,9 +102,7 @@ class FilmTrack:
         return self.film.as_text()
 
     def _repr_html_(self) -> str:
-        trajectory = self.film.video.trajectory
-        known = any(point.pose is not None for point in trajectory.points)
-        return _pre(str(self)) + (picture(plot_png(trajectory), "the track in plan") if known else "")
+        return _pre(str(self))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

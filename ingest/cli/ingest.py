@@ -158,12 +158,6 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
         "folder and the photos under the same paths (extra dask)",
     )
     group.add_argument(
-        "--vocabulary",
-        type=Path,
-        metavar="FILE",
-        help="of visual words for finding similar photos; default: the one that comes with featuredb",
-    )
-    group.add_argument(
         "--work",
         type=Path,
         metavar="DIR",

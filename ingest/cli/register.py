@@ -30,7 +30,7 @@ def register(subparsers: Any) -> None:
         help="of the surveyed heights, where their reference system does not say it: ellipsoidal, egm96, "
         "egm2008, navd88 or unknown (default)",
     )
-    parser.add_argument("--report", type=Path, metavar="DIR", help="write control.html, .json and .png there")
+    parser.add_argument("--report", type=Path, metavar="DIR", help="write control.html and .json there")
     parser.add_argument("--dry-run", action="store_true", help="show the residuals and commit nothing")
 
 

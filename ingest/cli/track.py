@@ -27,8 +27,8 @@ def register(subparsers: Any) -> None:
         type=Path,
         required=True,
         metavar="FILE",
-        help="trajectory: .csv (every frame), .tum, .geojson, .kml, .json (OGC GeoPose series), .srt, or "
-        "drawn: .png; may be repeated",
+        help="trajectory: .csv (every frame), .tum, .geojson, .kml or .json (OGC GeoPose series); "
+        "may be repeated",
     )
     parser.add_argument(
         "--overlay", type=Path, metavar="MP4", help="write the film with the track drawn over it"

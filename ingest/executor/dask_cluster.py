@@ -180,7 +180,7 @@ def _thread_caps() -> Any:
 
 
 def _require_shared(client: Any, address: str, folders: list[Path]) -> None:
-    """Every worker sees what this process wrote into the first folder, and this process what it wrote.
+    """Every worker sees the folders, and what this process wrote into the first, where it may write.
 
     Raises:
         IngestError: names the workers that do not.
@@ -195,15 +195,14 @@ def _require_shared(client: Any, address: str, folders: list[Path]) -> None:
     token = f".tmp-shared-{uuid.uuid4().hex}"
     if folders:
         folders[0].mkdir(parents=True, exist_ok=True)
-        (folders[0] / token).write_text(token, encoding="utf-8")
+        (folders[0] / token).touch()
     try:
-        answers: dict[str, Any] = client.run(
-            _look_around, [str(f) for f in folders], token, version("featuredb"), on_error="return"
+        problems: dict[str, Any] = client.run(
+            _problem, [str(f) for f in folders], token, version("featuredb"), on_error="return"
         )
-        problems = {worker: _problem(answer, folders, token) for worker, answer in answers.items()}
     finally:
-        for path in folders[0].glob(f"{token}*") if folders else ():
-            path.unlink(missing_ok=True)
+        for folder in folders[:1]:
+            (folder / token).unlink()
     bad = [f"{worker}: {problem}" for worker, problem in sorted(problems.items()) if problem]
     if bad:
         raise IngestError(
@@ -213,33 +212,16 @@ def _require_shared(client: Any, address: str, folders: list[Path]) -> None:
         )
 
 
-def _look_around(folders: list[str], token: str, wanted_version: str) -> str:
-    """On a worker: the name of a file that it wrote, or what is wrong after "!"."""
+def _problem(folders: list[str], token: str, wanted_version: str) -> str:
+    """On a worker: what is wrong, "" if nothing is."""
     found = version("featuredb")
     if found != wanted_version:
-        return f"!featuredb {found} there, {wanted_version} here"
+        return f"featuredb {found} there, {wanted_version} here"
     for folder in folders:
         if not os.access(folder, os.R_OK):
-            return f"!does not see {folder}"
-    if not folders:
-        return ""
-    mark, reply = Path(folders[0]) / token, f"{token}-{uuid.uuid4().hex}"
-    if not mark.is_file() or mark.read_text(encoding="utf-8") != token:
-        return f"!{folders[0]} there is another folder than here"
-    try:
-        (mark.parent / reply).write_text(token, encoding="utf-8")
-    except OSError as error:
-        return f"!cannot write to {folders[0]}: {error.strerror or error}"
-    return reply
-
-
-def _problem(answer: object, folders: list[Path], token: str) -> str:
-    """What is wrong with a worker by its answer, "" if nothing is."""
-    if isinstance(answer, BaseException):
-        return f"{type(answer).__name__}: {answer}"
-    text = str(answer)
-    if text.startswith("!"):
-        return text[1:]
-    if folders and not (folders[0] / text).is_file():
-        return f"what it writes into {folders[0]} does not arrive here"
+            return f"does not see {folder}"
+    if folders and not (Path(folders[0]) / token).is_file():
+        return f"{folders[0]} there is another folder than here"
+    if folders and not os.access(folders[0], os.W_OK):
+        return f"cannot write to {folders[0]}"
     return ""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,9 @@ from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from ingest.photos.photo import Photo, shared_key
 from ingest.placed_models import Component
+from ingest.plot_parts import PlanView
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage
-from ingest.report.values import CameraOutcome, MapOutcome, PhotoOutcome, PlanView
+from ingest.report.values import CameraOutcome, MapOutcome, PhotoOutcome
 
 _NO_POSE = (
     "it has matches, but they fit no reconstruction of three photos or more: most are with photos that are "
@@ -147,12 +149,12 @@ def registered_photos(component: Component, result: Reconstructed) -> dict[str, 
             name: replace(o, status="unplaced", reason_code=why["code"], reason=why["reason"])
             for name, o in outcomes.items()
         }
-    _, gps, residuals = _centers_and_gps(component, made)
+    _, residuals = _centers_and_residuals(component, made)
     used = _gps_used(component)
     return {
         photo.name: replace(
             outcomes[photo.name],
-            gps_residual_m=None if np.isnan(gps[k, 0]) else tuple(residuals[k].tolist()),
+            gps_residual_m=None if np.isnan(residuals[k, 0]) else tuple(residuals[k].tolist()),
             gps_used=used.get(k),
         )
         for k, photo in enumerate(component.photos)
@@ -195,22 +197,22 @@ def _outcome(
 
 
 def _plan(component: Component, feature_map: FeatureMap) -> PlanView:
-    centers, gps, _ = _centers_and_gps(component, feature_map)
+    centers, residuals = _centers_and_residuals(component, feature_map)
     used = _gps_used(component)
     return PlanView(
+        title=f"EPSG:{feature_map.epsg}",
+        what="GPS",
         points=feature_map.points.utm,
         cameras=centers,
-        gps=gps,
-        names=tuple(image.name for image in feature_map.images),
-        gps_used=np.array([used.get(k, False) for k in range(len(component.photos))]),
-        epsg=feature_map.epsg,
+        places=centers,
+        residuals=residuals,
+        used=np.array([used.get(k, False) for k in range(len(component.photos))]),
+        names=tuple(Path(image.name).stem for image in feature_map.images),
     )
 
 
-def _centers_and_gps(
-    component: Component, feature_map: FeatureMap
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """UTM camera centres (k, 3), GPS positions (k, 3) with NaN where absent, and their difference."""
+def _centers_and_residuals(component: Component, feature_map: FeatureMap) -> tuple[FloatArray, FloatArray]:
+    """UTM camera centres (k, 3), and GPS positions less them (k, 3), NaN where there is none."""
     enu = np.array([image.cam_from_local.center for image in feature_map.images])
     centers = feature_map.frame.utm_from_enu(enu, feature_map.epsg)
     gps = np.full_like(centers, np.nan)
@@ -220,7 +222,7 @@ def _centers_and_gps(
             place = (photo.gps.latitude_deg, photo.gps.longitude_deg, height or 0.0)
             gps[k] = utm_from_geodetic(place, feature_map.epsg)
             gps[k, 2] = np.nan if height is None else gps[k, 2]
-    return centers, gps, gps - centers
+    return centers, gps - centers
 
 
 def _gps_used(component: Component) -> dict[int, bool]:

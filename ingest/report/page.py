@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
+from ingest.plot_parts import plan_png
 from ingest.register.control.report import control_html
 from ingest.report.films import films_html
-from ingest.report.plots import plan_png
 from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, report_json
 from ingest.workspace import atomic_file, write_json
 
@@ -120,7 +120,7 @@ def _map(outcome: MapOutcome) -> str:
     notes = "".join(note(warning) for warning in outcome.warnings)
     pictures = ""
     if outcome.plan is not None:
-        pictures = picture(plan_png(outcome.plan), "Plan view and side view of the map")
+        pictures = picture(plan_png(outcome.plan), "The map from above, and the residuals of its positions")
     return (
         f"<h2>Map {escape(outcome.name)} {pill(*_MAP_PILLS[outcome.status])}</h2><section>{reason}{notes}"
         + table((), facts, names=(0,))

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.plain_json import plain
 from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
+from ingest.plot_parts import PlanView
 from ingest.register.control.maps import ControlledPlacement
 from ingest.report.films import FilmOutcome, films_json
 
@@ -110,27 +110,6 @@ class CameraOutcome:
     photos: int
     focal_before_px: float | None
     focal_after_px: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlanView:
-    """What the picture of a map shows, all in UTM metres of one zone.
-
-    Attributes:
-        points: (n, 3) easting, northing, height.
-        cameras: (k, 3) camera centres.
-        gps: (k, 3) their GPS positions, NaN where there is none.
-        names: k names.
-        gps_used: (k,) bool.
-        epsg: of the zone.
-    """
-
-    points: FloatArray
-    cameras: FloatArray
-    gps: FloatArray
-    names: tuple[str, ...]
-    gps_used: NDArray[np.bool_]
-    epsg: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

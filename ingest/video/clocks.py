@@ -20,7 +20,6 @@ from ingest.video.film_time import (
     log_text,
     moment_text,
     possible_beginnings,
-    reading,
     utc_text,
 )
 from ingest.video.lag import Lag, not_clear
@@ -133,7 +132,7 @@ def _found(match: Match, telemetry: Telemetry, film: FilmTime) -> Lag:
             correlation,
         )
     if abs(ahead) > 0.5:
-        said += f"; the time of making in its file is {ahead:+.1f} s from there{reading(ahead, film)}"
+        said += f"; the time of making in its file is {ahead:+.1f} s from there"
     return Lag(late_s=round(start, 3), correlation=correlation, message=said)
 
 

@@ -95,21 +95,6 @@ def possible_beginnings(film: FilmTime, telemetry: Telemetry) -> FloatArray | No
     return np.asarray(np.concatenate([begin, begin - film.duration_s]))
 
 
-def reading(ahead_s: float, film: FilmTime) -> str:
-    """How a film's time is to be read that is so far ahead of its true beginning."""
-    readings = [
-        (abs(ahead_s - 3600.0 * zone - (film.duration_s if end else 0.0)), abs(zone), end, zone)
-        for zone in _ZONES_H
-        for end in (False, True)
-    ]
-    # Of readings that are as good as each other, the one with the least to explain.
-    least = min(readings)[0]
-    _, _, end, zone = min((r for r in readings if r[0] <= least + 2.0), key=lambda r: (r[1], r[2]))
-    parts = [f"in a zone {zone:+g} h from the log's clock"] if zone else []
-    parts += ["of the end of the recording"] if end else []
-    return f" ({', '.join(parts)})" if parts else ""
-
-
 def log_span(telemetry: Telemetry) -> tuple[float, float]:
     """First and last sample with a position, seconds."""
     known = telemetry.times_s[telemetry.has_position]

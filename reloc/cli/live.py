@@ -37,8 +37,7 @@ def register(subparsers: Any) -> None:
         type=Path,
         default=[],
         metavar="FILE",
-        help="trajectory of the answered frames: .csv, .tum, .geojson, .kml, .json, .srt or .png; "
-        "may be repeated",
+        help="trajectory of the answered frames: .csv, .tum, .geojson, .kml or .json; may be repeated",
     )
     add_film_arguments(parser)
     parser.add_argument("--max-side", type=int, default=1280, metavar="PX", help="frames are sent at; 1280")

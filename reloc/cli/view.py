@@ -11,8 +11,6 @@ from featuredb.extras import require
 
 if TYPE_CHECKING:
     from featuredb.export.selection import Selection
-    from reloc.viewer.placing import PlacingPages
-    from reloc.viewer.scene import ViewerScene
 
 
 def register(subparsers: Any) -> None:
@@ -85,26 +83,8 @@ def _run(args: argparse.Namespace) -> int:
     from reloc.viewer.query import Queries
     from reloc.viewer.server import create_app, serve
 
-    pages = _placing_pages(scene, database.url, args)
-    try:
-        app = create_app(scene, pictures, Queries(database, scene), pages)
-        serve(app, args.port, browser=not args.no_browser, path="" if pages is None else f"#{pages.key}")
-    finally:
-        if pages is not None:
-            pages.close()
+    serve(create_app(scene, pictures, Queries(database, scene)), args.port, browser=not args.no_browser)
     return 0
-
-
-def _placing_pages(scene: "ViewerScene", url: str, args: argparse.Namespace) -> "PlacingPages | None":
-    """Where maps without a place can be placed from the page: the newest ones, by photos that are there."""
-    from reloc.viewer.placing import PlacingPages, anchor_command
-
-    if args.photos is None or args.as_of is not None or args.storage_option:
-        return None
-    unplaced = [m["id"] for place in scene.document["places"] if place.get("own") for m in place["maps"]]
-    if not unplaced:
-        return None
-    return PlacingPages({m: anchor_command(url, m, args.photos.absolute()) for m in unplaced})
 
 
 def _selection(args: argparse.Namespace) -> "Selection":

@@ -1,4 +1,4 @@
-"""What /openapi.json says beside the paths: bodies, examples, statuses."""
+"""What /openapi.json says beside the paths: bodies and statuses."""
 
 from typing import Any, Literal
 
@@ -41,61 +41,6 @@ _TOLD = {
     503: "BUSY, SHUTTING_DOWN, NO_SERVER: try again after Retry-After seconds",
     504: "DEADLINE, TIMEOUT: no answer in time",
 }
-_PRIVACY: dict[str, list[str]] = {
-    "dataRetention": [],
-    "dataAcceptableUse": [],
-    "dataSanitizationApplied": [],
-    "dataSanitizationRequested": [],
-}
-# A whole picture is longer than an example should be: this one is answered by 415.
-_EXAMPLE_REQUEST = {
-    "id": "d9fbf438-b7c6-419a-a75b-1cf79275e58d",
-    "timestamp": 1608995990413,
-    "type": "geopose",
-    "sensors": [{"id": "0", "type": "camera"}, {"id": "1", "type": "geolocation"}],
-    "sensorReadings": {
-        "cameraReadings": [
-            {
-                "timestamp": 1608995990381,
-                "sensorId": "0",
-                "privacy": _PRIVACY,
-                "sequenceNumber": 0,
-                "imageFormat": "JPG",
-                "size": [1920, 1080],
-                "imageBytes": "/9j/4AAQSkZJRg==",
-                "imageOrientation": {"mirrored": False, "rotation": 0},
-                "params": {
-                    "model": "OPENCV",
-                    "modelParams": [1499.027, 1499.027, 954.783, 511.957, 0.0, 0.0, 0.0, 0.0],
-                },
-            }
-        ],
-        "geolocationReadings": [
-            {
-                "timestamp": 1608995990381,
-                "sensorId": "1",
-                "privacy": _PRIVACY,
-                "latitude": 49.0149,
-                "longitude": 8.4091,
-                "altitude": 0,
-                "accuracy": 20,
-                "altitudeAccuracy": 0,
-                "heading": 0,
-                "speed": 0,
-            }
-        ],
-    },
-}
-_EXAMPLE_RESPONSE = {
-    "id": "d9fbf438-b7c6-419a-a75b-1cf79275e58d",
-    "timestamp": 1608995990413,
-    "accuracy": {"position": 0.12, "orientation": 0.08},
-    "type": "geopose",
-    "geopose": {
-        "position": {"lon": 8.4091, "lat": 49.0149, "h": 168.2},
-        "quaternion": {"x": 0.0, "y": 0.0, "z": 0.7071067811865476, "w": 0.7071067811865476},
-    },
-}
 
 
 def _responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -109,22 +54,14 @@ GEOPOSE: dict[str, Any] = {
             "model": GeoPoseResp,
             "description": "The pose. Header Featuredb-Height-Datum names the datum of h where it is not the "
             "ellipsoid's.",
-            "content": {
-                "application/json": {"example": _EXAMPLE_RESPONSE},
-                MEDIA_TYPE: {"schema": {"$ref": _REF.format(model="GeoPoseResp")}},
-            },
+            "content": {MEDIA_TYPE: {"schema": {"$ref": _REF.format(model="GeoPoseResp")}}},
         },
         **_responses(400, 406, 408, 413, 415, 422, 501, 502, 503, 504),
     },
     "openapi_extra": {
         "requestBody": {
             "required": True,
-            "content": {
-                "application/json": {
-                    "schema": {"$ref": _REF.format(model="GeoPoseReq")},
-                    "example": _EXAMPLE_REQUEST,
-                }
-            },
+            "content": {"application/json": {"schema": {"$ref": _REF.format(model="GeoPoseReq")}}},
         }
     },
 }

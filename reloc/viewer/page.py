@@ -140,7 +140,7 @@ def write_static_page(out: Path, scene: ViewerScene, pictures: Pictures) -> int:
             else:
                 shown[key] = data_url("image/jpeg", data)
         values = {
-            "scene": _json({**scene.document, "queries": False, "placing": False}),
+            "scene": _json({**scene.document, "queries": False}),
             "pictures": _json({"shown": shown, "missing": missing}),
         }
         for place, data in enumerate(scene.points):

@@ -1,8 +1,8 @@
 """The page and its data over HTTP, to this machine only.
 
 The socket is bound to 127.0.0.1. A web page from elsewhere, open in the same browser, could still send
-requests here: names that lead to 127.0.0.1 are refused by the Host header, and a photo is taken, or a page
-opened on which a map is placed, only with a media type that a browser does not send to another site unasked.
+requests here: names that lead to 127.0.0.1 are refused by the Host header, and a photo is taken only with a
+media type that a browser does not send to another site unasked.
 """
 
 import asyncio
@@ -27,14 +27,12 @@ from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, Se
 from featuredb.stop_signals import on_stop_signals
 from reloc.viewer.page import Asset, assets, content_policy, page
 from reloc.viewer.photos import PICTURE_PX, Pictures
-from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import LIMITS, Queries
 from reloc.viewer.scene import ViewerScene
 from reloc.wire.query import ErrorCode
 
 HOST = "127.0.0.1"
 PHOTO_TYPE = "application/octet-stream"
-KEY_HEADER = "X-Featuredb-Key"
 _STATUS = {
     ErrorCode.BAD_REQUEST.value: 400,
     ErrorCode.BAD_IMAGE.value: 415,
@@ -49,18 +47,15 @@ class ViewerStartError(FeatureDbError):
     """The viewer cannot listen."""
 
 
-def create_app(
-    scene: ViewerScene, pictures: Pictures, queries: Queries, pages: PlacingPages | None = None
-) -> FastAPI:
+def create_app(scene: ViewerScene, pictures: Pictures, queries: Queries) -> FastAPI:
     """The application.
 
     Args:
         queries: answers photos that are dropped on the page.
-        pages: on which maps are placed; None: the page shows the command only.
     """
     # Pictures and queries are decoded beside the event loop; a query takes its own turn inside.
     app, in_thread = local_app("featuredb viewer", page(), content_policy(), assets())
-    document = {**scene.document, "queries": True, "placing": pages is not None}
+    document = {**scene.document, "queries": True}
 
     @app.get("/api/scene")
     async def scene_document() -> Response:
@@ -90,14 +85,6 @@ def create_app(
     async def query(request: Request, exif_prior: bool = False) -> Response:
         photo = await _photo(request)
         return JSONResponse(await in_thread(partial(queries.ask, photo, exif_prior=exif_prior)))
-
-    @app.post("/api/place")
-    async def place(request: Request, map: str) -> Response:
-        _check_type(request)
-        key = request.headers.get(KEY_HEADER, "")
-        if pages is None:
-            raise HTTPException(404, "no folder of photos was given (--photos FOLDER)")
-        return JSONResponse({"url": await in_thread(partial(pages.open, map, key))})
 
     _add_failures(app)
     return app
@@ -196,20 +183,15 @@ async def _photo(request: Request) -> bytes:
     Raises:
         HTTPException: another media type, or too large.
     """
-    _check_type(request)
+    found = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    if found != PHOTO_TYPE:  # which a browser does not send for another site unasked
+        raise HTTPException(415, f"Content-Type: expected {PHOTO_TYPE}, found {found[:100]!r}")
     data = bytearray()
     async for part in request.stream():
         data += part
         if len(data) > LIMITS.max_bytes:
             raise HTTPException(413, f"the photo has more than {LIMITS.max_bytes} bytes")
     return bytes(data)
-
-
-def _check_type(request: Request) -> None:
-    """Refuse what a browser would send for another site unasked."""
-    found = request.headers.get("content-type", "").split(";")[0].strip().lower()
-    if found != PHOTO_TYPE:
-        raise HTTPException(415, f"Content-Type: expected {PHOTO_TYPE}, found {found[:100]!r}")
 
 
 def _where(scene: ViewerScene, place: int, east: float, north: float, up: float) -> dict[str, Any]:

@@ -2,9 +2,7 @@
 
 import os
 import shutil
-import sys
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -17,7 +15,6 @@ from featuredb.store import Database
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.viewer.page import write_static_page
 from reloc.viewer.photos import Pictures
-from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import ViewerSceneOptions, build_scene
 from tests.support.datasets import varied_database
 from tests.support.maps import random_map, random_unplaced_map
@@ -332,10 +329,8 @@ def test_a_map_without_a_place_is_shown_in_its_own_frame_and_says_how_to_place_i
     database.commit_maps([random_map(2), unplaced])
     options = ViewerSceneOptions(photos=tmp_path / "my photos")
     scene = build_scene(database, database.snapshot(), options=options)
-    said = "print('http://127.0.0.1:9/token/; stop with Ctrl-C', flush=True); import time; time.sleep(60)"
-    pages = PlacingPages({"map-1": [sys.executable, "-c", said]})
-    with closing(pages), running_viewer(database, scene, pages=pages) as address:
-        seen.open(f"{address}/#{pages.key}")
+    with running_viewer(database, scene) as address:
+        seen.open(address)
         assert not seen.page.locator("#own-frame").is_visible()
         seen.page.select_option("#place", label="random map 1, no place on Earth")
         seen.page.wait_for_selector("#own-frame:has-text('No place on Earth')")
@@ -350,8 +345,6 @@ def test_a_map_without_a_place_is_shown_in_its_own_frame_and_says_how_to_place_i
         seen.page.locator("#tree button[title=map-1]").click()
         command = f"featuredb anchor {database.url} map-1 --photos '{tmp_path}/my photos' --page"
         assert seen.page.locator("#place-this-map").inner_text() == command
-        seen.page.get_by_role("button", name="Place this map").click()
-        seen.page.wait_for_selector("#open-placing a[href='http://127.0.0.1:9/token/']")
         assert seen.page.locator("#panel li").all_inner_texts() == ["place it by picks"]
         assert not {"zone", "placed by"} & seen.panel().keys()
         seen.page.locator("#panel .photos button").first.click()

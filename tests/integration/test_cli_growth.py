@@ -91,17 +91,6 @@ def test_lineage_as_json_and_as_of(db: str, capsys: pytest.CaptureFixture[str]) 
     assert len(json.loads(run(capsys, "lineage", db, "--json", "--as-of", "1")[1])["maps"]) == 2
 
 
-def test_lineage_as_a_graph(db: str, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = run(capsys, "lineage", db, "--dot", "--all")[1].splitlines()
-    assert (lines[0], lines[-1]) == ("digraph lineage {", "}")
-    arrows = {line.strip() for line in lines if "->" in line}
-    assert arrows == {
-        '"a" -> "b";', '"b" -> "c";', '"c" -> "d";', '"z" -> "d";', '"b" -> "q";', '"b" -> "r";'
-    }  # fmt: skip
-    assert next(line for line in lines if line.startswith('  "q"')).endswith("style=dashed];")
-    assert next(line for line in lines if line.startswith('  "r"')).endswith("style=dotted];")
-
-
 def test_maps_show_their_drift(db: str, capsys: pytest.CaptureFixture[str]) -> None:
     header, _, *rows = run(capsys, "maps", db)[1].splitlines()
     assert "drift_m" in header

@@ -261,8 +261,7 @@ def test_the_catalogue_leads_to_every_map_and_file(database: Database, folder: P
             assert path.is_file()
             assert item.id in pq.read_table(path, columns=["map_id"])["map_id"].to_pylist()
     assert {Path(a.get_absolute_href() or "").resolve() for a in collection.assets.values()} == {
-        folder / name
-        for name in ("maps.parquet", "cameras.parquet", "attribution.csv", "README.md", "coverage.png")
+        folder / name for name in ("maps.parquet", "cameras.parquet", "attribution.csv", "README.md")
     }
 
 

@@ -1,4 +1,4 @@
-"""The OpenAPI document says what the gateway does: its examples run, and what it allows never is a defect."""
+"""The OpenAPI document says what the gateway does: what it allows never is a defect."""
 
 import json
 
@@ -45,25 +45,12 @@ def test_the_document_has_every_route_and_only_statuses_that_there_are(document)
             assert said <= set(STATUS_OF.values())
 
 
-def test_the_example_of_a_request_is_a_request_and_runs_with_a_picture(gateway, document):
+def test_a_request_is_as_the_document_says(document):
     content = document["paths"]["/geopose"]["post"]["requestBody"]["content"]["application/json"]
-    example = content["example"]
-    jsonschema.validate(example, {**content["schema"], "components": document["components"]})
-    response = gateway.post("/geopose", json=example)
-    assert (response.status_code, response.json()["code"]) == (415, "BAD_IMAGE")
-    reading = example["sensorReadings"]["cameraReadings"][0]
-    picture = geopose_request(photo(size=(192, 108)))["sensorReadings"]["cameraReadings"][0]["imageBytes"]
-    response = gateway.post(
-        "/geopose",
-        json={
-            **example,
-            "sensorReadings": {
-                **example["sensorReadings"],
-                "cameraReadings": [{**reading, "imageBytes": picture}],
-            },
-        },
-    )
-    assert response.status_code == 200, response.text
+    schema = {**content["schema"], "components": document["components"]}
+    jsonschema.validate(geopose_request(photo()), schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({}, schema)
 
 
 def test_answers_are_as_the_document_says(gateway, document):
@@ -71,10 +58,6 @@ def test_answers_are_as_the_document_says(gateway, document):
         content = document["paths"][path][method]["responses"][status]["content"]["application/json"]
         return {**content["schema"], "components": document["components"]}
 
-    example = document["paths"]["/geopose"]["post"]["responses"]["200"]["content"]["application/json"][
-        "example"
-    ]
-    jsonschema.validate(example, schema_of("/geopose", "post", "200"))
     good = gateway.post("/geopose", json=geopose_request(photo()))
     jsonschema.validate(good.json(), schema_of("/geopose", "post", "200"))
     jsonschema.validate(gateway.post("/geopose", json={}).json(), schema_of("/geopose", "post", "400"))

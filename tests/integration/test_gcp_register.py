@@ -77,7 +77,8 @@ def test_a_map_moves_to_its_control_points_and_back(
     assert after.points.error_px.mean() < 0.6
     evidence = json.loads((tmp_path / "report" / "control.json").read_text())
     assert [m["used"] for m in evidence["marks"]].count(False) == 1
-    assert (tmp_path / "report" / "control.png").stat().st_size > 5_000
+    page = (tmp_path / "report" / "control.html").read_text(encoding="utf-8")
+    assert len(page.split("data:image/png;base64,")[1]) > 5_000
     # The old place is still there, in the past and by rollback.
     old = database.snapshot(first.version).load_map("hills")
     np.testing.assert_array_equal(old.points.utm, before.points.utm)

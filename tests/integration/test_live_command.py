@@ -67,7 +67,7 @@ def _rate_hz(film: Path) -> float:
 def test_the_command_streams_a_film_and_writes_its_track(
     server: Server, film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    outs = [tmp_path / f"out/track.{kind}" for kind in ("csv", "tum", "geojson", "kml", "json", "srt")]
+    outs = [tmp_path / f"out/track.{kind}" for kind in ("csv", "tum", "geojson", "kml", "json")]
     told = [text for file in outs for text in ("--out", str(file))]
     where = ["--connect", server.endpoints[0], "--camera", _LENS]
     assert main(["live", str(film), *where, *told, "--json"]) == 0

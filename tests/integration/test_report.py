@@ -18,16 +18,14 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.place_bounds import PlaceBounds
 from ingest.api.ingesting import summary
-from ingest.plot_parts import residual_exaggeration
+from ingest.plot_parts import PlanView, plan_png, residual_exaggeration
 from ingest.report.outcomes import _gps_used
 from ingest.report.page import write_report
-from ingest.report.plots import plan_png
 from ingest.report.values import (
     CameraOutcome,
     IngestReport,
     MapOutcome,
     PhotoOutcome,
-    PlanView,
     StageTiming,
     report_json,
 )
@@ -60,17 +58,19 @@ def plan(k: int = 5, n: int = 2000, seed: int = 1) -> PlanView:
     rng = np.random.default_rng(seed)
     origin = np.array([512.0 * 1126, 512.0 * 10133, 150.0])
     cameras = origin + np.column_stack([np.linspace(-60, 60, k), np.linspace(-20, 30, k), np.full(k, 40.0)])
-    gps = cameras + rng.normal(0, 0.5, (k, 3))
-    gps[0] = np.nan
-    gps[1, 2] = np.nan
-    gps[2, :2] += 25.0
+    residuals = rng.normal(0, 0.5, (k, 3))
+    residuals[0] = np.nan
+    residuals[1, 2] = np.nan
+    residuals[2, :2] += 25.0
     return PlanView(
         points=origin + rng.uniform(-80, 80, (n, 3)) * (1, 1, 0.05),
         cameras=cameras,
-        gps=gps,
+        places=cameras,
+        residuals=residuals,
         names=tuple(f"{i}.jpg" for i in range(k)),
-        gps_used=np.arange(k) != 2,
-        epsg=32615,
+        used=np.arange(k) != 2,
+        title="EPSG:32615",
+        what="GPS",
     )
 
 
@@ -240,9 +240,10 @@ def test_pictures_of_few_and_many_photos(k: int) -> None:
     view = replace(
         view,
         cameras=view.cameras[:k],
-        gps=np.full((k, 3), np.nan) if k == 2 else view.gps[:k],
+        places=view.places[:k],
+        residuals=np.full((k, 3), np.nan) if k == 2 else view.residuals[:k],
         names=view.names[:k],
-        gps_used=view.gps_used[:k],
+        used=view.used[:k],
         points=view.points[:0] if k == 1 else view.points,
     )
     assert plan_png(view)[:8] == b"\x89PNG\r\n\x1a\n"
@@ -254,7 +255,7 @@ def test_plan_shows_cameras_where_they_are(tmp_path: Path) -> None:
     nowhere = np.full((3, 3), np.nan)
     one, two = (
         np.asarray(
-            Image.open(_file(tmp_path, plan_png(replace(view, gps=nowhere, names=names)))).convert("L")
+            Image.open(_file(tmp_path, plan_png(replace(view, residuals=nowhere, names=names)))).convert("L")
         )
         for names in (("a", "b", "c"), ("", "", ""))
     )

@@ -95,7 +95,7 @@ def test_verify_finds_a_place_that_a_map_without_one_cannot_have(database: Datab
     table = DeltaTable(f"{database.url}/points")
     table.update(updates={"easting": "456800.0"}, predicate="point_index = 3")
     problems = [p.what for p in verify(database).problems]
-    assert problems == ["points: UTM coordinates, of a map without a place"]
+    assert problems == ["points: easting is not that of the map's coordinates"]
 
 
 def test_an_old_database_answers_and_takes_placed_maps(old: Database) -> None:

@@ -55,11 +55,6 @@ def test_dry_run_and_second_run_change_nothing(
     assert database.poll_version() == version + 1
 
 
-def test_points_can_be_dropped(database: Database) -> None:
-    assert main(["thin", database.url, "parent", "--cover", "20", "--drop-points"]) == 0
-    assert database.snapshot().get("parent").points < 150
-
-
 def test_only_active_maps_and_known_ones(database: Database, capsys: pytest.CaptureFixture[str]) -> None:
     database.commit_map(replace(random_map(3, map_id="waiting"), status="quarantined"))
     assert main(["thin", database.url, "waiting"]) != 0

@@ -43,7 +43,7 @@ _LENS = f"{CAMERA.model},{CAMERA.width},{CAMERA.height},{','.join(map(str, CAMER
 def test_the_command_tracks_a_film(
     anchored: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    files = [tmp_path / f"out/track.{kind}" for kind in ("csv", "tum", "geojson", "kml", "json", "srt")]
+    files = [tmp_path / f"out/track.{kind}" for kind in ("csv", "tum", "geojson", "kml", "json")]
     outs = [text for file in files for text in ("--out", str(file))]
     overlay = tmp_path / "overlay.mp4"
     drawn_to = ["--overlay", str(overlay)]

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import zlib
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -28,7 +27,6 @@ from featuredb.store import Database
 from reloc.localiser import Localiser
 from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, Pictures
-from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import build_scene
 from reloc.viewer.server import ViewerStartError, listen, serve
 from reloc.wire.query import LocaliseWireRequest
@@ -350,17 +348,3 @@ def test_without_a_folder_of_photos_the_page_says_so() -> None:
     data, reason = Pictures(None).jpeg(random_map(images=1).images[0], 100)
     assert data is None
     assert "--photos" in reason
-
-
-def test_only_who_knows_the_key_opens_a_page_on_which_maps_are_placed(world: ViewerWorld) -> None:
-    pages = PlacingPages({"m": [sys.executable, "-c", "print('no scan covers the map')"]})
-    key = {"X-Featuredb-Key": pages.key}
-    with closing(pages), running_viewer(world.database, pages=pages) as address:
-        told = [
-            requests.post(f"{address}/api/place?map={name}", headers=headers, timeout=30)
-            for name, headers in (("m", PHOTO), ("other", PHOTO | key), ("m", PHOTO | key), ("m", key))
-        ]
-    assert [answer.status_code for answer in told] == [400, 400, 400, 415]
-    reasons = ("whole address", "expected a map", "no scan covers the map", "Content-Type")
-    for answer, words in zip(told, reasons, strict=True):
-        assert words in answer.json()["message"]

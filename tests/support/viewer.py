@@ -20,7 +20,6 @@ from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from reloc.viewer.photos import Pictures
-from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import Queries
 from reloc.viewer.scene import ViewerScene, build_scene
 from reloc.viewer.server import create_app, listen, uvicorn_server
@@ -117,11 +116,10 @@ def running_viewer(
     database: Database,
     scene: ViewerScene | None = None,
     photos: Path | None = None,
-    pages: PlacingPages | None = None,
 ) -> Iterator[str]:
     """A viewer on a free port, in a thread of the test; gives its URL without a slash at the end."""
     scene = scene or build_scene(database, database.snapshot())
-    server = uvicorn_server(create_app(scene, Pictures(photos), Queries(database, scene), pages))
+    server = uvicorn_server(create_app(scene, Pictures(photos), Queries(database, scene)))
     with listen(0) as bound:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
         thread.start()

@@ -37,4 +37,4 @@ def test_the_demo_says_what_it_does_before_it_does_it(
 
     monkeypatch.setattr(demo, "make_world", make)
     with pytest.raises(FeatureDbError, match="as far"):
-        demo.run_demo(tmp_path, size="short", seed=1, exact_gps=True, say=said.append)
+        demo.run_demo(tmp_path, size="short", seed=1, say=said.append)

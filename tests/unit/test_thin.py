@@ -1,7 +1,5 @@
 """K-cover thinning: what every image keeps, which points are chosen, what stays as it was."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +15,6 @@ from featuredb.maps.thin import (
     described_points_of_images,
     k_cover,
     thin_map,
-    with_descriptors,
 )
 from tests.support.maps import random_map
 from tests.support.planar_map import EASTING, EPSG, HEIGHT, NORTHING, planar_map, view
@@ -125,27 +122,6 @@ def test_nothing_moves_and_the_area_holds_the_chosen_points_only(field: FeatureM
     np.testing.assert_array_equal(build_area([after]).point_row, chosen)
     assert len(chosen) < 0.5 * len(before.points)
     assert after.provenance["thinned"]["points"] == len(chosen)
-
-
-def test_points_can_go_altogether_and_answers_see_the_same(field: FeatureMap) -> None:
-    before = field
-    kept = thin_map(before, 40)
-    gone = thin_map(before, 40, keep_points=False)
-    assert len(gone.points) == gone.provenance["thinned"]["points"] < len(kept.points)
-    a, b = build_area([kept]), build_area([gone])
-    np.testing.assert_array_equal(a.points, b.points)
-    np.testing.assert_array_equal(a.descriptors, b.descriptors)
-    np.testing.assert_array_equal(a.see_point, b.see_point)
-
-
-def test_points_without_descriptors_stay_when_others_are_dropped() -> None:
-    before = seen_map([(p, i, 500.0, 500.0) for p in range(4) for i in (0, 1)])
-    seen = before.observations
-    none = seen.point_index == 3
-    before = replace(before, observations=replace(seen, has_descriptor=~none))
-    after = with_descriptors(before, seen.point_index == 1, keep_points=False)
-    np.testing.assert_array_equal(after.points.utm, before.points.utm[[1, 3]])
-    assert after.observations.point_index.tolist() == [0, 0, 1, 1]
 
 
 def test_thinning_again_changes_nothing_and_thinner_does(field: FeatureMap) -> None:

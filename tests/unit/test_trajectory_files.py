@@ -8,7 +8,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import cv2
 import jsonschema
 import numpy as np
 import pytest
@@ -18,10 +17,8 @@ from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
-from featuredb.video.telemetry.read import read_telemetry
 from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import CSV_COLUMNS, check_format, write_trajectory
-from reloc.tracking.trajectory.plot import plot_png
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from schemas import load_schema
 from tests.support.planar_map import view
@@ -158,35 +155,7 @@ def test_the_geopose_series_is_one(trajectory: Trajectory, tmp_path: Path) -> No
         np.testing.assert_allclose(matrix_from_quaternion(turn)[:, 0], forward, atol=1e-7)
 
 
-def test_our_own_reader_understands_the_subtitles(trajectory: Trajectory, tmp_path: Path) -> None:
-    _written(tmp_path, "t.srt", trajectory)
-    read = read_telemetry(tmp_path / "t.srt")
-    assert len(read) == 5
-    for row, k in enumerate((0, 1, 3, 4, 5)):
-        place = _pose(k).geopose
-        assert read.times_s[row] == pytest.approx(k / 25.0, abs=1e-3)
-        assert read.latitude_deg[row] == pytest.approx(place.latitude_deg, abs=1e-8)
-        assert read.longitude_deg[row] == pytest.approx(place.longitude_deg, abs=1e-8)
-        heading, pitch, _ = place.heading_pitch_roll_deg
-        yaw, down, _ = read.gimbal_ypr_deg[row]
-        assert (yaw - heading + 180.0) % 360.0 == pytest.approx(180.0, abs=0.01)
-        assert down == pytest.approx(pitch, abs=0.01)
-
-
-def test_subtitles_end_where_the_track_is_lost(trajectory: Trajectory, tmp_path: Path) -> None:
-    """Frame 2 is lost: the one before is not shown in its place. Frames before the film have no subtitle."""
-    text = _written(tmp_path, "t.srt", trajectory)
-    times = re.findall(r"(\S+) --> (\S+)", text)
-    assert times[1] == ("00:00:00,040", "00:00:00,080")
-    assert times[2] == ("00:00:00,120", "00:00:00,160")
-    assert times[-1] == ("00:00:00,200", "00:00:00,240")
-    early = replace(trajectory, points=tuple(replace(p, time_s=p.time_s - 0.06) for p in trajectory.points))
-    write_trajectory(tmp_path / "t.srt", early)
-    shown = re.findall(r"(\S+) --> ", (tmp_path / "t.srt").read_text())
-    assert shown == ["00:00:00,060", "00:00:00,100", "00:00:00,140"]
-
-
-@pytest.mark.parametrize("kind", ["tum", "kml", "json", "srt"])
+@pytest.mark.parametrize("kind", ["tum", "kml", "json"])
 def test_heights_of_two_datums_are_not_mixed(kind: str, trajectory: Trajectory, tmp_path: Path) -> None:
     last = trajectory.points[-1]
     assert last.pose is not None
@@ -214,26 +183,8 @@ def test_a_track_without_poses_is_a_table_of_reasons_and_nothing_else(
     trajectory: Trajectory, tmp_path: Path
 ) -> None:
     lost = replace(trajectory, points=(trajectory.points[2],))
-    for name in ("t.tum", "t.geojson", "t.kml", "t.json", "t.srt"):
+    for name in ("t.tum", "t.geojson", "t.kml", "t.json"):
         with pytest.raises(InvalidValueError, match=r"no frame has a pose.*\(LOST"):
             write_trajectory(tmp_path / name, lost)
     assert not list(tmp_path.iterdir())
     assert _written(tmp_path, "t.csv", lost).count("\n") == 2
-
-
-def test_a_drawing_shows_where_the_track_is_lost(trajectory: Trajectory, tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "t.png", trajectory)
-    picture = cv2.imread(str(tmp_path / "t.png"))
-    assert picture is not None
-    assert picture.shape[0] > 500
-    pink = (picture == (0xD6, 0xD6, 0xF3)).all(axis=2)
-    columns = np.flatnonzero(pink.any(axis=0))
-    # One frame of six is lost, the third: a sixth of the width of the axes on the right.
-    assert len(columns) > 50
-    assert columns.min() > 0.5 * picture.shape[1]
-    whole = replace(trajectory, points=tuple(p for p in trajectory.points if p.pose is not None))
-    plain = cv2.imdecode(np.frombuffer(plot_png(whole), np.uint8), cv2.IMREAD_COLOR)
-    assert not (plain == (0xD6, 0xD6, 0xF3)).all(axis=2).any()
-    lost = replace(trajectory, points=trajectory.points[2:3])
-    with pytest.raises(InvalidValueError, match="found none; write CSV"):
-        plot_png(lost)

@@ -49,25 +49,29 @@ def test_natural_order() -> None:
 def test_times_of_a_folder(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "frames", NAMES)
     times = [0.5, 0.6, 1.0, 1.5, 1.6, 2.5]
-    (folder / "times.txt").write_text("# seconds\n" + "\n".join(f"{t}  # x" for t in times) + "\n\n")
-    assert [frame.time_s for frame in read(folder)] == times
-    assert [f.time_s for f in read(folder, start_s=0.6, end_s=2.0)] == [0.6, 1.0, 1.5, 1.6]
-    (folder / "times.txt").unlink()
     # A table may order the pictures otherwise than their names do.
     backward = "".join(f"{name}, {t}, x\n" for name, t in zip(NAMES, reversed(times), strict=True))
     (folder / "timestamps.csv").write_text("\ufefffile, time_s, note\n" + backward)
     frames = read(folder, fps=99.0)
     assert [frame.time_s for frame in frames] == times
     assert [shown(frame.gray) for frame in frames] == [5, 4, 3, 2, 1, 0]
+    assert [f.time_s for f in read(folder, start_s=0.6, end_s=2.0)] == [0.6, 1.0, 1.5, 1.6]
 
 
 @pytest.mark.parametrize(
     ("file", "text", "said"),
     [
-        ("times.txt", "1\n2\n", "expected 6 times.*found 2"),
-        ("times.txt", "1\n2\n3\nfour\n5\n6\n", "line 4: expected a time in seconds, found 'four'"),
-        ("times.txt", "1\n2\n3\nnan\n5\n6\n", "line 4"),
-        ("times.txt", "1\n2\n3\n3\n5\n6\n", r"increase, found 3 s for Frame9\.png and 3 s for Frame10\.png"),
+        (
+            "timestamps.csv",
+            "file,time_s\n" + "".join(f"{n},{t}\n" for n, t in zip(NAMES, (1, 2, 3, 3, 5, 6), strict=True)),
+            r"increase, found 3 s for Frame10\.png and 3 s for Frame9\.png",
+        ),
+        (
+            "timestamps.csv",
+            "file,time_s\nFrame1.png,four\n",
+            "line 2: expected a time in seconds, found 'four'",
+        ),
+        ("timestamps.csv", "file,time_s\nFrame1.png,nan\n", "line 2"),
         ("timestamps.csv", "name,time\n", "expected a heading with the columns file and time_s"),
         ("timestamps.csv", "", "expected a heading"),
         ("timestamps.csv", "file,time_s\nFrame1.png,0\nFrame1.png,1\n", "line 3: Frame1.png is there twice"),
@@ -89,10 +93,6 @@ def test_times_that_do_not_fit_are_refused(tmp_path: Path, file: str, text: str,
 def test_folders_that_are_refused(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "frames", NAMES)
     with pytest.raises(VideoError, match=r"times of its 6 pictures.*or give their rate by --fps"):
-        open_video(folder)
-    (folder / "times.txt").write_text("1")
-    (folder / "timestamps.csv").write_text("1")
-    with pytest.raises(VideoError, match=r"timestamps\.csv and times\.txt; remove one"):
         open_video(folder)
     (tmp_path / "empty").mkdir()
     with pytest.raises(VideoError, match="empty: expected pictures"):

@@ -16,9 +16,6 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.durable.log import utc
 from featuredb.store.tables import BOUNDS
 
-# Of each map, for the picture; more would not show.
-_DRAWN_POINTS = 1500
-
 _HALF_TURN_DEG, _TURN_DEG = 180.0, 360.0
 
 
@@ -99,14 +96,13 @@ def _cut(corners: FloatArray, *, east_side: bool) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapEntry:
-    """One map of the dataset, as its catalogue and its picture need it.
+    """One map of the dataset, as its catalogue needs it.
 
     Attributes:
         row: its columns in maps.parquet, but for the geometry.
         licences: of its photos, by number of them; "" where nobody has said.
         taken: when its first and its last photo were taken; None where no photo says so. Times without a zone
             are taken for UTC.
-        points_lon_lat, cameras_lon_lat: (n, 2) WGS84 degrees, some of the points and all of the images.
     """
 
     row: dict[str, Any]
@@ -114,8 +110,6 @@ class MapEntry:
     partition: Partition
     licences: Counter[str]
     taken: tuple[datetime, datetime] | None
-    points_lon_lat: FloatArray
-    cameras_lon_lat: FloatArray
 
     @property
     def map_id(self) -> str:
@@ -164,8 +158,6 @@ class Contents:
 
 def entry_of(feature_map: FeatureMap, row: dict[str, Any]) -> MapEntry:
     """What is kept of a map when it has passed."""
-    step = max(1, len(feature_map.points) // _DRAWN_POINTS)
-    centers = np.array([i.cam_from_local.center for i in feature_map.images], np.float64).reshape(-1, 3)
     times = [utc(i.capture_time) for i in feature_map.images if i.capture_time is not None]
     return MapEntry(
         row=row,
@@ -173,13 +165,7 @@ def entry_of(feature_map: FeatureMap, row: dict[str, Any]) -> MapEntry:
         partition=Partition(feature_map.epsg, feature_map.height_datum),
         licences=Counter(licence_of(image, feature_map) for image in feature_map.images),
         taken=(min(times), max(times)) if times else None,
-        points_lon_lat=_lon_lat(geodetic_from_utm(feature_map.points.utm[::step], feature_map.epsg)),
-        cameras_lon_lat=_lon_lat(feature_map.frame.geodetic_from_enu(centers)),
     )
-
-
-def _lon_lat(lat_lon_h: FloatArray) -> FloatArray:
-    return np.ascontiguousarray(lat_lon_h[:, 1::-1])
 
 
 def _around(west: FloatArray, east: FloatArray) -> tuple[float, float]:

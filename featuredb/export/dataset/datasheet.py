@@ -8,8 +8,6 @@ from typing import Any
 from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents
-from featuredb.export.dataset.own_frame import FOLDER
-from featuredb.export.dataset.picture import places_of
 from featuredb.export.dataset.sums import SUMS
 from featuredb.geo.crs.wkt import utm_projjson
 
@@ -36,9 +34,8 @@ def write_datasheet(contents: Contents, description: Mapping[str, Any], folder: 
         _places(contents),
         _licences(contents),
         _made(contents, description),
-        _files(folder, contents),
+        _files(),
         _reading(contents),
-        *([_scans(contents)] if contents.scans else []),
         "## Columns\n" + "\n".join(_columns(title, table) for title, table in _TABLES.items()),
     ]
     (folder / layout.DATASHEET).write_text("\n".join(sections), encoding="utf-8")
@@ -67,7 +64,7 @@ def _title(contents: Contents, description: Mapping[str, Any]) -> str:
         f"format {description['format']} {description['format_version']}."
     )
     title = f"# {_plain(description['name'])}\n\n{about}\n"
-    return f"{title}{_table(('', ''), rows)}\n![coverage]({layout.PICTURE})\n"
+    return f"{title}{_table(('', ''), rows)}"
 
 
 def _places(contents: Contents) -> str:
@@ -80,8 +77,8 @@ def _places(contents: Contents) -> str:
     return _section(
         "Where",
         _prose(
-            f"Places: {len(places_of(contents))}. Coordinates are UTM on WGS84, in metres; heights are "
-            "counted from what is named here, and nothing has been converted."
+            "Coordinates are UTM on WGS84, in metres; heights are counted from what is named here, and "
+            "nothing has been converted."
         ),
         _table(("zone", "heights", "CRS of the files", "maps", "images", "points"), rows),
     )
@@ -122,30 +119,13 @@ def _made(contents: Contents, description: Mapping[str, Any]) -> str:
     )
 
 
-def _files(folder: Path, contents: Contents) -> str:
-    own = (folder / FOLDER).is_dir()
-
-    def row(name: str, what: str) -> tuple[str, str, str]:
-        found = sorted(folder.glob(name))
-        return f"`{name}`", f"{sum(f.stat().st_size for f in found):,}", what
-
-    rows = [
-        row(layout.MAPS, "maps; GeoParquet 1.1, OGC:CRS84"),
-        row(layout.CAMERAS, "their cameras; Parquet"),
-        row(f"{layout.IMAGES}/*.parquet", "images, poses, covariances; GeoParquet 1.1"),
-        row(f"{layout.POINTS}/*.parquet", "3D points; GeoParquet 1.1"),
-        row(f"{layout.OBSERVATIONS}/*.parquet", "keypoints and descriptors; Parquet"),
-        *([row(f"{layout.LIDAR}/**/*.laz", "LiDAR tiles; LAZ 1.4")] if contents.scans else []),
-        *([row(f"{FOLDER}/*.parquet", "maps without a place, own frames; Parquet")] if own else []),
-        row(ATTRIBUTION, "every photo's owner, licence and capture time; CSV"),
-    ]
+def _files() -> str:
     return _section(
         "Files",
-        _table(("file", "bytes", "what"), rows),
         _prose(
             f"`{layout.STAC}/collection.json` is a STAC 1.0 catalogue with an item for each map, "
             f"`{layout.DESCRIPTION}` says what this is for programs, `{SUMS}` lists every file: "
-            f"`sha256sum --check {SUMS}`."
+            f"`sha256sum --check {SUMS}`. Scans, if any, are in `{layout.LIDAR}/scans.json`."
         ),
         _prose(
             "Files of points and images are named by zone, height datum and number, since a GeoParquet "
@@ -162,25 +142,6 @@ def _reading(contents: Contents) -> str:
         lines.append(f"duckdb -c \"select map_id, count(*) from '{layout.POINTS}/*.parquet' group by 1\"")
         lines.append(f"python -c \"import geopandas; print(geopandas.read_parquet('{example}'))\"")
     return "\n".join(lines) + "\n```\n"
-
-
-def _scans(contents: Contents) -> str:
-    rows = [
-        (
-            *(_plain(s["scan_id"]), _plain(s["name"]), _plain(s["licence"]) or "not stated"),
-            *(f"EPSG:{s['epsg']}", s["height_datum"], f"{len(s['tiles']):,}"),
-            f"{sum(t['points'] for t in s['tiles']):,}",
-        )
-        for s in contents.scans
-    ]
-    return _section(
-        "LiDAR",
-        _prose(
-            "The tiles of 512 m that touch the maps, with coordinates rounded to a millimetre; "
-            f"`{layout.LIDAR}/scans.json` has all that is known of the scans."
-        ),
-        _table(("scan", "name", "licence", "zone", "heights", "tiles", "points"), rows),
-    )
 
 
 def _columns(title: str, table: columns.Columns) -> str:

@@ -16,7 +16,6 @@ MAPS = "maps.parquet"
 CAMERAS = "cameras.parquet"
 POINTS, IMAGES, OBSERVATIONS = "points", "images", "observations"
 DATASHEET = "README.md"
-PICTURE = "coverage.png"
 STAC = "stac"
 LIDAR = "lidar"
 

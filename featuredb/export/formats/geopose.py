@@ -1,4 +1,4 @@
-"""OGC GeoPose 1.0 (21-056r11): every photo as Basic-YPR and Advanced, every map as an Irregular Series.
+"""OGC GeoPose 1.0 (21-056r11): every photo as Basic-YPR, every map as an Irregular Series.
 
 The body is the camera with axes x forward, y left, z up. Heights are above the ellipsoid, as the standard
 wants, where the map's datum can be converted here; `manifest.json` says of each map what its heights are.
@@ -11,15 +11,15 @@ from pathlib import Path
 from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.job import Exported, ExportJob, folder_for_each, folder_name, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.geo.geopose_documents import advanced, basic_ypr, irregular_series
+from featuredb.geo.geopose_documents import basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
 
-BASIC, ADVANCED, SERIES, MANIFEST = "basic_ypr", "advanced", "series.json", "manifest.json"
+BASIC, SERIES, MANIFEST = "basic_ypr", "series.json", "manifest.json"
 
 
 def write_geopose(job: ExportJob) -> Exported:
-    """Write `job.out`/<map>/basic_ypr/<photo>.json for every photo, and with its time where it is known:
-    advanced/<photo>.json, series.json.
+    """Write `job.out`/<map>/basic_ypr/<photo>.json for every photo, and series.json of those whose time is
+    known.
 
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
@@ -32,12 +32,10 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
     names = _file_names(shots)
     for shot, name in zip(shots, names, strict=True):
         write_json(folder / BASIC / name, basic_ypr(shot.geopose))
-    timed = [(s.unix_ms, s, name) for s, name in zip(shots, names, strict=True) if s.unix_ms is not None]
+    timed = [(shot.unix_ms, shot) for shot in shots if shot.unix_ms is not None]
     if timed:
-        for unix_ms, shot, name in timed:
-            write_json(folder / ADVANCED / name, advanced(shot.geopose, unix_ms))
         timed.sort(key=lambda row: (row[0], row[1].number))
-        write_json(folder / SERIES, irregular_series([(unix_ms, shot.geopose) for unix_ms, shot, _ in timed]))
+        write_json(folder / SERIES, irregular_series([(unix_ms, shot.geopose) for unix_ms, shot in timed]))
     manifest = {
         "map_id": feature_map.map_id,
         "height_datum": shots[0].height_datum if shots else feature_map.height_datum,

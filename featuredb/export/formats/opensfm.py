@@ -1,8 +1,7 @@
 """OpenSfM and OpenDroneMap: a folder for each map as OpenSfM leaves it when it has reconstructed.
 
 `reconstruction.json` has cameras, shots and points in the topocentric frame of `reference_lla.json`, which is
-the map's own local frame; `tracks.csv` the observations; `shots.geojson` the shots as ODM's report has them;
-`georeference.json` what OpenSfM has no room for.
+the map's own local frame; `tracks.csv` the observations; `georeference.json` what OpenSfM has no room for.
 """
 
 import json
@@ -16,7 +15,6 @@ from featuredb.export.formats.colmap import image_names
 from featuredb.export.formats.opensfm_camera import opensfm_camera
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob, folder_for_each, write_json
-from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.geometry.rotation import so3_log
 from featuredb.maps.feature_map import FeatureMap, MapImage
 
@@ -42,14 +40,6 @@ def write_map(folder: Path, feature_map: FeatureMap) -> None:
     write_json(folder / "reference_lla.json", reference)
     with (folder / "tracks.csv").open("w", encoding="utf-8", newline="\n") as out:
         _write_tracks(out, feature_map, names)
-    shots = {
-        "type": "FeatureCollection",
-        "features": [
-            _odm_shot(shot, image, feature_map, name)
-            for shot, image, name in zip(shots_of(feature_map), feature_map.images, names, strict=True)
-        ],
-    }
-    write_json(folder / "shots.geojson", shots)
     (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
     write_attribution(folder, attribution_of(feature_map))
 
@@ -116,36 +106,6 @@ def _write_tracks(out: IO[str], feature_map: FeatureMap, names: list[str]) -> No
         out.write(
             f"{name_of[image]}\t{point}\t{row}\t{x:.10g}\t{y:.10g}\t{scale:.8g}\t{red}\t{green}\t{blue}\n"
         )
-
-
-def _odm_shot(shot: PosedPhoto, image: MapImage, feature_map: FeatureMap, name: str) -> dict[str, Any]:
-    """As ODM writes it: position in UTM, rotation against the grid's axes."""
-    camera = opensfm_camera(shot.camera)
-    center = image.cam_from_local.center
-    utm = feature_map.frame.utm_from_enu(center, feature_map.epsg)
-    grid_from_local = feature_map.frame.grid_from_enu(center, feature_map.epsg)
-    place = shot.geopose
-    return {
-        "type": "Feature",
-        "properties": {
-            "filename": name,
-            "camera": _camera_id(image.camera_id),
-            "focal": camera.get("focal", camera.get("focal_x")),
-            "width": shot.camera.width,
-            "height": shot.camera.height,
-            "capture_time": 0.0 if shot.unix_ms is None else shot.unix_ms / 1000.0,
-            "translation": utm.tolist(),
-            "rotation": so3_log(image.cam_from_local.rotation @ grid_from_local.T).tolist(),
-            "epsg": feature_map.epsg,
-            "height_datum": feature_map.height_datum,
-            "owner": shot.owner,
-            "licence": shot.licence,
-        },
-        "geometry": {
-            "type": "Point",
-            "coordinates": [place.longitude_deg, place.latitude_deg, place.height_m],
-        },
-    }
 
 
 def _camera_id(index: int) -> str:

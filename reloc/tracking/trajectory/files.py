@@ -1,4 +1,4 @@
-"""A trajectory as a file: CSV, TUM, GeoJSON, KML, OGC GeoPose series, DJI's subtitles, or a drawing.
+"""A trajectory as a file: CSV, TUM, GeoJSON, KML, or OGC GeoPose series.
 
 The suffix chooses. Frames whose track is lost are rows without a pose in CSV, and gaps in all others. A file
 appears whole or not at all.
@@ -8,7 +8,6 @@ import json
 import os
 import secrets
 from collections.abc import Callable, Sequence
-from datetime import timedelta
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -17,7 +16,7 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose_documents import irregular_series
 from reloc.tracking.ground import EarthPose
-from reloc.tracking.trajectory.own_frame_files import OWN_FORMATS, UPPER, columns_of, csv_table
+from reloc.tracking.trajectory.own_frame_files import UPPER, columns_of, csv_table, own_csv_text
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 
 _AXES = ("re", "rn", "ru", "e", "n", "u")
@@ -30,20 +29,19 @@ CSV_COLUMNS = columns_of(_POSE)
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series), `.srt`, `.png`.
+    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series).
 
-    One in the frame of a map without a place: `.csv`, `.json`, see `own_frame_files`.
+    One in the frame of a map without a place: `.csv`, see `own_frame_files`.
 
     Raises:
         InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
     """
     own = next((point.in_map.map_id for point in trajectory.points if point.in_map is not None), None)
-    made = _format(path, own)(trajectory)
-    content = made if isinstance(made, bytes) else made.encode()
+    text = _format(path, own)(trajectory)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
-        temporary.write_bytes(content)
+        temporary.write_text(text, encoding="utf-8")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -174,56 +172,17 @@ def geopose_text(trajectory: Trajectory) -> str:
     return json.dumps(irregular_series(poses), indent=1) + "\n"
 
 
-def srt_text(trajectory: Trajectory) -> str:
-    """Subtitles in the manner of DJI's newer drones, which map programs and players read.
-
-    abs_alt is the height as the maps have it; angles are those of the camera.
-    """
-    found = _known(trajectory, "SRT")
-    times = [point.time_s for point in trajectory.points]
-    usual_s = float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
-    ends_s = [*times[1:], times[-1] + usual_s]
-    end_of = {point.index: end_s for point, end_s in zip(trajectory.points, ends_s, strict=True)}
-    blocks: list[str] = []
-    for point, pose in found:
-        if point.time_s < 0:
-            continue  # subtitles begin with the film
-        number, end_s = len(blocks) + 1, end_of[point.index]
-        heading, pitch, roll = pose.geopose.heading_pitch_roll_deg
-        clock = ""
-        if trajectory.start is not None:
-            when = trajectory.start + timedelta(seconds=point.time_s)
-            clock = f"{when:%Y-%m-%d %H:%M:%S}.{when.microsecond // 1000:03d}\n"
-        shown = f"{_srt_time(point.time_s)} --> {_srt_time(end_s)}"
-        blocks.append(
-            f"{number}\n{shown}\nFrameCnt: {point.index + 1}\n{clock}"
-            f"[latitude: {pose.geopose.latitude_deg:.8f}] [longitude: {pose.geopose.longitude_deg:.8f}] "
-            f"[abs_alt: {pose.utm[2]:.3f}] [gb_yaw: {(heading + 180.0) % 360.0 - 180.0:.3f} "
-            f"gb_pitch: {pitch:.3f} gb_roll: {roll:.3f}]\n"
-        )
-    return "\n".join(blocks)
-
-
-def png(trajectory: Trajectory) -> bytes:
-    """From above, and the bounds of each axis over time."""
-    from reloc.tracking.trajectory.plot import plot_png  # matplotlib takes a second to load
-
-    return plot_png(trajectory)
-
-
-_FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {
+_FORMATS: dict[str, Callable[[Trajectory], str]] = {
     ".csv": csv_text,
     ".tum": tum_text,
     ".geojson": geojson_text,
     ".kml": kml_text,
     ".json": geopose_text,
-    ".srt": srt_text,
-    ".png": png,
 }
 
 
-def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str | bytes]:
-    suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else OWN_FORMATS
+def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str]:
+    suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else {".csv": own_csv_text}
     if suffix in formats:
         return formats[suffix]
     if own_map is None:
@@ -231,8 +190,8 @@ def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str | byt
             f"{path.name}: expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
         )
     raise InvalidValueError(
-        f"{path.name}: needs places on Earth, and map {own_map} has none: expected {' or '.join(formats)}, "
-        "with poses in the map's own frame; or place the map first: `featuredb maps` says how"
+        f"{path.name}: needs places on Earth, and map {own_map} has none: expected .csv, with "
+        "poses in the map's own frame; or place the map first: `featuredb maps` says how"
     )
 
 
@@ -262,10 +221,3 @@ def _place(pose: EarthPose) -> list[float]:
         round(pose.geopose.latitude_deg, 10),
         round(float(pose.utm[2]), 4),
     ]
-
-
-def _srt_time(time_s: float) -> str:
-    milliseconds = round(1000.0 * max(time_s, 0.0))
-    minutes, rest = divmod(milliseconds, 60_000)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours:02d}:{minutes:02d}:{rest // 1000:02d},{rest % 1000:03d}"

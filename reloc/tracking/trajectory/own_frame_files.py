@@ -1,11 +1,10 @@
-"""A trajectory in the own frame of a map without a place, as a file: CSV or JSON.
+"""A trajectory in the own frame of a map without a place, as CSV.
 
-Its columns and keys are called otherwise than those of tracks on Earth, so that nobody takes it for one.
+Its columns are called otherwise than those of tracks on Earth, so that nobody takes it for one.
 """
 
 import csv
 import io
-import json
 from collections.abc import Callable, Sequence
 
 from featuredb.geometry.rotation import quaternion_from_matrix
@@ -50,41 +49,6 @@ def own_csv_text(trajectory: Trajectory) -> str:
     own_cov_* is the covariance, axes of the frame: rotation (rx, ry, rz) in rad before displacement.
     """
     return csv_table(_POSE, trajectory, lambda point: None if point.in_map is None else _cells(point.in_map))
-
-
-def own_json_text(trajectory: Trajectory) -> str:
-    """An object that says that nothing of it is on Earth, with a list of frames; lost ones have no pose."""
-    first = next(point.in_map for point in trajectory.points if point.in_map is not None)
-    frames = [
-        {
-            "frame": point.index,
-            "time_s": round(point.time_s, 6),
-            "state": point.state,
-            "inliers": point.inliers,
-            "cam_from_own": None
-            if point.in_map is None
-            else {
-                "center": [round(float(v), 9) for v in point.in_map.cam_from_map.center],
-                "rotation_xyzw": [
-                    round(float(q), 9) for q in quaternion_from_matrix(point.in_map.cam_from_map.rotation)
-                ],
-                "covariance": point.in_map.covariance.tolist(),
-            },
-            "detail": point.detail,
-        }
-        for point in trajectory.points
-    ]
-    about = {
-        "on_earth": False,
-        "unplaced_map": first.map_id,
-        "own_unit": _unit(first),
-        "own_z_is_up": first.frame.upright,
-        "source": trajectory.source,
-    }
-    return json.dumps(about | {"frames": frames}, indent=1) + "\n"
-
-
-OWN_FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {".csv": own_csv_text, ".json": own_json_text}
 
 
 def _cells(pose: OwnPose) -> list[str]:

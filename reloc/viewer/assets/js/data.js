@@ -56,11 +56,3 @@ async function answered(call) {
   const told = await response.json().catch(() => ({}));
   throw new Error(told.message ?? `the server answers ${response.status}`);
 }
-
-/** Opens the page on which a map is placed. @param {string} map its id @returns {Promise<string>} the address */
-export async function placingPage(map) {
-  // The key is in the address that the viewer has printed; browsers send this part of it to nobody.
-  const headers = { "Content-Type": "application/octet-stream", "X-Featuredb-Key": location.hash.slice(1) };
-  const call = fetch(`/api/place?${new URLSearchParams({ map })}`, { method: "POST", headers });
-  return (await (await answered(call)).json()).url;
-}

@@ -126,7 +126,7 @@ class Viewer {
     this.close();
     this.tree.mark(id);
     const photo = (p) => this.openPhoto(map, p);
-    const body = aboutMap(map, (m) => this.nameOf(m), (m) => this.openMap(m), photo, this.document.placing);
+    const body = aboutMap(map, (m) => this.nameOf(m), (m) => this.openMap(m), photo);
     const there = make("button", {}, "Go there");
     there.addEventListener("click", () => this.goToMap(map));
     show(map.name || map.id, () => this.close(), there, ...body);

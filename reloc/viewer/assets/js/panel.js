@@ -1,7 +1,6 @@
 /** The panel on the right: what is known of a photo, a map, or the answer to a photo. */
 
 import { ANSWER, SELECTED } from "viewer/colours.js";
-import { placingPage } from "viewer/data.js";
 import { byId, make, metres, table } from "viewer/dom.js";
 
 /** Shows an element's children under a title. @param {function(): void} onClose */
@@ -35,27 +34,8 @@ function poseInOwnFrame(photo) {
   return [make("h3", {}, "Pose in the map's own frame"), make("p", { class: "bad" }, "No place on Earth"), table(axes)];
 }
 
-/** A button that opens the page of picks. */
-function openPlacing(map) {
-  const open = make("button", {}, "Place this map");
-  const told = make("p", { role: "status" });
-  open.addEventListener("click", async () => {
-    open.disabled = true;
-    told.textContent = "The page is being opened; it loads the map and the scan.";
-    try {
-      const url = await placingPage(map.id);
-      const link = make("a", { href: url, target: "_blank", rel: "noreferrer" }, "Place it on this page");
-      told.replaceChildren(link, "; open the viewer again when it is placed.");
-    } catch (error) {
-      told.textContent = error.message;
-    }
-    open.disabled = false;
-  });
-  return make("div", { id: "open-placing" }, open, told);
-}
-
 /** That a map has no place, why, and what would give it one. */
-function withoutPlace(map, opens) {
+function withoutPlace(map) {
   const { reason, ways, command } = map.no_place;
   return [
     make("p", { class: "bad" }, "No place on Earth"),
@@ -63,7 +43,6 @@ function withoutPlace(map, opens) {
     make("h3", {}, "Place this map"),
     make("p", {}, "Click the same spots in a photo and on the scan, in a page that this command opens:"),
     make("code", { id: "place-this-map" }, command),
-    ...(opens ? [openPlacing(map)] : []),
     make("p", {}, "What would place it:"),
     make("ul", {}, ...ways.map((way) => make("li", {}, way))),
   ];
@@ -79,8 +58,8 @@ export function putPicture({ url, reason }, name) {
   }
 }
 
-/** What is known of a map, and its photos. @param {function(any): void} openPhoto @param {boolean} opens the page of picks */
-export function aboutMap(map, nameOf, openMap, openPhoto, opens = false) {
+/** What is known of a map, and its photos. @param {function(any): void} openPhoto */
+export function aboutMap(map, nameOf, openMap, openPhoto) {
   const links = (ids) => {
     const list = make("span");
     for (const id of ids) {
@@ -104,7 +83,7 @@ export function aboutMap(map, nameOf, openMap, openPhoto, opens = false) {
       ["drift", map.drift_m === null ? null : `${metres(map.drift_m)} (95 %), ${budget(map)}`],
       ["residual", metres(map.residual_rms_m)], ["zone", `EPSG:${map.epsg}, heights ${map.height_datum}`]];
   return [
-    ...(map.no_place ? withoutPlace(map, opens) : []),
+    ...(map.no_place ? withoutPlace(map) : []),
     table([
       ["status", status], ...place,
       ["points", `${map.points.toLocaleString("en")}, ${map.buffer.count.toLocaleString("en")} drawn`],
