@@ -58,6 +58,7 @@ FORMATS: dict[str, Format] = {
         write="formats.ply:write_ply_files",
     ),
     "geojson": Format(text="positions and angles of photos, one file", write="formats.geojson:write_geojson"),
+    "kml": Format(text="photos in space for Google Earth, one file", write="formats.kml:write_kml"),
     "geopose": Format(text="OGC GeoPose, a file for each photo", write="formats.geopose:write_geopose"),
     "opensfm": Format(
         text="a folder for each map as OpenSfM and OpenDroneMap have it",

@@ -1,10 +1,11 @@
-"""GeoJSON and GeoPose: every photo where and how it was taken, whose it is, and how sure that is."""
+"""GeoJSON, KML and GeoPose: every photo where and how it was taken, whose it is, and how sure that is."""
 
 import json
 import os
 import signal
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
@@ -16,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from featuredb.export.formats.geojson import write_geojson
 from featuredb.export.formats.geopose import write_geopose
+from featuredb.export.formats.kml import write_kml
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
-from featuredb.export.shots import pose_covariance
+from featuredb.export.shots import pose_covariance, shots_of
 from featuredb.geo.geopose import BODY_FROM_CAM
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
@@ -28,6 +30,8 @@ from featuredb.store import Database
 from schemas import load_schema
 from tests.support import planar_map as field
 from tests.support.maps import random_map
+
+KML = "{http://www.opengis.net/kml/2.2}"
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +116,44 @@ def test_geojson_tells_every_photo(tmp_path: Path, field_map: FeatureMap) -> Non
     assert {p["height_datum"] for p in unknown} == {"unknown"}
 
 
+def test_kml_looks_where_the_photo_looks(tmp_path: Path, field_map: FeatureMap) -> None:
+    """Turned as the standard says, about z, x, z again, KML's camera has the map's axes."""
+    rolled = Rigid3.exp([0.0, 0.0, 0.4, 0, 0, 0]) @ field_map.images[3].cam_from_local
+    images = (
+        *field_map.images[:3],
+        replace(field_map.images[3], cam_from_local=rolled),
+        *field_map.images[4:],
+    )
+    feature_map = replace(field_map, images=images)
+    write_kml(job_of(tmp_path, feature_map, out="photos.kml"))
+    document = ET.parse(tmp_path / "photos.kml").getroot()
+    overlays = list(document.iter(f"{KML}PhotoOverlay"))
+    assert [o.findtext(f"{KML}name") for o in overlays] == [i.name for i in images]
+    for image, shot, overlay in zip(images, shots_of(feature_map), overlays, strict=True):
+        camera = {child.tag.removeprefix(KML): child.text or "" for child in overlay[2]}
+        heading, tilt, roll = (float(camera[name]) for name in ("heading", "tilt", "roll"))
+        enu_from_view = Rotation.from_euler("ZXZ", [-heading, tilt, roll], degrees=True).as_matrix()
+        view_from_cam = np.diag([1.0, -1.0, -1.0])
+        true_from_cam = shot.geopose.true_enu_from_body @ BODY_FROM_CAM
+        np.testing.assert_allclose(enu_from_view @ view_from_cam, true_from_cam, atol=2e-3)
+        enu = feature_map.frame.enu_from_geodetic(
+            (float(camera["latitude"]), float(camera["longitude"]), float(camera["altitude"]))
+        )
+        np.testing.assert_allclose(enu[:2], image.cam_from_local.center[:2], atol=1e-3)
+        data = {d.get("name"): d.findtext(f"{KML}value") for d in overlay.iter(f"{KML}Data")}
+        assert (data["owner"] or "", data["licence"]) == (image.owner, image.licence or "CC0-1.0")
+        view = overlay.find(f"{KML}ViewVolume")
+        assert view is not None
+        assert float(view.findtext(f"{KML}rightFov") or "nan") == pytest.approx(
+            np.degrees(np.arctan(320 / 600)), abs=1e-4
+        )
+    # The order of elements is that of the schema; Google Earth refuses others.
+    order = [child.tag.removeprefix(KML) for child in overlays[0]]
+    assert order == [
+        *("name", "description", "Camera", "TimeStamp", "ExtendedData", "Icon", "ViewVolume", "Point"),
+    ]
+
+
 def test_geopose_validates_and_leads_back_to_the_pose(tmp_path: Path, field_map: FeatureMap) -> None:
     write_geopose(job_of(tmp_path, field_map))
     folder = tmp_path / "out" / "field"
@@ -154,7 +196,7 @@ def test_geopose_validates_and_leads_back_to_the_pose(tmp_path: Path, field_map:
     np.testing.assert_allclose(translation, moved, atol=1e-3)
 
 
-@pytest.mark.parametrize("write", [write_geojson, write_geopose])
+@pytest.mark.parametrize("write", [write_geojson, write_kml, write_geopose])
 def test_the_same_maps_give_the_same_bytes(tmp_path: Path, field_map: FeatureMap, write: object) -> None:
     assert callable(write)
     job = job_of(tmp_path, field_map, random_map(3))
@@ -175,16 +217,17 @@ from pathlib import Path
 from featuredb.export.formats.geojson import write_geojson
 from featuredb.export.formats.geopose import write_geopose
 from featuredb.export.job import ExportJob
+from featuredb.export.formats.kml import write_kml
 from featuredb.export.selection import Selection
 from featuredb.store import Database
 database = Database.open(sys.argv[1])
-{"geojson": write_geojson, "geopose": write_geopose}[sys.argv[3]](
+{"geojson": write_geojson, "kml": write_kml, "geopose": write_geopose}[sys.argv[3]](
     ExportJob(database=database, snapshot=database.snapshot(), selection=Selection(), out=Path(sys.argv[2]),
               told=lambda done, total: os.kill(os.getpid(), signal.SIGKILL)))
 """
 
 
-@pytest.mark.parametrize("name", ["geojson", "geopose"])
+@pytest.mark.parametrize("name", ["geojson", "kml", "geopose"])
 def test_a_kill_in_the_middle_leaves_nothing(tmp_path: Path, name: str) -> None:
     job = job_of(tmp_path, random_map(1), random_map(2))
     died = subprocess.run(

@@ -48,7 +48,7 @@ def test_ply_keeps_them_apart_from_places_on_earth(url: str, tmp_path: Path) -> 
     assert "map-1,random map 1,own_frame_map-1.ply,,,60" in (tmp_path / "ply" / "maps.csv").read_text()
 
 
-@pytest.mark.parametrize("kind", ["las", "geojson", "geopose", "opensfm", "dataset"])
+@pytest.mark.parametrize("kind", ["las", "geojson", "kml", "geopose", "opensfm", "dataset"])
 def test_formats_that_need_a_place_say_so(
     url: str, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
