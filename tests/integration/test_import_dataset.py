@@ -16,10 +16,11 @@ from featuredb.export.dataset.sums import write_sums
 from featuredb.export.selection import Selection
 from featuredb.store import Database
 from featuredb.store.changes import IMPORTED
+from featuredb.store.encode import content_digest
 from featuredb.store.verify import verify
 from tests.support.command_line import only_command
 from tests.support.datasets import EVERYTHING, export, files_of, map_at, varied_database
-from tests.support.maps import assert_same_map, random_map
+from tests.support.maps import assert_same_map, random_map, random_unplaced_map
 
 
 @pytest.fixture(scope="module")
@@ -220,13 +221,13 @@ def test_nothing_of_it_answers_before_somebody_vouches_for_it(
 
 
 def test_who_vouches_later_vouches_for_all_maps(tmp_path: Path, target: Database) -> None:
-    """Those in quarantine, too; one whose parent somebody here holds back waits."""
+    """Those without a place and in quarantine, too; one whose parent somebody here holds back waits."""
     source = Database.create(tmp_path / "source.db")
-    source.commit_maps([random_map(2), random_map(3), random_map(4)])
+    source.commit_maps([random_unplaced_map(1), random_map(2), random_map(3), random_map(4)])
     source.commit_map(random_map(5, parents=("map-2",)))
     source.set_status(["map-3"], "quarantined", "one owner only")
     source.set_status(["map-4"], "quarantined", IMPORTED)  # from elsewhere, there
-    export(source, tmp_path / "out", Selection(statuses=("active", "quarantined")))
+    export(source, tmp_path / "out", Selection(statuses=("active", "quarantined", "unplaced")))
     import_dataset(target, tmp_path / "out")
     reasons = _reasons(target)
     assert set(reasons.values()) == {IMPORTED}
@@ -246,7 +247,7 @@ def test_who_vouches_later_vouches_for_all_maps(tmp_path: Path, target: Database
 
 def _reasons(database: Database) -> dict[str, str]:
     snapshot = database.snapshot()
-    return {m.map_id: m.status_reason for m in snapshot.maps()}
+    return {m.map_id: m.status_reason for m in (*snapshot.maps(), *snapshot.unplaced_maps())}
 
 
 def test_a_map_whose_parents_are_missing_waits_in_quarantine(source: Database, tmp_path: Path) -> None:
@@ -334,3 +335,27 @@ def rewritten(folder: Path) -> None:
     """Make the checksums fit again."""
     (folder / "SHA256SUMS").unlink()
     write_sums(folder)
+
+
+def test_maps_without_a_place_come_back_beside_the_others(tmp_path: Path, target: Database) -> None:
+    source = Database.create(tmp_path / "source.db")
+    unplaced = random_unplaced_map(1)
+    source.commit_maps([unplaced, random_map(2)])
+    source.commit_map(random_unplaced_map(3))
+    source.retire("map-3", "blurred")
+    export(source, tmp_path / "out", Selection(statuses=("active", "unplaced", "retired")))
+    assert "maps without a place" in (tmp_path / "out" / "README.md").read_text()
+    assert import_dataset(target, tmp_path / "out", dry_run=True).created == ("map-2", "map-1", "map-3")
+    assert import_dataset(target, tmp_path / "out").created == ("map-2", "map-1", "map-3")
+    assert import_dataset(target, tmp_path / "out").created == ()
+    again = target.snapshot().load_unplaced("map-1")
+    assert content_digest(again) == content_digest(unplaced)
+    (retired,) = (m for m in target.snapshot().unplaced_maps(include_retired=True) if m.map_id == "map-3")
+    assert (retired.status, retired.status_reason) == ("retired", "blurred")
+    assert verify(target).ok
+    points = tmp_path / "out" / "own_frame" / "points.parquet"
+    pq.write_table(pq.read_table(points).slice(1), points)
+    (tmp_path / "out" / "SHA256SUMS").unlink()
+    write_sums(tmp_path / "out")
+    with pytest.raises(ExportError, match="map-1: its files do not make a map"):
+        import_dataset(Database.create(tmp_path / "third.db"), tmp_path / "out")

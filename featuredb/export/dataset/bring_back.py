@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from featuredb.errors import ExportError
+from featuredb.export.dataset.own_frame import load_own, own_rows
 from featuredb.export.dataset.read import Row, load_map, open_dataset
 from featuredb.export.job import Told
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
+from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
 from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
 from featuredb.store.commits import apply_change
 from featuredb.store.database import Database
@@ -67,6 +69,11 @@ def import_dataset(
             has been committed. ConflictError, StoreError: the store failed; the import can be run again.
     """
     rows, listed = open_dataset(folder)
+    own = own_rows(folder, listed)
+    if own and not dry_run:
+        database.require_newest_format("keep maps without a place")
+    rows = [*rows, *own]
+    own_ids = {row["map_id"] for row in own}
     snapshot = database.snapshot()
     everything: list[MapSummary | UnplacedSummary] = [
         *snapshot.maps(include_retired=True),
@@ -86,7 +93,7 @@ def import_dataset(
         new = map_id not in there or (map_id not in live and row["status"] != RETIRED)
         (created if new else present).append(map_id)
         if dry_run or new:
-            found = load_map(folder, row, listed)
+            found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
             if not dry_run:
                 _commit(database, found, _vouched_reason(row, missing), map_id in missing, trusted)
         told(done + 1, len(rows))
@@ -121,11 +128,12 @@ def _vouched_reason(row: Row, missing: Mapping[str, Sequence[str]]) -> str:
     return VOUCHED if row["status_reason"] == IMPORTED else row["status_reason"] or ""
 
 
-def _commit(database: Database, feature_map: FeatureMap, reason: str, missing: bool, trusted: bool) -> None:
-    if missing:
+def _commit(database: Database, feature_map: AnyMap, reason: str, missing: bool, trusted: bool) -> None:
+    if missing and isinstance(feature_map, FeatureMap):
         feature_map = feature_map.with_status("quarantined")
     if not trusted and feature_map.status != RETIRED:
-        feature_map = feature_map.with_status("quarantined")
+        if isinstance(feature_map, FeatureMap):
+            feature_map = feature_map.with_status("quarantined")
         reason = IMPORTED  # not what the dataset says: reasons decide what growth does with a map
     if feature_map.status == RETIRED and not reason:
         reason = "it was retired where the dataset is from"
@@ -137,11 +145,10 @@ def _check_rows(folder: Path, rows: Sequence[Row], digests: Mapping[str, str]) -
     twice = sorted(map_id for map_id, count in Counter(row["map_id"] for row in rows).items() if count > 1)
     if twice:
         raise ExportError(f"{folder}: expected different map ids, found {', '.join(twice)} more than once")
-    wrong = sorted({row["status"] for row in rows} - set(MAP_STATUSES))
+    known = dict.fromkeys((*MAP_STATUSES, *UNPLACED_STATUSES))
+    wrong = sorted({row["status"] for row in rows} - known.keys())
     if wrong:
-        raise ExportError(
-            f"{folder}: expected a status of {', '.join(MAP_STATUSES)}, found {', '.join(wrong)}"
-        )
+        raise ExportError(f"{folder}: expected a status of {', '.join(known)}, found {', '.join(wrong)}")
     others = [
         r["map_id"] for r in rows if digests.get(r["map_id"], r["content_digest"]) != r["content_digest"]
     ]

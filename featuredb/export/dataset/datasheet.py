@@ -8,6 +8,7 @@ from typing import Any
 from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents
+from featuredb.export.dataset.own_frame import FOLDER
 from featuredb.export.dataset.sums import SUMS
 from featuredb.geo.crs.wkt import utm_projjson
 
@@ -125,7 +126,8 @@ def _files() -> str:
         _prose(
             f"`{layout.STAC}/collection.json` is a STAC 1.0 catalogue with an item for each map, "
             f"`{layout.DESCRIPTION}` says what this is for programs, `{SUMS}` lists every file: "
-            f"`sha256sum --check {SUMS}`. Scans, if any, are in `{layout.LIDAR}/scans.json`."
+            f"`sha256sum --check {SUMS}`. Scans, if any, are in `{layout.LIDAR}/scans.json`, maps "
+            f"without a place in `{FOLDER}`."
         ),
         _prose(
             "Files of points and images are named by zone, height datum and number, since a GeoParquet "

@@ -1,7 +1,7 @@
 """The maps of a dataset, exactly as they were exported."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.partitions import COLUMNS
 from featuredb.export.dataset.sums import check_sums
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import MapKind
 from featuredb.store.decode import decode_map
 from featuredb.store.encode import content_digest
 
@@ -62,12 +63,25 @@ def load_map(folder: Path, row: Row, listed: frozenset[str]) -> FeatureMap:
     Raises:
         ExportError: its rows cannot be read, or are not the map that was exported.
     """
+    return decoded(
+        folder, row, lambda: {table: _rows_of(folder, table, row, listed) for table in COLUMNS}, FeatureMap
+    )
+
+
+def decoded(
+    folder: Path, row: Row, children: Callable[[], dict[str, list[pa.RecordBatch]]], kind: type[MapKind]
+) -> MapKind:
+    """The map of a row and of the rows of its tables.
+
+    Raises:
+        ExportError: its rows cannot be read, or are not the map that was exported.
+    """
     map_id = row["map_id"]
     try:
-        found = decode_map(row, {table: _rows_of(folder, table, row, listed) for table in COLUMNS})
+        found = decode_map(row, children())
     except FeatureDbError as error:
         raise ExportError(f"{folder}, map {map_id}: its files do not make a map ({error})") from error
-    if not isinstance(found, FeatureMap) or content_digest(found) != row["content_digest"]:
+    if not isinstance(found, kind) or content_digest(found) != row["content_digest"]:
         raise ExportError(
             f"{folder}, map {map_id}: the files hold another map than the one that was exported "
             f"(its digest was {row['content_digest']}); get the dataset once more from its source"

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from featuredb.errors import ExportError
 from featuredb.export.attribution import ATTRIBUTION, Attribution, attribution_of, write_attribution
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.columns import CAMERAS, MAPS
@@ -29,14 +30,16 @@ from featuredb.export.dataset.contents import Contents, MapEntry, entry_of
 from featuredb.export.dataset.datasheet import write_datasheet
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, wkb_of
 from featuredb.export.dataset.lidar_part import check_lidar, write_scans
+from featuredb.export.dataset.own_frame import OwnFrameFiles
 from featuredb.export.dataset.partitions import PartitionFiles
 from featuredb.export.dataset.sums import write_sums
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_json
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import MapLineage
+from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store.encode import encode_map
-from featuredb.store.snapshot import MapSummary
+from featuredb.store.snapshot import MapSummary, UnplacedSummary
 
 # Of maps.parquet, in a row group.
 _ROWS_AT_ONCE = 256
@@ -162,10 +165,10 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
         check_lidar()
     with whole_or_nothing(job.out) as folder:
         folder.mkdir()
-        contents = _write_maps(job, folder)
+        contents, own = _write_maps(job, folder)
         if with_lidar:
             contents.scans.extend(write_scans(job, contents, folder))
-        description = _description(job, contents)
+        description = _description(job, contents, own)
         write_json(folder / layout.DESCRIPTION, description)
         write_datasheet(contents, description, folder)
         write_catalogue(contents, description, folder)
@@ -173,24 +176,38 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
         return job.exported(folder)
 
 
-def _write_maps(job: ExportJob, folder: Path) -> Contents:
+def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
     """All tables and the attribution, with one map in memory at a time."""
     contents, lineages = Contents(), job.snapshot.lineages()
     credits: list[Attribution] = []
     cameras: list[dict[str, Any]] = []
-    with PartitionFiles(folder) as files:
-        for feature_map in job.maps():
+    with PartitionFiles(folder) as files, OwnFrameFiles(folder) as own:
+        for feature_map in job.any_maps():
             credits += attribution_of(feature_map)
+            if isinstance(feature_map, UnplacedMap):
+                own.add(feature_map, _unplaced(job, feature_map.map_id))
+                continue
             row = _write_rows(feature_map, job.snapshot.get(feature_map.map_id), files)
             row["lineage"] = _lineage_json(lineages[feature_map.map_id])
             contents.maps.append(entry_of(feature_map, row))
             cameras += _camera_rows(feature_map)
             del feature_map  # before the next one is loaded
     write_attribution(folder, credits)
+    if not contents.maps:
+        job.summaries()  # names what has no place
+        raise ExportError(
+            "a dataset says where maps lie: expected one with a place in the selection, found none"
+        )
     _write_areas(contents.maps, folder)
     with TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()) as file:
         file.write(pa.Table.from_pylist(cameras, schema=CAMERAS.schema))
-    return contents
+    return contents, own
+
+
+def _unplaced(job: ExportJob, map_id: str) -> UnplacedSummary:
+    summary = job.snapshot.get_any(map_id)
+    assert isinstance(summary, UnplacedSummary)
+    return summary
 
 
 def _write_rows(feature_map: FeatureMap, summary: MapSummary, files: PartitionFiles) -> dict[str, Any]:
@@ -245,7 +262,7 @@ def _lineage_json(lineage: MapLineage) -> str:
     return json.dumps(document, sort_keys=True)
 
 
-def _description(job: ExportJob, contents: Contents) -> dict[str, Any]:
+def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict[str, Any]:
     """What `dataset.json` says, and the datasheet and the catalogue are made of."""
     chosen = job.selection
     return {
@@ -264,6 +281,7 @@ def _description(job: ExportJob, contents: Contents) -> dict[str, Any]:
         },
         **{name: contents.total(name) for name in ("images", "points", "observations", "descriptors")},
         "maps": len(contents.maps),
+        **({"maps_without_a_place": len(own.rows)} if own.rows else {}),
         "scans": len(contents.scans),
         "bbox": list(contents.bbox()),
     }
