@@ -10,6 +10,7 @@ from featuredb.export.selection import licence_of
 from featuredb.geo.datum import ellipsoidal_height
 from featuredb.geo.geopose import GeoPose, geopose_from_camera
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 
@@ -33,6 +34,7 @@ class PosedPhoto:
     number: int
     name: str
     sha256: str
+    camera: Camera
     geopose: GeoPose
     height_datum: str
     map_height_m: float
@@ -64,6 +66,7 @@ def shots_of(feature_map: FeatureMap) -> Iterator[PosedPhoto]:
             number=image.image_id,
             name=image.name,
             sha256=image.sha256,
+            camera=feature_map.cameras[image.camera_id],
             geopose=GeoPose(
                 latitude_deg=placed.latitude_deg,
                 longitude_deg=placed.longitude_deg,
