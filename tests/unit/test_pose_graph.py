@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
@@ -12,8 +11,6 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.growth.graph.pose_graph import (
     GraphEdge,
     GraphNode,
-    left_jacobian,
-    small_adjoint,
     solve_pose_graph,
 )
 
@@ -28,23 +25,6 @@ def _edge(a: str, b: str, shift: tuple[float, ...] = (0.0,) * 7, covariance: Flo
 
 def _east(metres: float) -> tuple[float, ...]:
     return (0.0, 0.0, 0.0, 0.0, metres, 0.0, 0.0)
-
-
-def test_small_adjoint_is_the_derivative_of_the_adjoint() -> None:
-    tangent = np.array([0.3, 0.5, -0.2, 0.7, 1.0, 2.0, -3.0])
-    np.testing.assert_allclose(expm(small_adjoint(tangent)), Sim3.exp(tangent).adjoint(), atol=1e-12)
-
-
-@pytest.mark.parametrize("scale", [0.0, 0.2, 1.0])
-def test_left_jacobian_against_differences(scale: float) -> None:
-    tangent = scale * np.array([0.3, 0.5, -0.2, 0.7, 1.0, 2.0, -3.0])
-    base = Sim3.exp(tangent).inverse()
-    for k in range(7):
-        step = np.zeros(7)
-        step[k] = 1e-6
-        forward = (Sim3.exp(tangent + step) @ base).log()
-        back = (Sim3.exp(tangent - step) @ base).log()
-        np.testing.assert_allclose((forward - back) / 2e-6, left_jacobian(tangent)[:, k], atol=1e-7)
 
 
 def test_a_chain_of_n_edges_has_n_times_the_covariance() -> None:
