@@ -6,7 +6,7 @@ its digest of place differs, and the edge has to be measured again.
 
 import hashlib
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,28 +114,44 @@ def place_key(frame: LocalFrame, placement: Placement) -> str:
     return hashlib.sha256(np.array(numbers, dtype="<f8").tobytes()).hexdigest()[:16]
 
 
-def family(maps: Mapping[str, PlacedMap], edges: Iterable[tuple[str, str]], start: Iterable[str]) -> set[str]:
-    """Maps that are connected with those of `start` by edges, those among them."""
-    nodes = list(maps)
-    among = [(a, b) for a, b in edges if a in maps and b in maps]
-    group_of = dict(zip(nodes, tied_together(nodes, among), strict=True))
-    groups = {group_of[m] for m in start if m in maps}
-    return {m for m in nodes if group_of[m] in groups}
-
-
 def holds(maps: Mapping[str, PlacedMap], edge: Edge) -> bool:
     """Whether the other map is where it was when the overlap was measured."""
     return edge.map_id in maps and maps[edge.map_id].place == edge.place
 
 
-def graph_edges(maps: Mapping[str, PlacedMap], of: Iterable[str], frame: LocalFrame) -> list[GraphEdge]:
-    """Edges that still hold, in one frame."""
-    return [
-        in_graph(map_id, edge, maps[map_id].frame, frame)
-        for map_id in of
-        for edge in maps[map_id].edges
-        if holds(maps, edge)
+def solve_maps(
+    maps: Mapping[str, PlacedMap], new: Mapping[str, Sequence[Edge]], frame: LocalFrame
+) -> GraphSolution:
+    """The graph of the maps that overlaps connect with those of `new`, overlaps that hold and new ones.
+
+    Args:
+        new: overlaps by the map that has them; one that is not placed yet lies in `frame`, the graph's.
+    """
+    overlaps = [(m, e) for m, placed in maps.items() for e in placed.edges if holds(maps, e)]
+    overlaps += [(m, e) for m, own in new.items() for e in own if e.map_id in maps]
+    names = [*maps, *(m for m in new if m not in maps)]
+    groups = tied_together(names, [(m, e.map_id) for m, e in overlaps])
+    group_of = dict(zip(names, groups, strict=True))
+    wanted = {group_of[m] for m in new}
+    members = sorted(m for m in names if group_of[m] in wanted)
+    edges = [
+        in_graph(m, edge, maps[m].frame if m in maps else frame, frame)
+        for m, edge in overlaps
+        if group_of[m] in wanted
     ]
+    return solve_pose_graph([_node(m, maps.get(m), frame) for m in members], edges)
+
+
+def _node(map_id: str, placed: PlacedMap | None, frame: LocalFrame) -> GraphNode:
+    """Anchors with their own placement: where others have moved one, the edges say so anew."""
+    if placed is None or not placed.is_anchor:
+        return GraphNode(map_id=map_id)
+    covariance, moved = placed.own_placement
+    return GraphNode(
+        map_id=map_id,
+        prior=covariance_in_frame(covariance, placed.frame, frame),
+        present_from_own=in_frame(moved, placed.frame, frame),
+    )
 
 
 def in_graph(map_id: str, edge: Edge, own: LocalFrame, frame: LocalFrame) -> GraphEdge:
@@ -147,31 +163,6 @@ def in_graph(map_id: str, edge: Edge, own: LocalFrame, frame: LocalFrame) -> Gra
         covariance=covariance_in_frame(edge.covariance, own, frame),
         shared=Sim3.from_rigid3(frame.enu_from(own)).adjoint() @ edge.shared,
     )
-
-
-def graph_nodes(maps: Mapping[str, PlacedMap], of: Iterable[str], frame: LocalFrame) -> list[GraphNode]:
-    """Nodes; anchors with their own placement: where others have moved one, the edges say so anew."""
-    nodes = []
-    for map_id in of:
-        me, node = maps[map_id], GraphNode(map_id=map_id)
-        if me.is_anchor:
-            covariance, moved = me.own_placement
-            prior = covariance_in_frame(covariance, me.frame, frame)
-            node = replace(node, prior=prior, present_from_own=in_frame(moved, me.frame, frame))
-        nodes.append(node)
-    return nodes
-
-
-def solve_with_new(
-    maps: Mapping[str, PlacedMap], map_id: str, edges: Sequence[Edge], frame: LocalFrame
-) -> GraphSolution:
-    """The graph with one more map, in that map's frame. Edges name existing maps."""
-    pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges]
-    members = sorted(family(maps, pairs, [e.map_id for e in edges]) - {map_id})
-    nodes = [*graph_nodes(maps, members, frame), GraphNode(map_id=map_id)]
-    known = [e for e in graph_edges(maps, members, frame) if map_id not in (e.a, e.b)]
-    new = [in_graph(map_id, e, frame, frame) for e in edges if e.map_id in members]
-    return solve_pose_graph(nodes, [*known, *new])
 
 
 def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
@@ -256,7 +247,8 @@ def with_drift(
     )
     covariance = feature_map.placement.covariance
     relative = np.reshape(growth["covariance_relative"], (7, 7))
-    solution = solve_with_new(maps, feature_map.map_id, edges, feature_map.frame)
+    others = {m: placed for m, placed in maps.items() if m != feature_map.map_id}
+    solution = solve_maps(others, {feature_map.map_id: edges}, feature_map.frame)
     if solution.reason is None and feature_map.map_id in solution.covariance:
         covariance = solution.covariance[feature_map.map_id]
         relative = solution.covariance_relative[feature_map.map_id]

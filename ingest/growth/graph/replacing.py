@@ -19,15 +19,12 @@ from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import (
     OWN,
     PlacedMap,
-    family,
-    graph_edges,
-    graph_nodes,
     holds,
-    in_graph,
     place_key,
     placed_maps,
+    solve_maps,
 )
-from ingest.growth.graph.pose_graph import GraphSolution, solve_pose_graph
+from ingest.growth.graph.pose_graph import GraphSolution
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
 from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun, check_known
@@ -94,13 +91,8 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
     edges = _measured(snapshot, maps, overlaps_to_measure(maps), work)
     if not edges:
         return None
-    pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges if holds(maps, e)]
-    pairs += [(m, e.map_id) for m, own in edges.items() for e in own]
-    members = sorted(family(maps, pairs, edges))
-    frame = maps[next((m for m in members if maps[m].is_anchor), members[0])].frame
-    new = [in_graph(m, e, maps[m].frame, frame) for m, own in edges.items() for e in own]
-    known = graph_edges(maps, members, frame)
-    solution = solve_pose_graph(graph_nodes(maps, members, frame), [*known, *new])
+    frame = maps[min(edges)].frame
+    solution = solve_maps(maps, edges, frame)
     told = Replacement(
         reason=solution.reason,
         message=solution.message,
