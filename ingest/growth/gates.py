@@ -18,9 +18,6 @@ LEAST_AGREEING = 2  # photos; one alone proves nothing
 # Of the localised photos. Every accepted pose is right with a probability above 0.95; a third wrong means
 # that the reconstruction is, or that the place repeats itself.
 _AGREEING_SHARE = 0.66
-# Distance of centres over the viewing distance. Models of few photos, bent and with a lens not their own,
-# reached 0.4 %; a placement by a look-alike shows in pixels long before.
-_MAX_RESIDUAL = 0.01
 # Chi-square with two degrees of freedom is above this once in 10,000 honest positions.
 _GPS_LIMIT = 18.42
 # Share of positions that are wrong by accident, with a margin over the tenth that communities have; as many
@@ -78,23 +75,6 @@ def agreement(agreeing: int, disagreeing: int) -> Gate:
         passes=agreeing >= LEAST_AGREEING and found >= _AGREEING_SHARE,
         message=f"{agreeing} of {total} photos localised by themselves agree with the placement, "
         f"{LEAST_AGREEING} and {_AGREEING_SHARE:.0%} are needed",
-    )
-
-
-def residuals(offset_m: float, distance_m: float) -> Gate:
-    """Typical distance of localised camera centres from the placed ones, over the viewing distance.
-
-    What is larger than poses are uncertain is the bending of one of the two reconstructions.
-    """
-    share = offset_m / distance_m if distance_m > 0 else np.inf
-    return Gate(
-        name="residuals",
-        reason="RESIDUALS",
-        figure=share,
-        limit=_MAX_RESIDUAL,
-        passes=share <= _MAX_RESIDUAL,
-        message=f"localised cameras lie {offset_m:.2f} m from the placed ones, {share:.2%} of the viewing "
-        f"distance; {_MAX_RESIDUAL:.1%} is allowed",
     )
 
 

@@ -21,12 +21,6 @@ def test_a_third_of_the_photos_may_disagree() -> None:
     assert "2 of 4" in refused.message
 
 
-def test_residuals() -> None:
-    assert gates.residuals(0.4, 50.0).passes
-    assert not gates.residuals(0.6, 50.0).passes
-    assert not gates.residuals(float("nan"), 50.0).passes
-
-
 def test_a_lying_geotag_of_one_photo_does_not_matter() -> None:
     spread = np.tile(np.eye(2) * 25.0, (4, 1, 1))
     liar = np.array([[3.0, 1.0], [-2.0, 4.0], [5000.0, 0.0]])
@@ -81,10 +75,10 @@ def test_limit_of_three_sigmas_by_degrees_of_freedom() -> None:
 
 
 def test_first_refusal_and_json() -> None:
-    asked = (gates.agreement(3, 0), gates.residuals(9.0, 10.0))
+    asked = (gates.agreement(3, 0), gates.drift(0.9, 0.5))
     refusal = gates.first_refusal(asked)
     assert refusal is not None
-    assert refusal.name == "residuals"
+    assert refusal.name == "drift"
     assert gates.first_refusal(asked[:1]) is None
-    assert asked[1].as_json() == {"figure": 0.9, "limit": 0.01, "passes": False}
-    assert gates.residuals(0.1, 0.0).as_json()["figure"] is None
+    assert asked[1].as_json() == {"figure": 0.9, "limit": 0.5, "passes": False}
+    assert gates.drift(float("nan"), 0.5).as_json()["figure"] is None

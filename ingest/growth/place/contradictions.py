@@ -67,12 +67,6 @@ def contradicting_photos(
     return found
 
 
-def center_variance_m2(photo: LocalisedPhoto) -> float:
-    """Of a localised centre, all axes together, with what its focal length may be off."""
-    moved = pose_by_focal(photo)[3:] * _FOCAL_REL
-    return float(np.trace(photo.covariance[3:, 3:]) + moved @ moved)
-
-
 def pose_by_focal(photo: LocalisedPhoto) -> FloatArray:
     """(6,) how a localised pose moves (left perturbation) as its focal length grows by its own size."""
     middle = photo.camera.project(np.array([[0.0, 0.0, 1.0]]))

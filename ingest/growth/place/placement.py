@@ -23,7 +23,6 @@ from featuredb.maps.move import covariance_in_frame
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.gates import Gate
-from ingest.growth.place.contradictions import center_variance_m2
 from ingest.growth.place.similarity_fit import (
     Correspondences,
     FittedSimilarity,
@@ -129,15 +128,10 @@ def place_by_maps(
     # From the placed to the localised centres of the photos that agree, metres.
     offsets = np.array([own[k].cam_from_local.center - centers[k] for k in sorted(agree)])
     squared = (offsets**2).sum(axis=1)
-    # Beyond what they are uncertain by: photos at the rim of a map are localised badly, which bends no model.
-    own_m2 = np.array([center_variance_m2(own[k]) for k in sorted(agree)])
-    excess_m = float(np.sqrt(np.median(np.maximum(squared - own_m2, 0.0))))
-    reach = float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1)))
     positions = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
     parents = ", ".join(e.map_id for e in edges)
     asked = (
         gates.agreement(len(agree), len(disagree)),
-        gates.residuals(excess_m, reach),
         gates.geotags(*positions, by=parents),
         gates.visibility(existing[np.isfinite(existing)]),
     )
