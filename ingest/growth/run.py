@@ -24,6 +24,7 @@ from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate, gro
 from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, split
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
+from ingest.growth.place.refine import LEAST_LINK
 from ingest.growth.trust.corroboration import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_confirmed
 from ingest.growth.trust.scan_check import checked_by_scan
@@ -38,8 +39,8 @@ _MOST_ROUNDS = 10  # a bound on one run; each round needs a promotion
 # A reconstruction whose photos are at several places is split where its photos share less than the first of
 # these of their points, its parts at the second, and so on. 194 photos of a simulated town that look-alikes
 # had joined from five places fell apart at 0.10 into parts of one place each, but for ten photos; at 0.25
-# right ones do, too.
-_SPLIT_LINKS = (0.10, 0.15, 0.25)
+# right ones do, too, and no photo needs more.
+_SPLIT_LINKS = (0.10, 0.15, LEAST_LINK)
 
 
 def grow(

@@ -53,8 +53,8 @@ def test_more_wrong_geotags_than_come_by_accident_are_none() -> None:
 
 
 def test_geotags_count_by_their_own_sigma() -> None:
-    """Chi-square of (20, 0) is 16 at a sigma of 5 m and 25 at 4 m; the limit is 18.42."""
-    offsets = np.tile([[20.0, 0.0]], (3, 1))
+    """Chi-square of (15, 0) is 9 at a sigma of 5 m and 14 at 4 m; the limit is 11.8."""
+    offsets = np.tile([[15.0, 0.0]], (3, 1))
     assert gates.geotags(offsets, np.tile(np.eye(2) * 25.0, (3, 1, 1))).passes
     assert not gates.geotags(offsets, np.tile(np.eye(2) * 16.0, (3, 1, 1))).passes
 

@@ -13,12 +13,12 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, features_and_points, model_of
 from ingest.growth.place.localised import in_frame, localise_photo
-from ingest.growth.place.similarity_fit import agreed_similarity, find_correspondences, tolerances_px
-from ingest.growth.values import LEAST_PHOTOS, Edge, LocalisedPhoto, Refused
+from ingest.growth.place.similarity_fit import agreed_similarity, find_correspondences
+from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
 
-_LEAST_POINTS = 60  # matches behind an overlap; fewer leave scale and tilt open
+_LEAST_POINTS = 2 * LEAST_SHARED_POINTS  # behind an overlap; fewer leave scale and tilt open
 
 
 def measure_overlap(
@@ -40,7 +40,7 @@ def measure_overlap(
     indexed = IndexedArea.of([other])
     localised: dict[int, LocalisedPhoto] = {}
     for row, image in enumerate(images):
-        found = localise_image(feature_map, image, row, [indexed])
+        found = localise_image(feature_map, image, [indexed])
         if found is not None:
             localised[row] = in_frame(found, feature_map.frame)
     if len(localised) < LEAST_PHOTOS:
@@ -64,17 +64,15 @@ def _fitted(
     }
     correspondences = find_correspondences(model, localised, keypoints)
     found = agreed_similarity(model, localised, correspondences, [Sim3.identity()])
-    agree = set() if found is None else found[1]
-    if found is None or len(agree) < LEAST_PHOTOS:
+    photos = 0 if found is None else len(found[1])
+    if found is None or photos < LEAST_PHOTOS:
         return Refused(
             reason="FEW_IMAGES",
-            message=f"{len(agree)} images of map {feature_map.map_id} agree on how it lies to map "
+            message=f"{photos} images of map {feature_map.map_id} agree on how it lies to map "
             f"{other.map_id}, {LEAST_PHOTOS} are needed",
         )
-    fit = found[0]
-    near = np.isin(correspondences.photo_of, list(agree))
-    near &= fit.errors_px < tolerances_px(model, correspondences)
-    points = len(np.unique(correspondences.point_of[near]))
+    fit, _, used = found
+    points = len(np.unique(correspondences.point_of[used]))
     if points < _LEAST_POINTS:
         return Refused(
             reason="FEW_POINTS",
@@ -86,18 +84,18 @@ def _fitted(
         other_from_map=fit.local_from_sfm,
         covariance=fit.covariance,
         shared_points=points,
-        photos=len(agree),
+        photos=photos,
     )
 
 
 def localise_image(
-    feature_map: FeatureMap, image: MapImage, row: int, areas: Sequence[IndexedArea]
+    feature_map: FeatureMap, image: MapImage, areas: Sequence[IndexedArea]
 ) -> LocalisedPhoto | None:
     """An image of a map in other maps, by what its map keeps of it."""
     features, _ = features_and_points(feature_map, image)
     camera = feature_map.cameras[image.camera_id]
     photo = Photo(name=image.name, path=Path(image.name), width=camera.width, height=camera.height)
-    found = localise_photo(photo, row, features, areas, camera)
+    found = localise_photo(photo, features, areas, camera)
     return found if isinstance(found, LocalisedPhoto) else None
 
 

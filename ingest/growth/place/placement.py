@@ -28,17 +28,11 @@ from ingest.growth.place.similarity_fit import (
     FittedSimilarity,
     agreed_similarity,
     fit_similarity,
-    tolerances_px,
 )
-from ingest.growth.values import LEAST_SHARED_POINTS, LEAST_VIEWS, Edge, LocalisedPhoto
+from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto
 from ingest.photos.photo import Photo
 from reloc.localise.acceptance import agreement
 from reloc.localise.matching import EXPECTED_DEG, visible_points
-
-# Least share of the parts that should show points of existing maps or of the photo's own reconstruction. A
-# re-upload 13.3 m off showed 0.17; right photos of that database 0.32 and more, of the one that grew with
-# this limit 0.23 and more.
-_LEAST_SHOWN = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,9 +97,7 @@ def place_by_maps(
     found = agreed_similarity(model, own, correspondences)
     edges: tuple[Edge, ...] = ()
     if found is not None:
-        fit, agree = found
-        used = np.isin(correspondences.photo_of, list(agree)) | correspondences.carried
-        used &= fit.errors_px < tolerances_px(model, correspondences)
+        fit, agree, used = found
         edges = edges_of(model, fit, correspondences, used)
     if found is None or not edges:
         gate = gates.agreement(0, len(own))
@@ -122,7 +114,7 @@ def place_by_maps(
     existing, with_own = _shown_parts(model, sim, held, areas, frame)
     disagree = own.keys() - agree
     # Those that disagree are left out as such.
-    blind = set(np.flatnonzero(with_own < _LEAST_SHOWN).tolist()) - disagree
+    blind = set(np.flatnonzero(with_own < gates.LEAST_VISIBLE).tolist()) - disagree
     blind |= {k for k in agree if existing[k] < gates.LEAST_VISIBLE}
     centers = sim.act(model.centers())
     # From the placed to the localised centres of the photos that agree, metres.
@@ -239,7 +231,7 @@ def _shown_parts(
         are asked as well: a camera that looks through a wall, and a copy that was joined at a look-alike, fit
         what they see and do not show the rest.
     """
-    often = model.track_lengths() >= LEAST_VIEWS
+    often = model.track_lengths() >= LEAST_PHOTOS
     cones = view_cones(model.xyz, model.centers(), model.point_of, model.photo_of)
     shares = np.full((2, len(model.rows)), np.nan)
     for k, pose in enumerate(model.cam_from_sfm):

@@ -37,7 +37,7 @@ _ELSEWHERE = "the photo by itself sees existing points elsewhere than the others
 # `bottleneck_share` that photos need which are not localised themselves. In simulated communities photos tied
 # to look-alike halls, 68 and 78 m off, had 0.15 and 0.04; right photos nearly all 0.46 and more, single ones
 # 0.14. Those wait, and are localised by themselves once their neighbours are in an active map.
-_LEAST_LINK = 0.25
+LEAST_LINK = 0.25
 _ROUNDS = 4  # of leaving photos out; the others are adjusted without them
 
 
@@ -180,8 +180,8 @@ def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> di
     firm = bottleneck_share(model, held, outside)
     return {
         k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
-        f"{100 * _LEAST_LINK:.0f} % needed: look-alike places tie photos so"
-        for k in np.flatnonzero(firm < _LEAST_LINK).tolist()
+        f"{100 * LEAST_LINK:.0f} % needed: look-alike places tie photos so"
+        for k in np.flatnonzero(firm < LEAST_LINK).tolist()
         if k not in outside
     }
 

@@ -39,7 +39,7 @@ _OWN_FEATURES = AcceptanceOptions(min_spread=0.0, min_agreement=0.0)
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
 
-_OWN_NEAR, _OWN_ELSEWHERE = 8, 4  # images of active maps that are asked, around the new one and elsewhere
+_OWN_NEAR = 8  # images of active maps that are asked around the new one, and half as many elsewhere
 # Of an own image's answer, beside the drift budget; both are well above what new points within their sigma
 # move a pose by. An answer by the new map alone may miss by `SIGMAS` of its own instead, if that is more.
 _TOLERANCE_DEG = 1.0
@@ -205,7 +205,7 @@ def own_canaries(
                 around |= bool(((there >= low) & (there <= high)).all())
             (near if around else far).append((key, feature_map.map_id, image))
     chosen = sorted(near, key=lambda e: e[0])[:_OWN_NEAR]
-    chosen += sorted(far, key=lambda e: e[0])[:_OWN_ELSEWHERE]
+    chosen += sorted(far, key=lambda e: e[0])[: _OWN_NEAR // 2]
     snapshot = database.snapshot(before.snapshot)
     whole = {map_id: snapshot.load_map(map_id) for map_id in sorted({map_id for _, map_id, _ in chosen})}
     return [(whole[map_id], image) for _, map_id, image in chosen]

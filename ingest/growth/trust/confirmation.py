@@ -18,7 +18,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import Gate
-from ingest.growth.place.localised import QUERY
+from ingest.growth.values import QUERY
 
 # A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
 # photo in common count as one, three photos that confirm each other as one and a half.

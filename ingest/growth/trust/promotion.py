@@ -17,6 +17,7 @@ from ingest.fingerprint import digest
 from ingest.growth import gates
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.gates import Gate
+from ingest.growth.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import Confirmation, Sources, answering_with, confirm
 from ingest.growth.trust.corroboration import NewPhotos, corroborate
@@ -24,7 +25,7 @@ from ingest.growth.values import GrowthOptions, Refused
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
-_AROUND_M = 100.0  # boxes of maps that come this close may show the same
+_AROUND_M = 2.0 * NEAR_M  # boxes of maps that come this close may show the same
 PARENT_MOVED = "was placed anew"  # said of maps whose parent was, see featuredb.store.changes
 
 
