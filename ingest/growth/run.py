@@ -17,7 +17,6 @@ from featuredb.store.candidates.photos import mark_used
 from featuredb.store.candidates.states import OPERATOR
 from ingest.colmap.bridge import Model
 from ingest.growth.asked_before import recall, remember
-from ingest.growth.gates import figures
 from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.graph.replacing import Replacement, replace_descendants
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate, grown_entry, refused_entry
@@ -185,7 +184,7 @@ class _Run:
                     status="active" if outcome.promoted else "quarantined",
                     reason_code=outcome.reason_code,
                     reason=outcome.reason,
-                    gates={**entry.gates, **figures(outcome.gates)},
+                    gates={**entry.gates, **outcome.gates},
                 )
         return any(outcome.promoted for outcome in outcomes)
 

@@ -1,7 +1,7 @@
 """The values that pass between the steps of growth: new photos, localised ones, overlaps, refusals."""
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -143,16 +143,6 @@ class Refused:
     def by(cls, gate: Gate, *before: Gate, rows: tuple[int, ...] = ()) -> "Refused":
         """By a gate, after others that were asked."""
         return cls(reason=gate.reason, message=gate.message, rows=rows, gates=(*before, gate))
-
-    def as_json(self) -> dict[str, Any]:
-        """Without the rows, which are those of one run."""
-        gates = [{**asdict(g), "passes": bool(g.passes), "figure": float(g.figure)} for g in self.gates]
-        return {"reason": self.reason, "message": self.message, "gates": gates}
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> "Refused":
-        gates = tuple(Gate(**gate) for gate in value["gates"])
-        return cls(reason=value["reason"], message=value["message"], gates=gates)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -120,7 +120,7 @@ def test_two_owners_at_once_are_promoted_in_one_run(grown: tuple[Path, GrowthRep
     entry = report.maps[0]
     assert (entry.status, entry.generation) == ("active", 1)
     assert all(gate["passes"] for gate in entry.gates.values())
-    assert {"agreement", "residuals", "visibility", "drift", "confirmation", "canaries"} <= set(entry.gates)
+    assert {"agreement", "visibility", "drift", "confirmation", "canaries"} <= set(entry.gates)
     evidence = database.snapshot().load_map(entry.map_id).placement.evidence["growth"]
     assert evidence["drift_m"] == pytest.approx(entry.drift_m, abs=1e-6)
     images = database.snapshot().load_map(entry.map_id).images
