@@ -23,7 +23,7 @@ from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
-from ingest.growth.graph.pose_graph import GraphEdge, GraphNode, GraphSolution, solve_pose_graph
+from ingest.growth.graph.pose_graph import WORLD, GraphEdge, GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
 from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
@@ -139,18 +139,18 @@ def solve_maps(
         for m, edge in overlaps
         if group_of[m] in wanted
     ]
-    return solve_pose_graph([_node(m, maps.get(m), frame) for m in members], edges)
+    edges += [_placement(m, maps[m], frame) for m in members if m in maps and maps[m].is_anchor]
+    return solve_pose_graph(members, edges)
 
 
-def _node(map_id: str, placed: PlacedMap | None, frame: LocalFrame) -> GraphNode:
-    """Anchors with their own placement: where others have moved one, the edges say so anew."""
-    if placed is None or not placed.is_anchor:
-        return GraphNode(map_id=map_id)
-    covariance, moved = placed.own_placement
-    return GraphNode(
-        map_id=map_id,
-        prior=covariance_in_frame(covariance, placed.frame, frame),
-        present_from_own=in_frame(moved, placed.frame, frame),
+def _placement(map_id: str, anchor: PlacedMap, frame: LocalFrame) -> GraphEdge:
+    """An anchor's own placement: where others have moved it, their edges say so anew."""
+    covariance, moved = anchor.own_placement
+    return GraphEdge(
+        a=map_id,
+        b=WORLD,
+        b_from_a=in_frame(moved, anchor.frame, frame).inverse(),
+        covariance=covariance_in_frame(covariance, anchor.frame, frame),
     )
 
 

@@ -23,7 +23,7 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.growth.gates import SIGMAS
 from ingest.growth.values import tied_together
 
-_WORLD = ""  # what anchors are measured against
+WORLD = ""  # what anchors are measured against, and stays
 _CHANCE = float(chi2.sf(SIGMAS**2, 1))  # of a worse chi-square, below which something contradicts
 # An edge is left out when it takes with it so many times more of chi-square than the next one; where several
 # explain the contradiction alike, nobody can tell which is wrong.
@@ -40,23 +40,8 @@ _NOTHING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GraphNode:
-    """A map.
-
-    Attributes:
-        prior: (7, 7) covariance of its own placement, left perturbation in the graph's frame, where it is an
-            anchor; None for a map that others placed.
-        present_from_own: where an earlier graph has moved the anchor, from where its own placement has it.
-    """
-
-    map_id: str
-    prior: FloatArray | None = None
-    present_from_own: Sim3 = field(default_factory=Sim3.identity)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraphEdge:
-    """A measured overlap of two maps at their present places.
+    """A measured overlap of two maps at their present places, or an anchor's own placement, if b is `WORLD`.
 
     Attributes:
         b_from_a: carries what map a says to where map b says it; graph's frame.
@@ -99,37 +84,24 @@ class GraphSolution:
 
 
 class _Fit:
-    """A graph solved by least squares, with what is needed to judge it; corrections are new_from_present.
+    """A graph solved by least squares, with what is needed to judge it; corrections are new_from_present."""
 
-    An anchor's own placement is an edge like any other, to the world, which stays.
-    """
-
-    def __init__(self, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> None:
-        self._nodes, rows = nodes, {node.map_id: i for i, node in enumerate(nodes)}
-        self.edges = [e for e in edges if e.a in rows and e.b in rows]
-        placements = [
-            GraphEdge(
-                a=node.map_id,
-                b=_WORLD,
-                b_from_a=node.present_from_own.inverse(),
-                covariance=node.prior,
-            )
-            for node in nodes
-            if node.prior is not None
-        ]
-        self._measured = [*self.edges, *placements]
-        self._ends = [(rows[e.a], rows.get(e.b)) for e in self._measured]
+    def __init__(self, ids: Sequence[str], edges: Sequence[GraphEdge]) -> None:
+        self._ids, rows = ids, {map_id: i for i, map_id in enumerate(ids)}
+        self.edges = [e for e in edges if e.a in rows]
+        self._ends = [(rows[e.a], rows.get(e.b)) for e in self.edges]
+        self._anchors = {e.a for e in self.edges if e.b == WORLD}
         # W with W C W^T = I.
-        self._white = [np.linalg.inv(np.linalg.cholesky(e.covariance + _FLOOR)) for e in self._measured]
+        self._white = [np.linalg.inv(np.linalg.cholesky(e.covariance + _FLOOR)) for e in self.edges]
         places = self._solved()
         self._residuals, self._jacobian = self._linearised(places)
         self.corrections = dict(zip(rows, places, strict=True))
         self.chi_square = float(self._residuals @ self._residuals)
-        self.degrees = len(self._residuals) - 7 * len(nodes)
+        self.degrees = len(self._residuals) - 7 * len(ids)
 
     def _solved(self) -> list[Sim3]:
         """Corrections by Gauss and Newton from the present places; a step that makes it worse is halved."""
-        places = [Sim3.identity() for _ in self._nodes]
+        places = [Sim3.identity() for _ in self._ids]
         for _ in range(_ROUNDS):
             residuals, jacobian = self._linearised(places)
             step = -_solver(jacobian)((jacobian.T @ residuals)[:, None])[:, 0]
@@ -147,13 +119,13 @@ class _Fit:
         return places
 
     def _linearised(self, places: Sequence[Sim3]) -> tuple[FloatArray, csr_array]:
-        """Whitened residuals (7 m,) of all that is measured, derivatives by left perturbations.
+        """Whitened residuals (7 m,) of the edges, derivatives by left perturbations.
 
         Derivatives are those at a residual of nothing: it is small against the distances that turns act at.
         """
         residuals: list[FloatArray] = []
         blocks: list[tuple[int, int, FloatArray]] = []
-        for k, (edge, (a, b), white) in enumerate(zip(self._measured, self._ends, self._white, strict=True)):
+        for k, (edge, (a, b), white) in enumerate(zip(self.edges, self._ends, self._white, strict=True)):
             b_inverse = Sim3.identity() if b is None else places[b].inverse()
             along = white @ b_inverse.adjoint()
             residuals.append(white @ (b_inverse @ places[a] @ edge.b_from_a.inverse()).log())
@@ -163,12 +135,12 @@ class _Fit:
         return np.concatenate(residuals), _assemble(blocks, len(residuals), len(places))
 
     def judged(self) -> list[tuple[float, int]]:
-        """Of each edge, then each anchor's placement: the fall of chi-square without it, and its redundancy.
+        """Of each edge the fall of chi-square without it, and its redundancy.
 
         The redundancy is the number of its seven directions that others check.
         """
         solve, found = _solver(self._jacobian), []
-        for k in range(len(self._measured)):
+        for k in range(len(self.edges)):
             rows = self._jacobian[7 * k : 7 * k + 7]
             spread = np.eye(7) - rows @ solve(rows.T.toarray())
             values, vectors = np.linalg.eigh(0.5 * (spread + spread.T))
@@ -183,12 +155,12 @@ class _Fit:
         Args:
             relative: as if the anchors were where they are without error; zero for themselves.
         """
-        free = [i for i, node in enumerate(self._nodes) if node.prior is None or not relative]
-        found = {node.map_id: np.zeros((7, 7)) for node in self._nodes}
+        free = [i for i, map_id in enumerate(self._ids) if map_id not in self._anchors or not relative]
+        found = {map_id: np.zeros((7, 7)) for map_id in self._ids}
         if free:
             columns = (7 * np.array(free)[:, None] + np.arange(7)).ravel()
             for i, covariance in zip(free, self._covariances(self._jacobian[:, columns]), strict=True):
-                found[self._nodes[i].map_id] = covariance
+                found[self._ids[i]] = covariance
         return found
 
     def _covariances(self, jacobian: csr_array) -> FloatArray:
@@ -201,7 +173,7 @@ class _Fit:
         units = (np.eye(size, 7, -first) for first in range(0, size, 7))
         own = np.array([solve(unit)[7 * i : 7 * i + 7] for i, unit in enumerate(units)])
         together, apart = np.zeros((size // 7, 7, 3)), np.zeros((size // 7, 7, 7))
-        for k, (edge, white) in enumerate(zip(self._measured, self._white, strict=True)):
+        for k, (edge, white) in enumerate(zip(self.edges, self._white, strict=True)):
             if edge.shared.any():
                 rows = jacobian[7 * k : 7 * k + 7]
                 moved = solve(rows.T @ (white @ edge.shared)).reshape(-1, 7, 3)
@@ -212,29 +184,31 @@ class _Fit:
         return np.asarray(0.5 * (own + np.swapaxes(own, 1, 2)) + common)
 
 
-def solve_pose_graph(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> GraphSolution:
+def solve_pose_graph(ids: Sequence[str], edges: Sequence[GraphEdge]) -> GraphSolution:
     """The most likely places of all maps; edges that contradict the rest are named and left out.
+
+    Args:
+        ids: of the maps. edges: overlaps, and the anchors' own placements.
 
     Raises:
         InvalidValueError: map ids repeat, an edge names an unknown map, or its covariance is not finite.
     """
-    ids = [node.map_id for node in nodes]
     if len(set(ids)) != len(ids):
         raise InvalidValueError(f"pose graph: map ids repeat: {ids}")
-    if unknown := {m for e in edges for m in (e.a, e.b)} - set(ids):
+    if unknown := {m for e in edges for m in (e.a, e.b)} - {*ids, WORLD}:
         raise InvalidValueError(f"pose graph: edges name unknown maps {sorted(unknown)}")
     if broken := [str(e) for e in edges if not np.isfinite(e.covariance).all()]:
         raise InvalidValueError(f"pose graph: covariances that are not finite: {broken}")
     left_out: list[GraphEdge] = []
     remaining = list(edges)
-    reached = _anchored(nodes, remaining)
+    reached = _anchored(ids, remaining)
     if not reached:
         return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
     while True:
-        fitted = _Fit([n for n in nodes if n.map_id in reached], remaining)
+        fitted = _Fit(reached, remaining)
         judged = fitted.judged()
         worst = _contradicting(fitted, judged)
-        if worst is None or _anchored(nodes, [e for e in remaining if e is not worst]) != reached:
+        if worst is None or _anchored(ids, [e for e in remaining if e is not worst]) != reached:
             break
         left_out.append(worst)
         remaining.remove(worst)
@@ -248,7 +222,8 @@ def _solution(fitted: _Fit, judged: Sequence[tuple[float, int]]) -> GraphSolutio
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
     found = GraphSolution(reason=None, message=figures, chi_square=fitted.chi_square, degrees=fitted.degrees)
     if factor > _MOST_VARIANCE_FACTOR:
-        worst = [(chi, str(e)) for e, (chi, free) in zip(fitted.edges, judged, strict=False) if free]
+        overlaps = [(e, *of) for e, of in zip(fitted.edges, judged, strict=True) if e.b != WORLD]
+        worst = [(chi, str(edge)) for edge, chi, free in overlaps if free]
         named = "; ".join(f"{edge} by {chi:.1f}" for chi, edge in sorted(worst, reverse=True))
         text = f"the overlaps contradict each other and no single one stands out ({figures}): {named}"
         return replace(found, reason="CONTRADICTION", message=text)
@@ -267,9 +242,10 @@ def _likely(chi_square: float, degrees: int) -> bool:
 def _contradicting(fitted: _Fit, judged: Sequence[tuple[float, int]]) -> GraphEdge | None:
     """The edge that alone explains why the graph does not fit, if there is one."""
     chi_square, degrees = fitted.chi_square, fitted.degrees
-    if degrees == 0 or not fitted.edges or _likely(chi_square, degrees):
+    overlaps = [k for k, edge in enumerate(fitted.edges) if edge.b != WORLD]
+    if degrees == 0 or not overlaps or _likely(chi_square, degrees):
         return None
-    row = max(range(len(fitted.edges)), key=lambda k: judged[k][0])
+    row = max(overlaps, key=lambda k: judged[k][0])
     worst, redundancy = judged[row]
     if redundancy == 0 or _likely(worst, redundancy):
         return None
@@ -281,11 +257,10 @@ def _contradicting(fitted: _Fit, judged: Sequence[tuple[float, int]]) -> GraphEd
     return fitted.edges[row] if alone or (clean and not others_clean) else None
 
 
-def _anchored(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> set[str]:
-    """Maps with a chain of edges to an anchor."""
-    labels = tied_together([node.map_id for node in nodes], [(e.a, e.b) for e in edges])
-    held = {label for node, label in zip(nodes, labels, strict=True) if node.prior is not None}
-    return {node.map_id for node, label in zip(nodes, labels, strict=True) if label in held}
+def _anchored(ids: Sequence[str], edges: Sequence[GraphEdge]) -> list[str]:
+    """Maps with a chain of edges to an anchor's placement."""
+    world, *labels = tied_together([WORLD, *ids], [(e.a, e.b) for e in edges])
+    return [map_id for map_id, label in zip(ids, labels, strict=True) if label == world]
 
 
 def _solver(jacobian: csr_array) -> Callable[[FloatArray], FloatArray]:

@@ -160,7 +160,7 @@ def _measured(
                 said["edge"] = replace(found, place=maps[other_id].place).as_json()
                 said["note"] = f"{found.photos} images and {found.shared_points} points in common"
             else:
-                said["note"] = found.message
+                said["note"] = found
             remember(work, "overlaps", about, said, places)
         notes.append(f"{map_id} - {other_id}: {said['note']}")
         if said["edge"] is not None:
