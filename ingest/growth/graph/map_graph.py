@@ -220,7 +220,7 @@ def grow_within_budget(
             return replace(grown, feature_map=feature_map, left_out={**beyond, **grown.left_out})
         refused = Refused.by(gate, *grown.placement.gates, rows=everything)
         rows = [int(r) for r in grown.model.rows]
-        within = rows_within(feature_map, rows, relative, budget_m)
+        within = rows_within(feature_map, rows, relative, grown.bending_m, budget_m)
         left = keep_photos(part, within, least=LEAST_PHOTOS) if len(within) < len(rows) else None
         if left is None:
             break
@@ -236,10 +236,9 @@ def with_drift(
     """The map with its overlaps by the graph of maps, its drift (m) and covariance (7, 7) to anchors."""
     feature_map = grown.feature_map
     growth = growth_of(feature_map.placement.evidence)
-    shared = np.reshape(growth["shared_turn"], (7, 3))
     edges = no_surer_than(
         [
-            replace(edge, place=maps[edge.map_id].place, shared=shared)
+            replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn)
             for edge in grown.placement.edges
             if edge.map_id in maps
         ],
@@ -266,7 +265,7 @@ def with_drift(
 
 
 def rows_within(
-    feature_map: FeatureMap, rows: Sequence[int], relative: FloatArray, budget_m: float
+    feature_map: FeatureMap, rows: Sequence[int], relative: FloatArray, bending_m: float, budget_m: float
 ) -> list[int]:
     """Rows of the photos that are within the budget, each with its own bending in place of the largest.
 
@@ -274,7 +273,7 @@ def rows_within(
         rows: of the map's images, in their order.
         relative: (7, 7) covariance of the map relative to the anchors, with its bending.
     """
-    bending_m2 = float(growth_of(feature_map.placement.evidence)["bending_m"]) ** 2
+    bending_m2 = bending_m**2
     as_a_whole = relative - np.diag([0.0] * 4 + [bending_m2] * 3)
     points = feature_map.points_local()
     seen = feature_map.observations

@@ -26,7 +26,8 @@ from ingest.growth.values import tied_together
 WORLD = ""  # what anchors are measured against, and stays
 _CHANCE = float(chi2.sf(SIGMAS**2, 1))  # of a worse chi-square, below which something contradicts
 # An edge is left out when it takes with it so many times more of chi-square than the next one; where several
-# explain the contradiction alike, nobody can tell which is wrong.
+# explain the contradiction alike, nobody can tell which is wrong. Of 300 random graphs with one or two gross
+# errors a right edge was left out in 70 at 1, in none at 1.5 and more; a wrong one in 120 at 2.
 _CLEAR_LEAD = 2.0
 # Where no edge stands out, all covariances grow by chi-square over its degrees, up to this: deviations five
 # times those claimed are no longer noise.

@@ -1,7 +1,7 @@
 """From a reconstruction of new photos to a map that existing maps have placed, or to the reason why not."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.growth import gates
 from ingest.growth.place.localised import in_frame, with_lens
-from ingest.growth.place.placement import MapsPlacement, parents_covariance, place_by_maps
+from ingest.growth.place.placement import parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
 from ingest.growth.place.similarity_fit import find_correspondences
 from ingest.growth.values import LEAST_PHOTOS, FeaturesOf, LocalisedPhoto, Refused
@@ -37,18 +37,10 @@ AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "NOT_VISIBLE")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GrownMap:
-    """A new map, ready to be committed (as quarantined, by whoever commits it).
-
-    Attributes:
-        model: the reconstruction after refinement; metric, in the frame of the map.
-        left_out: photos of the reconstruction that are not in the map, by row, with reason and message.
-    """
+class GrownMap(Refinement):
+    """A refined reconstruction and its map, ready to be committed (as quarantined, by whoever commits it)."""
 
     feature_map: FeatureMap
-    placement: MapsPlacement
-    model: Model
-    left_out: Mapping[int, tuple[str, str]] = field(default_factory=dict)
 
 
 def grow_component(
@@ -142,8 +134,6 @@ def _assembled(
     growth = {
         "covariance_relative": to_anchors.ravel().tolist(),
         "gates": gates.figures(placement.gates),
-        "bending_m": refined.bending_m,
-        "shared_turn": refined.shared_turn.ravel().tolist(),
     }
     images = tuple(  # they know what their lenses leave open; as they were where nothing is known
         replace(image, covariance=own) if np.isfinite(own).all() else image
@@ -158,12 +148,7 @@ def _assembled(
         images=images,
         provenance=without_modes(feature_map.provenance),
     )
-    return GrownMap(
-        feature_map=grown,
-        placement=placement,
-        model=model,
-        left_out=refined.left_out,
-    )
+    return GrownMap(feature_map=grown, **{f.name: getattr(refined, f.name) for f in fields(refined)})
 
 
 def _named(photos: Sequence[Photo]) -> MapIdentity:

@@ -33,7 +33,6 @@ _MOST_SCORED = 3000  # correspondences that judge a proposal; more only take lon
 # A proposal rests on one photo, whose errors it carries far. What is of another place is hundreds of pixels
 # off.
 _LOOSE_PX = 2.0 * TOLERANCE_PX
-_LEAST_SHARE = 0.5  # of a photo's own correspondences that must be within the tolerance for it to agree
 _ROUNDS = 20  # of reweighting; weights settle within ten
 
 
@@ -274,7 +273,7 @@ def agreeing_photos(
     count = int(correspondences.photo_of.max(initial=-1)) + 1
     total = np.bincount(correspondences.photo_of[own], minlength=count)
     near = np.bincount(correspondences.photo_of[own & (errors_px < tolerance_px)], minlength=count)
-    return np.flatnonzero((total > 0) & (near >= _LEAST_SHARE * total))
+    return np.flatnonzero((total > 0) & (2 * near >= total))
 
 
 def fit_similarity(
