@@ -34,7 +34,6 @@ from ingest.sfm.links import keep_photos
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
-_MOST_ROUNDS = 10  # a bound on one run; each round needs a promotion
 # A reconstruction whose photos are at several places is split where its photos share less than the first of
 # these of their points, its parts at the second, and so on. 194 photos of a simulated town that look-alikes
 # had joined from five places fell apart at 0.10 into parts of one place each, but for ten photos; at 0.25
@@ -57,7 +56,7 @@ def grow(
     started, clock = datetime.now(UTC), time.perf_counter()
     run = _Run(database=database, new=new, work=work, options=options or GrowthOptions())
     run.recall_lost()
-    for _ in range(_MOST_ROUNDS):
+    while True:  # each round but the last promotes a map that waited
         run.start_round()
         run.localise()
         run.place()

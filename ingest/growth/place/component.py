@@ -33,7 +33,7 @@ _MAPS = MapOptions(min_track_length=2)
 # the geotags of a part agree is to choose the photos of whoever lies. Of a block copied elsewhere, half of
 # whose tags were at its twin, the parts with those tags were left over, small enough for one forged photo to
 # confirm them: twelve photos promoted 277 m off.
-AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "NOT_VISIBLE")
+AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "CONTRADICTS", "NOT_VISIBLE")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
