@@ -10,7 +10,7 @@ import ingest.growth.place.localised as localised_module
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapObservations
-from ingest.growth.place.contradictions import pose_by_focal
+from ingest.growth.place.contradictions import pose_by_lens
 from ingest.growth.place.localised import (
     localise_photo,
     localise_photos,
@@ -120,7 +120,7 @@ def test_a_pose_moves_with_its_focal_length_as_is_said(localised: dict[int, Loca
         longer = replace(photo.camera, params=(1.01 * photo.camera.params[0], *photo.camera.params[1:]))
         moved = with_lens(photo, longer)
         turn = photo.cam_from_local.rotation
-        expected = 0.01 * pose_by_focal(photo)
+        expected = pose_by_lens(photo, longer)
         offset = moved.cam_from_local.center - photo.cam_from_local.center
         # Which way it goes is a matter of sign, and of no matter to a covariance.
         said = turn.T @ expected[3:]
