@@ -18,7 +18,6 @@ from featuredb.stage_clock import StageClock
 from featuredb.store import Database, Snapshot
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.growth.place.scene_elsewhere import same_scene_elsewhere
 from ingest.map_builder import MapIdentity
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photos.photo import Photo
@@ -29,6 +28,7 @@ from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, recons
 from ingest.register.control.maps import Survey
 from ingest.report.outcomes import map_outcome, photo_outcomes, registered_photos
 from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, StageTiming
+from ingest.scene_elsewhere import same_scene_elsewhere
 from ingest.workspace import Workspace, default_root, remove_leftovers
 
 logger = logging.getLogger(__name__)

@@ -93,7 +93,7 @@ class _Note:
         def place_by_maps(model: Any, localised: Any, correspondences: Any, photos: Any, *more: Any) -> Any:
             placement = step(model, localised, correspondences, photos, *more)
             self._photos = photos
-            self._model("place", model, placement, placement.gates)
+            self._model("place", model, placement, _said(placement.gates))
             return placement
 
         return place_by_maps
@@ -103,9 +103,9 @@ class _Note:
             refined = step(model, placement, *more)
             refused = isinstance(refined, Refused)
             asked = refined.gates if refused else refined.placement.gates
-            own = [gate for gate in asked if gate.name not in {g.name for g in placement.gates}]
-            if refused and all(gate.passes for gate in own):  # by photos that are left out
-                own.append(_said_no(refined.reason))
+            own = {n: yes for n, yes in _said(asked).items() if n not in _said(placement.gates)}
+            if refused and all(own.values()):  # by photos that are left out
+                own[f"photos: {refined.reason}"] = False
             self._model("refine", model, placement, own)
             return refined
 
@@ -114,7 +114,7 @@ class _Note:
     def drifting(self, step: Any) -> Any:
         def with_drift(grown: Any, maps: Any, budget_m: float) -> Any:
             found = step(grown, maps, budget_m)
-            self._map("budget", found[0], [gates.drift(found[1], budget_m)])
+            self._map("budget", found[0], _said([gates.drift(found[1], budget_m)]))
             return found
 
         return with_drift
@@ -124,24 +124,25 @@ class _Note:
             outcomes = step(database, *args, **more)
             for outcome in outcomes:
                 if outcome.gates:
-                    self._map("trust", database.snapshot().load_map(outcome.map_id), outcome.gates)
+                    said = {name: bool(gate["passes"]) for name, gate in outcome.gates.items()}
+                    self._map("trust", database.snapshot().load_map(outcome.map_id), said)
             return outcomes
 
         return promote_confirmed
 
-    def _model(self, step: str, model: Any, placement: Any, gates: Iterable[Gate]) -> None:
+    def _model(self, step: str, model: Any, placement: Any, gates: dict[str, bool]) -> None:
         if placement.local_from_sfm is None:
             return
         names = [self._photos[int(row)].name for row in model.rows]
         centers = placement.local_from_sfm.act(model.centers())
         self._write(step, names, self._frame.enu_from(placement.frame).act(centers), gates)
 
-    def _map(self, step: str, feature_map: FeatureMap, gates: Iterable[Gate]) -> None:
+    def _map(self, step: str, feature_map: FeatureMap, gates: dict[str, bool]) -> None:
         centers = np.array([image.cam_from_local.center for image in feature_map.images])
         names = [image.name for image in feature_map.images]
         self._write(step, names, self._frame.enu_from(feature_map.frame).act(centers), gates)
 
-    def _write(self, step: str, names: Sequence[str], centers: FloatArray, gates: Iterable[Gate]) -> None:
+    def _write(self, step: str, names: Sequence[str], centers: FloatArray, gates: dict[str, bool]) -> None:
         wrong = 0
         for name, center in zip(names, centers, strict=True):
             true = self._true_place(name)
@@ -151,21 +152,15 @@ class _Note:
             "key": " ".join(sorted(names)),
             "right": len(names) - wrong,
             "wrong": wrong,
-            "gates": {gate.name: gate.passes for gate in gates},
+            "gates": gates,
         }
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
 
 
-def _said_no(reason: str) -> Gate:
-    return Gate(
-        name=f"photos: {reason}",
-        reason=reason,
-        figure=1.0,
-        limit=0.0,
-        passes=False,
-        message="too few are left",
-    )
+def _said(gates: Iterable[Gate]) -> dict[str, bool]:
+    """Which gates pass, by name."""
+    return {gate.name: bool(gate.passes) for gate in gates}
 
 
 def read_judgements(paths: Sequence[Path]) -> list[Judgement]:

@@ -27,6 +27,7 @@ from featuredb.store.tables import CANARIES, SPECS, UTM_COORDINATES
 Origin = Literal["person", "answer"]
 LONGEST_NAME = 200
 _UNIT = 1e-6  # how far the norm of a stored quaternion may be from 1
+TOLERANCE_DEG = 1.0  # that an answer may be turned by; well above what more points move a pose by
 _POSE_AS_STORED = ("epsg", "height_datum", "tolerance_m", "tolerance_deg")
 _LIGHT = [field.name for field in SPECS[CANARIES].schema if field.name != "image"]
 
@@ -52,7 +53,7 @@ class KnownPose:
     height_datum: str
     cam_from_utm_xyzw: FloatArray
     tolerance_m: float = 0.5
-    tolerance_deg: float = 1.0
+    tolerance_deg: float = TOLERANCE_DEG
 
     def __post_init__(self) -> None:
         zone_of(self.epsg)

@@ -35,7 +35,7 @@ _FUNCTION_TOLERANCE = 1e-6  # relative
 _ROUNDS = 3  # of adjusting and dropping
 # Of the Cauchy loss, and of observations that are dropped between rounds, at images of 1600: a SIFT keypoint
 # is good to about half a pixel of the image that it was found on, and reconstruction itself allows four.
-_LOSS_PX, _MAX_ERROR_PX = 0.5, 4.0
+KEYPOINT_PX, _MAX_ERROR_PX = 0.5, 4.0
 # Of a lens that a map lends, against that map's points. They were made with that very lens: what it trades
 # for height, they trade alike. Photos were localised with it, so it is no mistake that photos could find out,
 # and its prior never lets go. Of the coefficients of a lens that is not whole no more is known than of any.
@@ -128,7 +128,7 @@ def adjust_anchored(
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     priors, pixels = lenses.priors(model.cameras), model.pixels(keypoints)
     state = model
-    keypoint_px = _LOSS_PX * pixel_scale(*model.cameras)
+    keypoint_px = KEYPOINT_PX * pixel_scale(*model.cameras)
     variance_px2 = keypoint_px**2  # until the model has settled
     for _ in range(_ROUNDS):
         block, marks = block_and_marks(state, observation, keypoints, fixed, kept)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.growth.place.localised import QUERY
+from ingest.growth.values import QUERY
 from ingest.workspace import read_json, write_json
 
 # Raised when the same question gets another answer: with any limit of growth (its gates, `place/`, `trust/`).
-_VERSION = "4"
+_VERSION = "5"
 
 
 def recall(work: Path, kind: str, about: str, question: str = "") -> dict[str, Any] | None:

@@ -12,24 +12,20 @@ from scipy.special import bdtrc, chdtrc, chdtri
 
 from featuredb.geo.words import way_words
 from featuredb.geometry.arrays import FloatArray
+from reloc.localise.acceptance import AcceptanceOptions
 
 SIGMAS = 3.0  # what errors are larger than this once in 370 times contradicts, wherever growth compares two
 LEAST_AGREEING = 2  # photos; one alone proves nothing
-# Of the localised photos. Every accepted pose is right with a probability above 0.95; a third wrong means
-# that the reconstruction is, or that the place repeats itself.
-_AGREEING_SHARE = 0.66
-# Distance of centres over the viewing distance. Models of few photos, bent and with a lens not their own,
-# reached 0.4 %; a placement by a look-alike shows in pixels long before.
-_MAX_RESIDUAL = 0.01
-# Chi-square with two degrees of freedom is above this once in 10,000 honest positions.
-_GPS_LIMIT = 18.42
+# Of the localised photos, and of the verified matches of two. Every accepted pose is right with a probability
+# above 0.95; a third wrong means that the reconstruction is, or that the place repeats itself.
+AGREEING_SHARE = 0.66
 # Share of positions that are wrong by accident, with a margin over the tenth that communities have; as many
 # wrong ones as come about less often than that are no accident.
 _WRONG_TAGS, _ACCIDENT = 0.15, 0.01
-# Least share of the parts of a photo where existing points should be seen that shows some, as for a query. In
-# a simulated community a re-upload 10.8 m off showed 0.13 of its parts, right photos 0.22 and more.
-LEAST_VISIBLE = 0.2
-_MAX_BLIND = 0.34  # share of photos that show less; single ones are left out
+# Least share of the parts of a photo where points should be seen that shows some, as for a query. In
+# simulated communities re-uploads 10.8 and 13.3 m off showed 0.13 and 0.17 of their parts, right photos 0.22
+# and more.
+LEAST_VISIBLE = AcceptanceOptions().min_agreement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,27 +70,10 @@ def agreement(agreeing: int, disagreeing: int) -> Gate:
         name="agreement",
         reason="TOO_FEW_AGREE" if agreeing < LEAST_AGREEING else "PHOTOS_DISAGREE",
         figure=found,
-        limit=_AGREEING_SHARE,
-        passes=agreeing >= LEAST_AGREEING and found >= _AGREEING_SHARE,
+        limit=AGREEING_SHARE,
+        passes=agreeing >= LEAST_AGREEING and found >= AGREEING_SHARE,
         message=f"{agreeing} of {total} photos localised by themselves agree with the placement, "
-        f"{LEAST_AGREEING} and {_AGREEING_SHARE:.0%} are needed",
-    )
-
-
-def residuals(offset_m: float, distance_m: float) -> Gate:
-    """Typical distance of localised camera centres from the placed ones, over the viewing distance.
-
-    What is larger than poses are uncertain is the bending of one of the two reconstructions.
-    """
-    share = offset_m / distance_m if distance_m > 0 else np.inf
-    return Gate(
-        name="residuals",
-        reason="RESIDUALS",
-        figure=share,
-        limit=_MAX_RESIDUAL,
-        passes=share <= _MAX_RESIDUAL,
-        message=f"localised cameras lie {offset_m:.2f} m from the placed ones, {share:.2%} of the viewing "
-        f"distance; {_MAX_RESIDUAL:.1%} is allowed",
+        f"{LEAST_AGREEING} and {AGREEING_SHARE:.0%} are needed",
     )
 
 
@@ -112,7 +91,7 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gat
     against, where = 0, ""
     if len(offsets_m):
         solved = np.linalg.solve(covariances, offsets_m[:, :, None])[:, :, 0]
-        contradict = np.einsum("ni,ni->n", offsets_m, solved) > _GPS_LIMIT
+        contradict = np.einsum("ni,ni->n", offsets_m, solved) > sigmas_limit(2)
         against = int(contradict.sum())
         if against:
             way = way_words(*np.median(offsets_m[contradict], axis=0))
@@ -124,9 +103,9 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gat
         figure=chance,
         limit=_ACCIDENT,
         passes=chance >= _ACCIDENT,
-        message=f"{against} of {len(offsets_m)} positions contradict the placement{where} (chi-square above "
-        f"{_GPS_LIMIT}): if {_WRONG_TAGS:.0%} of all positions are wrong, that happens {chance:.2%} of the "
-        f"time, and what happens less than {_ACCIDENT:.0%} is not taken",
+        message=f"{against} of {len(offsets_m)} positions contradict the placement{where} (by more than "
+        f"{SIGMAS:g} sigma): if {_WRONG_TAGS:.0%} of all positions are wrong, that happens {chance:.2%} of "
+        f"the time, and what happens less than {_ACCIDENT:.0%} is not taken",
     )
 
 
@@ -136,16 +115,16 @@ def visibility(shown: FloatArray) -> Gate:
     Args:
         shown: (n,) for each photo that should see parts of existing maps: share of these in which it does.
     """
-    blind = int((shown < LEAST_VISIBLE).sum())
+    blind, most = int((shown < LEAST_VISIBLE).sum()), round(1.0 - AGREEING_SHARE, 2)
     share = blind / len(shown) if len(shown) else 0.0
     return Gate(
         name="visibility",
         reason="NOT_VISIBLE",
         figure=share,
-        limit=_MAX_BLIND,
-        passes=share <= _MAX_BLIND,
+        limit=most,
+        passes=share <= most,
         message=f"{blind} of {len(shown)} photos show less than {LEAST_VISIBLE:.0%} of what they should see "
-        f"of existing maps, a share of {_MAX_BLIND:.0%} is allowed",
+        f"of existing maps, a share of {most:.0%} is allowed",
     )
 
 

@@ -100,7 +100,7 @@ class GrowthReport:
             "version": self.version,
             "photos": [asdict(photo) for photo in self.photos],
             "maps": [asdict(entry) for entry in self.maps],
-            "promotions": [p.as_json() for p in self.promotions],
+            "promotions": [asdict(promotion) for promotion in self.promotions],
             "replacements": [r.as_json() for r in self.replacements],
             "notes": list(self.notes),
         }

@@ -10,10 +10,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.unplaced_map import AnyMap
 from ingest.colmap.bridge import Model
+from ingest.growth.values import LEAST_SHARED_POINTS
 
-# Observations with descriptors that an image needs to be asked: an answer has at least 15 inliers, and a
-# third of the features of a good image are.
-LEAST_FEATURES = 60
+# Observations with descriptors that an image needs to be asked, of which a third are inliers in a good one.
+LEAST_FEATURES = 2 * LEAST_SHARED_POINTS
 NEAR_M = 50.0  # images of maps around another one are asked whose camera is so far from it at most
 MOST_IMAGES = 24  # that are asked of a map or around one, nearest first; more only sharpen what they say
 

@@ -68,6 +68,11 @@ def inflated(feature_map: FeatureMap) -> FeatureMap:
     return replace(feature_map, placement=replace(placement, covariance=alike))
 
 
+def turns_about(middle: FloatArray) -> FloatArray:
+    """(7, 3) left perturbations of rotations about a place."""
+    return np.vstack([np.zeros((1, 3)), np.eye(3), skew(middle)])
+
+
 def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> FloatArray:
     """(7, 7) that turns and shifts the map in all directions as much as the given one in its worst.
 
@@ -78,7 +83,7 @@ def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> Floa
     jacobian = point_jacobian(middle)
     shift_m2 = float(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1])
     turn = float(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])
-    about = np.vstack([np.zeros((1, 3)), np.eye(3), skew(middle)])
+    about = turns_about(middle)
     grow = np.concatenate([[1.0, 0.0, 0.0, 0.0], -middle])[:, None]
     alike = covariance[0, 0] * grow @ grow.T + turn * about @ about.T
     alike += np.diag([0.0] * 4 + [shift_m2] * 3)

@@ -17,13 +17,13 @@ from featuredb.store.candidates.photos import mark_used
 from featuredb.store.candidates.states import OPERATOR
 from ingest.colmap.bridge import Model
 from ingest.growth.asked_before import recall, remember
-from ingest.growth.gates import figures
 from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.graph.replacing import Replacement, replace_descendants
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate, grown_entry, refused_entry
 from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, split
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
+from ingest.growth.place.refine import LEAST_LINK
 from ingest.growth.trust.corroboration import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_confirmed
 from ingest.growth.trust.scan_check import checked_by_scan
@@ -34,12 +34,11 @@ from ingest.sfm.links import keep_photos
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
-_MOST_ROUNDS = 10  # a bound on one run; each round needs a promotion
 # A reconstruction whose photos are at several places is split where its photos share less than the first of
 # these of their points, its parts at the second, and so on. 194 photos of a simulated town that look-alikes
 # had joined from five places fell apart at 0.10 into parts of one place each, but for ten photos; at 0.25
-# right ones do, too.
-_SPLIT_LINKS = (0.10, 0.15, 0.25)
+# right ones do, too, and no photo needs more.
+_SPLIT_LINKS = (0.10, 0.15, LEAST_LINK)
 
 
 def grow(
@@ -57,7 +56,7 @@ def grow(
     started, clock = datetime.now(UTC), time.perf_counter()
     run = _Run(database=database, new=new, work=work, options=options or GrowthOptions())
     run.recall_lost()
-    for _ in range(_MOST_ROUNDS):
+    while True:  # each round but the last promotes a map that waited
         run.start_round()
         run.localise()
         run.place()
@@ -184,7 +183,7 @@ class _Run:
                     status="active" if outcome.promoted else "quarantined",
                     reason_code=outcome.reason_code,
                     reason=outcome.reason,
-                    gates={**entry.gates, **figures(outcome.gates)},
+                    gates={**entry.gates, **outcome.gates},
                 )
         return any(outcome.promoted for outcome in outcomes)
 

@@ -8,7 +8,7 @@ believe it. It keeps its id, and what could not be taken along stays a map witho
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,15 +58,17 @@ def place_unplaced_maps(
     for summary in waiting:
         asked = digest(asks, summary.write_id, *write_ids)
         known = recall(work, "maps", summary.map_id, asked)
-        outcome = (
-            Refused.from_json(known) if known else _place(database, snapshot, summary, areas, options, notes)
-        )
+        if known is not None:
+            unplaced.append(GrownEntry(**known))
+            continue
+        outcome = _place(database, snapshot, summary, areas, options, notes)
         if isinstance(outcome, FeatureMap):
             placed.append(grown_entry(outcome))
             continue
-        if known is None and outcome.reason not in ("CONFLICT", NOT_ASKED):
-            remember(work, "maps", summary.map_id, outcome.as_json(), asked)
-        unplaced.append(refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points))
+        entry = refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points)
+        unplaced.append(entry)
+        if entry.reason_code not in ("CONFLICT", NOT_ASKED):
+            remember(work, "maps", summary.map_id, asdict(entry), asked)
     return placed, unplaced, notes
 
 

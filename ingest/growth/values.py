@@ -1,7 +1,7 @@
 """The values that pass between the steps of growth: new photos, localised ones, overlaps, refusals."""
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,21 +19,31 @@ from ingest.growth.gates import Gate
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.pairs import Pair
+from reloc.localise.acceptance import AcceptanceOptions
+from reloc.localise.lens_prior import LensPriors
+from reloc.localise.options import LocaliseOptions, PoseOptions
 from reloc.localise.result import LocaliseResult
 
 FeaturesOf = Callable[[int], PhotoFeatures]
 """Features of the photo of a row; called when they are needed, so that not all are in memory."""
 
 DRIFT_BUDGET_M = 0.5  # what a survey's points are usually wanted for
-LEAST_PHOTOS = 3  # of a reconstruction, of a map without a place, and of those by which two maps overlap
-# Points in common that connect two maps; an existing map with fewer would not hold a new one alone. An
-# accepted pose has 15 inliers, and an overlap is measured by 60.
-LEAST_SHARED_POINTS = 30
+# Of a reconstruction, of a map without a place, of those by which two maps overlap, and of those that see a
+# point that is asked for what is there: two leave it along a ray.
+LEAST_PHOTOS = 3
 MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
-LEAST_VIEWS = 3  # of points that are asked for what is there; two leave them along a ray
+
+# As for queries, but for the gate of `spread`: where a query stands alone, photos that are taken into a map
+# must agree with others in any case (a tenth of ten strangers' photos of a church was lost to it).
+QUERY = LocaliseOptions(
+    pose=PoseOptions(lens=LensPriors(whole_lens=False)), acceptance=AcceptanceOptions(min_spread=0.0)
+)
+# Points in common that connect two maps, of two poses; an existing map with fewer would not hold a new one
+# alone.
+LEAST_SHARED_POINTS = 2 * QUERY.acceptance.min_inliers
 # At images of 1600: twice the inlier tolerance of a pose, for two poses, or reconstructions of few photos
 # that are bent.
-TOLERANCE_PX = 8.0
+TOLERANCE_PX = 2.0 * 1600.0 * QUERY.pose.tolerance_rel
 
 
 def tied_together(nodes: Sequence[Hashable], pairs: Iterable[tuple[Hashable, Hashable]]) -> list[int]:
@@ -61,7 +71,6 @@ class LocalisedPhoto:
         result: the answer as a query would have got it.
     """
 
-    row: int
     frame: LocalFrame
     cam_from_local: Rigid3
     covariance: FloatArray
@@ -134,16 +143,6 @@ class Refused:
     def by(cls, gate: Gate, *before: Gate, rows: tuple[int, ...] = ()) -> "Refused":
         """By a gate, after others that were asked."""
         return cls(reason=gate.reason, message=gate.message, rows=rows, gates=(*before, gate))
-
-    def as_json(self) -> dict[str, Any]:
-        """Without the rows, which are those of one run."""
-        gates = [{**asdict(g), "passes": bool(g.passes), "figure": float(g.figure)} for g in self.gates]
-        return {"reason": self.reason, "message": self.message, "gates": gates}
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> "Refused":
-        gates = tuple(Gate(**gate) for gate in value["gates"])
-        return cls(reason=value["reason"], message=value["message"], gates=gates)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

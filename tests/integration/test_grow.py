@@ -120,7 +120,7 @@ def test_two_owners_at_once_are_promoted_in_one_run(grown: tuple[Path, GrowthRep
     entry = report.maps[0]
     assert (entry.status, entry.generation) == ("active", 1)
     assert all(gate["passes"] for gate in entry.gates.values())
-    assert {"agreement", "residuals", "visibility", "drift", "confirmation", "canaries"} <= set(entry.gates)
+    assert {"agreement", "visibility", "drift", "confirmation", "canaries"} <= set(entry.gates)
     evidence = database.snapshot().load_map(entry.map_id).placement.evidence["growth"]
     assert evidence["drift_m"] == pytest.approx(entry.drift_m, abs=1e-6)
     images = database.snapshot().load_map(entry.map_id).images
@@ -263,9 +263,9 @@ def test_a_photo_is_not_looked_for_twice_in_the_same_maps(
     looked: list[tuple[str, int]] = []
     honest = localised_module.localise_photo
 
-    def counted(photo: Photo, row: int, features: Features, areas: list[IndexedArea], *rest: Any) -> Any:
+    def counted(photo: Photo, features: Features, areas: list[IndexedArea], *rest: Any) -> Any:
         looked.append((Path(photo.name).stem, sum(int(a.area.searched.sum()) for a in areas)))
-        return honest(photo, row, features, areas, *rest)
+        return honest(photo, features, areas, *rest)
 
     monkeypatch.setattr(localised_module, "localise_photo", counted)
     away = step_of(_AWAY_M, owners=("anna",), each=1)[0]

@@ -10,7 +10,7 @@ import ingest.growth.place.localised as localised_module
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapObservations
-from ingest.growth.place.contradictions import pose_by_focal
+from ingest.growth.place.contradictions import pose_by_lens
 from ingest.growth.place.localised import (
     localise_photo,
     localise_photos,
@@ -120,7 +120,7 @@ def test_a_pose_moves_with_its_focal_length_as_is_said(localised: dict[int, Loca
         longer = replace(photo.camera, params=(1.01 * photo.camera.params[0], *photo.camera.params[1:]))
         moved = with_lens(photo, longer)
         turn = photo.cam_from_local.rotation
-        expected = 0.01 * pose_by_focal(photo)
+        expected = pose_by_lens(photo, longer)
         offset = moved.cam_from_local.center - photo.cam_from_local.center
         # Which way it goes is a matter of sign, and of no matter to a covariance.
         said = turn.T @ expected[3:]
@@ -136,7 +136,7 @@ def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
         new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, [pose], camera_key=KEY, gps=[gps])
         features = new.features_of(0).features
         shown = features.take(np.flatnonzero(features.xy[:, 0] < 0.55 * CAMERA.width))
-        return localise_photo(new.photos[0], 0, shown, [area])
+        return localise_photo(new.photos[0], shown, [area])
 
     for gps in (None, prior(pose, (2.0, 1.0))):
         there = found_by(gps)
@@ -154,11 +154,11 @@ def test_a_photo_half_covered_is_refused_as_a_query_and_heard_by_growth(
     new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, [walk(1)[0]], camera_key=KEY)
     features = new.features_of(0).features
     shown = features.take(np.flatnonzero(features.xy[:, 0] < 0.4 * CAMERA.width))
-    heard = localise_photo(new.photos[0], 0, shown, [area])
+    heard = localise_photo(new.photos[0], shown, [area])
     assert isinstance(heard, LocalisedPhoto), heard
     assert np.linalg.norm(heard.cam_from_local.center - new.poses[0].center) < 0.2
     monkeypatch.setattr(localised_module, "QUERY", LocaliseOptions())
-    refused = localise_photo(new.photos[0], 0, shown, [area])
+    refused = localise_photo(new.photos[0], shown, [area])
     assert isinstance(refused, str)
     assert refused.startswith("AMBIGUOUS"), refused
 
@@ -182,7 +182,7 @@ def test_what_a_geotag_reaches_is_searched_once(area: IndexedArea, monkeypatch: 
         gps = prior(pose, offset)
         new = take_photos(np.random.default_rng(5), POINTS, strange, [pose], camera_key=KEY, gps=[gps])
         asked.clear()
-        found = localise_photo(new.photos[0], 0, new.features_of(0).features, [area])
+        found = localise_photo(new.photos[0], new.features_of(0).features, [area])
         assert isinstance(found, str), found
         assert [(r.prior, r.beyond) for r, _ in asked] == [(gps, None), (None, gps)]
         for (_, outcome), reason in zip(asked, (first, second), strict=True):

@@ -11,7 +11,7 @@ from tests.support.scenes import CAMERA
 from tests.support.service import not_localised
 
 
-def localised_photo(row: int, cam_from_local: Rigid3, **values: Any) -> LocalisedPhoto:
+def localised_photo(cam_from_local: Rigid3, **values: Any) -> LocalisedPhoto:
     """A photo localised at that pose, without any inlier unless they are given."""
     of_points: dict[str, Any] = {
         "feature_rows": np.zeros(0, dtype=np.int64),
@@ -24,7 +24,6 @@ def localised_photo(row: int, cam_from_local: Rigid3, **values: Any) -> Localise
     }
     given: dict[str, Any] = {"covariance": np.eye(6) * 1e-6, "camera": CAMERA} | of_points | values
     return LocalisedPhoto(
-        row=row,
         frame=LocalFrame(latitude_deg=49.0, longitude_deg=8.0, height_m=0.0),
         cam_from_local=cam_from_local,
         result=not_localised(snapshot=0),

@@ -9,7 +9,6 @@ import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import GROWTH
 from ingest.growth import gates
 from ingest.growth.graph import map_graph
 from ingest.growth.graph.map_graph import rows_within
@@ -31,8 +30,7 @@ def bent(own_sigma_m: list[float | None]) -> FeatureMap:
         image if sigma is None else replace(image, covariance=np.diag([1e-8] * 3 + [sigma**2] * 3))
         for image, sigma in zip(plain.images, own_sigma_m, strict=True)
     )
-    evidence = {GROWTH: {"bending_m": BENDING_M}}
-    return replace(plain, images=images, placement=replace(plain.placement, evidence=evidence))
+    return replace(plain, images=images)
 
 
 def relative(sigma_m: float) -> FloatArray:
@@ -42,15 +40,15 @@ def relative(sigma_m: float) -> FloatArray:
 
 def test_photos_are_judged_by_their_own_bending() -> None:
     feature_map = bent([0.02, 0.05, 0.29, 0.1])
-    assert rows_within(feature_map, [7, 3, 9, 4], relative(0.05), BUDGET_M) == [7, 3, 4]
+    assert rows_within(feature_map, [7, 3, 9, 4], relative(0.05), BENDING_M, BUDGET_M) == [7, 3, 4]
 
 
 def test_photos_that_know_nothing_of_themselves_bend_as_the_worst() -> None:
-    assert rows_within(bent([None, 0.02]), [0, 1], relative(0.05), BUDGET_M) == [1]
+    assert rows_within(bent([None, 0.02]), [0, 1], relative(0.05), BENDING_M, BUDGET_M) == [1]
 
 
 def test_where_the_map_as_a_whole_has_drifted_no_photo_is_within() -> None:
-    assert rows_within(bent([0.01, 0.01]), [0, 1], relative(0.3), BUDGET_M) == []
+    assert rows_within(bent([0.01, 0.01]), [0, 1], relative(0.3), BENDING_M, BUDGET_M) == []
 
 
 @pytest.mark.parametrize(("drift_m", "passes"), [(0.5, True), (0.51, False)])
@@ -67,7 +65,15 @@ def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) ->
 
     def grown(part: Any, *_: object) -> GrownMap:
         left_out = {3: ("WEAK_LINK", "little")} if 3 in part.rows else {}
-        return GrownMap(feature_map=part, placement=placement, model=part, left_out=left_out)
+        return GrownMap(
+            feature_map=part,
+            placement=placement,
+            model=part,
+            left_out=left_out,
+            poses=np.zeros((0, 6, 6)),
+            bending_m=BENDING_M,
+            shared_turn=np.zeros((7, 3)),
+        )
 
     def cut(part: Any, rows: list[int], least: int) -> Any:
         return SimpleNamespace(rows=np.array([0, 1, 2]))  # 4 hangs on nothing that is left

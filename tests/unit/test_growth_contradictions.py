@@ -39,7 +39,7 @@ def posed(count: int) -> tuple[Model, list[Rigid3]]:
     return replace(model_of(*[range(5)] * count), cam_from_sfm=tuple(poses)), poses
 
 
-def drawn(rng: np.random.Generator, row: int, pose: Rigid3, scale: float = 1.0) -> LocalisedPhoto:
+def drawn(rng: np.random.Generator, pose: Rigid3, scale: float = 1.0) -> LocalisedPhoto:
     """The photo, localised at the pose with errors of both covariances times the scale."""
     own, refined = (scale * np.linalg.cholesky(c) @ rng.normal(size=6) for c in (LOCALISED, REFINED))
     # The refined pose's covariance is that of exp(d) cam_from_local, in axes of the camera.
@@ -47,14 +47,14 @@ def drawn(rng: np.random.Generator, row: int, pose: Rigid3, scale: float = 1.0) 
     rotation = pose.rotation @ so3_exp(-turn)
     center = pose.center + move
     at = Rigid3(rotation=rotation, translation=-rotation @ center)
-    return localised_photo(row, at, covariance=LOCALISED)
+    return localised_photo(at, covariance=LOCALISED)
 
 
 def found(scale: float, fit: FittedSimilarity, spread: FloatArray | None = None) -> float:
     """Share of 600 photos that contradict."""
     model, poses = posed(600)
     rng = np.random.default_rng(7)
-    photos = {k: drawn(rng, k, pose, scale) for k, pose in enumerate(poses)}
+    photos = {k: drawn(rng, pose, scale) for k, pose in enumerate(poses)}
     spread = np.tile(REFINED, (600, 1, 1)) if spread is None else spread
     return len(contradicting_photos(model, photos, spread, [fit])) / 600
 
@@ -75,7 +75,7 @@ def test_poses_that_share_errors_of_points_are_as_uncertain_as_the_fit_says() ->
 def test_the_larger_of_both_fits_counts() -> None:
     model, poses = posed(50)
     rng = np.random.default_rng(7)
-    photos = {k: drawn(rng, k, pose, 5.0) for k, pose in enumerate(poses)}
+    photos = {k: drawn(rng, pose, 5.0) for k, pose in enumerate(poses)}
     spread = np.tile(REFINED, (50, 1, 1))
     alone = contradicting_photos(model, photos, spread, [fit_of()])
     before = fit_of(spread=2.0, neighbours_factor=40.0)
@@ -93,7 +93,7 @@ def test_only_photos_that_are_asked_are_named_and_with_figures() -> None:
         rotation=poses[1].rotation, translation=poses[1].translation + poses[1].rotation @ [0, 3, 0]
     )
     spread = np.tile(REFINED, (3, 1, 1))
-    named = contradicting_photos(model, {1: localised_photo(1, away)}, spread, [fit_of()])
+    named = contradicting_photos(model, {1: localised_photo(away)}, spread, [fit_of()])
     assert list(named) == [1]
     assert "3.00 m and 0.00 degrees" in named[1]
     assert contradicting_photos(model, {}, spread, [fit_of()]) == {}
@@ -104,7 +104,7 @@ def test_the_limit_is_that_of_so_many_sigmas(sigmas: float, monkeypatch: pytest.
     monkeypatch.setattr(gates, "SIGMAS", sigmas)
     model, poses = posed(400)
     rng = np.random.default_rng(9)
-    photos = {k: drawn(rng, k, pose) for k, pose in enumerate(poses)}
+    photos = {k: drawn(rng, pose) for k, pose in enumerate(poses)}
     named = contradicting_photos(model, photos, np.tile(REFINED, (400, 1, 1)), [fit_of()])
     expected = {1.0: 0.317, 6.0: 0.0}[sigmas]
     assert len(named) / 400 == pytest.approx(expected, abs=0.08)

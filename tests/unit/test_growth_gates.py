@@ -21,12 +21,6 @@ def test_a_third_of_the_photos_may_disagree() -> None:
     assert "2 of 4" in refused.message
 
 
-def test_residuals() -> None:
-    assert gates.residuals(0.4, 50.0).passes
-    assert not gates.residuals(0.6, 50.0).passes
-    assert not gates.residuals(float("nan"), 50.0).passes
-
-
 def test_a_lying_geotag_of_one_photo_does_not_matter() -> None:
     spread = np.tile(np.eye(2) * 25.0, (4, 1, 1))
     liar = np.array([[3.0, 1.0], [-2.0, 4.0], [5000.0, 0.0]])
@@ -59,8 +53,8 @@ def test_more_wrong_geotags_than_come_by_accident_are_none() -> None:
 
 
 def test_geotags_count_by_their_own_sigma() -> None:
-    """Chi-square of (20, 0) is 16 at a sigma of 5 m and 25 at 4 m; the limit is 18.42."""
-    offsets = np.tile([[20.0, 0.0]], (3, 1))
+    """Chi-square of (15, 0) is 9 at a sigma of 5 m and 14 at 4 m; the limit is 11.8."""
+    offsets = np.tile([[15.0, 0.0]], (3, 1))
     assert gates.geotags(offsets, np.tile(np.eye(2) * 25.0, (3, 1, 1))).passes
     assert not gates.geotags(offsets, np.tile(np.eye(2) * 16.0, (3, 1, 1))).passes
 
@@ -81,10 +75,10 @@ def test_limit_of_three_sigmas_by_degrees_of_freedom() -> None:
 
 
 def test_first_refusal_and_json() -> None:
-    asked = (gates.agreement(3, 0), gates.residuals(9.0, 10.0))
+    asked = (gates.agreement(3, 0), gates.drift(0.9, 0.5))
     refusal = gates.first_refusal(asked)
     assert refusal is not None
-    assert refusal.name == "residuals"
+    assert refusal.name == "drift"
     assert gates.first_refusal(asked[:1]) is None
-    assert asked[1].as_json() == {"figure": 0.9, "limit": 0.01, "passes": False}
-    assert gates.residuals(0.1, 0.0).as_json()["figure"] is None
+    assert asked[1].as_json() == {"figure": 0.9, "limit": 0.5, "passes": False}
+    assert gates.drift(float("nan"), 0.5).as_json()["figure"] is None

@@ -13,7 +13,7 @@ def test_rays_meet_in_the_points() -> None:
     points = box_points(np.random.default_rng(1), 50)
     a, b = ring(8)[:2]
     pixels = [CAMERA.project(pose.act(points)) for pose in (a, b)]
-    found, angle = intersections(CAMERA, a, pixels[0], CAMERA, b, pixels[1])
+    found, angle = intersections((localised_photo(a), localised_photo(b)), (pixels[0], pixels[1]))
     assert np.abs(found - points).max() < 1e-6
     expected = [
         np.arccos(
@@ -29,7 +29,7 @@ def test_rays_from_one_spot_have_no_angle() -> None:
     (a,) = ring(1)
     turned = Rigid3.exp([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]) @ a
     pixels = [CAMERA.project(pose.act(points)) for pose in (a, turned)]
-    _, angle = intersections(CAMERA, a, pixels[0], CAMERA, turned, pixels[1])
+    _, angle = intersections((localised_photo(a), localised_photo(turned)), (pixels[0], pixels[1]))
     assert angle.max() < 1e-3
 
 
@@ -47,4 +47,4 @@ def test_when_matches_bear_two_poses_out(wrong: int, apart: bool, agrees: bool) 
     a, b = ring(8)[:2] if apart else ring(8)[:1] * 2
     pixels = CAMERA.project(a.act(points))
     others = CAMERA.project(b.act(np.concatenate([np.roll(points[:wrong], 1, axis=0), points[wrong:]])))
-    assert poses_fit(localised_photo(0, a), localised_photo(1, b), pixels, others) is agrees
+    assert poses_fit(localised_photo(a), localised_photo(b), pixels, others) is agrees

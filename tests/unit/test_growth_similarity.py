@@ -187,7 +187,6 @@ def test_anchors_are_carried_along_tracks() -> None:
     rows = np.arange(20)
     world_rows = new.world_of[0][rows]
     photo = localised_photo(
-        0,
         new.poses[0],
         camera=new.model.cameras[0],
         feature_rows=rows,

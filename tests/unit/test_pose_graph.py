@@ -4,18 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.growth.graph.pose_graph import (
-    GraphEdge,
-    GraphNode,
-    left_jacobian,
-    small_adjoint,
-    solve_pose_graph,
-)
+from ingest.growth.graph.pose_graph import GraphEdge
+from tests.support.pose_graphs import GraphNode, solved
 
 _SIGMA = np.array([1e-4, 2e-4, 2e-4, 3e-4, 0.03, 0.02, 0.04])
 _EDGE = np.diag(_SIGMA**2)
@@ -30,27 +24,10 @@ def _east(metres: float) -> tuple[float, ...]:
     return (0.0, 0.0, 0.0, 0.0, metres, 0.0, 0.0)
 
 
-def test_small_adjoint_is_the_derivative_of_the_adjoint() -> None:
-    tangent = np.array([0.3, 0.5, -0.2, 0.7, 1.0, 2.0, -3.0])
-    np.testing.assert_allclose(expm(small_adjoint(tangent)), Sim3.exp(tangent).adjoint(), atol=1e-12)
-
-
-@pytest.mark.parametrize("scale", [0.0, 0.2, 1.0])
-def test_left_jacobian_against_differences(scale: float) -> None:
-    tangent = scale * np.array([0.3, 0.5, -0.2, 0.7, 1.0, 2.0, -3.0])
-    base = Sim3.exp(tangent).inverse()
-    for k in range(7):
-        step = np.zeros(7)
-        step[k] = 1e-6
-        forward = (Sim3.exp(tangent + step) @ base).log()
-        back = (Sim3.exp(tangent - step) @ base).log()
-        np.testing.assert_allclose((forward - back) / 2e-6, left_jacobian(tangent)[:, k], atol=1e-7)
-
-
 def test_a_chain_of_n_edges_has_n_times_the_covariance() -> None:
     nodes = [GraphNode(map_id="A", prior=_TIGHT), *(GraphNode(map_id=f"m{k}") for k in range(5))]
     edges = [_edge(f"m{k}", "A" if k == 0 else f"m{k - 1}") for k in range(5)]
-    found = solve_pose_graph(nodes, edges)
+    found = solved(nodes, edges)
     assert found.reason is None
     for k in range(5):
         np.testing.assert_allclose(found.covariance_relative[f"m{k}"], (k + 1) * _EDGE, rtol=1e-6, atol=1e-15)
@@ -64,7 +41,7 @@ def test_an_anchor_at_the_far_end_halves_the_middle() -> None:
     nodes += [GraphNode(map_id=f"m{k}") for k in range(1, 4)]
     names = ["A", "m1", "m2", "m3", "B"]
     edges = [_edge(b, a) for a, b in itertools.pairwise(names)]
-    found = solve_pose_graph(nodes, edges)
+    found = solved(nodes, edges)
     for k in range(1, 4):
         np.testing.assert_allclose(
             found.covariance_relative[f"m{k}"], k * (4 - k) / 4 * _EDGE, rtol=1e-6, atol=1e-15
@@ -78,7 +55,7 @@ def test_the_drift_of_a_chain_is_spread_over_its_edges() -> None:
     nodes += [GraphNode(map_id=f"m{k}") for k in range(1, 4)]
     # The chain drifted 0.08 m east by B, whose overlap with m3 says so.
     edges = [_edge("m1", "A"), _edge("m2", "m1"), _edge("m3", "m2"), _edge("m3", "B", _east(-0.08))]
-    found = solve_pose_graph(nodes, edges)
+    found = solved(nodes, edges)
     assert found.reason is None
     for k in range(1, 4):
         np.testing.assert_allclose(found.corrections[f"m{k}"].log()[4:], [-0.02 * k, 0.0, 0.0], atol=1e-6)
@@ -95,7 +72,7 @@ def test_general_similarities_are_recovered() -> None:
     pairs = [("b", "a"), ("c", "b"), ("d", "c"), ("d", "a"), ("c", "a")]
     edges = [GraphEdge(a=i, b=j, b_from_a=truth[j].inverse() @ truth[i], covariance=_EDGE) for i, j in pairs]
     nodes = [GraphNode(map_id=m, prior=_TIGHT if m == "a" else None) for m in "abcd"]
-    found = solve_pose_graph(nodes, edges)
+    found = solved(nodes, edges)
     assert found.chi_square < 1e-6
     for m in "bcd":
         np.testing.assert_allclose(found.corrections[m].matrix(), truth[m].matrix(), atol=1e-6)
@@ -114,17 +91,17 @@ def test_covariance_is_that_of_many_trials(monkeypatch: pytest.MonkeyPatch) -> N
     nodes = [GraphNode(map_id="a", prior=_TIGHT), GraphNode(map_id="b"), GraphNode(map_id="c")]
     pairs = [("b", "a"), ("c", "b"), ("c", "a")]
 
-    def solved(noise: bool) -> tuple[dict[str, Sim3], dict[str, FloatArray]]:
+    def drawn(noise: bool) -> tuple[dict[str, Sim3], dict[str, FloatArray]]:
         edges = []
         for i, j in pairs:
             xi = rng.normal(0, _SIGMA) if noise else np.zeros(7)
             measured = Sim3.exp(xi) @ truth[j].inverse() @ truth[i]
             edges.append(GraphEdge(a=i, b=j, b_from_a=measured, covariance=_EDGE))
-        found = solve_pose_graph(nodes, edges)
+        found = solved(nodes, edges)
         return dict(found.corrections), dict(found.covariance)
 
-    _, covariance = solved(noise=False)
-    samples = [solved(noise=True)[0] for _ in range(40)]
+    _, covariance = drawn(noise=False)
+    samples = [drawn(noise=True)[0] for _ in range(40)]
     for m in "bc":
         errors = np.array([(s[m] @ truth[m].inverse()).log() for s in samples])
         whitened = errors @ np.linalg.inv(np.linalg.cholesky(covariance[m])).T
@@ -143,7 +120,7 @@ def _square(wrong: tuple[float, ...]) -> tuple[list[GraphNode], list[GraphEdge]]
 
 
 def test_an_edge_that_contradicts_the_rest_is_named_and_left_out() -> None:
-    found = solve_pose_graph(*_square(_east(5.0)))
+    found = solved(*_square(_east(5.0)))
     assert found.reason is None
     assert [str(edge) for edge in found.left_out] == ["m3 - m1"]
     for m in ("m1", "m2", "m3"):
@@ -151,7 +128,7 @@ def test_an_edge_that_contradicts_the_rest_is_named_and_left_out() -> None:
 
 
 def test_an_edge_within_its_noise_is_kept() -> None:
-    found = solve_pose_graph(*_square(_east(0.03)))
+    found = solved(*_square(_east(0.03)))
     assert found.reason is None
     assert found.left_out == ()
     assert found.chi_square > 0
@@ -164,7 +141,7 @@ def _loop(closing_m: float) -> tuple[list[GraphNode], list[GraphEdge]]:
 
 def test_a_loop_that_misses_by_more_than_its_noise_widens_all_covariances() -> None:
     """Either edge explains it alike, so none is left out; the middle is taken, less sure of itself."""
-    found = solve_pose_graph(*_loop(0.4))
+    found = solved(*_loop(0.4))
     assert found.reason is None
     assert found.left_out == ()
     chi_square = 0.4**2 / (2 * _SIGMA[4] ** 2)
@@ -174,7 +151,7 @@ def test_a_loop_that_misses_by_more_than_its_noise_widens_all_covariances() -> N
 
 
 def test_a_loop_that_misses_by_far_is_refused_with_its_edges() -> None:
-    found = solve_pose_graph(*_loop(30.0))
+    found = solved(*_loop(30.0))
     assert found.reason == "CONTRADICTION"
     assert "m - A" in found.message
     assert "m - B" in found.message
@@ -183,9 +160,9 @@ def test_a_loop_that_misses_by_far_is_refused_with_its_edges() -> None:
 
 def test_maps_without_an_anchor_stay() -> None:
     nodes = [GraphNode(map_id="A", prior=_TIGHT), *(GraphNode(map_id=m) for m in ("m", "x", "y"))]
-    found = solve_pose_graph(nodes, [_edge("m", "A"), _edge("x", "y")])
+    found = solved(nodes, [_edge("m", "A"), _edge("x", "y")])
     assert set(found.corrections) == {"A", "m"}
-    nothing = solve_pose_graph(nodes[1:], [_edge("x", "y")])
+    nothing = solved(nodes[1:], [_edge("x", "y")])
     assert nothing.reason == "NO_ANCHOR"
 
 
@@ -194,7 +171,7 @@ def test_anchors_give_way_within_their_own_covariance() -> None:
     loose = np.diag(np.repeat([1e-3, 3.0], [4, 3]) ** 2)
     firm = np.diag(np.repeat([1e-5, 0.03], [4, 3]) ** 2)
     nodes = [GraphNode(map_id="gps", prior=loose), GraphNode(map_id="lidar", prior=firm)]
-    found = solve_pose_graph(nodes, [_edge("gps", "lidar", _east(2.0), _TIGHT)])
+    found = solved(nodes, [_edge("gps", "lidar", _east(2.0), _TIGHT)])
     assert found.corrections["gps"].log()[4] == pytest.approx(2.0, abs=0.01)
     assert abs(found.corrections["lidar"].log()[4]) < 0.01
 
@@ -203,7 +180,7 @@ def test_an_anchor_that_was_moved_remembers_its_own_placement() -> None:
     """Moved 2 m by an earlier graph; with the same overlap again nothing moves or is counted twice."""
     loose = np.diag(np.repeat([1e-3, 3.0], [4, 3]) ** 2)
     firm = np.diag(np.repeat([1e-5, 0.03], [4, 3]) ** 2)
-    first = solve_pose_graph(
+    first = solved(
         [GraphNode(map_id="gps", prior=loose), GraphNode(map_id="lidar", prior=firm)],
         [_edge("gps", "lidar", _east(2.0), _TIGHT)],
     )
@@ -212,7 +189,7 @@ def test_an_anchor_that_was_moved_remembers_its_own_placement() -> None:
         for m, prior in (("gps", loose), ("lidar", firm))
     ]
     measured = first.corrections["lidar"] @ Sim3.exp(_east(2.0)) @ first.corrections["gps"].inverse()
-    again = solve_pose_graph(nodes, [GraphEdge(a="gps", b="lidar", b_from_a=measured, covariance=_TIGHT)])
+    again = solved(nodes, [GraphEdge(a="gps", b="lidar", b_from_a=measured, covariance=_TIGHT)])
     np.testing.assert_allclose(again.corrections["gps"].matrix(), np.eye(4), atol=1e-6)
     np.testing.assert_allclose(again.covariance["gps"], first.covariance["gps"], rtol=1e-3, atol=1e-9)
 
@@ -223,13 +200,13 @@ def test_a_large_graph_takes_the_sparse_way_to_the_same_answer() -> None:
     nodes += [GraphNode(map_id=f"m{k}") for k in range(1, count)]
     names = ["A", *(f"m{k}" for k in range(1, count)), "B"]
     edges = [_edge(b, a) for a, b in itertools.pairwise(names)]
-    found = solve_pose_graph(nodes, edges)
+    found = solved(nodes, edges)
     np.testing.assert_allclose(found.covariance_relative["m100"], 50 * _EDGE, rtol=1e-5, atol=1e-14)
 
 
 def test_unknown_and_repeated_maps_are_refused() -> None:
     node = GraphNode(map_id="A", prior=_TIGHT)
     with pytest.raises(InvalidValueError, match="unknown"):
-        solve_pose_graph([node], [_edge("A", "nobody")])
+        solved([node], [_edge("A", "nobody")])
     with pytest.raises(InvalidValueError, match="repeat"):
-        solve_pose_graph([node, node], [])
+        solved([node, node], [])

@@ -11,8 +11,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.growth.graph.map_graph import in_graph
-from ingest.growth.graph.pose_graph import GraphEdge, GraphNode, GraphSolution, solve_pose_graph
+from ingest.growth.graph.pose_graph import GraphEdge, GraphSolution
 from ingest.growth.values import Edge
+from tests.support.pose_graphs import GraphNode, solved
 
 MAPS, STEP_M = 12, 30.0
 OWN = np.diag(np.array([1e-5, 5e-5, 5e-5, 5e-5, 0.005, 0.005, 0.005]) ** 2)
@@ -42,7 +43,7 @@ def chain(errors: FloatArray, said: bool, far_anchor: bool = False) -> GraphSolu
                 shared=common if said else np.zeros((7, 3)),
             )
         )
-    return solve_pose_graph(nodes, edges)
+    return solved(nodes, edges)
 
 
 def drawn(rng: np.random.Generator, count: int = MAPS) -> FloatArray:

@@ -98,6 +98,10 @@ def test_without_the_extra_a_map_with_a_scan_waits(monkeypatch: pytest.MonkeyPat
         feature_map=known,
         placement=placement,
         model=model_of(known, known.points_local(), known.images, described=False),
+        poses=np.zeros((0, 6, 6)),
+        bending_m=0.0,
+        shared_turn=np.zeros((7, 3)),
+        left_out={},
     )
     database: Any = SimpleNamespace(has=lambda _: True)
     monkeypatch.setattr(scan_check, "load_cloud", lambda *_: world.cloud)

@@ -9,7 +9,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.vocabulary import shipped_vocabulary
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from ingest.growth.place.scene_elsewhere import SceneElsewhere, chance_of_offset, same_scene_elsewhere
+from ingest.scene_elsewhere import SceneElsewhere, chance_of_offset, same_scene_elsewhere
 from tests.support.scene_strip import strip_map
 
 _GPS = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 3.0, 3.0, 5.0]) ** 2

@@ -6,7 +6,7 @@ its digest of place differs, and the edge has to be measured again.
 
 import hashlib
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
-from ingest.growth.graph.pose_graph import GraphEdge, GraphNode, GraphSolution, solve_pose_graph
+from ingest.growth.graph.pose_graph import WORLD, GraphEdge, GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
 from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
@@ -114,28 +114,44 @@ def place_key(frame: LocalFrame, placement: Placement) -> str:
     return hashlib.sha256(np.array(numbers, dtype="<f8").tobytes()).hexdigest()[:16]
 
 
-def family(maps: Mapping[str, PlacedMap], edges: Iterable[tuple[str, str]], start: Iterable[str]) -> set[str]:
-    """Maps that are connected with those of `start` by edges, those among them."""
-    nodes = list(maps)
-    among = [(a, b) for a, b in edges if a in maps and b in maps]
-    group_of = dict(zip(nodes, tied_together(nodes, among), strict=True))
-    groups = {group_of[m] for m in start if m in maps}
-    return {m for m in nodes if group_of[m] in groups}
-
-
 def holds(maps: Mapping[str, PlacedMap], edge: Edge) -> bool:
     """Whether the other map is where it was when the overlap was measured."""
     return edge.map_id in maps and maps[edge.map_id].place == edge.place
 
 
-def graph_edges(maps: Mapping[str, PlacedMap], of: Iterable[str], frame: LocalFrame) -> list[GraphEdge]:
-    """Edges that still hold, in one frame."""
-    return [
-        in_graph(map_id, edge, maps[map_id].frame, frame)
-        for map_id in of
-        for edge in maps[map_id].edges
-        if holds(maps, edge)
+def solve_maps(
+    maps: Mapping[str, PlacedMap], new: Mapping[str, Sequence[Edge]], frame: LocalFrame
+) -> GraphSolution:
+    """The graph of the maps that overlaps connect with those of `new`, overlaps that hold and new ones.
+
+    Args:
+        new: overlaps by the map that has them; one that is not placed yet lies in `frame`, the graph's.
+    """
+    overlaps = [(m, e) for m, placed in maps.items() for e in placed.edges if holds(maps, e)]
+    overlaps += [(m, e) for m, own in new.items() for e in own if e.map_id in maps]
+    names = [*maps, *(m for m in new if m not in maps)]
+    groups = tied_together(names, [(m, e.map_id) for m, e in overlaps])
+    group_of = dict(zip(names, groups, strict=True))
+    wanted = {group_of[m] for m in new}
+    members = sorted(m for m in names if group_of[m] in wanted)
+    edges = [
+        in_graph(m, edge, maps[m].frame if m in maps else frame, frame)
+        for m, edge in overlaps
+        if group_of[m] in wanted
     ]
+    edges += [_placement(m, maps[m], frame) for m in members if m in maps and maps[m].is_anchor]
+    return solve_pose_graph(members, edges)
+
+
+def _placement(map_id: str, anchor: PlacedMap, frame: LocalFrame) -> GraphEdge:
+    """An anchor's own placement: where others have moved it, their edges say so anew."""
+    covariance, moved = anchor.own_placement
+    return GraphEdge(
+        a=map_id,
+        b=WORLD,
+        b_from_a=in_frame(moved, anchor.frame, frame).inverse(),
+        covariance=covariance_in_frame(covariance, anchor.frame, frame),
+    )
 
 
 def in_graph(map_id: str, edge: Edge, own: LocalFrame, frame: LocalFrame) -> GraphEdge:
@@ -147,31 +163,6 @@ def in_graph(map_id: str, edge: Edge, own: LocalFrame, frame: LocalFrame) -> Gra
         covariance=covariance_in_frame(edge.covariance, own, frame),
         shared=Sim3.from_rigid3(frame.enu_from(own)).adjoint() @ edge.shared,
     )
-
-
-def graph_nodes(maps: Mapping[str, PlacedMap], of: Iterable[str], frame: LocalFrame) -> list[GraphNode]:
-    """Nodes; anchors with their own placement: where others have moved one, the edges say so anew."""
-    nodes = []
-    for map_id in of:
-        me, node = maps[map_id], GraphNode(map_id=map_id)
-        if me.is_anchor:
-            covariance, moved = me.own_placement
-            prior = covariance_in_frame(covariance, me.frame, frame)
-            node = replace(node, prior=prior, present_from_own=in_frame(moved, me.frame, frame))
-        nodes.append(node)
-    return nodes
-
-
-def solve_with_new(
-    maps: Mapping[str, PlacedMap], map_id: str, edges: Sequence[Edge], frame: LocalFrame
-) -> GraphSolution:
-    """The graph with one more map, in that map's frame. Edges name existing maps."""
-    pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges]
-    members = sorted(family(maps, pairs, [e.map_id for e in edges]) - {map_id})
-    nodes = [*graph_nodes(maps, members, frame), GraphNode(map_id=map_id)]
-    known = [e for e in graph_edges(maps, members, frame) if map_id not in (e.a, e.b)]
-    new = [in_graph(map_id, e, frame, frame) for e in edges if e.map_id in members]
-    return solve_pose_graph(nodes, [*known, *new])
 
 
 def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
@@ -216,7 +207,7 @@ def grow_within_budget(
     refused = Refused(reason="", message="")
     for _ in range(_TRIES):
         try:
-            grown = grow_component(part, photos, features_of, localised, areas, identity, budget_m)
+            grown = grow_component(part, photos, features_of, localised, areas, identity)
         except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
             _LOG.exception("a reconstruction of %d photos", len(everything))
             text = f"{type(error).__name__}: {error}; the log tells where. Please report it"
@@ -229,7 +220,7 @@ def grow_within_budget(
             return replace(grown, feature_map=feature_map, left_out={**beyond, **grown.left_out})
         refused = Refused.by(gate, *grown.placement.gates, rows=everything)
         rows = [int(r) for r in grown.model.rows]
-        within = rows_within(feature_map, rows, relative, budget_m)
+        within = rows_within(feature_map, rows, relative, grown.bending_m, budget_m)
         left = keep_photos(part, within, least=LEAST_PHOTOS) if len(within) < len(rows) else None
         if left is None:
             break
@@ -245,10 +236,9 @@ def with_drift(
     """The map with its overlaps by the graph of maps, its drift (m) and covariance (7, 7) to anchors."""
     feature_map = grown.feature_map
     growth = growth_of(feature_map.placement.evidence)
-    shared = np.reshape(growth["shared_turn"], (7, 3))
     edges = no_surer_than(
         [
-            replace(edge, place=maps[edge.map_id].place, shared=shared)
+            replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn)
             for edge in grown.placement.edges
             if edge.map_id in maps
         ],
@@ -256,7 +246,8 @@ def with_drift(
     )
     covariance = feature_map.placement.covariance
     relative = np.reshape(growth["covariance_relative"], (7, 7))
-    solution = solve_with_new(maps, feature_map.map_id, edges, feature_map.frame)
+    others = {m: placed for m, placed in maps.items() if m != feature_map.map_id}
+    solution = solve_maps(others, {feature_map.map_id: edges}, feature_map.frame)
     if solution.reason is None and feature_map.map_id in solution.covariance:
         covariance = solution.covariance[feature_map.map_id]
         relative = solution.covariance_relative[feature_map.map_id]
@@ -274,7 +265,7 @@ def with_drift(
 
 
 def rows_within(
-    feature_map: FeatureMap, rows: Sequence[int], relative: FloatArray, budget_m: float
+    feature_map: FeatureMap, rows: Sequence[int], relative: FloatArray, bending_m: float, budget_m: float
 ) -> list[int]:
     """Rows of the photos that are within the budget, each with its own bending in place of the largest.
 
@@ -282,7 +273,7 @@ def rows_within(
         rows: of the map's images, in their order.
         relative: (7, 7) covariance of the map relative to the anchors, with its bending.
     """
-    bending_m2 = float(growth_of(feature_map.placement.evidence)["bending_m"]) ** 2
+    bending_m2 = bending_m**2
     as_a_whole = relative - np.diag([0.0] * 4 + [bending_m2] * 3)
     points = feature_map.points_local()
     seen = feature_map.observations

@@ -19,15 +19,13 @@ from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import (
     OWN,
     PlacedMap,
-    family,
-    graph_edges,
-    graph_nodes,
     holds,
-    in_graph,
     place_key,
     placed_maps,
+    solve_maps,
 )
-from ingest.growth.graph.pose_graph import GraphSolution, solve_pose_graph
+from ingest.growth.graph.pose_graph import GraphSolution
+from ingest.growth.map_images import NEAR_M
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
 from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun, check_known
@@ -36,7 +34,6 @@ from ingest.growth.values import Edge
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
-_GAP_M = 5.0  # boxes of a grown map and a new anchor that come this close are looked at for an overlap
 _LEAST_MOVE_M = 0.01  # anchors that would move by less stay where they are
 _SAME_M = 1e-6  # an answer that moves by less was not touched
 
@@ -94,13 +91,8 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
     edges = _measured(snapshot, maps, overlaps_to_measure(maps), work)
     if not edges:
         return None
-    pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges if holds(maps, e)]
-    pairs += [(m, e.map_id) for m, own in edges.items() for e in own]
-    members = sorted(family(maps, pairs, edges))
-    frame = maps[next((m for m in members if maps[m].is_anchor), members[0])].frame
-    new = [in_graph(m, e, maps[m].frame, frame) for m, own in edges.items() for e in own]
-    known = graph_edges(maps, members, frame)
-    solution = solve_pose_graph(graph_nodes(maps, members, frame), [*known, *new])
+    frame = maps[min(edges)].frame
+    solution = solve_maps(maps, edges, frame)
     told = Replacement(
         reason=solution.reason,
         message=solution.message,
@@ -145,7 +137,7 @@ def _touch(a: PlacedMap, b: PlacedMap) -> bool:
     if not len(a.corners) or not len(b.corners):
         return False
     other = a.frame.enu_from(b.frame).act(b.corners)
-    low, high = a.corners.min(axis=0)[:2] - _GAP_M, a.corners.max(axis=0)[:2] + _GAP_M
+    low, high = a.corners.min(axis=0)[:2] - NEAR_M, a.corners.max(axis=0)[:2] + NEAR_M
     return bool((other.min(axis=0)[:2] <= high).all() and (low <= other.max(axis=0)[:2]).all())
 
 
@@ -168,7 +160,7 @@ def _measured(
                 said["edge"] = replace(found, place=maps[other_id].place).as_json()
                 said["note"] = f"{found.photos} images and {found.shared_points} points in common"
             else:
-                said["note"] = found.message
+                said["note"] = found
             remember(work, "overlaps", about, said, places)
         notes.append(f"{map_id} - {other_id}: {said['note']}")
         if said["edge"] is not None:

@@ -1,7 +1,7 @@
 """From a reconstruction of new photos to a map that existing maps have placed, or to the reason why not."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -15,10 +15,10 @@ from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.growth import gates
 from ingest.growth.place.localised import in_frame, with_lens
-from ingest.growth.place.placement import MapsPlacement, parents_covariance, place_by_maps
+from ingest.growth.place.placement import parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
 from ingest.growth.place.similarity_fit import find_correspondences
-from ingest.growth.values import DRIFT_BUDGET_M, LEAST_PHOTOS, FeaturesOf, LocalisedPhoto, Refused
+from ingest.growth.values import LEAST_PHOTOS, FeaturesOf, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
 from ingest.sfm.links import connected_parts, keep_photos
@@ -33,22 +33,14 @@ _MAPS = MapOptions(min_track_length=2)
 # the geotags of a part agree is to choose the photos of whoever lies. Of a block copied elsewhere, half of
 # whose tags were at its twin, the parts with those tags were left over, small enough for one forged photo to
 # confirm them: twelve photos promoted 277 m off.
-AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "RESIDUALS", "NOT_VISIBLE")
+AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "CONTRADICTS", "NOT_VISIBLE")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GrownMap:
-    """A new map, ready to be committed (as quarantined, by whoever commits it).
-
-    Attributes:
-        model: the reconstruction after refinement; metric, in the frame of the map.
-        left_out: photos of the reconstruction that are not in the map, by row, with reason and message.
-    """
+class GrownMap(Refinement):
+    """A refined reconstruction and its map, ready to be committed (as quarantined, by whoever commits it)."""
 
     feature_map: FeatureMap
-    placement: MapsPlacement
-    model: Model
-    left_out: Mapping[int, tuple[str, str]] = field(default_factory=dict)
 
 
 def grow_component(
@@ -58,7 +50,6 @@ def grow_component(
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     identity: MapIdentity | None,
-    max_bound_m: float = DRIFT_BUDGET_M,
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
 
@@ -70,7 +61,6 @@ def grow_component(
         areas: of the active maps, as `localised` had them.
         identity: of the map; None: it is named by the photos that were tried, so that the same ones give the
             same map.
-        max_bound_m: photos that may be further off (95 %) are left out.
     """
     rows = tuple(int(r) for r in model.rows)
     mine = {r: localised[r] for r in rows if r in localised}
@@ -87,7 +77,7 @@ def grow_component(
     placement = place_by_maps(model, mine, correspondences, photos, near, frame)
     if placement.reason is not None:
         return Refused(reason=placement.reason, message=placement.message, rows=rows, gates=placement.gates)
-    refined = refine_placed(model, placement, correspondences, mine, keypoints, lenses, max_bound_m)
+    refined = refine_placed(model, placement, correspondences, mine, keypoints, lenses)
     if isinstance(refined, Refused):
         return refined
     named = identity or _named([photos[r] for r in rows])
@@ -144,8 +134,6 @@ def _assembled(
     growth = {
         "covariance_relative": to_anchors.ravel().tolist(),
         "gates": gates.figures(placement.gates),
-        "bending_m": refined.bending_m,
-        "shared_turn": refined.shared_turn.ravel().tolist(),
     }
     images = tuple(  # they know what their lenses leave open; as they were where nothing is known
         replace(image, covariance=own) if np.isfinite(own).all() else image
@@ -160,12 +148,7 @@ def _assembled(
         images=images,
         provenance=without_modes(feature_map.provenance),
     )
-    return GrownMap(
-        feature_map=grown,
-        placement=placement,
-        model=model,
-        left_out=refined.left_out,
-    )
+    return GrownMap(feature_map=grown, **{f.name: getattr(refined, f.name) for f in fields(refined)})
 
 
 def _named(photos: Sequence[Photo]) -> MapIdentity:

@@ -53,9 +53,9 @@ def contradicting_photos(
         turn = so3_log(own_pose.rotation.T @ pose.rotation)
         offset = np.concatenate([turn, own_pose.center - pose.center])
         into_local = block_diag(pose.rotation.T, pose.rotation.T)
-        by_focal = pose_by_focal(photo) * _FOCAL_REL
-        by_lens = pose_by_lens(photo, model.cameras[int(model.camera_of[k])])
-        lenses = np.outer(by_focal, by_focal) + np.outer(by_lens, by_lens)
+        longer = photo.camera.with_focal((1.0 + _FOCAL_REL) * photo.camera.focal_px)
+        refined = model.cameras[int(model.camera_of[k])]
+        lenses = sum(np.outer(by, by) for by in (pose_by_lens(photo, lens) for lens in (longer, refined)))
         own = into_local @ (np.nan_to_num(spread[k]) + lenses) @ into_local.T
         square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
         if square > limit:
@@ -67,26 +67,13 @@ def contradicting_photos(
     return found
 
 
-def center_variance_m2(photo: LocalisedPhoto) -> float:
-    """Of a localised centre, all axes together, with what its focal length may be off."""
-    moved = pose_by_focal(photo)[3:] * _FOCAL_REL
-    return float(np.trace(photo.covariance[3:, 3:]) + moved @ moved)
+def pose_by_lens(photo: LocalisedPhoto, lens: Camera) -> FloatArray:
+    """(6,) how far a localised pose is off (left perturbation), if the photo's lens is another one.
 
-
-def pose_by_focal(photo: LocalisedPhoto) -> FloatArray:
-    """(6,) how a localised pose moves (left perturbation) as its focal length grows by its own size."""
-    middle = photo.camera.project(np.array([[0.0, 0.0, 1.0]]))
-    return _pose_by_pixels(photo, photo.pixels - middle)
-
-
-def pose_by_lens(photo: LocalisedPhoto, refined: Camera) -> FloatArray:
-    """(6,) how far a localised pose is off, if the lens that it was localised with is not the refined one."""
+    The change of pose that moves the pixels of its points most alike.
+    """
     seen = photo.cam_from_local.act(photo.points)
-    return _pose_by_pixels(photo, refined.project(seen) - photo.camera.project(seen))
-
-
-def _pose_by_pixels(photo: LocalisedPhoto, moved_px: FloatArray) -> FloatArray:
-    """(6,) the change of pose (left perturbation) that moves the pixels (k, 2) of its points most alike."""
+    moved_px = lens.project(seen) - photo.camera.project(seen)
     count = len(photo.pixels)
     if count < 4:
         return np.zeros(6)

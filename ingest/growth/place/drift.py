@@ -16,12 +16,12 @@ from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import Marks, Terms
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap.adjust import longest_side, residuals_of
 from ingest.colmap.anchored import MAPPING, FixedPoints, Lenses, block_and_marks
 from ingest.colmap.bridge import Model, with_observations
 from ingest.colmap.precision import design_effect
+from ingest.growth.map_places import turns_about
 
 _LEAST_FREEDOM = 0.1
 _PIECE = 5  # photos; a photo alone says more of its own noise than of where its neighbourhood looks
@@ -173,7 +173,7 @@ def turning_covariance(model: Model, covariance: FloatArray, spread: PhotoSpread
     for turn in spread.turns[seen]:
         values, vectors = np.linalg.eigh(turn - covariance[1:4, 1:4] - more)
         more += (vectors * np.maximum(values, 0.0)) @ vectors.T
-    about = _about(model.centers()[seen].mean(axis=0))
+    about = turns_about(model.centers()[seen].mean(axis=0))
     return np.asarray(about @ more @ about.T)
 
 
@@ -189,12 +189,7 @@ def shared_turn(model: Model, spread: PhotoSpread) -> FloatArray:
     turns = spread.lens_turns[seen]
     values, vectors = np.linalg.eigh(turns[np.argmax(np.trace(turns, axis1=1, axis2=2))])
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return np.asarray(_about(model.centers()[seen].mean(axis=0)) @ root)
-
-
-def _about(middle: FloatArray) -> FloatArray:
-    """(7, 3) left perturbations of rotations about a place."""
-    return np.vstack([np.zeros((1, 3)), np.eye(3), skew(middle)])
+    return np.asarray(turns_about(model.centers()[seen].mean(axis=0)) @ root)
 
 
 def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray) -> float:

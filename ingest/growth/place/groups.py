@@ -11,16 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.anchored import FixedPoints, Lenses, adjust_anchored, pixel_scale, triangulate_posed
 from ingest.colmap.bridge import Model, SfmPhoto, TwoView
+from ingest.growth.gates import AGREEING_SHARE
 from ingest.growth.place.localised import in_frame
 from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, tied_together
 from ingest.sfm.pairs import Pair
 from reloc.localise.pose import reprojection_errors
 
-_LEAST_FITTING = 0.7  # share of a pair's verified matches that must fit the poses
 # Median between the rays. Below, any two photos from one spot fit, and two copies of one picture.
 _LEAST_ANGLE_DEG = 1.0
 
@@ -66,40 +64,33 @@ def lone_groups(
 
 def poses_fit(a: LocalisedPhoto, b: LocalisedPhoto, pixels_a: FloatArray, pixels_b: FloatArray) -> bool:
     """Whether the verified matches of two photos, pixels (m, 2) of each, bear out the poses in one frame."""
-    points, angle = intersections(a.camera, a.cam_from_local, pixels_a, b.camera, b.cam_from_local, pixels_b)
+    points, angle = intersections((a, b), (pixels_a, pixels_b))
     fits = np.ones(len(points), dtype=np.bool_)
     for photo, pixels in ((a, pixels_a), (b, pixels_b)):
         errors = reprojection_errors(pixels, points, photo.camera, photo.cam_from_local)
         fits &= errors < TOLERANCE_PX * pixel_scale(photo.camera)
-    enough = fits.sum() >= _LEAST_FITTING * len(fits)
+    enough = fits.sum() >= AGREEING_SHARE * len(fits)
     return bool(enough and np.degrees(np.median(angle[fits])) >= _LEAST_ANGLE_DEG)
 
 
 def intersections(
-    camera_a: Camera,
-    pose_a: Rigid3,
-    pixels_a: FloatArray,
-    camera_b: Camera,
-    pose_b: Rigid3,
-    pixels_b: FloatArray,
+    photos: tuple[LocalisedPhoto, LocalisedPhoto], pixels: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Midpoints (m, 3) of the shortest lines between the rays of pixel pairs, and the rays' angles (rad)."""
-    ray_a, ray_b = _rays(camera_a, pose_a, pixels_a), _rays(camera_b, pose_b, pixels_b)
-    base = pose_b.center - pose_a.center
-    cosine = np.einsum("mi,mi->m", ray_a, ray_b)
+    """Midpoints (m, 3) of the shortest lines between the rays of pixel pairs, and the rays' angles (rad).
+
+    The lens may not reach a pixel; its ray is the optical axis.
+    """
+    poses, rays = [photo.cam_from_local for photo in photos], []
+    for photo, pose, xy in zip(photos, poses, pixels, strict=True):
+        ray = np.column_stack([np.nan_to_num(photo.camera.unproject(xy)), np.ones(len(xy))]) @ pose.rotation
+        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    base = poses[1].center - poses[0].center
+    cosine = np.einsum("mi,mi->m", *rays)
     sine2 = np.maximum(1.0 - cosine**2, 1e-12)
-    along_a, along_b = ray_a @ base, ray_b @ base
-    depth_a = (along_a - cosine * along_b) / sine2
-    depth_b = (cosine * along_a - along_b) / sine2
-    middle = 0.5 * (pose_a.center + depth_a[:, None] * ray_a + pose_b.center + depth_b[:, None] * ray_b)
-    return middle, np.arccos(np.clip(cosine, -1.0, 1.0))
-
-
-def _rays(camera: Camera, pose: Rigid3, pixels: FloatArray) -> FloatArray:
-    """Unit vectors (m, 3) in the local frame; along the axis for pixels that the lens cannot reach."""
-    xy = np.nan_to_num(camera.unproject(pixels))
-    rays = np.column_stack([xy, np.ones(len(xy))]) @ pose.rotation
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    along = [ray @ base for ray in rays]
+    depths = ((along[0] - cosine * along[1]) / sine2, (cosine * along[0] - along[1]) / sine2)
+    ends = [p.center + d[:, None] * ray for p, d, ray in zip(poses, depths, rays, strict=True)]
+    return 0.5 * (ends[0] + ends[1]), np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def _triangulated(

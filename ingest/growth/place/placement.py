@@ -23,23 +23,16 @@ from featuredb.maps.move import covariance_in_frame
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.gates import Gate
-from ingest.growth.place.contradictions import center_variance_m2
 from ingest.growth.place.similarity_fit import (
     Correspondences,
     FittedSimilarity,
     agreed_similarity,
     fit_similarity,
-    tolerances_px,
 )
-from ingest.growth.values import LEAST_SHARED_POINTS, LEAST_VIEWS, Edge, LocalisedPhoto
+from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto
 from ingest.photos.photo import Photo
 from reloc.localise.acceptance import agreement
 from reloc.localise.matching import EXPECTED_DEG, visible_points
-
-# Least share of the parts that should show points of existing maps or of the photo's own reconstruction. A
-# re-upload 13.3 m off showed 0.17; right photos of that database 0.32 and more, of the one that grew with
-# this limit 0.23 and more.
-_LEAST_SHOWN = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,9 +97,7 @@ def place_by_maps(
     found = agreed_similarity(model, own, correspondences)
     edges: tuple[Edge, ...] = ()
     if found is not None:
-        fit, agree = found
-        used = np.isin(correspondences.photo_of, list(agree)) | correspondences.carried
-        used &= fit.errors_px < tolerances_px(model, correspondences)
+        fit, agree, used = found
         edges = edges_of(model, fit, correspondences, used)
     if found is None or not edges:
         gate = gates.agreement(0, len(own))
@@ -123,21 +114,16 @@ def place_by_maps(
     existing, with_own = _shown_parts(model, sim, held, areas, frame)
     disagree = own.keys() - agree
     # Those that disagree are left out as such.
-    blind = set(np.flatnonzero(with_own < _LEAST_SHOWN).tolist()) - disagree
+    blind = set(np.flatnonzero(with_own < gates.LEAST_VISIBLE).tolist()) - disagree
     blind |= {k for k in agree if existing[k] < gates.LEAST_VISIBLE}
     centers = sim.act(model.centers())
     # From the placed to the localised centres of the photos that agree, metres.
     offsets = np.array([own[k].cam_from_local.center - centers[k] for k in sorted(agree)])
     squared = (offsets**2).sum(axis=1)
-    # Beyond what they are uncertain by: photos at the rim of a map are localised badly, which bends no model.
-    own_m2 = np.array([center_variance_m2(own[k]) for k in sorted(agree)])
-    excess_m = float(np.sqrt(np.median(np.maximum(squared - own_m2, 0.0))))
-    reach = float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1)))
     positions = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
     parents = ", ".join(e.map_id for e in edges)
     asked = (
         gates.agreement(len(agree), len(disagree)),
-        gates.residuals(excess_m, reach),
         gates.geotags(*positions, by=parents),
         gates.visibility(existing[np.isfinite(existing)]),
     )
@@ -245,7 +231,7 @@ def _shown_parts(
         are asked as well: a camera that looks through a wall, and a copy that was joined at a look-alike, fit
         what they see and do not show the rest.
     """
-    often = model.track_lengths() >= LEAST_VIEWS
+    often = model.track_lengths() >= LEAST_PHOTOS
     cones = view_cones(model.xyz, model.centers(), model.point_of, model.photo_of)
     shares = np.full((2, len(model.rows)), np.nan)
     for k, pose in enumerate(model.cam_from_sfm):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from ingest.colmap.anchored import KEYPOINT_PX
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto
@@ -32,7 +33,6 @@ _MOST_SCORED = 3000  # correspondences that judge a proposal; more only take lon
 # A proposal rests on one photo, whose errors it carries far. What is of another place is hundreds of pixels
 # off.
 _LOOSE_PX = 2.0 * TOLERANCE_PX
-_LEAST_SHARE = 0.5  # of a photo's own correspondences that must be within the tolerance for it to agree
 _ROUNDS = 20  # of reweighting; weights settle within ten
 
 
@@ -86,24 +86,12 @@ def find_correspondences(
     """Correspondences of a model's photos, own and carried along its tracks; photos are in one frame.
 
     Args:
+        localised: one of the model's photos at least.
         keypoints: pixels (n, 2) of all features of the model's photos, by row.
     """
     mine = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
     map_ids = tuple(sorted({m for photo in mine.values() for m in photo.map_ids}))
-    none = np.zeros(0, dtype=np.int64)
-    nothing = Correspondences(
-        map_ids=map_ids,
-        photo_of=none,
-        feature=none,
-        pixels=np.zeros((0, 2)),
-        points=np.zeros((0, 3)),
-        covariance=np.zeros((0, 3, 3)),
-        map_of=none,
-        point_of=none,
-        model_point=none,
-        carried=np.zeros(0, dtype=np.bool_),
-    )
-    own = _joined(nothing, *(_own(model, k, photo, map_ids) for k, photo in mine.items()))
+    own = _joined(*(_own(model, k, photo, map_ids) for k, photo in mine.items()))
     return _joined(own, _carried(model, own, keypoints))
 
 
@@ -187,8 +175,8 @@ def agreed_similarity(
     own: Mapping[int, LocalisedPhoto],
     correspondences: Correspondences,
     more: Sequence[Sim3] = (),
-) -> tuple[FittedSimilarity, set[int]] | None:
-    """The fit to the photos that agree with it, and these; None where no photo does.
+) -> tuple[FittedSimilarity, set[int], NDArray[np.bool_]] | None:
+    """The fit to the photos that agree with it, these, and the correspondences (m,) that do; or None.
 
     Args:
         own: localised photos, by place among the model's, in order.
@@ -214,7 +202,8 @@ def agreed_similarity(
             break
         chosen = again
     assert fit is not None
-    return fit, chosen
+    used = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
+    return fit, chosen, used & (fit.errors_px < tolerance)
 
 
 def _best_proposal(
@@ -284,7 +273,7 @@ def agreeing_photos(
     count = int(correspondences.photo_of.max(initial=-1)) + 1
     total = np.bincount(correspondences.photo_of[own], minlength=count)
     near = np.bincount(correspondences.photo_of[own & (errors_px < tolerance_px)], minlength=count)
-    return np.flatnonzero((total > 0) & (near >= _LEAST_SHARE * total))
+    return np.flatnonzero((total > 0) & (2 * near >= total))
 
 
 def fit_similarity(
@@ -341,8 +330,7 @@ def _equations(
     )
     by_point = np.where(np.isfinite(linear.by_point), linear.by_point, 0.0)
     residual = np.where(np.isfinite(linear.residual), linear.residual, 1e6)
-    # A SIFT keypoint is good to about half a pixel of the image of 1600 that it was found on.
-    sigma = 0.5 * np.maximum(1.0, tolerances_px(model, correspondences, 1.0))
+    sigma = KEYPOINT_PX * np.maximum(1.0, tolerances_px(model, correspondences, 1.0))
     noise = sigma[:, None, None] ** 2 * np.eye(2)
     noise = noise + by_point @ correspondences.covariance @ np.swapaxes(by_point, 1, 2)
     jacobian = by_point @ point_jacobian(correspondences.points)

@@ -21,7 +21,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store import Database
-from featuredb.store.canaries import Canary, KnownPose, list_canaries, load_canary_image
+from featuredb.store.canaries import TOLERANCE_DEG, Canary, KnownPose, list_canaries, load_canary_image
 from ingest.growth.gates import SIGMAS, Gate
 from ingest.growth.map_images import LEAST_FEATURES, NEAR_M, features_and_points
 from ingest.growth.values import DRIFT_BUDGET_M
@@ -39,10 +39,7 @@ _OWN_FEATURES = AcceptanceOptions(min_spread=0.0, min_agreement=0.0)
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
 
-_OWN_NEAR, _OWN_ELSEWHERE = 8, 4  # images of active maps that are asked, around the new one and elsewhere
-# Of an own image's answer, beside the drift budget; both are well above what new points within their sigma
-# move a pose by. An answer by the new map alone may miss by `SIGMAS` of its own instead, if that is more.
-_TOLERANCE_DEG = 1.0
+_OWN_NEAR = 8  # images of active maps that are asked around the new one, and half as many elsewhere
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,7 +202,7 @@ def own_canaries(
                 around |= bool(((there >= low) & (there <= high)).all())
             (near if around else far).append((key, feature_map.map_id, image))
     chosen = sorted(near, key=lambda e: e[0])[:_OWN_NEAR]
-    chosen += sorted(far, key=lambda e: e[0])[:_OWN_ELSEWHERE]
+    chosen += sorted(far, key=lambda e: e[0])[: _OWN_NEAR // 2]
     snapshot = database.snapshot(before.snapshot)
     whole = {map_id: snapshot.load_map(map_id) for map_id in sorted({map_id for _, map_id, _ in chosen})}
     return [(whole[map_id], image) for _, map_id, image in chosen]
@@ -214,15 +211,18 @@ def own_canaries(
 def _check_own(
     feature_map: FeatureMap, image: MapImage, before: Localiser, after: Localiser, new_ids: tuple[str, ...]
 ) -> CanaryCheck:
-    """Ask an image of a map of both, and of the new maps alone."""
+    """Ask an image of a map of both, and of the new maps alone.
+
+    An answer may miss by the drift budget, one by the new maps alone by `SIGMAS` of its own, if that is more.
+    """
     features, _ = features_and_points(feature_map, image)
     request = LocaliseRequest(camera=feature_map.cameras[image.camera_id])
     asked = ((before, None), (after, None), (after, new_ids))
     results = [_ask(features, request, localiser, ids) for localiser, ids in asked]
     misses = [_miss_of_image(result.pose, feature_map, image) for result in results]
-    verdicts = [_verdict(miss, DRIFT_BUDGET_M, _TOLERANCE_DEG) for miss in misses[:2]]
+    verdicts = [_verdict(miss, DRIFT_BUDGET_M, TOLERANCE_DEG) for miss in misses[:2]]
     may_miss_m = SIGMAS * misses[2].sigma_m if misses[2] else 0.0
-    alone = _verdict(misses[2], max(DRIFT_BUDGET_M, may_miss_m), _TOLERANCE_DEG)
+    alone = _verdict(misses[2], max(DRIFT_BUDGET_M, may_miss_m), TOLERANCE_DEG)
     check = _checked(f"{image.name} of map {feature_map.map_id}", verdicts, misses, results[1])
     if check.regression or alone != "moved":
         return replace(check, alone=alone)

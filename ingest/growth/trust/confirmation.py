@@ -18,11 +18,8 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import Gate
-from ingest.growth.place.localised import QUERY
+from ingest.growth.values import QUERY
 
-# A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
-# photo in common count as one, three photos that confirm each other as one and a half.
-_ONE_PAIR = 1.0
 # Distance of two cameras over their distance from what both see. The same picture given by two people, cut or
 # compressed anew, shows no parallax; poses of one place are good to some thousandths.
 _LEAST_PARALLAX = 0.01
@@ -191,12 +188,15 @@ def _pairs(agree: NDArray[np.bool_]) -> float:
 def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[OutsidePhoto]) -> Gate:
     """Whether more pairs confirm the map than one and as many as contradict it.
 
+    A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
+    photo in common count as one, three photos that confirm each other as one and a half.
+
     Each proven photo contradicts it, and each other owner once, whose photos may all lie.
     """
     theirs = [photo.source for photo in against]
     contradicting = sum(s.proven for s in theirs) + len({s.owner for s in theirs if not s.proven})
-    needed = contradicting + (0.0 if proven else _ONE_PAIR)
-    if against and (proven or pairs > _ONE_PAIR):
+    needed = contradicting + (0.0 if proven else 1.0)
+    if against and (proven or pairs > 1.0):
         reason = "CONTRADICTED"
         message = (
             f"{len(against)} photos from outside contradict it and count as {contradicting}, {pairs:g} pairs "

@@ -103,7 +103,7 @@ def _of_maps(
 ) -> Iterator[OutsidePhoto]:
     names = {image.sha256 for image in feature_map.images}
     for other, image, source in _images_around(feature_map, others, own, sources):
-        found = None if image.sha256 in names else localise_image(other, image, 0, [indexed])
+        found = None if image.sha256 in names else localise_image(other, image, [indexed])
         if found is not None:
             pose = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
             known = pose.center, _center_variance(other, image)

@@ -1,8 +1,8 @@
 """Quarantined maps are promoted once independent sources confirm them and no canary regresses."""
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,15 @@ from ingest.fingerprint import digest
 from ingest.growth import gates
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.gates import Gate
+from ingest.growth.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import Confirmation, Sources, answering_with, confirm
 from ingest.growth.trust.corroboration import NewPhotos, corroborate
-from ingest.growth.values import GrowthOptions, Refused
+from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
-_AROUND_M = 100.0  # boxes of maps that come this close may show the same
+_AROUND_M = 2.0 * NEAR_M  # boxes of maps that come this close may show the same
 PARENT_MOVED = "was placed anew"  # said of maps whose parent was, see featuredb.store.changes
 
 
@@ -46,22 +47,13 @@ class ExaminedMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Promotion:
-    """What became of one quarantined map, and why it stays one or was promoted."""
+    """What became of one quarantined map, and why it stays one or was promoted; figures of gates by name."""
 
     map_id: str
     promoted: bool
     reason_code: str
     reason: str
-    gates: tuple[Gate, ...] = ()
-
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "map_id": self.map_id,
-            "promoted": self.promoted,
-            "reason_code": self.reason_code,
-            "reason": self.reason,
-            "gates": gates.figures(self.gates),
-        }
+    gates: Mapping[str, Any] = field(default_factory=dict)
 
 
 def promote_confirmed(
@@ -87,21 +79,20 @@ def promote_confirmed(
         if summary.status != "quarantined" or summary.method != "map":
             continue
         known = recall(work, "maps", summary.map_id, asked)
-        why = _held_back(summary, snapshot, options.drift_budget_m)
-        why = why or (Refused.from_json(known) if known else None)
-        if why is None:
+        stays = _held_back(summary, snapshot, options.drift_budget_m)
+        stays = stays or (Promotion(**known) if known else None)
+        if stays is None:
             open_maps.append(summary)
         else:
-            outcomes.append(_stays(summary.map_id, why))
-    found = _examined(open_maps, snapshot, sources, new, options.threads)
-    for summary, one in zip(open_maps, found, strict=True):
+            outcomes.append(stays)
+    for one in _examined(open_maps, snapshot, sources, new, options.threads):
         if isinstance(one, ExaminedMap):
             ready.append(one)
         else:
-            outcomes.append(_stays(summary.map_id, one))
-            remember(work, "maps", summary.map_id, one.as_json(), asked)
+            outcomes.append(one)
+            remember(work, "maps", one.map_id, asdict(one), asked)
 
-    def by_itself(was: ExaminedMap) -> ExaminedMap | Refused:
+    def by_itself(was: ExaminedMap) -> ExaminedMap | Promotion:
         as_is = replace(sources, owners=read_owners(database, database.snapshot()))
         return _examined([was.summary], snapshot, as_is, new, options.threads)[0]
 
@@ -111,15 +102,14 @@ def promote_confirmed(
         after = _question(database, now, replace(sources, owners=read_owners(database, now)), new)
         for outcome in decided:
             if not outcome.promoted and outcome.reason_code != "CONFLICT":
-                why = Refused(reason=outcome.reason_code, message=outcome.reason, gates=outcome.gates)
-                remember(work, "maps", outcome.map_id, why.as_json(), after)
+                remember(work, "maps", outcome.map_id, asdict(outcome), after)
         outcomes += decided
     return outcomes
 
 
 def _examined(
     waiting: Sequence[MapSummary], snapshot: Snapshot, sources: Sources, new: NewPhotos | None, threads: int
-) -> list[ExaminedMap | Refused]:
+) -> list[ExaminedMap | Promotion]:
     """All of them, with the records that they make for each other: else what two newcomers show beside what
     an anchor shows would lose its descriptors, which do not come back.
     """
@@ -162,22 +152,22 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
         raise StoreError(f"map {map_id} is retired ({summary.status_reason}); commit it again")
     gate = _tried(database, Localiser.open(database), [snapshot.load_map(map_id)]).gate
     if not gate.passes and not force:
-        return _stays(map_id, Refused.by(gate))
+        return _stays(map_id, gate)
     text = f"{reason} (by hand; {gate.message})"
     mark_confirmed(database, read_owners(database, snapshot).made_of.get(map_id, ()), map_id)
     database.set_status([map_id], "active", text, based_on={map_id: summary.write_id})
-    return Promotion(map_id=map_id, promoted=True, reason_code="", reason=text, gates=(gate,))
+    return Promotion(map_id=map_id, promoted=True, reason_code="", reason=text, gates=gates.figures([gate]))
 
 
 def _examine(
     summary: MapSummary, snapshot: Snapshot, sources: Sources, new: NewPhotos | None, threads: int
-) -> ExaminedMap | Refused:
+) -> ExaminedMap | Promotion:
     """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
     feature_map, others = snapshot.load_map(summary.map_id), _others(summary, snapshot)
     heard = corroborate(feature_map, others, new, sources, write_id=summary.write_id, threads=threads)
     confirmation = confirm(feature_map, sources, heard)
     if not confirmation.gate.passes:
-        return Refused.by(confirmation.gate)
+        return _stays(feature_map.map_id, confirmation.gate)
     contributed = sources.owners.made_of.get(feature_map.map_id, frozenset())
     earned = {i.sha256[:32] for i in feature_map.images if i.image_id in confirmation.earned}
     return ExaminedMap(
@@ -188,23 +178,30 @@ def _examine(
     )
 
 
-def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Refused | None:
+def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Promotion | None:
     """What keeps a map in quarantine before anybody is asked."""
-    if is_imported(summary.status, summary.status_reason):
-        return Refused(reason="IMPORTED", message=summary.status_reason)
-    if PARENT_MOVED in summary.status_reason:
-        return Refused(reason="PARENT_MOVED", message=summary.status_reason)
     active = {m.map_id for m in snapshot.maps() if m.status == "active"}
-    if not active.intersection(summary.parents):
-        text = f"no active map holds it: {', '.join(summary.parents)} is not active"
-        return Refused(reason="NO_PARENT", message=text)
     gate = gates.drift(summary.drift_m or 0.0, budget_m)
-    return None if gate.passes else Refused(reason=gate.reason, message=gate.message)
+    code, text = gate.reason, gate.message
+    if is_imported(summary.status, summary.status_reason):
+        code, text = "IMPORTED", summary.status_reason
+    elif PARENT_MOVED in summary.status_reason:
+        code, text = "PARENT_MOVED", summary.status_reason
+    elif not active.intersection(summary.parents):
+        code, text = "NO_PARENT", f"no active map holds it: {', '.join(summary.parents)} is not active"
+    elif gate.passes:
+        return None
+    return Promotion(map_id=summary.map_id, promoted=False, reason_code=code, reason=text)
 
 
-def _stays(map_id: str, why: Refused) -> Promotion:
+def _stays(map_id: str, gate: Gate) -> Promotion:
+    """By a gate."""
     return Promotion(
-        map_id=map_id, promoted=False, reason_code=why.reason, reason=why.message, gates=why.gates
+        map_id=map_id,
+        promoted=False,
+        reason_code=gate.reason,
+        reason=gate.message,
+        gates=gates.figures([gate]),
     )
 
 
@@ -238,7 +235,7 @@ def _promote(
     database: Database,
     before: Localiser,
     ready: Sequence[ExaminedMap],
-    by_itself: Callable[[ExaminedMap], ExaminedMap | Refused],
+    by_itself: Callable[[ExaminedMap], ExaminedMap | Promotion],
 ) -> list[Promotion]:
     """Ask the canaries: of all of them together, and one by one where that shows a regression.
 
@@ -253,7 +250,7 @@ def _promote(
         map_id = waiting[asked].feature_map.map_id
         found = by_itself(waiting[asked])
         if not isinstance(found, ExaminedMap):
-            outcomes[map_id] = _stays(map_id, found)
+            outcomes[map_id] = found
             asked += 1
             continue
         run = _tried(database, before, [found.feature_map])
@@ -270,34 +267,40 @@ def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) ->
     return run_canaries(database, before, after, maps)
 
 
-def _still_active(database: Database, active: Sequence[str]) -> None:
-    """Raises ConflictError where other maps are active than those that were asked."""
-    now = [m.write_id for m in database.snapshot().maps() if m.status == "active"]
-    if sorted(now) != sorted(active):
-        raise ConflictError("other maps are active since the known photos were asked; they are asked again")
-
-
 def _decide(
     database: Database, before: Localiser, ready: Sequence[ExaminedMap], run: CanaryRun
 ) -> list[Promotion]:
     asked = {found.feature_map.map_id: (found.confirmation.gate, run.gate) for found in ready}
+
+    def outcomes(code: str, reason: str, *, promoted: bool = False) -> list[Promotion]:
+        return [
+            Promotion(
+                map_id=map_id,
+                promoted=promoted,
+                reason_code=code,
+                reason=reason,
+                gates=gates.figures(of),
+            )
+            for map_id, of in asked.items()
+        ]
+
     if not run.gate.passes:
-        return [_stays(m, Refused.by(run.gate, of[0])) for m, of in asked.items()]
+        return outcomes(run.gate.reason, run.gate.message)
     confirmed = "; ".join(dict.fromkeys(found.confirmation.message for found in ready))
     reason = f"{confirmed}; {run.message}"
     active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
     for found in ready:
         mark_confirmed(database, found.earned, found.feature_map.map_id)
     try:
-        _still_active(database, active)  # before a map loses what nobody confirms
+        now = [m.write_id for m in database.snapshot().maps() if m.status == "active"]
+        if sorted(now) != sorted(active):  # before a map loses what nobody confirms
+            raise ConflictError(
+                "other maps are active since the known photos were asked; they are asked again"
+            )
         based_on = {found.feature_map.map_id: _committed(database, found) for found in ready}
         database.set_status(list(asked), "active", reason, based_on=based_on, active=active)
     except ConflictError as error:
         _LOG.info("promotion of %s waits: %s", list(asked), error)
-        return [
-            _stays(m, Refused(reason="CONFLICT", message=str(error), gates=of)) for m, of in asked.items()
-        ]
+        return outcomes("CONFLICT", str(error))
     _LOG.info("promoted %s: %s", list(asked), reason)
-    return [
-        Promotion(map_id=m, promoted=True, reason_code="", reason=reason, gates=of) for m, of in asked.items()
-    ]
+    return outcomes("", reason, promoted=True)

@@ -24,7 +24,7 @@ from featuredb.store.tables import LIDAR
 from ingest.growth.gates import SIGMAS, Gate, sigmas_limit
 from ingest.growth.map_places import growth_of, with_growth
 from ingest.growth.place.component import GrownMap
-from ingest.growth.values import LEAST_VIEWS, MAD, Refused
+from ingest.growth.values import LEAST_PHOTOS, MAD, Refused
 from ingest.register.structure.surface_fit import (
     MIN_REACH_M,
     Surface,
@@ -36,7 +36,8 @@ from ingest.register.structure.surface_fit import (
 NOT_ASKED = "SCAN_NOT_ASKED"  # reason of a gate that another installation may pass
 
 _LOG = logging.getLogger(__name__)
-_NARROW, _WIDE_TO_NARROW = 0.0, (2.0, 1.0, 0.5, 0.0)  # metres; 0: `SIGMAS`
+# Metres of a fit, in turn; 0: `SIGMAS`.
+_NARROW, _WIDE_TO_NARROW = 0.0, (MIN_REACH_M, MIN_REACH_M / 2, MIN_REACH_M / 4, 0.0)
 _ROUNDS = 5  # of nearest planes, each cut
 _OPEN = np.diag([1.0] * 3 + [1e-8] * 3)  # 1 rad and 10 km: what nothing holds
 _LEAST_POINTS, _MOST_POINTS = 100, 8000  # over the scan; fewer decide nothing, more say nothing new
@@ -204,7 +205,7 @@ def _gate(chi2: float, what: str) -> Gate:
 def _points(feature_map: FeatureMap) -> FloatArray:
     """Points (n, 3) that enough photos see; single far ones would load a county of scan."""
     views = np.bincount(feature_map.observations.point_index, minlength=len(feature_map.points))
-    points = feature_map.points_local()[views >= LEAST_VIEWS]
+    points = feature_map.points_local()[views >= LEAST_PHOTOS]
     if not len(points):
         return points
     low, high = np.percentile(points, (1.0, 99.0), axis=0)
