@@ -23,8 +23,7 @@ AGREEING_SHARE = 0.66
 # wrong ones as come about less often than that are no accident.
 _WRONG_TAGS, _ACCIDENT = 0.15, 0.01
 # Least share of the parts of a photo where points should be seen that shows some, as for a query. In
-# simulated communities re-uploads 10.8 and 13.3 m off showed 0.13 and 0.17 of their parts, right photos 0.22
-# and more.
+# a simulated community a re-upload 10.8 m off showed 0.13 of its parts, right photos 0.22 and more.
 LEAST_VISIBLE = AcceptanceOptions().min_agreement
 
 

@@ -25,7 +25,6 @@ from ingest.growth.graph.map_graph import (
     solve_maps,
 )
 from ingest.growth.graph.pose_graph import GraphSolution
-from ingest.growth.map_images import NEAR_M
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
 from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun, check_known
@@ -35,6 +34,7 @@ from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
 _LEAST_MOVE_M = 0.01  # anchors that would move by less stay where they are
+_GAP_M = 5.0  # boxes of a grown map and a new anchor that come this close are looked at for an overlap
 _SAME_M = 1e-6  # an answer that moves by less was not touched
 
 Edges = Mapping[str, Sequence[Edge]]
@@ -137,7 +137,7 @@ def _touch(a: PlacedMap, b: PlacedMap) -> bool:
     if not len(a.corners) or not len(b.corners):
         return False
     other = a.frame.enu_from(b.frame).act(b.corners)
-    low, high = a.corners.min(axis=0)[:2] - NEAR_M, a.corners.max(axis=0)[:2] + NEAR_M
+    low, high = a.corners.min(axis=0)[:2] - _GAP_M, a.corners.max(axis=0)[:2] + _GAP_M
     return bool((other.min(axis=0)[:2] <= high).all() and (low <= other.max(axis=0)[:2]).all())
 
 
