@@ -135,7 +135,7 @@ def try_frames(
         if image.image_id in ids
     }
     reader = _Reader(read_gray)
-    ranking = propose_frames(feature_map, cloud, priors, reader.for_ranking)
+    ranking = propose_frames(feature_map, cloud, priors)
     ranked = {p.image.image_id: p for p in ranking}
     images = {image.image_id: image for image in feature_map.images}
     # A frame that a person chose is tried whether it sees much of the scan or not.
@@ -186,9 +186,7 @@ def _tried_together(
 
 def _unranked(image: MapImage, prior: FramePrior) -> FrameProposal:
     nan = float("nan")
-    score = FrameScore(
-        score=nan, coverage=nan, downward=nan, points=0, spread=nan, texture=nan, sharpness=nan
-    )
+    score = FrameScore(score=nan, coverage=nan, downward=nan, points=0, spread=nan)
     return FrameProposal(image=image, score=score, prior=prior)
 
 
@@ -267,11 +265,6 @@ class _Reader:
             self.unreadable[image.name] = str(error)
             _LOG.warning("photo %s cannot be read: %s", image.name, error)
             return None
-
-    def for_ranking(self, image: MapImage) -> NDArray[np.uint8]:
-        """A picture without texture for what cannot be read, which then comes last."""
-        gray = self.full(image)
-        return np.zeros((8, 8), np.uint8) if gray is None else gray
 
 
 # Do frames that were registered one by one move the map to the same place?

@@ -1,9 +1,8 @@
 """Which frames of a map are worth registering first."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,17 +17,12 @@ PhotoReader = Callable[[MapImage], NDArray[np.uint8]]
 
 
 _VIEW_WIDTH_PX = 200  # of the renders that tell coverage; figures change by a hundredth with twice as many
-_GRID = 8  # cells along each side of the photo in which texture and map points are counted
+_GRID = 8  # cells along each side of the photo in which map points are counted
 # Frames that see less of the scan are not proposed; scans have holes (brighton's frames see 0.4 to 0.65), but
 # a quarter of a photo must have something to match.
 _MIN_COVERAGE = 0.25
-# Standard deviation of the grey values (0 to 255) of a cell that has texture: above the noise of sky, water
-# and out-of-focus lawn (2 to 4 in the photos of brighton and lewis).
-_CELL_CONTRAST = 6.0
 # Map points seen by a frame after which more do not help: structure projection works with hundreds.
 _ENOUGH_POINTS = 300
-_MAX_PHOTOS_READ = 40  # so many photos, best by geometry, are opened for their sharpness
-_PHOTO_SIDE_PX = 800  # they are shrunk to this side for it
 # The score of a frame is multiplied by 1 - penalty times the share of its map points that frames chosen
 # before see already: frames side by side tell of the same corner of the map.
 _OVERLAP_PENALTY = 0.5
@@ -44,9 +38,7 @@ class FrameScore:
         downward: mean cosine between viewing rays and the vertical: airborne scans see roofs and ground well,
             walls hardly.
         points: map points seen, a number.
-        spread: share of the photo's cells that see map points.
-        texture: share of the photo's cells with texture; NaN where the photo was not opened.
-        sharpness: energy of fine detail over that of coarser detail, of the best frame; NaN likewise.
+        spread: share of the photo's cells that see map points: blur and water show few.
     """
 
     score: float
@@ -54,8 +46,6 @@ class FrameScore:
     downward: float
     points: int
     spread: float
-    texture: float
-    sharpness: float
 
     def as_figures(self) -> dict[str, float]:
         """JSON-able."""
@@ -75,7 +65,6 @@ def propose_frames(
     feature_map: FeatureMap,
     cloud: PointCloud,
     priors: Mapping[int, FramePrior],
-    read_gray: PhotoReader | None,
 ) -> list[FrameProposal]:
     """All frames that see enough of the scan, the most promising first.
 
@@ -84,28 +73,18 @@ def propose_frames(
 
     Args:
         priors: of the images to be ranked, by image id, in the cloud's frame.
-        read_gray: gives the photo's grey pixels (h, w) uint8, at any size; None ranks by geometry alone.
     """
     rough = []
     for image in feature_map.images:
         if image.image_id in priors:
-            score = _geometry_score(feature_map, image, priors[image.image_id], cloud)
+            score = _score(feature_map, image, priors[image.image_id], cloud)
             if score.coverage >= _MIN_COVERAGE:
                 rough.append(FrameProposal(image=image, score=score, prior=priors[image.image_id]))
     rough.sort(key=lambda p: (-p.score.score, p.image.image_id))
-    if read_gray is not None:
-        read = [_photo_figures(read_gray(p.image)) for p in rough[:_MAX_PHOTOS_READ]]
-        best = max((sharpness for _, sharpness in read), default=1.0) or 1.0
-        for i, p in enumerate(rough):
-            texture, sharpness = read[i] if i < len(read) else (np.nan, np.nan)
-            score = _scored(replace(p.score, texture=texture, sharpness=sharpness / best))
-            rough[i] = replace(p, score=score)
     return _spread_out(feature_map, rough)
 
 
-def _geometry_score(
-    feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: PointCloud
-) -> FrameScore:
+def _score(feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: PointCloud) -> FrameScore:
     camera = feature_map.cameras[image.camera_id]
     small = small_camera(camera, _VIEW_WIDTH_PX)
     seen = render(cloud, small, prior.cam_from_local, RenderOptions(attributes=False))
@@ -115,16 +94,14 @@ def _geometry_score(
     points = len(np.unique(feature_map.observations.point_index[mine]))
     cells = feature_map.observations.xy[mine] / [camera.width, camera.height] * _GRID
     spread = len(np.unique(np.floor(cells).clip(0, _GRID - 1), axis=0)) / _GRID**2
-    return _scored(
-        FrameScore(
-            score=0.0,
-            coverage=coverage,
-            downward=_downward(small, prior.cam_from_local, valid),
-            points=points,
-            spread=spread,
-            texture=float("nan"),
-            sharpness=float("nan"),
-        )
+    downward = _downward(small, prior.cam_from_local, valid)
+    factors = [coverage, downward, min(points / _ENOUGH_POINTS, 1.0), spread]
+    return FrameScore(
+        score=float(np.prod(np.sqrt(factors))),
+        coverage=coverage,
+        downward=downward,
+        points=points,
+        spread=spread,
     )
 
 
@@ -138,31 +115,6 @@ def _downward(camera: Camera, pose: Rigid3, valid: NDArray[np.bool_]) -> float:
     rays = np.column_stack([rays, np.ones(len(rays))])
     up = rays @ pose.rotation[:, 2] / np.linalg.norm(rays, axis=1)
     return float(np.maximum(-up[np.isfinite(up)], 0.0).mean())
-
-
-def _scored(score: FrameScore) -> FrameScore:
-    factors = [
-        score.coverage,
-        score.downward,
-        min(score.points / _ENOUGH_POINTS, 1.0),
-        score.spread,
-        score.texture,
-        score.sharpness,
-    ]
-    value = float(np.prod([np.sqrt(f) for f in factors if np.isfinite(f)]))
-    return replace(score, score=value)
-
-
-def _photo_figures(gray: NDArray[np.uint8]) -> tuple[float, float]:
-    """Share of textured cells, and the energy of the finest detail over that of twice as coarse detail."""
-    shrink = _PHOTO_SIDE_PX / max(gray.shape)
-    small = cv2.resize(gray, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA).astype(np.float32)
-    blocks = [np.array_split(band, _GRID, axis=1) for band in np.array_split(small, _GRID)]
-    contrast = np.array([[block.std() for block in row] for row in blocks])
-    fine = small - cv2.GaussianBlur(small, (0, 0), 1.0)
-    coarse = cv2.GaussianBlur(small, (0, 0), 1.0) - cv2.GaussianBlur(small, (0, 0), 2.0)
-    sharpness = float(fine.std() / max(float(coarse.std()), 1e-6))
-    return float((contrast >= _CELL_CONTRAST).mean()), sharpness
 
 
 def _spread_out(feature_map: FeatureMap, proposals: Sequence[FrameProposal]) -> list[FrameProposal]:

@@ -84,8 +84,6 @@ def frame_rows(report: AnchorReport) -> list[tuple[Any, ...]]:
                 _rounded(score.score),
                 _rounded(score.coverage),
                 score.points,
-                _rounded(score.texture),
-                _rounded(score.sharpness),
                 verdict,
                 inliers,
                 sigma,
@@ -96,7 +94,7 @@ def frame_rows(report: AnchorReport) -> list[tuple[Any, ...]]:
 
 
 FRAME_HEADER = (
-    *("frame", "score", "covers", "points", "texture", "sharp", "registration"),
+    *("frame", "score", "covers", "points", "registration"),
     *("inliers", "sigma m", "B s"),
 )
 
