@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 
 from featuredb.errors import FeatureDbError, StoreError
+from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.photos import count_candidates
@@ -225,7 +226,12 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Found]:
     mine = ds.field("write_id") == row["write_id"]
     for name, expected in encoded.children.items():
         places = _PLACES[name]
-        found = snapshot.dataset(name).to_table([_INDEX[name], *places], filter=mine).sort_by(_INDEX[name])
+        try:
+            found = snapshot.dataset(name).to_table([_INDEX[name], *places], filter=mine)
+        except (OSError, pa.ArrowException) as error:
+            yield where, f"cannot read its {name}: {one_line(error)[:300]}"
+            continue
+        found = found.sort_by(_INDEX[name])
         for column in places:
             if not _same(found[column], expected[column]):
                 yield where, f"{name}: {column} is not that of the map's coordinates"
@@ -242,14 +248,16 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
     """Do the points of a scan agree with its row, and are they those that were committed?"""
     where = f"scan {scan.scan_id}"
     levels, coordinates = np.zeros(len(scan.level_points), np.int64), PointsChecksum()
+    elsewhere = 0
     try:
-        for batch in scan_batches(database, scan, (*UTM_COORDINATES, "level")):
+        for batch in scan_batches(database, scan, (*UTM_COORDINATES, "tile", "level")):
             utm = _utm(batch)
             coordinates.add(utm)
             levels += np.bincount(batch["level"].to_numpy(), minlength=len(levels))[: len(levels)]
             if not np.isfinite(utm).all():
                 yield where, "coordinates that are not finite"
                 return
+            elsewhere += int((tile_of(utm) != batch["tile"].to_numpy(zero_copy_only=False)).sum())
     except (OSError, pa.ArrowException) as error:
         yield where, f"cannot read its points: {one_line(error)[:300]}"
         return
@@ -257,6 +265,8 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
         yield where, f"expected {list(scan.level_points)} points by level, found {levels.tolist()}"
     elif coordinates.text() != scan.row["points_checksum"]:
         yield where, "its points are not those that were committed: checksums differ"
+    if elsewhere:
+        yield where, f"{elsewhere} points in another tile than their coordinates'"
 
 
 def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:

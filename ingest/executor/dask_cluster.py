@@ -202,7 +202,7 @@ def _require_shared(client: Any, address: str, folders: list[Path]) -> None:
         )
     finally:
         for folder in folders[:1]:
-            (folder / token).unlink()
+            (folder / token).unlink(missing_ok=True)
     bad = [f"{worker}: {problem}" for worker, problem in sorted(problems.items()) if problem]
     if bad:
         raise IngestError(

@@ -84,20 +84,19 @@ def test_features_and_pictures_add_up() -> None:
 
 
 def test_middling_evidence_far_from_the_prior_is_refused() -> None:
-    asked = replace(MIDDLING, places_elsewhere=5)
+    asked = replace(MIDDLING, places_elsewhere=5, confirmation=replace(CONFIRMED, log_nfa=7.7))
     assert verdict(replace(asked, prior_sigmas=2.4)) is None
-    assert weighed_log_nfa(asked) == log_nfa_of(38, 150)
-    refusal = verdict(replace(asked, prior_sigmas=5.5))
+    assert weighed_log_nfa(replace(asked, prior_sigmas=2.4)) == 7.7
+    refusal = verdict(replace(asked, prior_sigmas=4.7))
     assert refusal is not None
     assert refusal[0] == "NOT_CONFIRMED"
-    assert "5.5 deviations" in refusal[1]
-    assert verdict(replace(GOOD, prior_sigmas=5.5)) is None  # features speak for it
+    assert "4.7 deviations" in refusal[1]
+    assert verdict(replace(GOOD, prior_sigmas=4.7)) is None  # features speak for it
 
 
 def test_middling_evidence_is_refused_where_houses_stand_elsewhere() -> None:
-    asked = replace(
-        MIDDLING, places_elsewhere=5, confirmation=replace(CONFIRMED, agreeing=26, pieces=79, log_nfa=6.5)
-    )
+    crossing = replace(CONFIRMED, agreeing=26, pieces=79, log_nfa=log_nfa_of(26, 79))
+    asked = replace(MIDDLING, places_elsewhere=5, confirmation=crossing)
     assert verdict(asked) is None
     relief = replace(CONFIRMED, confirmed=False, agreeing=1, pieces=78, log_nfa=0.0)
     refusal = verdict(replace(asked, relief=relief))
@@ -108,6 +107,11 @@ def test_middling_evidence_is_refused_where_houses_stand_elsewhere() -> None:
         verdict(replace(asked, relief=replace(relief, agreeing=0, pieces=20))) is None
     )  # too few to be asked
     assert verdict(replace(GOOD, relief=relief)) is None  # features speak for it
+
+
+def test_relief_takes_evidence_away_and_adds_none() -> None:
+    relief = replace(CONFIRMED, agreeing=60, pieces=150)
+    assert weighed_log_nfa(replace(MIDDLING, relief=relief)) == MIDDLING.confirmation.log_nfa
 
 
 def test_elsewhere_is_asked_only_where_it_decides() -> None:

@@ -51,12 +51,13 @@ def _error(sim: Sim3) -> FloatArray:
     return (_TRUE @ sim.inverse()).log()
 
 
-def test_ransac_finds_the_similarity_among_two_thirds_outliers() -> None:
+@pytest.mark.parametrize("outliers", [200, 30, 0])
+def test_ransac_finds_the_similarity_among_outliers(outliers: int) -> None:
     rng = np.random.default_rng(1)
     pairs = _pairs(rng, 300, sigma=0.02)
     target = pairs.target.copy()
-    wrong = rng.permutation(300)[:200]
-    target[wrong] += rng.normal(0, 20, (200, 3))
+    wrong = rng.permutation(300)[:outliers]
+    target[wrong] += rng.normal(0, 20, (outliers, 3))
     found = ransac_similarity(pairs.source, target, np.full(300, 0.3))
     assert found is not None
     right = np.setdiff1d(np.arange(300), wrong)

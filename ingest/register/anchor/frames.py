@@ -147,9 +147,10 @@ def try_frames(
     ask = together and not starts
     if ask and cloud.rgb is None:
         ask, vouched = False, _tried_together(feature_map, cloud, ranking, read_gray, wanted)
-    for number, proposal in enumerate(order[: max(least, _MORE_TRIES)]):
+    for proposal in order:
         accepted = sum(frame.registration.accepted for frame in tried)
-        if vouched or accepted >= wanted or (number >= least and not accepted):
+        most = max(least, _MORE_TRIES) if accepted else least
+        if vouched or accepted >= wanted or len(tried) >= most:
             break
         frame = _try(feature_map, cloud, proposal, reader)
         if frame is None:
