@@ -27,6 +27,19 @@ def drift_m(covariance_relative: FloatArray, places: FloatArray) -> float:
     return SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
 
 
+def map_drift_m(feature_map: FeatureMap, covariance_relative: FloatArray) -> float:
+    """`drift_m` of a map, metres, and no less than at any of its photos' centres.
+
+    These are few among thousands of places, and may all be in the hundredth that is left out.
+
+    Args:
+        covariance_relative: (7, 7) relative to the map's anchors, in its frame.
+    """
+    centers = np.reshape([image.cam_from_local.center for image in feature_map.images], (-1, 3))
+    worst = SIGMAS_95 * float(place_sigmas_m(covariance_relative, centers).max(initial=0.0))
+    return max(worst, drift_m(covariance_relative, places_of(feature_map)))
+
+
 def place_sigmas_m(covariance: FloatArray, places: FloatArray) -> FloatArray:
     """(n,) largest standard deviation of each of the places (n, 3) under a similarity (7, 7), metres."""
     jacobian = point_jacobian(places)

@@ -56,7 +56,7 @@ def grow(
     started, clock = datetime.now(UTC), time.perf_counter()
     run = _Run(database=database, new=new, work=work, options=options or GrowthOptions())
     run.recall_lost()
-    while True:  # each round but the last promotes a map that waited
+    while True:  # each round but the last promotes a map that no round before it did
         run.start_round()
         run.localise()
         run.place()
@@ -77,6 +77,7 @@ class _Run:
             the reason.
         map_of: maps that photos are in; why: code and reason of those that are in none.
         entries: maps that this run has made; refused, unplaced: what this round could not place.
+        promotions: the last word on each quarantined map; ever_promoted: maps that any round promoted.
     """
 
     database: Database
@@ -96,6 +97,7 @@ class _Run:
     refused: list[GrownEntry] = field(default_factory=list)
     unplaced: list[GrownEntry] = field(default_factory=list)
     promotions: dict[str, Promotion] = field(default_factory=dict)
+    ever_promoted: set[str] = field(default_factory=set)
     replacements: list[Replacement] = field(default_factory=list)
     notes: dict[str, None] = field(default_factory=dict)
 
@@ -169,7 +171,10 @@ class _Run:
         self.why.update({row: _split_reason(reason) for row, reason in waiting.items()})
 
     def promote(self) -> bool:
-        """Confirm and promote; whether anything was."""
+        """Confirm and promote; whether a map was that this run had not promoted before.
+
+        A map that goes back to quarantine and is promoted again, round by round, would keep the run going.
+        """
         outside = NewPhotos(
             given=self.new, rows=self._open_rows(), localised=self.localised, heard=self.heard
         )
@@ -185,7 +190,9 @@ class _Run:
                     reason=outcome.reason,
                     gates={**entry.gates, **outcome.gates},
                 )
-        return any(outcome.promoted for outcome in outcomes)
+        first = {outcome.map_id for outcome in outcomes if outcome.promoted} - self.ever_promoted
+        self.ever_promoted |= first
+        return bool(first)
 
     def report(self, started: datetime, seconds: float) -> GrowthReport:
         active = {m.map_id for m in self.database.snapshot().maps() if m.status == "active"}

@@ -139,7 +139,7 @@ def test_geotags_that_contradict_are_not_cut_away(
 
 
 @pytest.mark.parametrize(
-    "reason", [AT_SEVERAL_PLACES[0], pytest.param("CONTRADICTS_GPS", marks=pytest.mark.evaluation)]
+    "reason", [*AT_SEVERAL_PLACES, pytest.param("CONTRADICTS_GPS", marks=pytest.mark.evaluation)]
 )
 def test_what_is_refused_as_a_whole_is_tried_in_parts_if_places_may_be_mixed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: str

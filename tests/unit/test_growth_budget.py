@@ -11,10 +11,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from ingest.growth import gates
 from ingest.growth.graph import map_graph
-from ingest.growth.graph.map_graph import rows_within
+from ingest.growth.graph.map_graph import rows_within, with_drift
+from ingest.growth.map_places import drift_m, places_of, turns_about, with_growth
 from ingest.growth.place.component import GrownMap
 from ingest.growth.place.placement import MapsPlacement
-from tests.support.scenes import box_points, random_descriptors, ring, scene_map
+from tests.support.scenes import box_points, looking_at, random_descriptors, ring, scene_map
 
 RNG = np.random.default_rng(4)
 POINTS = box_points(RNG, 300)
@@ -51,11 +52,33 @@ def test_where_the_map_as_a_whole_has_drifted_no_photo_is_within() -> None:
     assert rows_within(bent([0.01, 0.01]), [0, 1], relative(0.3), BENDING_M, BUDGET_M) == []
 
 
-@pytest.mark.parametrize(("drift_m", "passes"), [(0.5, True), (0.51, False)])
-def test_the_gate_of_drift(drift_m: float, passes: bool) -> None:
-    gate = gates.drift(drift_m, BUDGET_M)
+@pytest.mark.parametrize(("off_m", "passes"), [(0.5, True), (0.51, False)])
+def test_the_gate_of_drift(off_m: float, passes: bool) -> None:
+    gate = gates.drift(off_m, BUDGET_M)
     assert gate.passes == passes
-    assert f"{drift_m:.2f} m" in gate.message
+    assert f"{off_m:.2f} m" in gate.message
+
+
+def test_photos_far_from_what_they_show_keep_the_budget_like_its_points() -> None:
+    """A turn about the box moves two distant cameras by 0.8 m, and 99 of 100 places by 0.1 m at most."""
+    points = box_points(RNG, 2000)
+    far = [looking_at(np.array([x, 0.0, 40.0]), np.array([0.0, 0.0, 3.0])) for x in (-400.0, 400.0)]
+    plain = scene_map(points=points, descriptors=random_descriptors(RNG, 2000), poses=[*ring(4), *far])
+    turn = turns_about(np.zeros(3)) @ turns_about(np.zeros(3)).T * 1e-3**2
+    grown = GrownMap(
+        feature_map=with_growth(plain, covariance_relative=turn.ravel().tolist(), gates={}),
+        placement=MapsPlacement(reason=None, message="", frame=plain.frame),
+        model=SimpleNamespace(),  # type: ignore[arg-type]
+        left_out={},
+        poses=np.zeros((0, 6, 6)),
+        bending_m=0.0,
+        shared_turn=np.zeros((7, 3)),
+    )
+    assert drift_m(turn, places_of(plain)) < 0.11
+    feature_map, drift, relative = with_drift(grown, {}, BUDGET_M)
+    assert drift == pytest.approx(1.96e-3 * np.hypot(400.0, 40.0), rel=1e-6)
+    assert not gates.drift(drift, BUDGET_M).passes
+    assert rows_within(feature_map, list(range(6)), relative, 0.0, BUDGET_M) == [0, 1, 2, 3]
 
 
 def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) -> None:

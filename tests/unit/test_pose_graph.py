@@ -4,11 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.growth.graph.pose_graph import GraphEdge
+from ingest.growth.graph.pose_graph import GraphEdge, left_jacobian, small_adjoint
 from tests.support.pose_graphs import GraphNode, solved
 
 _SIGMA = np.array([1e-4, 2e-4, 2e-4, 3e-4, 0.03, 0.02, 0.04])
@@ -22,6 +23,23 @@ def _edge(a: str, b: str, shift: tuple[float, ...] = (0.0,) * 7, covariance: Flo
 
 def _east(metres: float) -> tuple[float, ...]:
     return (0.0, 0.0, 0.0, 0.0, metres, 0.0, 0.0)
+
+
+def test_small_adjoint_is_the_derivative_of_the_adjoint() -> None:
+    tangent = np.array([0.3, 0.5, -0.2, 0.7, 1.0, 2.0, -3.0])
+    np.testing.assert_allclose(expm(small_adjoint(tangent)), Sim3.exp(tangent).adjoint(), atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.2, 1.0])
+def test_left_jacobian_against_differences(scale: float) -> None:
+    tangent = scale * np.array([0.3, 0.5, -0.2, 0.7, 1.0, 2.0, -3.0])
+    base = Sim3.exp(tangent).inverse()
+    for k in range(7):
+        step = np.zeros(7)
+        step[k] = 1e-6
+        forward = (Sim3.exp(tangent + step) @ base).log()
+        back = (Sim3.exp(tangent - step) @ base).log()
+        np.testing.assert_allclose((forward - back) / 2e-6, left_jacobian(tangent)[:, k], atol=1e-7)
 
 
 def test_a_chain_of_n_edges_has_n_times_the_covariance() -> None:
@@ -119,12 +137,33 @@ def _square(wrong: tuple[float, ...]) -> tuple[list[GraphNode], list[GraphEdge]]
     return nodes, edges
 
 
-def test_an_edge_that_contradicts_the_rest_is_named_and_left_out() -> None:
-    found = solved(*_square(_east(5.0)))
+_TURNED = [
+    pytest.param((0.0, 0.0, 0.0, np.radians(angle), 20.0, 5.0, 0.0), id=f"{angle} degrees")
+    for angle in (90, 180)
+]
+
+
+@pytest.mark.parametrize("wrong", [pytest.param(_east(5.0), id="5 m"), *_TURNED])
+def test_an_edge_that_contradicts_the_rest_is_named_and_left_out(wrong: tuple[float, ...]) -> None:
+    found = solved(*_square(wrong))
     assert found.reason is None
     assert [str(edge) for edge in found.left_out] == ["m3 - m1"]
     for m in ("m1", "m2", "m3"):
         np.testing.assert_allclose(found.corrections[m].log(), np.zeros(7), atol=1e-6)
+
+
+@pytest.mark.parametrize("wrong", _TURNED)
+@pytest.mark.parametrize("edge", [("m4", "m3"), ("m4", "m2")], ids=" - ".join)
+def test_of_two_overlaps_that_alone_hold_a_map_none_is_left_out(
+    edge: tuple[str, str], wrong: tuple[float, ...]
+) -> None:
+    """At the end of a band of maps, each of which overlaps the next two, one of the last two is turned."""
+    names = ["A", "m1", "m2", "m3", "m4"]
+    nodes = [GraphNode(map_id=m, prior=_TIGHT if m == "A" else None) for m in names]
+    pairs = [*zip(names[1:], names, strict=False), *zip(names[2:], names, strict=False)]
+    found = solved(nodes, [_edge(*pair, wrong if pair == edge else (0.0,) * 7) for pair in pairs])
+    assert found.reason == "CONTRADICTION"
+    assert not found.corrections
 
 
 def test_an_edge_within_its_noise_is_kept() -> None:

@@ -24,7 +24,7 @@ from featuredb.store.tables import BOUNDS
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.graph.pose_graph import WORLD, GraphEdge, GraphSolution, solve_pose_graph
-from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
+from ingest.growth.map_places import drift_m, growth_of, inflated, map_drift_m, with_growth
 from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
 from ingest.map_builder import MapIdentity
@@ -251,7 +251,7 @@ def with_drift(
     if solution.reason is None and feature_map.map_id in solution.covariance:
         covariance = solution.covariance[feature_map.map_id]
         relative = solution.covariance_relative[feature_map.map_id]
-    drift = drift_m(relative, places_of(feature_map))
+    drift = map_drift_m(feature_map, relative)
     placed = with_growth(
         feature_map,
         drift_m=round(drift, 6),
@@ -281,7 +281,6 @@ def rows_within(
     for row, image in zip(rows, feature_map.images, strict=True):
         own = points[seen.point_index[seen.image_id == image.image_id]]
         pose = image.cam_from_local
-        places = np.vstack([own, pose.center[None]])
         excess = bending_m2
         if image.covariance is not None:
             jacobian = point_jacobian(pose.center)
@@ -289,7 +288,8 @@ def rows_within(
             most = np.linalg.eigvalsh(spread - jacobian @ as_a_whole @ jacobian.T)[-1]
             excess = float(np.clip(most, 0.0, bending_m2))
         mine = as_a_whole + np.diag([0.0] * 4 + [excess] * 3)
+        places = np.vstack([np.percentile(np.vstack([own, pose.center]), (10, 90), axis=0), pose.center])
         # A tenth off the budget: the part that is left is held by less, and its own bound is larger.
-        if drift_m(mine, np.percentile(places, (10, 90), axis=0)) <= 0.9 * budget_m:
+        if drift_m(mine, places) <= 0.9 * budget_m:
             within.append(row)
     return within

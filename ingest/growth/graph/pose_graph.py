@@ -13,12 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import expm
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 from scipy.stats import chi2
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3
 from ingest.growth.gates import SIGMAS
 from ingest.growth.values import tied_together
@@ -122,14 +124,16 @@ class _Fit:
     def _linearised(self, places: Sequence[Sim3]) -> tuple[FloatArray, csr_array]:
         """Whitened residuals (7 m,) of the edges, derivatives by left perturbations.
 
-        Derivatives are those at a residual of nothing: it is small against the distances that turns act at.
+        Those at a residual of nothing lead nowhere where an overlap is turned by a right angle: the fit stops
+        short, and of two overlaps that hold a map alike the right one was left out.
         """
         residuals: list[FloatArray] = []
         blocks: list[tuple[int, int, FloatArray]] = []
         for k, (edge, (a, b), white) in enumerate(zip(self.edges, self._ends, self._white, strict=True)):
             b_inverse = Sim3.identity() if b is None else places[b].inverse()
-            along = white @ b_inverse.adjoint()
-            residuals.append(white @ (b_inverse @ places[a] @ edge.b_from_a.inverse()).log())
+            miss = (b_inverse @ places[a] @ edge.b_from_a.inverse()).log()
+            along = white @ np.linalg.solve(left_jacobian(miss), b_inverse.adjoint())
+            residuals.append(white @ miss)
             blocks.append((k, a, along))
             if b is not None:
                 blocks.append((k, b, -along))
@@ -281,3 +285,25 @@ def _assemble(blocks: Sequence[tuple[int, int, FloatArray]], rows: int, columns:
     column = np.concatenate([np.tile(7 * c + inner, 7) for _, c, _ in blocks])
     value = np.concatenate([block.ravel() for _, _, block in blocks])
     return csr_array(coo_array((value, (row, column)), shape=(7 * rows, 7 * columns)))
+
+
+def small_adjoint(tangent: FloatArray) -> FloatArray:
+    """(7, 7) matrix of the Lie bracket with (sigma, omega, nu), the derivative of Sim3.adjoint."""
+    sigma, omega, nu = float(tangent[0]), tangent[1:4], tangent[4:]
+    ad = np.zeros((7, 7))
+    ad[1:4, 1:4] = skew(omega)
+    ad[4:, 0] = -nu
+    ad[4:, 1:4] = skew(nu)
+    ad[4:, 4:] = sigma * np.eye(3) + skew(omega)
+    return ad
+
+
+def left_jacobian(tangent: FloatArray) -> FloatArray:
+    """J (7, 7) with exp(x + dx) = exp(J dx) exp(x) to first order.
+
+    The integral of exp(t ad) over t in [0, 1]: the corner of one matrix exponential (Van Loan 1978).
+    """
+    both = np.zeros((14, 14))
+    both[:7, :7] = small_adjoint(tangent)
+    both[:7, 7:] = np.eye(7)
+    return np.asarray(expm(both)[:7, 7:], dtype=np.float64)

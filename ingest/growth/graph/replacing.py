@@ -25,7 +25,7 @@ from ingest.growth.graph.map_graph import (
     solve_maps,
 )
 from ingest.growth.graph.pose_graph import GraphSolution
-from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
+from ingest.growth.map_places import growth_of, inflated, map_drift_m, with_growth
 from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun, check_known
 from ingest.growth.trust.promotion import PARENT_MOVED
@@ -272,7 +272,7 @@ def _with_evidence(
     """The moved map with its drift, overlaps and parents; and its drift."""
     map_id, own = feature_map.map_id, feature_map.frame
     relative = covariance_in_frame(solution.covariance_relative[map_id], frame, own)
-    drift = drift_m(relative, places_of(feature_map))
+    drift = map_drift_m(feature_map, relative)
     if before.is_anchor:
         covariance, present_from_own = before.own_placement
         total = in_frame(solution.corrections[map_id], frame, own) @ present_from_own

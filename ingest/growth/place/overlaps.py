@@ -51,6 +51,7 @@ def measure_overlap(
     if found is None:
         return "no image agrees with another"
     fit, agree, used = found
+    used &= np.isin(correspondences.photo_of, list(agree))  # and not those carried into images that do not
     points = len(np.unique(correspondences.point_of[used]))
     if len(agree) < LEAST_PHOTOS or points < _LEAST_POINTS:
         return f"{len(agree)} images and {points} points agree, {LEAST_PHOTOS} and {_LEAST_POINTS} are needed"
