@@ -107,6 +107,7 @@ _MAX_MARK_ERROR_PX = 12.0
 _MIN_RAY_ANGLE_DEG = 1.0  # rays closer to parallel than that give no place
 _OUTLIER_SIGMAS = 3.5  # points further out are left out; 3.5 keeps 99.8 % of honest ones in the plane
 _MIN_SIGMA_M = 0.02  # survey and marks are not better than that, so smaller residuals never make outliers
+_ROUNDS = 6  # of choosing and fitting; two or three settle
 _SAMPLES = 1500  # of hypotheses
 _SEED = 0  # of the samples
 
@@ -161,23 +162,14 @@ def fit_similarity(
     if start is None:
         return None
     sim = start
-    for _ in range(10):  # settles in two or three rounds
-        residuals = _residuals(sim, xyz, surveyed[point])
-        lengths = np.linalg.norm(residuals, axis=1)
+    for _ in range(_ROUNDS):
+        lengths = np.linalg.norm(_residuals(sim, xyz, surveyed[point]), axis=1)
         sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical)
         chosen = _choose(found, point, lengths, _OUTLIER_SIGMAS * sigma)
         inliers = lengths[chosen] <= _OUTLIER_SIGMAS * sigma
-        refined = refined_similarity(sim, xyz[chosen][inliers], surveyed[inliers], sigma, vertical)
-        moved = float(np.abs(refined.act(xyz[chosen]) - sim.act(xyz[chosen])).max())
-        sim = refined
-        if moved < 1e-6:
-            break
-    rest = surveyed - sim.act(xyz[chosen])
+        sim = refined_similarity(sim, xyz[chosen][inliers], surveyed[inliers], sigma, vertical)
     return ControlFit(
-        local_from_block=sim,
-        inliers=np.linalg.norm(np.nan_to_num(rest), axis=1) <= _OUTLIER_SIGMAS * sigma,
-        chosen=tuple(found[int(i)] for i in chosen),
-        sigma_m=sigma,
+        local_from_block=sim, inliers=inliers, chosen=tuple(found[int(i)] for i in chosen), sigma_m=sigma
     )
 
 
@@ -260,12 +252,7 @@ def _choose(
     found: Sequence[Hypothesis], point: NDArray[np.int64], lengths: FloatArray, limit_m: float
 ) -> NDArray[np.int64]:
     """For each point the hypothesis of most marks within the limit, the nearest if none is."""
-    chosen = np.zeros(int(point.max()) + 1, dtype=np.int64)
-    for row in range(len(chosen)):
-        rows = np.flatnonzero(point == row).tolist()
-        near = [i for i in rows if lengths[i] <= limit_m]
-        chosen[row] = min(
-            near or rows,
-            key=lambda i: (-len(found[i].marks), lengths[i]) if near else (0, lengths[i]),
-        )
-    return chosen
+    near = lengths <= limit_m
+    marks = np.array([len(hypothesis.marks) for hypothesis in found])
+    order = np.lexsort((lengths, np.where(near, -marks, 0), ~near, point))
+    return order[np.unique(point[order], return_index=True)[1]]

@@ -64,9 +64,9 @@ def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjuste
     Returns:
         The last adjustment, degrees of freedom of the surveyed coordinates, and the number of adjustments.
     """
-    control, rounds, adjusted = task.control, 0, None
+    control, rounds = task.control, 0
     while True:
-        adjusted = adjust(task, weights, adjusted)
+        adjusted = adjust(task, weights)
         rounds += 1
         control_m, freedom = _control_sigma(adjusted, control)
         tested = replace(
