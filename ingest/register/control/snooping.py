@@ -5,7 +5,6 @@ and the detection of outliers, 1976): an observation is compared with what the o
 covariance of all residuals, and one is left out at a time.
 """
 
-import logging
 from dataclasses import replace
 
 import numpy as np
@@ -19,10 +18,7 @@ from ingest.register.control.fit import ControlFit
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import mark_residuals
 
-_LOG = logging.getLogger(__name__)
 _SETTLED = 0.01  # relative change of the sigma, whose own uncertainty is tens of per cent
-
-
 _SIGNIFICANCE = 0.01  # chance of naming a good observation as wrong, over the whole file
 # Chance above which a point that was left out comes back; well above the former, so that none goes back and
 # forth.
@@ -58,16 +54,15 @@ def initial_weights(
     return weights, xyz
 
 
-def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjusted, float, int]:
+def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjusted, float]:
     """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none.
 
     Returns:
-        The last adjustment, degrees of freedom of the surveyed coordinates, and the number of adjustments.
+        The last adjustment, and degrees of freedom of the surveyed coordinates.
     """
-    control, rounds = task.control, 0
-    while True:
+    control = task.control
+    for _ in range(_MAX_ROUNDS):
         adjusted = adjust(task, weights)
-        rounds += 1
         control_m, freedom = _control_sigma(adjusted, control)
         tested = replace(
             _tested(adjusted, control, freedom),
@@ -76,10 +71,10 @@ def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjuste
         )
         settled = np.allclose(tested.control_m, weights.control_m, rtol=_SETTLED)
         unchanged = (tested.marks == weights.marks).all() and (tested.points == weights.points).all()
-        if (settled and unchanged) or rounds >= _MAX_ROUNDS:
-            return adjusted, freedom, rounds
+        if settled and unchanged:
+            break
         weights = tested
-        _LOG.info("round %d: control sigma %s m", rounds, weights.control_m)
+    return adjusted, freedom
 
 
 def left_out(adjusted: Adjusted, control: Control, point: int) -> tuple[FloatArray, float]:
