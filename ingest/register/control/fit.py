@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import rotation_to_up
-from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.geometry.similarity import refined_similarity, similarity_closed_form
+from featuredb.geometry.rotation import rotation_to_up, so3_exp
+from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import intersect, on_ground, shown
 
@@ -49,21 +49,6 @@ class Vertical:
     sigma_up_m: float
     source: str
 
-    def residual(self, local_from_block: Sim3) -> FloatArray:
-        """(3,) whitened: tilt east, tilt north, height."""
-        up = local_from_block.rotation @ self.up_block
-        height = local_from_block.act(self.anchor_block)[2] - self.anchor_up_m
-        return np.append(self._whiten() @ up[:2], height / self.sigma_up_m)
-
-    def jacobian(self, local_from_block: Sim3) -> FloatArray:
-        """(3, 7) of `residual` by the left perturbation."""
-        x, y, z = local_from_block.rotation @ self.up_block
-        by_rotation = np.array([[0.0, z, -y], [-z, 0.0, x]])
-        rows = np.zeros((3, 7))
-        rows[:2, 1:4] = self._whiten() @ by_rotation
-        rows[2] = point_jacobian(local_from_block.act(self.anchor_block))[2] / self.sigma_up_m
-        return rows
-
     def moved(self, target_from_block: Sim3) -> "Vertical":
         """The same of a block that has moved."""
         return replace(
@@ -71,9 +56,6 @@ class Vertical:
             up_block=target_from_block.rotation @ self.up_block,
             anchor_block=target_from_block.act(self.anchor_block),
         )
-
-    def _whiten(self) -> FloatArray:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.tilt_covariance)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,7 +149,7 @@ def fit_similarity(
         sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical)
         chosen = _choose(found, point, lengths, _OUTLIER_SIGMAS * sigma)
         inliers = lengths[chosen] <= _OUTLIER_SIGMAS * sigma
-        sim = refined_similarity(sim, xyz[chosen][inliers], surveyed[inliers], sigma, vertical)
+        sim = _similarity(xyz[chosen][inliers], surveyed[inliers], vertical) or sim
     return ControlFit(
         local_from_block=sim, inliers=inliers, chosen=tuple(found[int(i)] for i in chosen), sigma_m=sigma
     )
@@ -195,11 +177,7 @@ def _least_trimmed(
     kept = (count + size + 1) // 2
     best: tuple[float, Sim3] | None = None
     for rows in _samples(usable, point, size):
-        sim = (
-            similarity_closed_form(xyz[rows], surveyed[point[rows]])
-            if vertical is None
-            else _levelled(xyz[rows], surveyed[point[rows]], vertical)
-        )
+        sim = _similarity(xyz[rows], surveyed[point[rows]], vertical)
         if sim is None:
             continue
         lengths = np.linalg.norm(_residuals(sim, xyz, surveyed[point]), axis=1)
@@ -222,16 +200,21 @@ def _samples(usable: NDArray[np.int64], point: NDArray[np.int64], size: int) -> 
     return samples
 
 
-def _levelled(xyz: FloatArray, surveyed: FloatArray, vertical: Vertical) -> Sim3 | None:
-    """The similarity of two points that keeps the vertical: a turn, a scale and a shift in the plane."""
+def _similarity(xyz: FloatArray, surveyed: FloatArray, vertical: Vertical | None) -> Sim3 | None:
+    """The similarity of points (n, 3) by least squares, where a vertical is given the best that keeps it.
+
+    None where the points coincide.
+    """
+    if vertical is None:
+        known = np.isfinite(surveyed[:, 2])
+        return similarity_closed_form(xyz[known], surveyed[known])
     level = rotation_to_up(vertical.up_block)
     source, target = (xyz @ level.T)[:, :2] @ [1, 1j], surveyed[:, :2] @ [1, 1j]
-    if abs(source[1] - source[0]) < 1e-12 or abs(target[1] - target[0]) < 1e-6:
+    around, wanted = source - source.mean(), target - target.mean()
+    if np.abs(around).max() < 1e-12 or np.abs(wanted).max() < 1e-6:
         return None
-    turn = (target[1] - target[0]) / (source[1] - source[0])
-    angle = np.angle(turn)
-    about_up = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-    rotation = about_up @ level
+    turn = np.vdot(around, wanted) / np.vdot(around, around)
+    rotation = so3_exp([0.0, 0.0, np.angle(turn)]) @ level
     scale = float(abs(turn))
     shift = target.mean() - turn * source.mean()
     up = vertical.anchor_up_m - scale * (rotation @ vertical.anchor_block)[2]
