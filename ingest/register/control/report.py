@@ -35,28 +35,23 @@ def control_png(placement: GcpPlacement) -> bytes:
     shown = points[:: max(1, len(points) // _MAX_POINTS)]
     axes.plot(*shown[:, :2].T, ".", color=_FAINT, ms=1.0, label="map points")
     axes.plot(*cameras[:, :2].T, "^", mfc="white", mec=_INK, ms=6, label="cameras")
-    for p in placement.points:
-        if not np.isfinite(p.found_m).all():
-            continue
-        colour = _USED if p.used else _BAD
-        x, y = (float(v) for v in p.found_m[:2])
-        east, north = (factor * float(v) for v in p.residual_m[:2])
-        axes.annotate(
-            "",
-            xy=(x + east, y + north),
-            xytext=(x, y),
-            arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.6},
-        )
-        axes.plot(x, y, "o", color=colour, ms=5)
-        axes.annotate(
-            f"{p.name} {p.horizontal_m:.2f} m",
-            (x, y),
-            xytext=(6, -10),
-            textcoords="offset points",
-            fontsize=8,
-            color=colour,
-            bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.75},
-        )
+    colours = np.where(used, _USED, _BAD).tolist()
+    arrows = factor * residuals[:, :2]
+    axes.quiver(
+        *places[:, :2].T, *arrows.T, color=colours, angles="xy", scale_units="xy", scale=1, width=3e-3
+    )
+    axes.scatter(places[:, 0], places[:, 1], c=colours, s=25)
+    for p, colour in zip(placement.points, colours, strict=True):
+        if np.isfinite(p.found_m).all():
+            axes.annotate(
+                f"{p.name} {p.horizontal_m:.2f} m",
+                (float(p.found_m[0]), float(p.found_m[1])),
+                xytext=(6, -10),
+                textcoords="offset points",
+                fontsize=8,
+                color=colour,
+                bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.75},
+            )
     margin = 0.06 * extent
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)

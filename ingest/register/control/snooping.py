@@ -162,25 +162,20 @@ def _fitting(adjusted: Adjusted, control: Control, freedom: float) -> NDArray[np
 def _worst_mark(adjusted: Adjusted) -> int | None:
     rows = np.flatnonzero(adjusted.weights.marks)
     residuals = adjusted.marks.of(np.ones((len(rows), 2), dtype=bool))
-    tests = []
-    for k, row in enumerate(rows.tolist()):
-        alone, chance = chance_of(residuals, 2 * k + np.arange(2))
-        if adjusted.weights.mark_px * float(np.linalg.norm(alone)) > _MIN_MARK_PX:
-            tests.append((chance, row))
-    return _least(tests, len(rows))
+    tests = [chance_of(residuals, 2 * k + np.arange(2)) for k in range(len(rows))]
+    return _worst(rows, tests, _MIN_MARK_PX / adjusted.weights.mark_px)
 
 
 def _worst_point(adjusted: Adjusted, control: Control) -> int | None:
     rows = np.flatnonzero(adjusted.weights.points)
-    tests = []
-    for point in rows.tolist():
-        residual, chance = left_out(adjusted, control, point)
-        if float(np.linalg.norm(residual)) > _MIN_POINT_M:
-            tests.append((chance, point))
-    return _least(tests, len(rows))
+    return _worst(rows, [left_out(adjusted, control, point) for point in rows.tolist()], _MIN_POINT_M)
 
 
-def _least(tests: list[tuple[float, int]], count: int) -> int | None:
-    """The row of the least chance, where it is too small for so many tests."""
-    chance, row = min(tests, default=(1.0, -1))
-    return row if chance < _SIGNIFICANCE / count else None
+def _worst(rows: NDArray[np.int64], tests: list[tuple[FloatArray, float]], least: float) -> int | None:
+    """The row of the least chance, where it is too small for so many tests, and the error no small one."""
+    wrong = [
+        (chance, row)
+        for row, (alone, chance) in zip(rows.tolist(), tests, strict=True)
+        if chance < _SIGNIFICANCE / len(rows) and float(np.linalg.norm(alone)) > least
+    ]
+    return min(wrong)[1] if wrong else None
