@@ -18,8 +18,9 @@ from ingest.own_frame import WAYS_TO_A_PLACE, held_of
 from ingest.photos.photo import Photo, capture_seconds, gps_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.register.block import block_of_model, model_of_block
-from ingest.register.control.maps import ControlledPlacement, Survey, place_by_survey, vertical_of
+from ingest.register.control.maps import Survey, place_by_survey, vertical_of
 from ingest.register.control.marks import control_frame
+from ingest.register.control.placement import GcpPlacement
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.register.tagged_elsewhere import TaggedElsewhere, tagged_elsewhere
 from ingest.sfm.extract import PhotoFeatures
@@ -59,7 +60,7 @@ class Component:
     unplaced: UnplacedMap | None = None
     reason_code: str = ""
     reason: str = ""
-    control: ControlledPlacement | None = None
+    control: GcpPlacement | None = None
 
 
 def place_models(
@@ -268,20 +269,20 @@ def _by_control(
     if by_gps.reason is None and by_gps.local_from_sfm is not None and by_gps.covariance is not None:
         vertical = vertical_of(by_gps.local_from_sfm, by_gps.covariance, block.xyz, "the photos' GPS")
     positions = [photo.gps for photo in component.photos]
-    control = place_by_survey(block, positions, frame or control_frame(survey.file), vertical, survey)
-    component = replace(component, control=control)
-    placed = control.placement
+    frame = frame or control_frame(survey.file)
+    placed = place_by_survey(block, positions, frame, vertical, survey)
+    component = replace(component, control=placed)
     if placed.reason is not None:
         component = replace(component, reason_code=placed.reason, reason=placed.message)
         return _without_place(component, features, identity, options)
     assert placed.block is not None
     assert placed.local_from_block is not None  # accepted
     model = model_of_block(component.model, placed.block.moved(placed.local_from_block.inverse()))
-    datum = control.height_datum(options.maps.height_datum, options.maps.height_datum)
+    datum = placed.height_datum(options.maps.height_datum, options.maps.height_datum)
     feature_map = build_map(
         model,
-        control.map_placement(Sim3.identity()),
-        control.frame,
+        placed.map_placement(Sim3.identity()),
+        frame,
         component.photos,
         features,
         identity,

@@ -15,8 +15,9 @@ from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions, Stage
 from ingest.register.control.control_file import read_control_file
-from ingest.register.control.maps import Survey, residual_table
+from ingest.register.control.maps import Survey
 from ingest.register.control.placement import GcpOptions
+from ingest.register.control.report import residual_table
 from ingest.report.films import FilmOutcome, films_text
 from ingest.report.page import write_report
 from ingest.report.values import IngestReport, MapOutcome
@@ -163,8 +164,8 @@ def summary(report: IngestReport) -> str:
             )
             lines.extend(f"  {words}" for words in outcome.place_words)
         if outcome.control is not None and outcome.control.control.marks:
-            lines.extend(f"note: {text}" for text in outcome.control.file.notes)
-            lines.append(residual_table(outcome.control.placement, outcome.control.control).rstrip("\n"))
+            lines.extend(f"note: {text}" for text in outcome.control.control.file.notes)
+            lines.append(residual_table(outcome.control).rstrip("\n"))
     lines += films_text(report.films, report.photos)
     left_out = [photo for photo in report.photos if photo.status in ("not_registered", "skipped")]
     lines.extend(f"  {p.name}: {p.reason_code}: {p.reason}" for p in left_out[:_LISTED])

@@ -11,10 +11,9 @@ from ingest.register.control.maps import (
     Survey,
     place_unplaced_by_gcp,
     register_by_gcp,
-    residual_table,
 )
 from ingest.register.control.placement import GcpOptions
-from ingest.register.control.report import write_control_report
+from ingest.register.control.report import residual_table, write_control_report
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,10 +31,9 @@ class ControlledMap:
 
     def as_text(self) -> str:
         """For the terminal."""
-        controlled, committed = self.result.controlled, self.committed
-        placement = controlled.placement
-        lines = [f"note: {note}" for note in controlled.file.notes]
-        lines.append(residual_table(placement, controlled.control).rstrip("\n"))
+        placement, committed = self.result.placement, self.committed
+        lines = [f"note: {note}" for note in placement.control.file.notes]
+        lines.append(residual_table(placement).rstrip("\n"))
         if self.result.feature_map is None:
             return "\n".join([*lines, f"refused: {placement.reason}: {placement.message}"]) + "\n"
         lines.append(_moved_words(self.result))
@@ -79,8 +77,7 @@ def place_by_control(
     else:
         result = register_by_gcp(before, survey, height_datum)
     if report is not None:
-        done, title = result.controlled, f"Control points of {before.name}"
-        write_control_report(report, title, done.placement, done.control, done.evidence)
+        write_control_report(report, f"Control points of {before.name}", result.placement)
     committed = None
     if result.feature_map is not None and not dry_run:
         based_on = snapshot.get_any(map_id).write_id

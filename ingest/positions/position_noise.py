@@ -6,8 +6,7 @@ For the horizontal axes and the vertical each: noise is independent, drift is a 
 the time of the flight, the bias that a flight shares cannot be told from the similarity's translation. What
 is left of the lens' error bends the reconstruction: without that shape, survey-grade positions would seem to
 drift (the map's own covariances have it). What positions say of themselves is a prior of these components of
-variance (`MixedModel`). Positions far out are found with weights of Student's t (Lange, Little, Taylor 1989)
-and then left out.
+variance (`MixedModel`). Positions far out are left out.
 """
 
 from dataclasses import dataclass, replace
@@ -21,8 +20,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.positions.one_height import told_once
 from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean, stated_sigma
 
-_TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
-_ROUNDS = 12  # of weights and components; most settle in five
+_ROUNDS = 24  # of what is left out, and components; most settle in five
 _MOST_STEP = 0.5  # of the logarithm of the scale and of a turn; further it is not linear
 _SETTLED = 1e-3  # of a step over its standard deviation
 _TREND = 0.75  # of the variance of a drift at its end: what has one slope all along
@@ -211,9 +209,9 @@ def fit_noisy(
         speed, order = _speeds(centers, times_s), times_s
     moving = np.linalg.norm(speed, axis=1)
     usual = start.scale * float(np.median(moving[moving > 0])) if moving.any() else 0.0
-    taken = np.zeros((len(centers), 1))
-    taken[np.argsort(order, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = 1.0
-    sigmas = told_once(positions, sigmas, start.act(centers), taken[:, 0] > 0)
+    taken = np.zeros((len(centers), 1), dtype=np.bool_)
+    taken[np.argsort(order, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = True
+    sigmas = told_once(positions, sigmas, start.act(centers), taken[:, 0])
     data = _Data(
         centers=centers,
         positions=middle.inverse().act(positions),
@@ -226,28 +224,30 @@ def fit_noisy(
         held=held,
     )
     state, theta = _State(middle.inverse() @ start, 0.0), prior_mean(stated)
-    weights = taken * _start_weights(data, state)
-    for _ in range(_ROUNDS):  # heavy tails: a start that nothing far out decides
-        state, theta, settled = _round(data, state, weights, theta)
-        weights = taken * _weights(_squared(data, state, weights, theta))
-        if settled:
+    # What is far out at first is so for noise of the size that residuals have at the median.
+    squared = _relative(data, state.residual(data))
+    squared /= np.maximum(np.median(squared, axis=0) / chdtri(_SIZES, 0.5), _LEAST_M)
+    used, settled = np.zeros((len(centers), 2), dtype=np.bool_), False
+    for _ in range(_ROUNDS):
+        again = squared <= chdtri(_SIZES, 1.0 - _INSIDE)
+        again |= (again & taken).sum(axis=0) < _LEAST_PHOTOS
+        if settled and (again == used).all():
             break
-    used = np.zeros((len(centers), 2), dtype=np.bool_)
-    for _ in range(_ROUNDS):  # then normal ones, without what is far out
-        again = _squared(data, state, weights, theta) <= chdtri(_SIZES, 1.0 - _INSIDE)
-        again |= (again & (taken > 0)).sum(axis=0) < _LEAST_PHOTOS
-        if (again == used).all():
-            break
-        used, weights = again, taken * again
-        state, theta, _ = _round(data, state, weights, theta)
-    problem = _at(data, state, weights)
-    modes = problem.modes(theta, stated)
-    step, covariance = problem.integrated(modes, stated)
+        used, counted = again, taken & again
+        problem = _at(data, state, counted)
+        theta = problem.most_likely(theta, stated)
+        step, covariance = problem.solution(theta)
+        settled = bool(np.abs(step / np.sqrt(np.diag(covariance))).max() < _SETTLED)
+        state = state.moved(step)
+        squared = _squared(data, state, theta)
+    problem = _at(data, state, counted)
+    theta = problem.most_likely(theta, stated)
+    step, covariance = problem.integrated(theta, stated)
     checked = covariance[2:5, 2:5]
     if held is not None and not held.told:
-        free = _at(replace(data, held=None), state, weights)
-        checked = free.integrated(modes, stated)[1][2:5, 2:5]
-    state, theta = state.moved(step), modes[0]
+        free = _at(replace(data, held=None), state, counted)
+        checked = free.integrated(theta, stated)[1][2:5, 2:5]
+    state = state.moved(step)
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(
         local_from_sfm=middle @ state.sim,
@@ -256,19 +256,8 @@ def fit_noisy(
         lag_s=state.lag_s,
         checked_turn_rad=float(np.sqrt(np.linalg.eigvalsh(checked)[-1])),
         used=used,
-        log_chance=_log_chance(data, state, weights, int(taken.sum())),
+        log_chance=_log_chance(data, state, counted, int(taken.sum())),
     )
-
-
-def _round(
-    data: _Data, state: _State, weights: FloatArray, theta: FloatArray
-) -> tuple[_State, FloatArray, bool]:
-    """Components, then similarity; whether it has settled."""
-    problem = _at(data, state, weights)
-    theta = problem.most_likely(theta, data.stated)
-    step, covariance = problem.solution(theta)
-    settled = np.abs(step / np.sqrt(np.diag(covariance))).max() < _SETTLED
-    return state.moved(step), theta, bool(settled)
 
 
 def _speeds(centers: FloatArray, times_s: FloatArray) -> FloatArray:
@@ -293,7 +282,9 @@ def _walk(times_s: FloatArray) -> FloatArray:
     return np.asarray((1.0 - _TREND) * np.minimum(share[:, None], share) + _TREND * np.outer(share, share))
 
 
-def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: FloatArray) -> list[ModelAxis]:
+def _axes(
+    data: _Data, residual: FloatArray, jacobian: FloatArray, counted: NDArray[np.bool_]
+) -> list[ModelAxis]:
     """East, north, up.
 
     Args:
@@ -302,8 +293,8 @@ def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: Floa
     result = []
     for group, axes in enumerate(_AXES):
         for axis in axes.tolist():
-            known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
-            root = np.sqrt(weights[known, group]) * data.stated[group] / data.sigmas[known, axis]
+            known = np.isfinite(data.sigmas[:, axis]) & counted[:, group]
+            root = data.stated[group] / data.sigmas[known, axis]
             walk = data.walk[np.ix_(known, known)]
             variance, basis = np.linalg.eigh(root[:, None] * walk * root)
             result.append(
@@ -317,32 +308,17 @@ def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: Floa
     return result
 
 
-def _at(data: _Data, state: _State, weights: FloatArray) -> MixedModel:
-    axes = _axes(data, state.residual(data), state.jacobian(data), weights)
+def _at(data: _Data, state: _State, counted: NDArray[np.bool_]) -> MixedModel:
+    axes = _axes(data, state.residual(data), state.jacobian(data), counted)
     return MixedModel(axes, *state.known(data), data.shape_m**2)
 
 
-def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: FloatArray) -> FloatArray:
-    """The walk (n, 3) that is most likely for residuals (n, 3), with a constant taken off each axis."""
-    result = np.zeros_like(residual)
-    white, drift = data.shape_m**2 + np.exp(2.0 * theta[:2]), np.exp(2.0 * theta[2:])
-    for group, axes in enumerate(_AXES):
-        for axis in axes.tolist():
-            known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
-            if not known.any():
-                continue
-            ratio = data.sigmas[known, axis] / data.stated[group]
-            walk = drift[group] * data.walk
-            own = walk[np.ix_(known, known)] + np.diag(white[group] * ratio**2 / weights[known, group])
-            result[:, axis] = walk[:, known] @ np.linalg.solve(own, residual[known, axis])
-    return result
-
-
-def _squared(data: _Data, state: _State, weights: FloatArray, theta: FloatArray) -> FloatArray:
-    """(n, 2) squared residuals over the noise, horizontal and vertical, less the walk; 0 where not known."""
-    residual = state.residual(data)
-    own = residual - _walked(data, residual, weights, theta)
-    return _relative(data, own) / (data.shape_m**2 + np.exp(2.0 * theta[:2]))
+def _squared(data: _Data, state: _State, theta: FloatArray) -> FloatArray:
+    """(n, 2) squared residuals over noise and drift, horizontal and vertical; 0 where not known."""
+    variance = (
+        data.shape_m**2 + np.exp(2.0 * theta[:2]) + np.exp(2.0 * theta[2:]) * np.diag(data.walk)[:, None]
+    )
+    return _relative(data, state.residual(data)) / variance
 
 
 def _relative(data: _Data, residual: FloatArray) -> FloatArray:
@@ -355,18 +331,7 @@ def _relative(data: _Data, residual: FloatArray) -> FloatArray:
     return result
 
 
-def _start_weights(data: _Data, state: _State) -> FloatArray:
-    """As if all were noise of the size that residuals have at the median."""
-    squared = _relative(data, state.residual(data))
-    return _weights(squared / np.maximum(np.median(squared, axis=0) / chdtri(_SIZES, 0.5), _LEAST_M))
-
-
-def _weights(squared: FloatArray) -> FloatArray:
-    """Of Student's t."""
-    return np.asarray((_TAIL + _SIZES) / (_TAIL + squared))
-
-
-def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> float:
+def _log_chance(data: _Data, state: _State, counted: NDArray[np.bool_], total: int) -> float:
     """See `NoisyFit`: four of the degrees of freedom are the scale's and the turn's, so that the ratio of the
     sums of squares, which is the likelihoods', has a beta distribution. A lag counts as two.
 
@@ -374,11 +339,11 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
         total: positions before any was left out.
     """
     shift = np.broadcast_to(np.eye(3), (len(data.centers), 3, 3))
-    known = np.isfinite(data.sigmas) & (weights > 0)[:, [0, 0, 1]]
+    known = np.isfinite(data.sigmas) & counted[:, [0, 0, 1]]
     off = np.where(np.isfinite(data.sigmas), data.positions, 0.0)
     costs = []
     for residual in (state.residual(data), off - np.median(off, axis=0)):
-        problem = MixedModel(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
+        problem = MixedModel(_axes(data, residual, shift, counted), np.eye(3) / _UNKNOWN_M, np.zeros(3))
         spread = [np.square(residual[known[:, axes[0]]][:, axes]) for axes in _AXES]
         size = np.array([float(np.sqrt(of.mean())) if of.size else 1.0 for of in spread])
         size = np.maximum(size, _LEAST_SHARE * data.stated)  # heights that are all the same are told in steps
@@ -393,6 +358,6 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
     rest = half * -np.expm1(log_ratio)
     beta = 1.0 + rest + (0.0 if taken_up == 4 else 0.5 * (1.0 + 1.0 / half) * rest**2)
     tail = half * log_ratio + np.log(beta)  # of beta(half, taken_up / 2)
-    kept = int((weights > 0).all(axis=1).sum())
+    kept = int(counted.all(axis=1).sum())
     ways = gammaln(total + 1) - gammaln(kept + 1) - gammaln(total - kept + 1)
     return float(min(tail + ways + np.log(_TURNS), 0.0))

@@ -5,7 +5,6 @@ import numpy as np
 from featuredb.errors import RegistrationError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
 from featuredb.maps.move import placed_map
@@ -50,10 +49,11 @@ def place_by_photo(
             *(prior.sigma_horizontal_m, prior.sigma_horizontal_m, prior.sigma_vertical_m),
         ]
     )
+    at_camera = Sim3(scale=1.0, rotation=np.eye(3), translation=pose.center)
     placement = Placement(
         method="lidar",
         local_from_sfm=local_from_own,
-        covariance=_about(pose.center, sigmas),
+        covariance=at_camera.carried(np.diag(sigmas**2)),
         residual_rms_m=0.0,
         evidence={"start": {"image": image.name, "no_place": unplaced.no_place.reason_code}},
     )
@@ -92,11 +92,3 @@ def _scale(
     middle = float(np.median(logs))
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
     return float(np.exp(middle)), spread / np.sqrt(_MIN_POINTS)
-
-
-def _about(center: FloatArray, sigmas: FloatArray) -> FloatArray:
-    """(7, 7) covariance of a left perturbation from sigmas of scale, turns and shift about a centre."""
-    at_center = np.eye(7)
-    at_center[4:, 0] = -center
-    at_center[4:, 1:4] = skew(center)
-    return np.asarray(at_center @ np.diag(sigmas**2) @ at_center.T)

@@ -116,7 +116,7 @@ def _map(outcome: MapOutcome) -> str:
     ]
     control = ""
     if outcome.control is not None and outcome.control.control.marks:
-        control = control_html(outcome.control.placement, outcome.control.control)
+        control = control_html(outcome.control)
     notes = "".join(note(warning) for warning in outcome.warnings)
     pictures = ""
     if outcome.plan is not None:

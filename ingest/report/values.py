@@ -13,7 +13,7 @@ from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.plain_json import plain
 from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
 from ingest.plot_parts import PlanView
-from ingest.register.control.maps import ControlledPlacement
+from ingest.register.control.placement import GcpPlacement
 from ingest.report.films import FilmOutcome, films_json
 
 FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
@@ -152,7 +152,7 @@ class MapOutcome:
     errors_px: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     track_lengths: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     plan: PlanView | None = None
-    control: ControlledPlacement | None = None
+    control: GcpPlacement | None = None
 
     @property
     def place_words(self) -> tuple[str, ...]:

@@ -7,8 +7,9 @@ import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.control.maps import residual_table, vertical_of
+from ingest.register.control.maps import vertical_of
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
+from ingest.register.control.report import residual_table
 from tests.support.control import LOCAL_FROM_BLOCK, SurveyedBlock, moved_mark, surveyed_block
 
 _OPTIONS = GcpOptions()
@@ -97,7 +98,7 @@ def test_a_shifted_mark_is_named(world: SurveyedBlock, heights: bool) -> None:
     wrong = [m for m in placed.marks if not m.used]
     assert [(m.mark.point, m.mark.photo) for m in wrong] == [(f"p{key[0]}", f"{key[1]}.jpg")]
     assert wrong[0].error_px == pytest.approx(60.0, abs=4.0)
-    assert "px off: probably the wrong target" in residual_table(placed, control)
+    assert "px off: probably the wrong target" in residual_table(placed)
     assert all(p.used for p in placed.points)
 
 
@@ -229,5 +230,5 @@ def test_marks_that_cannot_be_used_are_told(world: SurveyedBlock) -> None:
     reasons = {mark.photo: reason for mark, reason in control.unused}
     assert "no photo 77.jpg" in reasons["77.jpg"]
     assert "outside" in reasons[f"{first[1]}.jpg"]
-    table = residual_table(place_by_gcp(world.block, control, _OPTIONS), control)
+    table = residual_table(place_by_gcp(world.block, control, _OPTIONS))
     assert "mark of p0 in 77.jpg" in table

@@ -46,12 +46,11 @@ def edges_of(view: Rendering) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """
     depth = view.depth
     jump = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
-        step = np.abs(np.diff(depth, axis=axis)) / np.minimum(
-            *(np.take(depth, range(i, depth.shape[axis] - 1 + i), axis) for i in (0, 1))
-        )
-        mark = np.nan_to_num(step, nan=0.0) > _DEPTH_STEP
-        jump |= np.pad(mark, [(0, int(axis == 0)), (0, int(axis == 1))])
+    for marked, here, there in (
+        (jump[:-1], depth[:-1], depth[1:]),
+        (jump[:, :-1], depth[:, :-1], depth[:, 1:]),
+    ):
+        marked |= np.abs(there - here) > _DEPTH_STEP * np.minimum(here, there)  # not where one is NaN
     gray = cv2.cvtColor(view_rgb(view), cv2.COLOR_RGB2GRAY)
     valid = view.valid
     inside = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
@@ -107,17 +106,15 @@ def map_over_scan_png(
     top, side = figure.subplots(2, 1, height_ratios=(2.4 * ratio, 1.2))
     colours = np.percentile(scan[:, 2], (1, 99)) if len(scan) else (0.0, 1.0)
     top.scatter(scan[:, 0], scan[:, 1], s=0.6, c=scan[:, 2], cmap="Greys_r", vmin=colours[0], vmax=colours[1])
+    side.plot(scan[:, 0], scan[:, 2], ",", color=_SCAN)
     for points, colour, label in ((before_local, _BEFORE, "before"), (after_local, _AFTER, "after")):
         few = _thinned(points, 8000)
         top.plot(few[:, 0], few[:, 1], ".", ms=1.2, color=colour)
+        side.plot(few[:, 0], few[:, 2], ".", ms=1.2, color=colour)
         top.plot([], [], "o", ms=5, color=colour, label=f"map points {label}")
     top.plot(centers_local[:, 0], centers_local[:, 1], "^", ms=5, color=_INK, label="cameras after")
     top.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", ylabel="north, m")
     top.legend(loc="upper right", fontsize=8, framealpha=0.9)
-    side.plot(scan[:, 0], scan[:, 2], ",", color=_SCAN)
-    for points, colour in ((before_local, _BEFORE), (after_local, _AFTER)):
-        few = _thinned(points, 8000)
-        side.plot(few[:, 0], few[:, 2], ".", ms=1.2, color=colour)
     heights = np.percentile(np.concatenate([before_local[:, 2], after_local[:, 2]]), (0.5, 99.5))
     margin = 0.15 * (heights[1] - heights[0]) + 1.0
     side.set(

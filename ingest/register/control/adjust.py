@@ -23,7 +23,6 @@ from featuredb.adjust.terms import (
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.geometry.similarity import refined_similarity
 from ingest.colmap.adjust import AdjustOptions, block_variance_px2
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control
@@ -97,81 +96,58 @@ class Task:
             photo shows.
         block: those of its points that take part.
         control_xyz: (n, 3) where the control points lie in it.
-        vertical: what is known of it in that frame.
-        weight_px: standard deviation of a keypoint's coordinate with which keypoints count.
-        keep_lens: keep all lenses.
+        terms: what is known beside the control points.
     """
 
     placed: Block
     block: Block
     control: Control
     control_xyz: FloatArray
-    vertical: Vertical | None
-    weight_px: float
-    keep_lens: bool
+    terms: Terms
 
 
 def task_of(
     placed: Block, control: Control, control_xyz: FloatArray, vertical: Vertical | None, keep_lens: bool
 ) -> Task:
-    """For a block in metres in the local frame, in place but for small changes."""
+    """For a block in metres in the local frame, in place but for small changes.
+
+    Args:
+        vertical: what is known of it in that frame. keep_lens: keep all lenses.
+    """
     chosen = _sample(placed, _POINTS_PER_PHOTO)
     variance_px2 = max(block_variance_px2(chosen), _LEAST_PX2)
     share = len(chosen.xy) / len(placed.xy)
-    return Task(
-        placed=placed,
-        block=chosen if keep_lens else whole_lens(chosen),
-        control=control,
-        control_xyz=control_xyz,
-        vertical=vertical,
-        weight_px=float(np.sqrt(variance_px2 * max(1.0, _DILUTION * share))),
-        keep_lens=keep_lens,
-    )
-
-
-def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Adjusted:
-    """Adjust a block.
-
-    Args:
-        previous: under other weights, to go on from.
-    """
-    control, used = task.control, weights.points
-    block, xyz, vertical, change = task.block, task.control_xyz, task.vertical, Sim3.identity()
-    if previous is not None:
-        block, change = previous.block, previous.change
-        lost = np.isnan(previous.control_xyz)
-        xyz = np.where(lost, change.act(xyz), previous.control_xyz)
-        vertical = None if vertical is None else vertical.moved(change)
-    move = refined_similarity(Sim3.identity(), xyz[used], control.surveyed[used], weights.control_m, vertical)
-    start, xyz, vertical = (
-        block.moved(move),
-        move.act(xyz),
-        None if vertical is None else vertical.moved(move),
-    )
-    count = len(start.xyz)
+    block = chosen if keep_lens else whole_lens(chosen)
     terms = Terms(
-        keypoint_px=task.weight_px,
-        lenses=tuple(None if task.keep_lens else lens_prior(camera, _LENS) for camera in task.block.cameras),
-        orientations=None if vertical is None else _upright(start, vertical),
-        points=None if vertical is None else _anchor(start, vertical),
-        targets=Targets(
-            point_of=count + control.point_of[weights.marks],
-            photo_of=control.photo_of[weights.marks],
-            xy=control.xy[weights.marks],
-            sigma_px=weights.mark_px,
-            survey=_survey(task, move @ change, xyz, weights),
-        ),
+        keypoint_px=float(np.sqrt(variance_px2 * max(1.0, _DILUTION * share))),
+        lenses=tuple(None if keep_lens else lens_prior(camera, _LENS) for camera in block.cameras),
+        orientations=None if vertical is None else _upright(block, vertical),
+        points=None if vertical is None else _anchor(block, vertical),
     )
-    problem = Problem(replace(start, xyz=np.concatenate([start.xyz, xyz])), terms)
+    return Task(placed=placed, block=block, control=control, control_xyz=control_xyz, terms=terms)
+
+
+def adjust(task: Task, weights: Weights) -> Adjusted:
+    """Adjust a block."""
+    control, start, count = task.control, task.block, len(task.block.xyz)
+    targets = Targets(
+        point_of=count + control.point_of[weights.marks],
+        photo_of=control.photo_of[weights.marks],
+        xy=control.xy[weights.marks],
+        sigma_px=weights.mark_px,
+        survey=_survey(task, weights),
+    )
+    whole = replace(start, xyz=np.concatenate([start.xyz, task.control_xyz]))
+    problem = Problem(whole, replace(task.terms, targets=targets))
     problem.solve(_MAX_ITERATIONS, _TOLERANCE, _RADIUS)
     everything, found = problem.block(), problem.target_marginals()
     adjusted = replace(everything, xyz=everything.xyz[:count])
     by_poses = similarity_of_change(adjusted)
     poses = 6 * len(adjusted.names)
-    located = np.isin(np.arange(len(used)), control.point_of[weights.marks])
+    located = np.isin(np.arange(len(control.names)), control.point_of[weights.marks])
     return Adjusted(
         block=adjusted,
-        change=_common_change(start, adjusted) @ move @ change,
+        change=_common_change(start, adjusted),
         covariance=by_poses @ found.block.shared[:poses, :poses] @ by_poses.T,
         control_xyz=np.where(located[:, None], everything.xyz[count:], np.nan),
         spread=found.point,
@@ -190,7 +166,7 @@ def with_all_points(adjusted: Adjusted, task: Task) -> Block:
         xyz=adjusted.change.act(task.placed.xyz),
     )
     held = Terms(
-        keypoint_px=task.weight_px,
+        keypoint_px=task.terms.keypoint_px,
         lenses=(None,) * len(start.cameras),
         held_photos=tuple(range(len(start.names))),
     )
@@ -219,22 +195,22 @@ def _sample(block: Block, per_photo: int) -> Block:
     )
 
 
-def _survey(task: Task, change: Sim3, xyz: FloatArray, weights: Weights) -> PointPriors:
-    """Surveyed coordinates of the points (n, 3), else the ground's height, else next to nothing."""
+def _survey(task: Task, weights: Weights) -> PointPriors:
+    """Surveyed coordinates of the points, else the ground's height, else next to nothing."""
     control = task.control
-    expected, sigma = xyz.copy(), np.full(xyz.shape, _LOOSE_M)
+    expected, sigma = task.control_xyz.copy(), np.full(task.control_xyz.shape, _LOOSE_M)
     rows = np.flatnonzero(weights.marks)
     point_of = control.point_of[rows]
     for row in rows[np.bincount(point_of)[point_of] == 1].tolist():
         photo, point = int(control.photo_of[row]), int(control.point_of[row])
         ground = on_ground(task.placed, photo, control.xy[row])
         if ground is not None:
-            expected[point, 2] = change.act(ground)[2]
+            expected[point, 2] = ground[2]
             distance_m = np.linalg.norm(ground - task.placed.cam_from_block[photo].center)
             sigma[point, 2] = _GROUND_SHARE * distance_m
     known = np.isfinite(control.surveyed) & weights.points[:, None]
     return PointPriors(
-        point_of=len(task.block.xyz) + np.arange(len(xyz)),
+        point_of=len(task.block.xyz) + np.arange(len(expected)),
         xyz=np.where(known, control.surveyed, expected),
         covariance=np.where(known, weights.control_m, sigma)[:, :, None] ** 2 * np.eye(3),
     )

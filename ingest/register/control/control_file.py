@@ -10,14 +10,12 @@ pixel, whose centre is (0.5, 0.5). See https://docs.opendronemap.org/gcp/.
 """
 
 import math
-from collections import defaultdict
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from featuredb.errors import ControlFileError, GeodesyError, InvalidValueError
+from featuredb.errors import ControlFileError, GeodesyError
 from featuredb.geo.crs.survey import SurveyCrs, geodetic_from_survey, survey_crs
 from featuredb.geometry.arrays import FloatArray
 
@@ -25,6 +23,8 @@ _COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
 _MOST_ERRORS = 8  # a file with a wrong separator has one on every line
 _MAX_BYTES = 20_000_000  # about 200,000 marks; more is some other file
 _UNKNOWN_HEIGHTS = ("nan", "na", "none", "-")
+
+_Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,23 +63,6 @@ class ControlFile:
     marks: tuple[Mark, ...]
     notes: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        places = np.array(self.lat_lon_h, dtype=np.float64)
-        if places.shape != (len(self.names), 3):
-            raise InvalidValueError(
-                f"ControlFile.lat_lon_h: expected shape ({len(self.names)}, 3), found {places.shape}"
-            )
-        places.setflags(write=False)
-        object.__setattr__(self, "lat_lon_h", places)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Line:
-    """A mark, whose point is "" where the line names none, and where the point lies."""
-
-    mark: Mark
-    place: tuple[float, float, float]
-
 
 def read_control_file(path: Path, crs: str | None = None) -> ControlFile:
     """Read and check a control point file.
@@ -117,17 +100,21 @@ def parse_control_file(text: str, where: str, crs: str | None = None) -> Control
     system, body = _header(filled, where, crs)
     if not body:
         raise ControlFileError(f"{where}: expected a mark per line ({_COLUMNS}), found only a header")
-    lines = _collect(body, where)
-    points, notes = _points(lines, where)
-    marks, more_notes = _marks(points, where)
-    xyz = np.array([lines[0].place for lines in points.values()])
-    xyz, height_notes = _heights(xyz, list(points), system)
+    lines, faults = [], []
+    for number, line in body:
+        try:
+            lines.append(_parse_line(number, line, system))
+        except ControlFileError as error:
+            faults.append(str(error))
+    _raise(faults, where)
+    places, marks, notes = _points(lines, where)
+    xyz, height_notes = _heights(places, system)
+    try:
+        lat_lon_h = geodetic_from_survey(system, xyz)
+    except GeodesyError as error:
+        raise ControlFileError(f"{where}: {error}") from error
     return ControlFile(
-        crs=system,
-        names=tuple(points),
-        lat_lon_h=_geodetic(system, xyz, points, where),
-        marks=marks,
-        notes=(*notes, *more_notes, *height_notes),
+        crs=system, names=tuple(places), lat_lon_h=lat_lon_h, marks=marks, notes=(*notes, *height_notes)
     )
 
 
@@ -136,7 +123,8 @@ def _header(
 ) -> tuple[SurveyCrs, list[tuple[int, str]]]:
     """The reference system and the lines after it."""
     number, first = filled[0]
-    first_is_mark = _looks_like_mark(first)
+    fields = first.split()
+    first_is_mark = len(fields) >= 6 and None not in map(_number, (*fields[:2], *fields[3:5]))
     if first_is_mark and given is None:
         raise ControlFileError(
             f"{where}, line {number}: expected the reference system of the coordinates, found a mark; put "
@@ -150,13 +138,11 @@ def _header(
     return system, filled if first_is_mark else filled[1:]
 
 
-def _looks_like_mark(line: str) -> bool:
-    fields = line.split()
-    return len(fields) >= 6 and all(_number(field) is not None for field in (*fields[:2], *fields[3:5]))
-
-
-def _parse_line(number: int, line: str) -> _Line:
-    fields = _fields(line)
+def _parse_line(number: int, line: str, crs: SurveyCrs) -> tuple[Mark, _Place]:
+    """A mark, whose point is "" where the line names none, and where the point lies."""
+    fields = [field.strip() for field in line.split("\t") if field.strip()]
+    if len(fields) < 6:  # by tabs where they make enough columns, since names of photos may hold spaces
+        fields = line.split()
     if len(fields) < 6:
         hint = "; separate columns by spaces or tabs, not commas" if line.count(",") >= 5 else ""
         raise ControlFileError(
@@ -175,15 +161,13 @@ def _parse_line(number: int, line: str) -> _Line:
         raise ControlFileError(
             f"line {number}: expected pixels >= 0, found {px:g} {py:g}; the columns are {_COLUMNS}"
         )
+    if crs.geographic and (abs(x) > 180 or abs(y) > 90):
+        raise ControlFileError(
+            f"line {number}: expected longitude and latitude in degrees ({crs.name}), found {x:g} {y:g}; "
+            "name the projected system in the first line"
+        )
     name = fields[6] if len(fields) > 6 else ""
-    mark = Mark(point=name, photo=fields[5].replace("\\", "/"), x=px, y=py, line=number)
-    return _Line(mark=mark, place=(x, y, z))
-
-
-def _fields(line: str) -> list[str]:
-    """Columns; by tabs where they make enough of them, since names of photos may hold spaces."""
-    by_tab = [field.strip() for field in line.split("\t") if field.strip()]
-    return by_tab if len(by_tab) >= 6 else line.split()
+    return Mark(point=name, photo=fields[5].replace("\\", "/"), x=px, y=py, line=number), (x, y, z)
 
 
 def _number(field: str) -> float | None:
@@ -194,100 +178,67 @@ def _number(field: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _collect(body: Iterable[tuple[int, str]], where: str) -> list[_Line]:
-    """All lines, or one error that names every line at fault."""
-    lines, faults = [], []
-    for number, line in body:
-        try:
-            lines.append(_parse_line(number, line))
-        except ControlFileError as error:
-            faults.append(str(error))
-    _raise(faults, where)
-    return lines
-
-
 def _raise(faults: list[str], where: str) -> None:
+    """One error that names every line at fault."""
     if faults:
         more = f"\n  and {len(faults) - _MOST_ERRORS} more" if len(faults) > _MOST_ERRORS else ""
         raise ControlFileError(f"{where}:\n  " + "\n  ".join(faults[:_MOST_ERRORS]) + more)
 
 
-def _points(lines: list[_Line], where: str) -> tuple[dict[str, list[_Line]], list[str]]:
-    """Lines by point: by name, and by equal coordinates where there is no name."""
+def _points(
+    lines: list[tuple[Mark, _Place]], where: str
+) -> tuple[dict[str, _Place], tuple[Mark, ...], list[str]]:
+    """Places by point, marks and notes.
+
+    Lines belong to one point by its name, and by equal coordinates where there is none. A repeated mark
+    counts once; contradicting ones are a fault, as contradicting places are.
+    """
     name_at: dict[tuple[float, float], str] = {}
-    points: dict[str, list[_Line]] = defaultdict(list)
-    faults, notes = [], []
-    for line in lines:
-        if name := line.mark.point:
-            other = name_at.setdefault(line.place[:2], name)
-            if other != name and name not in points:
-                notes.append(f"line {line.mark.line}: {name} has the coordinates of {other}")
-    for line in lines:
-        name = line.mark.point or name_at.setdefault(line.place[:2], f"point {len(name_at) + 1}")
-        first = points[name][0] if points[name] else line
-        if not np.array_equal(first.place, line.place, equal_nan=True):
-            here, there = (" ".join(f"{v:.10g}" for v in found.place) for found in (line, first))
-            faults.append(
-                f"line {line.mark.line}: {name} is at {here}, line {first.mark.line} says {there}; give it "
-                "one position, or different names to different points"
-            )
-            continue
-        points[name].append(replace(line, mark=replace(line.mark, point=name)))
-    _raise(faults, where)
-    return dict(points), notes
-
-
-def _marks(points: dict[str, list[_Line]], where: str) -> tuple[tuple[Mark, ...], list[str]]:
-    """Marks in the order of the file; a repeated one counts once, contradicting ones are a fault."""
+    places: dict[str, tuple[int, _Place]] = {}
     marks: dict[tuple[str, str], Mark] = {}
     faults, notes = [], []
-    for name, lines in points.items():
-        for mark in (line.mark for line in lines):
-            first = marks.setdefault((name, mark.photo), mark)
-            if first is mark:
-                continue
-            if (first.x, first.y) == (mark.x, mark.y):
-                notes.append(f"line {mark.line} repeats line {first.line}")
-            else:
-                faults.append(
-                    f"line {mark.line}: {name} is marked in {mark.photo} a second time, at {mark.x:g} "
-                    f"{mark.y:g}; line {first.line} has it at {first.x:g} {first.y:g}; remove one of them"
-                )
+    for mark, place in lines:
+        if mark.point:
+            name_at.setdefault(place[:2], mark.point)
+    for mark, place in lines:
+        name = mark.point or name_at.setdefault(place[:2], f"point {len(name_at) + 1}")
+        if name not in places and name_at[place[:2]] != name:
+            notes.append(f"line {mark.line}: {name} has the coordinates of {name_at[place[:2]]}")
+        line, other = places.setdefault(name, (mark.line, place))
+        if not np.array_equal(other, place, equal_nan=True):
+            here, there = (" ".join(f"{v:.10g}" for v in found) for found in (place, other))
+            faults.append(
+                f"line {mark.line}: {name} is at {here}, line {line} says {there}; give it one position, or "
+                "different names to different points"
+            )
+            continue
+        first = marks.setdefault((name, mark.photo), replace(mark, point=name))
+        if first.line == mark.line:
+            continue
+        if (first.x, first.y) == (mark.x, mark.y):
+            notes.append(f"line {mark.line} repeats line {first.line}")
+        else:
+            faults.append(
+                f"line {mark.line}: {name} is marked in {mark.photo} a second time, at {mark.x:g} "
+                f"{mark.y:g}; line {first.line} has it at {first.x:g} {first.y:g}; remove one of them"
+            )
     _raise(faults, where)
-    return tuple(sorted(marks.values(), key=lambda m: m.line)), notes
+    return {name: place for name, (_, place) in places.items()}, tuple(marks.values()), notes
 
 
-def _heights(xyz: FloatArray, names: list[str], crs: SurveyCrs) -> tuple[FloatArray, list[str]]:
-    """Coordinates with heights NaN where unknown, and what was made of them."""
-    heights = xyz[:, 2]
-    known = np.isfinite(heights)
+def _heights(places: dict[str, _Place], crs: SurveyCrs) -> tuple[FloatArray, list[str]]:
+    """Coordinates (n, 3) with heights NaN where unknown, and what was made of them."""
+    xyz = np.array(list(places.values()))
+    known = np.isfinite(xyz[:, 2])
     notes = []
-    if known.any() and (heights[known] == 0.0).all():
-        xyz = xyz.copy()
+    if known.any() and (xyz[known, 2] == 0.0).all():
         xyz[:, 2] = np.nan
         return xyz, ["every height is exactly zero, so heights are taken as unknown"]
     if not known.any():
         notes.append("no point has a height")
     elif not known.all():
-        lacking = ", ".join(name for name, there in zip(names, known, strict=True) if not there)
+        lacking = ", ".join(name for name, there in zip(places, known, strict=True) if not there)
         notes.append(f"without a height: {lacking}")
     if known.any() and crs.height_unit_m != 1.0:
         notes.append(f"heights are taken in the system's unit of {crs.height_unit_m:.10g} m")
     return xyz, notes
-
-
-def _geodetic(crs: SurveyCrs, xyz: FloatArray, points: dict[str, list[_Line]], where: str) -> FloatArray:
-    faults = []
-    if crs.geographic:
-        for lines in points.values():
-            x, y, _ = lines[0].place
-            if abs(x) > 180 or abs(y) > 90:
-                faults.append(
-                    f"line {lines[0].mark.line}: expected longitude and latitude in degrees ({crs.name}), "
-                    f"found {x:g} {y:g}; name the projected system in the first line"
-                )
-    _raise(faults, where)
-    try:
-        return geodetic_from_survey(crs, xyz)
-    except GeodesyError as error:
-        raise ControlFileError(f"{where}: {error}") from error

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import rotation_to_up
-from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.geometry.similarity import refined_similarity, similarity_closed_form
+from featuredb.geometry.rotation import rotation_to_up, so3_exp
+from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import intersect, on_ground, shown
 
@@ -49,21 +49,6 @@ class Vertical:
     sigma_up_m: float
     source: str
 
-    def residual(self, local_from_block: Sim3) -> FloatArray:
-        """(3,) whitened: tilt east, tilt north, height."""
-        up = local_from_block.rotation @ self.up_block
-        height = local_from_block.act(self.anchor_block)[2] - self.anchor_up_m
-        return np.append(self._whiten() @ up[:2], height / self.sigma_up_m)
-
-    def jacobian(self, local_from_block: Sim3) -> FloatArray:
-        """(3, 7) of `residual` by the left perturbation."""
-        x, y, z = local_from_block.rotation @ self.up_block
-        by_rotation = np.array([[0.0, z, -y], [-z, 0.0, x]])
-        rows = np.zeros((3, 7))
-        rows[:2, 1:4] = self._whiten() @ by_rotation
-        rows[2] = point_jacobian(local_from_block.act(self.anchor_block))[2] / self.sigma_up_m
-        return rows
-
     def moved(self, target_from_block: Sim3) -> "Vertical":
         """The same of a block that has moved."""
         return replace(
@@ -71,9 +56,6 @@ class Vertical:
             up_block=target_from_block.rotation @ self.up_block,
             anchor_block=target_from_block.act(self.anchor_block),
         )
-
-    def _whiten(self) -> FloatArray:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.tilt_covariance)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,6 +89,7 @@ _MAX_MARK_ERROR_PX = 12.0
 _MIN_RAY_ANGLE_DEG = 1.0  # rays closer to parallel than that give no place
 _OUTLIER_SIGMAS = 3.5  # points further out are left out; 3.5 keeps 99.8 % of honest ones in the plane
 _MIN_SIGMA_M = 0.02  # survey and marks are not better than that, so smaller residuals never make outliers
+_ROUNDS = 6  # of choosing and fitting; two or three settle
 _SAMPLES = 1500  # of hypotheses
 _SEED = 0  # of the samples
 
@@ -161,23 +144,14 @@ def fit_similarity(
     if start is None:
         return None
     sim = start
-    for _ in range(10):  # settles in two or three rounds
-        residuals = _residuals(sim, xyz, surveyed[point])
-        lengths = np.linalg.norm(residuals, axis=1)
+    for _ in range(_ROUNDS):
+        lengths = np.linalg.norm(_residuals(sim, xyz, surveyed[point]), axis=1)
         sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical)
         chosen = _choose(found, point, lengths, _OUTLIER_SIGMAS * sigma)
         inliers = lengths[chosen] <= _OUTLIER_SIGMAS * sigma
-        refined = refined_similarity(sim, xyz[chosen][inliers], surveyed[inliers], sigma, vertical)
-        moved = float(np.abs(refined.act(xyz[chosen]) - sim.act(xyz[chosen])).max())
-        sim = refined
-        if moved < 1e-6:
-            break
-    rest = surveyed - sim.act(xyz[chosen])
+        sim = _similarity(xyz[chosen][inliers], surveyed[inliers], vertical) or sim
     return ControlFit(
-        local_from_block=sim,
-        inliers=np.linalg.norm(np.nan_to_num(rest), axis=1) <= _OUTLIER_SIGMAS * sigma,
-        chosen=tuple(found[int(i)] for i in chosen),
-        sigma_m=sigma,
+        local_from_block=sim, inliers=inliers, chosen=tuple(found[int(i)] for i in chosen), sigma_m=sigma
     )
 
 
@@ -203,11 +177,7 @@ def _least_trimmed(
     kept = (count + size + 1) // 2
     best: tuple[float, Sim3] | None = None
     for rows in _samples(usable, point, size):
-        sim = (
-            similarity_closed_form(xyz[rows], surveyed[point[rows]])
-            if vertical is None
-            else _levelled(xyz[rows], surveyed[point[rows]], vertical)
-        )
+        sim = _similarity(xyz[rows], surveyed[point[rows]], vertical)
         if sim is None:
             continue
         lengths = np.linalg.norm(_residuals(sim, xyz, surveyed[point]), axis=1)
@@ -230,16 +200,21 @@ def _samples(usable: NDArray[np.int64], point: NDArray[np.int64], size: int) -> 
     return samples
 
 
-def _levelled(xyz: FloatArray, surveyed: FloatArray, vertical: Vertical) -> Sim3 | None:
-    """The similarity of two points that keeps the vertical: a turn, a scale and a shift in the plane."""
+def _similarity(xyz: FloatArray, surveyed: FloatArray, vertical: Vertical | None) -> Sim3 | None:
+    """The similarity of points (n, 3) by least squares, where a vertical is given the best that keeps it.
+
+    None where the points coincide.
+    """
+    if vertical is None:
+        known = np.isfinite(surveyed[:, 2])
+        return similarity_closed_form(xyz[known], surveyed[known])
     level = rotation_to_up(vertical.up_block)
     source, target = (xyz @ level.T)[:, :2] @ [1, 1j], surveyed[:, :2] @ [1, 1j]
-    if abs(source[1] - source[0]) < 1e-12 or abs(target[1] - target[0]) < 1e-6:
+    around, wanted = source - source.mean(), target - target.mean()
+    if np.abs(around).max() < 1e-12 or np.abs(wanted).max() < 1e-6:
         return None
-    turn = (target[1] - target[0]) / (source[1] - source[0])
-    angle = np.angle(turn)
-    about_up = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-    rotation = about_up @ level
+    turn = np.vdot(around, wanted) / np.vdot(around, around)
+    rotation = so3_exp([0.0, 0.0, np.angle(turn)]) @ level
     scale = float(abs(turn))
     shift = target.mean() - turn * source.mean()
     up = vertical.anchor_up_m - scale * (rotation @ vertical.anchor_block)[2]
@@ -260,12 +235,7 @@ def _choose(
     found: Sequence[Hypothesis], point: NDArray[np.int64], lengths: FloatArray, limit_m: float
 ) -> NDArray[np.int64]:
     """For each point the hypothesis of most marks within the limit, the nearest if none is."""
-    chosen = np.zeros(int(point.max()) + 1, dtype=np.int64)
-    for row in range(len(chosen)):
-        rows = np.flatnonzero(point == row).tolist()
-        near = [i for i in rows if lengths[i] <= limit_m]
-        chosen[row] = min(
-            near or rows,
-            key=lambda i: (-len(found[i].marks), lengths[i]) if near else (0, lengths[i]),
-        )
-    return chosen
+    near = lengths <= limit_m
+    marks = np.array([len(hypothesis.marks) for hypothesis in found])
+    order = np.lexsort((lengths, np.where(near, -marks, 0), ~near, point))
+    return order[np.unique(point[order], return_index=True)[1]]

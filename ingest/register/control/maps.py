@@ -1,10 +1,7 @@
-"""Control points place a reconstruction that is no map yet, a map that has a place, and one that has none;
-evidence and a table of what they leave.
-"""
+"""Control points place a reconstruction that is no map yet, a map that has a place, and one that has none."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +16,7 @@ from featuredb.maps.unplaced_map import UnplacedMap
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.control.control_file import ControlFile
 from ingest.register.control.fit import Vertical
-from ingest.register.control.marks import Control, control_frame, meet
+from ingest.register.control.marks import control_frame, meet
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
 
 # A local frame is good for tens of kilometres; a new one further away keeps coordinates small.
@@ -34,61 +31,13 @@ class Survey:
     options: GcpOptions = field(default_factory=GcpOptions)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControlledPlacement:
-    """A reconstruction placed by control points, or why not.
-
-    Attributes:
-        placement: with residuals; its reason is None where it was accepted.
-        control: what met the photos, and what did not.
-        frame: local frame of the placement.
-        file: the control points.
-    """
-
-    placement: GcpPlacement
-    control: Control
-    frame: LocalFrame
-    file: ControlFile
-
-    @property
-    def evidence(self) -> dict[str, Any]:
-        """Figures, residuals of every point and mark, and notes; JSON-able."""
-        return _evidence(self.placement, self.control) | {"file_notes": list(self.file.notes)}
-
-    def map_placement(self, block_from_sfm: Sim3) -> Placement:
-        """For the map, of an accepted placement.
-
-        Args:
-            block_from_sfm: what had placed the block in its own frame.
-        """
-        assert self.placement.local_from_block is not None
-        assert self.placement.covariance is not None  # accepted
-        return Placement(
-            method="gcp",
-            local_from_sfm=self.placement.local_from_block @ block_from_sfm,
-            covariance=self.placement.covariance,
-            residual_rms_m=self.placement.residual_rms_m,
-            evidence=self.evidence,
-        )
-
-    def height_datum(self, before: str, said: str) -> str:
-        """Datum of the map's heights: the survey's where it gives heights, else what it was before.
-
-        Args:
-            said: of the surveyed heights, where the file's reference system does not say it.
-        """
-        if np.isfinite(self.control.surveyed[:, 2]).sum() < 3:
-            return before
-        return self.file.crs.height_datum if self.file.crs.height_datum != "unknown" else said
-
-
 def place_by_survey(
     block: Block,
     positions: Sequence[GeoPrior | None],
     frame: LocalFrame,
     vertical: Vertical | None,
     survey: Survey,
-) -> ControlledPlacement:
+) -> GcpPlacement:
     """Place and adjust a block.
 
     Args:
@@ -97,10 +46,7 @@ def place_by_survey(
     """
     control = meet(survey.file, block, frame)
     gps, sigma = _gps_in(frame, positions)
-    placement = place_by_gcp(
-        block, control, survey.options, vertical=vertical, gps_local=gps, gps_sigma_m=sigma
-    )
-    return ControlledPlacement(placement=placement, control=control, frame=frame, file=survey.file)
+    return place_by_gcp(block, control, survey.options, vertical=vertical, gps_local=gps, gps_sigma_m=sigma)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -108,13 +54,13 @@ class GcpRegistration:
     """A map placed anew by control points, or why not.
 
     Attributes:
-        controlled: the placement.
+        placement: by the points.
         feature_map: to be committed in the old one's place, None where it was refused.
         moved_m: (3,) median of how far the map's points moved, east, north, up; None without a map, and where
             it had no place before.
     """
 
-    controlled: ControlledPlacement
+    placement: GcpPlacement
     feature_map: FeatureMap | None = None
     moved_m: FloatArray | None = None
 
@@ -134,15 +80,15 @@ def register_by_gcp(
     vertical = _vertical_of_map(feature_map, block.xyz, frame_from_map)
     positions = [image.gps for image in feature_map.images]
     found = place_by_survey(block, positions, frame, vertical, survey)
-    if not found.placement.accepted:
-        return GcpRegistration(controlled=found)
-    assert found.placement.block is not None
+    if not found.accepted:
+        return GcpRegistration(placement=found)
+    assert found.block is not None
     placement = found.map_placement(feature_map.placement.local_from_sfm)
     datum = found.height_datum(feature_map.height_datum, height_datum)
     return GcpRegistration(
-        controlled=found,
-        feature_map=map_of_block(feature_map, found.placement.block, frame, placement, datum),
-        moved_m=np.median(found.placement.block.xyz - frame_from_map.act(block.xyz), axis=0),
+        placement=found,
+        feature_map=map_of_block(feature_map, found.block, frame, placement, datum),
+        moved_m=np.median(found.block.xyz - frame_from_map.act(block.xyz), axis=0),
     )
 
 
@@ -209,80 +155,3 @@ def _vertical_of_map(feature_map: FeatureMap, points: FloatArray, frame_from_map
         return None
     covariance = frame_from_map.carried(feature_map.placement.covariance)
     return vertical_of(frame_from_map, covariance, points, f"the map's placement by {method}")
-
-
-def _evidence(placement: GcpPlacement, control: Control) -> dict[str, Any]:
-    return {
-        **placement.figures,
-        "notes": list(placement.notes),
-        "points": [
-            {
-                "name": p.name,
-                "residual_enu_m": _numbers(p.residual_m),
-                "leave_one_out_enu_m": _numbers(p.leave_one_out_m),
-                "marks": p.marks,
-                "used": p.used,
-                "remark": p.remark,
-            }
-            for p in placement.points
-        ],
-        "marks": [
-            {
-                "point": m.mark.point,
-                "photo": m.mark.photo,
-                "line": m.mark.line,
-                "residual_px": _numbers(m.residual_px),
-                "used": m.used,
-                "remark": m.remark,
-            }
-            for m in placement.marks
-        ],
-        "unused_marks": [f"line {mark.line}: {reason}" for mark, reason in control.unused],
-        "unmarked_points": list(control.unmarked),
-    }
-
-
-def residual_table(placement: GcpPlacement, control: Control) -> str:
-    """Residuals of every point, what is odd, and what was assumed, as lines of text."""
-    lines = [
-        "control point        marks  east m  north m    up m  horizontal m  without it m",
-        "-------------------  -----  ------  -------  ------  ------------  ------------",
-    ]
-    for p in placement.points:
-        alone = float(np.hypot(*p.leave_one_out_m[:2]))
-        lines.append(
-            f"{p.name[:19]:19s}  {f'{p.marks}/{p.marks_given}':>5s}  {_cell(p.residual_m[0], 6)}  "
-            f"{_cell(p.residual_m[1], 7)}  {_cell(p.residual_m[2], 6)}  {_cell(p.horizontal_m, 12)}  "
-            f"{_cell(alone, 12)}{'' if p.used else '  not used'}"
-        )
-    used = [p.horizontal_m for p in placement.points if p.used]
-    if used:
-        marks = [m.error_px for m in placement.marks if m.used]
-        lines.append(
-            f"{len(used)} of {len(placement.points)} points used: median horizontal residual "
-            f"{np.median(used):.3f} m; {len(marks)} of {len(placement.marks)} marks, median "
-            f"{np.median(marks):.2f} px"
-        )
-    return "\n".join([*lines, *remarks(placement, control)]) + "\n"
-
-
-def remarks(placement: GcpPlacement, control: Control) -> list[str]:
-    """What is odd about points and marks, what could not be used, and what was assumed."""
-    return [
-        *(p.remark for p in placement.points if p.remark),
-        *(m.remark for m in placement.marks if m.remark),
-        *(
-            f"mark of {mark.point} in {mark.photo} (line {mark.line}) is not used: {reason}"
-            for mark, reason in control.unused
-        ),
-        *(f"{name} has no mark in the map's photos" for name in control.unmarked),
-        *(f"note: {note}" for note in placement.notes),
-    ]
-
-
-def _numbers(values: FloatArray) -> list[float | None]:
-    return [round(float(v), 4) if np.isfinite(v) else None for v in values]
-
-
-def _cell(value: float, width: int) -> str:
-    return f"{value:{width}.3f}" if np.isfinite(value) else "-".rjust(width)

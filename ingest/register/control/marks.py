@@ -1,7 +1,6 @@
 """Control points that meet a block: which marks lie in which of its photos, and what cannot be used."""
 
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +17,7 @@ class Control:
     """Marks of control points in the photos of a block.
 
     Attributes:
+        file: the control points. frame: the local frame.
         names: of the n points that have at least one mark in the block.
         surveyed: (n, 3) east, north, up in metres in the local frame; up is NaN where unknown.
         marks: m marks, as the file has them.
@@ -27,6 +27,8 @@ class Control:
         unmarked: names of points without any mark in the block.
     """
 
+    file: ControlFile
+    frame: LocalFrame
     names: tuple[str, ...]
     surveyed: FloatArray
     marks: tuple[Mark, ...]
@@ -59,22 +61,32 @@ def meet(file: ControlFile, block: Block, frame: LocalFrame) -> Control:
     Args:
         frame: of the surveyed positions that come out.
     """
-    found, unused = _photos(file.marks, block)
-    chosen = [(mark, photo) for mark, photo in found if _inside(mark, block, photo)]
-    unused += [
-        (mark, _outside_words(mark, block, photo)) for mark, photo in found if not _inside(mark, block, photo)
-    ]
+    by_name = {name.lower(): [row] for row, name in enumerate(block.names)}
+    by_file = defaultdict(list)
+    for row, name in enumerate(block.names):
+        by_file[_file_name(name)].append(row)
+    chosen: list[tuple[Mark, int]] = []
+    unused: list[tuple[Mark, str]] = []
+    for mark in file.marks:
+        photos = by_name.get(mark.photo.lower()) or by_file[_file_name(mark.photo)]
+        reason = _why_not(mark, block, photos)
+        if reason:
+            unused.append((mark, reason))
+        else:
+            chosen.append((mark, photos[0]))
     marked = {mark.point for mark, _ in chosen}
     kept = [i for i, name in enumerate(file.names) if name in marked]
     index = {file.names[i]: row for row, i in enumerate(kept)}
     return Control(
-        names=tuple(file.names[i] for i in kept),
+        file=file,
+        frame=frame,
+        names=tuple(index),
         surveyed=_local(frame, file.lat_lon_h[kept]),
         marks=tuple(mark for mark, _ in chosen),
         point_of=np.array([index[mark.point] for mark, _ in chosen], dtype=np.int64),
         photo_of=np.array([photo for _, photo in chosen], dtype=np.int64),
         xy=np.array([(mark.x, mark.y) for mark, _ in chosen], dtype=np.float64).reshape(-1, 2),
-        unused=tuple(sorted(unused, key=lambda pair: pair[0].line)),
+        unused=tuple(unused),
         unmarked=tuple(name for name in file.names if name not in marked),
     )
 
@@ -82,43 +94,28 @@ def meet(file: ControlFile, block: Block, frame: LocalFrame) -> Control:
 def _local(frame: LocalFrame, lat_lon_h: FloatArray) -> FloatArray:
     """Local east, north, up; a point without height is taken at the frame's own, its up is NaN."""
     unknown = np.isnan(lat_lon_h[:, 2])
-    filled = np.where(unknown[:, None] & np.array([False, False, True]), frame.height_m, lat_lon_h)
-    enu = np.array(frame.enu_from_geodetic(filled))
+    enu = np.array(frame.enu_from_geodetic(np.nan_to_num(lat_lon_h, nan=frame.height_m)))
     enu[unknown, 2] = np.nan
     return enu
-
-
-def _photos(marks: Sequence[Mark], block: Block) -> tuple[list[tuple[Mark, int]], list[tuple[Mark, str]]]:
-    """The block's photo of each mark: by its name, else by its file name alone where only one has it."""
-    by_name = {name.lower(): row for row, name in enumerate(block.names)}
-    by_file = defaultdict(list)
-    for row, name in enumerate(block.names):
-        by_file[_file_name(name)].append(row)
-    found, unused = [], []
-    for mark in marks:
-        rows = by_file[_file_name(mark.photo)]
-        if mark.photo.lower() in by_name:
-            found.append((mark, by_name[mark.photo.lower()]))
-        elif len(rows) == 1:
-            found.append((mark, rows[0]))
-        elif rows:
-            unused.append((mark, f"{len(rows)} photos are called {mark.photo}; name it with its folder"))
-        else:
-            unused.append((mark, f"no photo {mark.photo} in the map"))
-    return found, unused
 
 
 def _file_name(name: str) -> str:
     return name.rsplit("/", 1)[-1].lower()
 
 
-def _inside(mark: Mark, block: Block, photo: int) -> bool:
-    camera = block.camera(photo)
-    return mark.x <= camera.width and mark.y <= camera.height
+def _why_not(mark: Mark, block: Block, photos: list[int]) -> str:
+    """Why a mark cannot take part, "" where it can.
 
-
-def _outside_words(mark: Mark, block: Block, photo: int) -> str:
-    camera = block.camera(photo)
+    Args:
+        photos: of the block that are called as the mark says.
+    """
+    if not photos:
+        return f"no photo {mark.photo} in the map"
+    if len(photos) > 1:
+        return f"{len(photos)} photos are called {mark.photo}; name it with its folder"
+    camera = block.camera(photos[0])
+    if mark.x <= camera.width and mark.y <= camera.height:
+        return ""
     return (
         f"pixel {mark.x:g} {mark.y:g} is outside {mark.photo} of {camera.width}x{camera.height}; marks must "
         "be made on the photos as they are stored, not on larger or turned copies"

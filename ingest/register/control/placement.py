@@ -1,8 +1,8 @@
 """Placement by ground control points: the whole way from marks to an adjusted block with its uncertainty.
 
-1. Marks are intersected and the similarity is found that most points agree on (`control_fit`).
-2. The block is adjusted with the points as control (`control_adjust`).
-3. Marks and points that contradict all others are tested, named and left out (`control_test`), and the block
+1. Marks are intersected and the similarity is found that most points agree on (`fit`).
+2. The block is adjusted with the points as control (`adjust`).
+3. Marks and points that contradict all others are tested, named and left out (`snooping`), and the block
    is adjusted again.
 
 Surveyed heights may be unknown. Then position, heading and scale come from the points; tilt and height come
@@ -18,18 +18,10 @@ import numpy as np
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.control.adjust import (
-    Adjusted,
-    Weights,
-    task_of,
-    with_all_points,
-)
-from ingest.register.control.fit import (
-    ControlFit,
-    Vertical,
-    fit_similarity,
-    hypotheses,
-)
+from featuredb.maps.feature_map import Placement
+from featuredb.plain_json import plain
+from ingest.register.control.adjust import Adjusted, task_of, with_all_points
+from ingest.register.control.fit import ControlFit, Vertical, fit_similarity, hypotheses
 from ingest.register.control.marks import Control
 from ingest.register.control.residuals import MarkResidual, PointResidual, gps_offset, residuals_of
 from ingest.register.control.snooping import improve, initial_weights
@@ -43,10 +35,7 @@ GcpReason = Literal[
     "CONTRADICTS_GPS",
 ]
 
-
 _STEEP = 0.5  # sine of 30 degrees: half the photos look up more steeply than photos of a place ever do
-
-
 _MIN_POINTS = 3  # three are the least with which one can be found to be wrong
 _MIN_SHARE = 0.5  # of the points that must agree; with fewer, the file and the photos do not belong together
 # Of the surveyed coordinates' standard deviation over the extent of the points; beyond, they agree no better
@@ -64,6 +53,7 @@ _MAX_GPS_OFFSET_M = 150.0
 # tilted by more (7 degrees against the plane in `copr`).
 _SIGMA_TILT_DEG = 3.5
 _KEPT_SHARE = 0.9  # of the points, nearest to the middle of them; the far ones are trees and errors
+_KEPT_HEIGHT_M = 0.01  # standard deviation of a height that the adjustment is to keep
 _ANY_HEIGHT_M = (0.0, 1000.0)  # and standard deviation: that of not knowing; most land lies lower
 
 
@@ -88,16 +78,17 @@ class GcpPlacement:
     """Outcome of a placement: accepted when `reason` is None.
 
     Attributes:
+        control: what met the photos, and what did not.
         reason: gate that refused it, or None; `message` says it for people.
         local_from_block: the similarity nearest to what became of the block, None where there is none.
         covariance: (7, 7) of its left perturbation (sigma, omega, nu), or None.
         block: adjusted, in metres in the local frame, or None.
         points: every control point with its residual; marks: every mark.
-        residual_rms_m: of the surveyed coordinates that were used, root mean square length.
         notes: what was assumed, for people.
         figures: what the decision rests on, JSON-able.
     """
 
+    control: Control
     reason: GcpReason | None
     message: str
     local_from_block: Sim3 | None = None
@@ -114,8 +105,52 @@ class GcpPlacement:
 
     @property
     def residual_rms_m(self) -> float:
+        """Root mean square length of the residuals of the surveyed coordinates that were used."""
         squared = [float(np.nansum(p.residual_m**2)) for p in self.points if p.used]
         return float(np.sqrt(np.mean(squared))) if squared else float("nan")
+
+    @property
+    def evidence(self) -> dict[str, Any]:
+        """Figures, residuals of every point and mark, and notes; JSON-able."""
+        found: dict[str, Any] = plain(
+            {
+                **self.figures,
+                "notes": self.notes,
+                "points": [point.figures() for point in self.points],
+                "marks": [mark.figures() for mark in self.marks],
+                "unused_marks": [f"line {mark.line}: {reason}" for mark, reason in self.control.unused],
+                "unmarked_points": self.control.unmarked,
+                "file_notes": self.control.file.notes,
+            }
+        )
+        return found
+
+    def map_placement(self, block_from_sfm: Sim3) -> Placement:
+        """For the map, where it is accepted.
+
+        Args:
+            block_from_sfm: what had placed the block in its own frame.
+        """
+        assert self.local_from_block is not None
+        assert self.covariance is not None  # accepted
+        return Placement(
+            method="gcp",
+            local_from_sfm=self.local_from_block @ block_from_sfm,
+            covariance=self.covariance,
+            residual_rms_m=self.residual_rms_m,
+            evidence=self.evidence,
+        )
+
+    def height_datum(self, before: str, said: str) -> str:
+        """Datum of the map's heights: the survey's where it gives heights, else what it was before.
+
+        Args:
+            said: of the surveyed heights, where the file's reference system does not say it.
+        """
+        if np.isfinite(self.control.surveyed[:, 2]).sum() < 3:
+            return before
+        datum = self.control.file.crs.height_datum
+        return datum if datum != "unknown" else said
 
 
 def place_by_gcp(
@@ -140,12 +175,11 @@ def place_by_gcp(
     found = hypotheses(block, control)
     usable = sorted({h.point for h in found})
     if len(usable) < _MIN_POINTS:
-        return GcpPlacement(
-            reason="TOO_FEW",
-            message=f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are "
-            "needed; mark each point in two photos or more",
-            figures={"points": len(control.names), "usable_points": len(usable), "marks": len(control.marks)},
+        message = (
+            f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are "
+            "needed; mark each point in two photos or more"
         )
+        return GcpPlacement(control=control, reason="TOO_FEW", message=message)
     notes: tuple[str, ...] = ()
     if not _vertical_is_needed(control, usable):
         vertical = None
@@ -157,16 +191,21 @@ def place_by_gcp(
     fit = fit_similarity(found, control.surveyed, vertical)
     extent = float(np.linalg.norm(np.ptp(control.surveyed[usable, :2], axis=0)))
     if fit is None or extent <= 0:
-        return GcpPlacement(
-            reason="DEGENERATE_LINE",
-            message="the control points, or their places in the photos, coincide or lie along a line",
-            figures={"usable_points": len(usable), "extent_m": extent},
+        message = "the control points, or their places in the photos, coincide or lie along a line"
+        return GcpPlacement(control=control, reason="DEGENERATE_LINE", message=message)
+    agree = int(fit.inliers.sum())
+    if agree < max(_MIN_POINTS, _MIN_SHARE * len(usable)) or fit.sigma_m > _MAX_SIGMA_OVER_EXTENT * extent:
+        message = (
+            f"the control points do not fit the photos: {agree} of {len(usable)} agree, to "
+            f"{fit.sigma_m:.2f} m over {extent:.0f} m; check the reference system, the order of x and y, the "
+            "units, and that the marks are of these photos"
         )
-    refused = _gate_fit(fit, extent)
-    if refused is not None:
-        return refused
-    placement = _adjusted_placement(block, control, fit, vertical, options)
-    return _gate(replace(placement, notes=notes), gps_local, gps_sigma_m)
+        return GcpPlacement(control=control, reason="RESIDUALS", message=message)
+    placement = replace(_adjusted_placement(block, control, fit, vertical, options), notes=notes)
+    if gps_local is not None:
+        placement = _with_gps_offset(placement, gps_local, gps_sigma_m)
+    reason, message = _verdict(placement, gps_sigma_m)
+    return replace(placement, reason=reason, message=message)
 
 
 def level_ground(block: Block, anchor_block: FloatArray, ground_m: tuple[float, float] | None) -> Vertical:
@@ -216,24 +255,6 @@ def _vertical_is_needed(control: Control, usable: list[int]) -> bool:
     return bool(spread[1] < _MIN_LINE_RATIO * spread[0])
 
 
-def _gate_fit(fit: ControlFit, extent: float) -> GcpPlacement | None:
-    agree, usable = int(fit.inliers.sum()), len(fit.inliers)
-    if agree >= max(_MIN_POINTS, _MIN_SHARE * usable) and fit.sigma_m <= _MAX_SIGMA_OVER_EXTENT * extent:
-        return None
-    return GcpPlacement(
-        reason="RESIDUALS",
-        message=f"the control points do not fit the photos: {agree} of {usable} agree, to "
-        f"{fit.sigma_m:.2f} m over {extent:.0f} m; check the reference system, the order of x and y, the "
-        "units, and that the marks are of these photos",
-        figures={
-            "usable_points": usable,
-            "extent_m": extent,
-            "agreeing_share": agree / usable,
-            "fit_sigma_m": fit.sigma_m,
-        },
-    )
-
-
 def _adjusted_placement(
     block: Block,
     control: Control,
@@ -241,14 +262,22 @@ def _adjusted_placement(
     vertical: Vertical | None,
     options: GcpOptions,
 ) -> GcpPlacement:
-    placed = block.moved(fit.local_from_block)
-    local_vertical, free_height_m = _in_place(vertical, fit.local_from_block, control)
+    free_height_m = 0.0
+    if vertical is not None:
+        vertical = vertical.moved(fit.local_from_block)
+        if not np.isfinite(control.surveyed[:, 2]).any():
+            # Nothing else says the height: the adjustment keeps it, and its uncertainty is added afterwards,
+            # which spares the equations a kilometre beside a millimetre.
+            free_height_m = vertical.sigma_up_m
+            vertical = replace(vertical, sigma_up_m=_KEPT_HEIGHT_M)
     weights, xyz = initial_weights(control, fit, options.sigma_m)
-    task = task_of(placed, control, xyz, local_vertical, options.keep_lens)
-    adjusted, freedom, rounds = improve(task, weights, options.sigma_m is not None)
+    task = task_of(block.moved(fit.local_from_block), control, xyz, vertical, options.keep_lens)
+    adjusted, freedom = improve(task, weights, options.sigma_m is not None)
     points, marks = residuals_of(adjusted, control)
     covariance = _covariance(adjusted, free_height_m, freedom)
+    weights = adjusted.weights
     return GcpPlacement(
+        control=control,
         reason=None,
         message="placed by control points",
         local_from_block=adjusted.change @ fit.local_from_block,
@@ -257,31 +286,15 @@ def _adjusted_placement(
         points=points,
         marks=marks,
         figures={
-            "rounds": rounds,
             "degrees_of_freedom": freedom,
-            "control_sigma_from": "options" if options.sigma_m is not None else "residuals",
-            "fit_sigma_m": fit.sigma_m,
-            "heights": "surveyed" if vertical is None else "unknown or too few",
-            **_figures(adjusted.weights, covariance),
-            **({} if vertical is None else {"vertical": {"source": vertical.source}}),
+            "points_used": int(weights.points.sum()),
+            "marks_used": int(weights.marks.sum()),
+            "control_sigma_m": weights.control_m.tolist(),
+            "mark_sigma_px": weights.mark_px,
+            "scale_sigma": float(np.sqrt(covariance[0, 0])),
+            "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),
         },
     )
-
-
-def _in_place(
-    vertical: Vertical | None, local_from_block: Sim3, control: Control
-) -> tuple[Vertical | None, float]:
-    """What is known of the vertical, for the placed block, and the sigma of a height that is free.
-
-    Where no point has a height, nothing but `vertical` says it: the adjustment then keeps it, and its
-    uncertainty is added afterwards, which spares the equations a kilometre beside a millimetre.
-    """
-    if vertical is None:
-        return None, 0.0
-    free = not np.isfinite(control.surveyed[:, 2]).any()
-    sigma_up_m = 0.01 if free else vertical.sigma_up_m
-    placed = replace(vertical.moved(local_from_block), sigma_up_m=sigma_up_m)
-    return placed, vertical.sigma_up_m if free else 0.0
 
 
 def _covariance(adjusted: Adjusted, free_height_m: float, freedom: float) -> FloatArray:
@@ -291,58 +304,39 @@ def _covariance(adjusted: Adjusted, free_height_m: float, freedom: float) -> Flo
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _figures(weights: Weights, covariance: FloatArray) -> dict[str, Any]:
-    return {
-        "points_used": int(weights.points.sum()),
-        "marks_used": int(weights.marks.sum()),
-        "control_sigma_m": weights.control_m.tolist(),
-        "mark_sigma_px": weights.mark_px,
-        "scale_sigma": float(np.sqrt(covariance[0, 0])),
-        "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),
-    }
-
-
-def _gate(
-    placement: GcpPlacement, gps_local: FloatArray | None, gps_sigma_m: tuple[float, float]
+def _with_gps_offset(
+    placement: GcpPlacement, gps_local: FloatArray, gps_sigma_m: tuple[float, float]
 ) -> GcpPlacement:
-    """The gates that look at the finished placement."""
-    figures = dict(placement.figures)
     assert placement.block is not None
+    assert placement.covariance is not None
+    figures, notes = gps_offset(gps_local, gps_sigma_m, placement.block.centers(), placement.covariance)
+    return replace(placement, figures=placement.figures | figures, notes=(*placement.notes, *notes))
+
+
+def _verdict(placement: GcpPlacement, gps_sigma_m: tuple[float, float]) -> tuple[GcpReason | None, str]:
+    """The gates that look at the finished placement: which refuses it, and what to tell."""
+    figures = placement.figures
+    assert placement.block is not None
+    looks_up = float(np.median([pose.rotation[2, 2] for pose in placement.block.cam_from_block]))
+    away_m = float(np.hypot(*figures.get("gps_offset_m", (0.0, 0.0))[:2]))
     if figures["points_used"] < _MIN_POINTS:
-        return replace(
-            placement,
-            reason="RESIDUALS",
-            message=f"only {figures['points_used']} control points are left after those that contradict the "
-            f"others; at least {_MIN_POINTS} are needed",
+        return "RESIDUALS", (
+            f"only {figures['points_used']} control points are left after those that contradict the "
+            f"others; at least {_MIN_POINTS} are needed"
         )
     if figures["scale_sigma"] > _MAX_SCALE_SIGMA:
-        return replace(
-            placement,
-            reason="SCALE",
-            message=f"the scale is known to {figures['scale_sigma']:.1%} only, {_MAX_SCALE_SIGMA:.0%} "
-            "is needed: the control points are too close together for their accuracy",
+        return "SCALE", (
+            f"the scale is known to {figures['scale_sigma']:.1%} only, {_MAX_SCALE_SIGMA:.0%} "
+            "is needed: the control points are too close together for their accuracy"
         )
-    looks_up = float(np.median([pose.rotation[2, 2] for pose in placement.block.cam_from_block]))
     if looks_up > _STEEP:
-        return replace(
-            placement,
-            reason="UPSIDE_DOWN",
-            message="the control points put the cameras under the ground, looking up; x and y of the survey "
-            "are probably exchanged, or heights have the wrong sign",
+        return "UPSIDE_DOWN", (
+            "the control points put the cameras under the ground, looking up; x and y of the survey "
+            "are probably exchanged, or heights have the wrong sign"
         )
-    notes: list[str] = []
-    if gps_local is not None and np.isfinite(gps_local[:, 0]).any():
-        assert placement.covariance is not None
-        centers = placement.block.centers()
-        found, notes = gps_offset(gps_local, gps_sigma_m, centers, placement.covariance)
-        figures |= found
-        away = float(np.linalg.norm(figures["gps_offset_m"][:2]))
-        if away > _MAX_GPS_OFFSET_M + 3.0 * gps_sigma_m[0]:
-            return replace(
-                placement,
-                reason="CONTRADICTS_GPS",
-                message=f"the control points put the photos {away:,.0f} m from their GPS; "
-                "check the file's reference system, its zone and its units",
-                figures=figures,
-            )
-    return replace(placement, figures=figures, notes=(*placement.notes, *notes))
+    if away_m > _MAX_GPS_OFFSET_M + 3.0 * gps_sigma_m[0]:
+        return "CONTRADICTS_GPS", (
+            f"the control points put the photos {away_m:,.0f} m from their GPS; "
+            "check the file's reference system, its zone and its units"
+        )
+    return None, placement.message

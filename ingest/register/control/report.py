@@ -1,17 +1,18 @@
-"""The page of a placement by control points: a plan of residual vectors, and tables."""
+"""What a placement by control points leaves: lines of text, and a page with a plan of residual vectors."""
 
+from decimal import Decimal
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
-from featuredb.geometry.arrays import FloatArray
+from featuredb.cli.common import format_table
 from ingest.html_parts import note, page, picture, table
 from ingest.plot_parts import PlanView, plan_png
-from ingest.register.control.maps import remarks
-from ingest.register.control.marks import Control
 from ingest.register.control.placement import GcpPlacement
 from ingest.workspace import atomic_file, write_json
+
+_HEADER = ("control point", "marks", "east m", "north m", "up m", "horizontal m", "without it m", "")
 
 
 def control_plan(placement: GcpPlacement) -> PlanView | None:
@@ -30,33 +31,17 @@ def control_plan(placement: GcpPlacement) -> PlanView | None:
     )
 
 
-def control_html(placement: GcpPlacement, control: Control) -> str:
+def control_html(placement: GcpPlacement) -> str:
     """Picture, remarks, residuals of points and marks; a part of a page."""
     parts = ["<h3>Control points</h3>"]
     plan = control_plan(placement)
     if plan is not None:
         parts.append(picture(plan_png(plan), "Control points and their residuals"))
-    parts += [note(remark) for remark in remarks(placement, control)]
-    points = [
-        (
-            p.name,
-            f"{p.marks} of {p.marks_given}",
-            *_cells(p.residual_m),
-            *_cells(p.leave_one_out_m),
-            "" if p.used else "not used",
-        )
-        for p in placement.points
-    ]
-    head = ("point", "marks", "east, m", "north, m", "up, m", "without it: east", "north", "up", "")
-    parts.append(table(head, points, numbers=(2, 3, 4, 5, 6, 7), names=(0,)))
+    parts += [note(remark) for remark in remarks(placement)]
+    points = [["" if cell is None else str(cell) for cell in row] for row in _rows(placement)]
+    parts.append(table(_HEADER, points, numbers=(2, 3, 4, 5, 6), names=(0,)))
     marks = [
-        (
-            m.mark.point,
-            m.mark.photo,
-            str(m.mark.line),
-            *_cells(m.residual_px),
-            "" if m.used else "not used",
-        )
+        (m.mark.point, m.mark.photo, str(m.mark.line), *(f"{v:.3f}" for v in m.residual_px), _word(m.used))
         for m in placement.marks
     ]
     mark_head = ("point", "photo", "line", "x, px", "y, px", "")
@@ -65,16 +50,60 @@ def control_html(placement: GcpPlacement, control: Control) -> str:
     return "\n".join(parts)
 
 
-def write_control_report(
-    folder: Path, title: str, placement: GcpPlacement, control: Control, evidence: dict[str, object]
-) -> None:
+def residual_table(placement: GcpPlacement) -> str:
+    """Residuals of every point, what is odd, and what was assumed, as lines of text."""
+    lines = [format_table(_HEADER, _rows(placement)).rstrip("\n")]
+    used = [p.horizontal_m for p in placement.points if p.used]
+    if used:
+        marks = [m.error_px for m in placement.marks if m.used]
+        lines.append(
+            f"{len(used)} of {len(placement.points)} points used: median horizontal residual "
+            f"{np.median(used):.3f} m; {len(marks)} of {len(placement.marks)} marks, median "
+            f"{np.median(marks):.2f} px"
+        )
+    return "\n".join([*lines, *remarks(placement)]) + "\n"
+
+
+def remarks(placement: GcpPlacement) -> list[str]:
+    """What is odd about points and marks, what could not be used, and what was assumed."""
+    return [
+        *(p.remark for p in placement.points if p.remark),
+        *(m.remark for m in placement.marks if m.remark),
+        *(
+            f"mark of {mark.point} in {mark.photo} (line {mark.line}) is not used: {reason}"
+            for mark, reason in placement.control.unused
+        ),
+        *(f"{name} has no mark in the map's photos" for name in placement.control.unmarked),
+        *(f"note: {note}" for note in placement.notes),
+    ]
+
+
+def _rows(placement: GcpPlacement) -> list[tuple[object, ...]]:
+    """A row of `_HEADER` for each point."""
+    return [
+        (
+            p.name,
+            f"{p.marks}/{p.marks_given}",
+            *map(_decimal, (*p.residual_m, p.horizontal_m, np.hypot(*p.leave_one_out_m[:2]))),
+            _word(p.used),
+        )
+        for p in placement.points
+    ]
+
+
+def _word(used: bool) -> str:
+    return "" if used else "not used"
+
+
+def write_control_report(folder: Path, title: str, placement: GcpPlacement) -> None:
     """control.json and control.html into a folder."""
-    write_json(folder / "control.json", evidence)
+    write_json(folder / "control.json", placement.evidence)
     verdict = "accepted" if placement.accepted else f"{placement.reason}: {placement.message}"
-    body = [f"<h1>{escape(title)}</h1>", note(verdict), control_html(placement, control)]
+    body = [f"<h1>{escape(title)}</h1>", note(verdict), control_html(placement)]
     with atomic_file(folder / "control.html") as temporary:
         temporary.write_text(page(title, body), encoding="utf-8")
 
 
-def _cells(values: FloatArray) -> list[str]:
-    return [f"{v:.3f}" if np.isfinite(v) else "-" for v in values]
+def _decimal(value: float) -> Decimal | None:
+    """To the millimetre; None for NaN."""
+    return Decimal(f"{value:.3f}") if np.isfinite(value) else None

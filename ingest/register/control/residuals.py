@@ -39,6 +39,17 @@ class PointResidual:
     used: bool
     remark: str
 
+    def figures(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "name": self.name,
+            "residual_enu_m": self.residual_m.round(4),
+            "leave_one_out_enu_m": self.leave_one_out_m.round(4),
+            "marks": self.marks,
+            "used": self.used,
+            "remark": self.remark,
+        }
+
     @property
     def horizontal_m(self) -> float:
         """Length of the horizontal residual."""
@@ -59,6 +70,17 @@ class MarkResidual:
     residual_px: FloatArray
     used: bool
     remark: str
+
+    def figures(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "point": self.mark.point,
+            "photo": self.mark.photo,
+            "line": self.mark.line,
+            "residual_px": self.residual_px.round(4),
+            "used": self.used,
+            "remark": self.remark,
+        }
 
     @property
     def error_px(self) -> float:

@@ -5,7 +5,6 @@ and the detection of outliers, 1976): an observation is compared with what the o
 covariance of all residuals, and one is left out at a time.
 """
 
-import logging
 from dataclasses import replace
 
 import numpy as np
@@ -19,10 +18,7 @@ from ingest.register.control.fit import ControlFit
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import mark_residuals
 
-_LOG = logging.getLogger(__name__)
 _SETTLED = 0.01  # relative change of the sigma, whose own uncertainty is tens of per cent
-
-
 _SIGNIFICANCE = 0.01  # chance of naming a good observation as wrong, over the whole file
 # Chance above which a point that was left out comes back; well above the former, so that none goes back and
 # forth.
@@ -58,16 +54,15 @@ def initial_weights(
     return weights, xyz
 
 
-def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjusted, float, int]:
+def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjusted, float]:
     """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none.
 
     Returns:
-        The last adjustment, degrees of freedom of the surveyed coordinates, and the number of adjustments.
+        The last adjustment, and degrees of freedom of the surveyed coordinates.
     """
-    control, rounds, adjusted = task.control, 0, None
-    while True:
-        adjusted = adjust(task, weights, adjusted)
-        rounds += 1
+    control = task.control
+    for _ in range(_MAX_ROUNDS):
+        adjusted = adjust(task, weights)
         control_m, freedom = _control_sigma(adjusted, control)
         tested = replace(
             _tested(adjusted, control, freedom),
@@ -76,10 +71,10 @@ def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjuste
         )
         settled = np.allclose(tested.control_m, weights.control_m, rtol=_SETTLED)
         unchanged = (tested.marks == weights.marks).all() and (tested.points == weights.points).all()
-        if (settled and unchanged) or rounds >= _MAX_ROUNDS:
-            return adjusted, freedom, rounds
+        if settled and unchanged:
+            break
         weights = tested
-        _LOG.info("round %d: control sigma %s m", rounds, weights.control_m)
+    return adjusted, freedom
 
 
 def left_out(adjusted: Adjusted, control: Control, point: int) -> tuple[FloatArray, float]:
@@ -167,25 +162,20 @@ def _fitting(adjusted: Adjusted, control: Control, freedom: float) -> NDArray[np
 def _worst_mark(adjusted: Adjusted) -> int | None:
     rows = np.flatnonzero(adjusted.weights.marks)
     residuals = adjusted.marks.of(np.ones((len(rows), 2), dtype=bool))
-    tests = []
-    for k, row in enumerate(rows.tolist()):
-        alone, chance = chance_of(residuals, 2 * k + np.arange(2))
-        if adjusted.weights.mark_px * float(np.linalg.norm(alone)) > _MIN_MARK_PX:
-            tests.append((chance, row))
-    return _least(tests, len(rows))
+    tests = [chance_of(residuals, 2 * k + np.arange(2)) for k in range(len(rows))]
+    return _worst(rows, tests, _MIN_MARK_PX / adjusted.weights.mark_px)
 
 
 def _worst_point(adjusted: Adjusted, control: Control) -> int | None:
     rows = np.flatnonzero(adjusted.weights.points)
-    tests = []
-    for point in rows.tolist():
-        residual, chance = left_out(adjusted, control, point)
-        if float(np.linalg.norm(residual)) > _MIN_POINT_M:
-            tests.append((chance, point))
-    return _least(tests, len(rows))
+    return _worst(rows, [left_out(adjusted, control, point) for point in rows.tolist()], _MIN_POINT_M)
 
 
-def _least(tests: list[tuple[float, int]], count: int) -> int | None:
-    """The row of the least chance, where it is too small for so many tests."""
-    chance, row = min(tests, default=(1.0, -1))
-    return row if chance < _SIGNIFICANCE / count else None
+def _worst(rows: NDArray[np.int64], tests: list[tuple[FloatArray, float]], least: float) -> int | None:
+    """The row of the least chance, where it is too small for so many tests, and the error no small one."""
+    wrong = [
+        (chance, row)
+        for row, (alone, chance) in zip(rows.tolist(), tests, strict=True)
+        if chance < _SIGNIFICANCE / len(rows) and float(np.linalg.norm(alone)) > least
+    ]
+    return min(wrong)[1] if wrong else None

@@ -119,16 +119,11 @@ class PickSession:
         pixels, points = self.spots(spots)
         self._fits.pop(image_id, None)
         least = least_picks(focal_rel)
-        if len(spots) < least:
-            return {
-                "ready": False,
-                "pose": False,
-                "message": f"{len(spots)} of at least {least} picks",
-                "picks": [],
-            }
-        fit = fit_picks(pixels, points, camera, focal_rel)
+        fit = fit_picks(pixels, points, camera, focal_rel) if len(spots) >= least else None
         if fit is None:
-            return {"ready": False, "pose": False, "message": "no pose explains these picks", "picks": []}
+            few = f"{len(spots)} of at least {least} picks" if len(spots) < least else ""
+            message = few or "no pose explains these picks"
+            return {"ready": False, "pose": False, "message": message, "picks": []}
         self._fits[image_id] = fit
         found: dict[str, Any] = {
             "pose": True,
@@ -148,11 +143,8 @@ class PickSession:
         except FeatureDbError as error:
             return found | {"ready": False, "message": str(error)}
         east, north, up = self.cloud.frame.utm_from_enu(prior.cam_from_local.center, self.epsg)
-        wrong = (
-            ""
-            if not fit.wrong
-            else f"pick {', '.join(str(i + 1) for i in fit.wrong)} contradicts the others. "
-        )
+        names = ", ".join(str(i + 1) for i in fit.wrong)
+        wrong = f"pick {names} contradicts the others. " if names else ""
         return found | {
             "ready": True,
             "message": f"{wrong}Camera at {east:.1f} E, {north:.1f} N, {up:.1f} m (EPSG:{self.epsg}), to "
@@ -241,9 +233,6 @@ class PickSession:
         return self.map.cameras[image.camera_id]
 
     def _upright(self, image: MapImage) -> Any:
-        known = self.map.frame.upright if isinstance(self.map, UnplacedMap) else True
-        if not known:
-            return None
         if isinstance(self.map, UnplacedMap):
-            return image.cam_from_local
+            return image.cam_from_local if self.map.frame.upright else None
         return image.cam_from_local @ self.map.frame.enu_from(self.cloud.frame)

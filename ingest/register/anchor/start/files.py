@@ -42,47 +42,31 @@ def read_picks(path: Path, image: str | None) -> list[Picks]:
             f"picks {path}: expected lines of x, y, easting, northing, height, found none"
         )
     separator = max(",;\t", key=numbered[0][1].count)
-    rows = [
-        (n, [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]) for n, line in numbered
-    ]
-    columns = _header(rows[0][1])
-    if columns is not None:
-        rows = rows[1:]
+    rows = [next(csv.reader([line], delimiter=separator)) for _, line in numbered]
+    names = [cell.strip().lower() for cell in rows[0]]
+    first = int(set(_COLUMNS) <= set(names))  # 1 behind a header
     picks: dict[str, list[list[float]]] = {}
-    for number, cells in rows:
-        name, values = _pick(path, number, cells, columns, image)
+    for (number, _), cells in zip(numbered[first:], rows[first:], strict=True):
+        found = dict(zip(names if first else (*_COLUMNS, "image"), map(str.strip, cells), strict=False))
+        try:
+            values = [float(found[name]) for name in _COLUMNS]
+        except (KeyError, ValueError) as error:
+            raise RegistrationError(
+                f"picks {path}, line {number}: expected x, y, easting, northing, height, found {cells} "
+                f"({error})"
+            ) from error
+        if not np.isfinite(values).all():
+            raise RegistrationError(f"picks {path}, line {number}: expected finite numbers, found {cells}")
+        name = found.get("image") or image
+        if not name:
+            raise RegistrationError(
+                f"picks {path}, line {number}: names no photo; add a column image, or give --image"
+            )
         picks.setdefault(name, []).append(values)
     return [
         Picks(image=name, pixels=np.array(values)[:, :2], utm=np.array(values)[:, 2:])
         for name, values in picks.items()
     ]
-
-
-def _header(cells: list[str]) -> dict[str, int] | None:
-    """Column of each name, or None where the line is no header."""
-    names = {cell.lower(): i for i, cell in enumerate(cells)}
-    return names if all(column in names for column in _COLUMNS) else None
-
-
-def _pick(
-    path: Path, number: int, cells: list[str], columns: dict[str, int] | None, image: str | None
-) -> tuple[str, list[float]]:
-    order = columns or {name: i for i, name in enumerate((*_COLUMNS, "image"))}
-    try:
-        values = [float(cells[order[name]]) for name in _COLUMNS]
-    except (IndexError, ValueError) as error:
-        raise RegistrationError(
-            f"picks {path}, line {number}: expected x, y, easting, northing, height, found {cells} ({error})"
-        ) from error
-    if not np.isfinite(values).all():
-        raise RegistrationError(f"picks {path}, line {number}: expected finite numbers, found {cells}")
-    at = order.get("image", len(cells))
-    name = cells[at] if at < len(cells) and cells[at] else image
-    if not name:
-        raise RegistrationError(
-            f"picks {path}, line {number}: names no photo; add a column image, or give --image"
-        )
-    return name, values
 
 
 class RoughPose(BaseModel):
