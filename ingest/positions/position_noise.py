@@ -20,7 +20,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.positions.one_height import told_once
 from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean, stated_sigma
 
-_ROUNDS = 24  # of what is left out, and components; most settle in five
+_ROUNDS = 12  # of weights and components; most settle in five
 _MOST_STEP = 0.5  # of the logarithm of the scale and of a turn; further it is not linear
 _SETTLED = 1e-3  # of a step over its standard deviation
 _TREND = 0.75  # of the variance of a drift at its end: what has one slope all along
@@ -209,9 +209,9 @@ def fit_noisy(
         speed, order = _speeds(centers, times_s), times_s
     moving = np.linalg.norm(speed, axis=1)
     usual = start.scale * float(np.median(moving[moving > 0])) if moving.any() else 0.0
-    taken = np.zeros((len(centers), 1), dtype=np.bool_)
-    taken[np.argsort(order, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = True
-    sigmas = told_once(positions, sigmas, start.act(centers), taken[:, 0])
+    taken = np.zeros((len(centers), 1))
+    taken[np.argsort(order, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = 1.0
+    sigmas = told_once(positions, sigmas, start.act(centers), taken[:, 0] > 0)
     data = _Data(
         centers=centers,
         positions=middle.inverse().act(positions),
@@ -230,22 +230,22 @@ def fit_noisy(
     used, settled = np.zeros((len(centers), 2), dtype=np.bool_), False
     for _ in range(_ROUNDS):
         again = squared <= chdtri(_SIZES, 1.0 - _INSIDE)
-        again |= (again & taken).sum(axis=0) < _LEAST_PHOTOS
+        again |= (again & (taken > 0)).sum(axis=0) < _LEAST_PHOTOS
         if settled and (again == used).all():
             break
-        used, counted = again, taken & again
-        problem = _at(data, state, counted)
+        used, weights = again, taken * again
+        problem = _at(data, state, weights)
         theta = problem.most_likely(theta, stated)
         step, covariance = problem.solution(theta)
         settled = bool(np.abs(step / np.sqrt(np.diag(covariance))).max() < _SETTLED)
         state = state.moved(step)
-        squared = _squared(data, state, theta)
-    problem = _at(data, state, counted)
+        squared = _squared(data, state, weights, theta)
+    problem = _at(data, state, weights)
     theta = problem.most_likely(theta, stated)
     step, covariance = problem.integrated(theta, stated)
     checked = covariance[2:5, 2:5]
     if held is not None and not held.told:
-        free = _at(replace(data, held=None), state, counted)
+        free = _at(replace(data, held=None), state, weights)
         checked = free.integrated(theta, stated)[1][2:5, 2:5]
     state = state.moved(step)
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
@@ -256,7 +256,7 @@ def fit_noisy(
         lag_s=state.lag_s,
         checked_turn_rad=float(np.sqrt(np.linalg.eigvalsh(checked)[-1])),
         used=used,
-        log_chance=_log_chance(data, state, counted, int(taken.sum())),
+        log_chance=_log_chance(data, state, weights, int(taken.sum())),
     )
 
 
@@ -282,9 +282,7 @@ def _walk(times_s: FloatArray) -> FloatArray:
     return np.asarray((1.0 - _TREND) * np.minimum(share[:, None], share) + _TREND * np.outer(share, share))
 
 
-def _axes(
-    data: _Data, residual: FloatArray, jacobian: FloatArray, counted: NDArray[np.bool_]
-) -> list[ModelAxis]:
+def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: FloatArray) -> list[ModelAxis]:
     """East, north, up.
 
     Args:
@@ -293,8 +291,8 @@ def _axes(
     result = []
     for group, axes in enumerate(_AXES):
         for axis in axes.tolist():
-            known = np.isfinite(data.sigmas[:, axis]) & counted[:, group]
-            root = data.stated[group] / data.sigmas[known, axis]
+            known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
+            root = np.sqrt(weights[known, group]) * data.stated[group] / data.sigmas[known, axis]
             walk = data.walk[np.ix_(known, known)]
             variance, basis = np.linalg.eigh(root[:, None] * walk * root)
             result.append(
@@ -308,17 +306,32 @@ def _axes(
     return result
 
 
-def _at(data: _Data, state: _State, counted: NDArray[np.bool_]) -> MixedModel:
-    axes = _axes(data, state.residual(data), state.jacobian(data), counted)
+def _at(data: _Data, state: _State, weights: FloatArray) -> MixedModel:
+    axes = _axes(data, state.residual(data), state.jacobian(data), weights)
     return MixedModel(axes, *state.known(data), data.shape_m**2)
 
 
-def _squared(data: _Data, state: _State, theta: FloatArray) -> FloatArray:
-    """(n, 2) squared residuals over noise and drift, horizontal and vertical; 0 where not known."""
-    variance = (
-        data.shape_m**2 + np.exp(2.0 * theta[:2]) + np.exp(2.0 * theta[2:]) * np.diag(data.walk)[:, None]
-    )
-    return _relative(data, state.residual(data)) / variance
+def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: FloatArray) -> FloatArray:
+    """The walk (n, 3) that is most likely for residuals (n, 3), with a constant taken off each axis."""
+    result = np.zeros_like(residual)
+    white, drift = data.shape_m**2 + np.exp(2.0 * theta[:2]), np.exp(2.0 * theta[2:])
+    for group, axes in enumerate(_AXES):
+        for axis in axes.tolist():
+            known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
+            if not known.any():
+                continue
+            ratio = data.sigmas[known, axis] / data.stated[group]
+            walk = drift[group] * data.walk
+            own = walk[np.ix_(known, known)] + np.diag(white[group] * ratio**2 / weights[known, group])
+            result[:, axis] = walk[:, known] @ np.linalg.solve(own, residual[known, axis])
+    return result
+
+
+def _squared(data: _Data, state: _State, weights: FloatArray, theta: FloatArray) -> FloatArray:
+    """(n, 2) squared residuals over the noise, horizontal and vertical, less the walk; 0 where not known."""
+    residual = state.residual(data)
+    own = residual - _walked(data, residual, weights, theta)
+    return _relative(data, own) / (data.shape_m**2 + np.exp(2.0 * theta[:2]))
 
 
 def _relative(data: _Data, residual: FloatArray) -> FloatArray:
@@ -331,7 +344,7 @@ def _relative(data: _Data, residual: FloatArray) -> FloatArray:
     return result
 
 
-def _log_chance(data: _Data, state: _State, counted: NDArray[np.bool_], total: int) -> float:
+def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> float:
     """See `NoisyFit`: four of the degrees of freedom are the scale's and the turn's, so that the ratio of the
     sums of squares, which is the likelihoods', has a beta distribution. A lag counts as two.
 
@@ -339,11 +352,11 @@ def _log_chance(data: _Data, state: _State, counted: NDArray[np.bool_], total: i
         total: positions before any was left out.
     """
     shift = np.broadcast_to(np.eye(3), (len(data.centers), 3, 3))
-    known = np.isfinite(data.sigmas) & counted[:, [0, 0, 1]]
+    known = np.isfinite(data.sigmas) & (weights > 0)[:, [0, 0, 1]]
     off = np.where(np.isfinite(data.sigmas), data.positions, 0.0)
     costs = []
     for residual in (state.residual(data), off - np.median(off, axis=0)):
-        problem = MixedModel(_axes(data, residual, shift, counted), np.eye(3) / _UNKNOWN_M, np.zeros(3))
+        problem = MixedModel(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
         spread = [np.square(residual[known[:, axes[0]]][:, axes]) for axes in _AXES]
         size = np.array([float(np.sqrt(of.mean())) if of.size else 1.0 for of in spread])
         size = np.maximum(size, _LEAST_SHARE * data.stated)  # heights that are all the same are told in steps
@@ -358,6 +371,6 @@ def _log_chance(data: _Data, state: _State, counted: NDArray[np.bool_], total: i
     rest = half * -np.expm1(log_ratio)
     beta = 1.0 + rest + (0.0 if taken_up == 4 else 0.5 * (1.0 + 1.0 / half) * rest**2)
     tail = half * log_ratio + np.log(beta)  # of beta(half, taken_up / 2)
-    kept = int(counted.all(axis=1).sum())
+    kept = int((weights > 0).all(axis=1).sum())
     ways = gammaln(total + 1) - gammaln(kept + 1) - gammaln(total - kept + 1)
     return float(min(tail + ways + np.log(_TURNS), 0.0))

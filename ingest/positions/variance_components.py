@@ -1,7 +1,7 @@
 """Components of variance of a linear model whose noise is white beside a random walk.
 
 Estimated by restricted maximum likelihood (Patterson, Thompson 1971) under a prior, and integrated over
-(importance sampling around the most likely ones), so that few observations give wide answers.
+(importance sampling around the modes), so that few observations give wide answers.
 """
 
 from dataclasses import dataclass, replace
