@@ -241,13 +241,13 @@ def fit_noisy(
         state = state.moved(step)
         squared = _squared(data, state, weights, theta)
     problem = _at(data, state, weights)
-    theta = problem.most_likely(theta, stated)
-    step, covariance = problem.integrated(theta, stated)
+    modes = problem.modes(theta, stated)
+    step, covariance = problem.integrated(modes, stated)
     checked = covariance[2:5, 2:5]
     if held is not None and not held.told:
         free = _at(replace(data, held=None), state, weights)
-        checked = free.integrated(theta, stated)[1][2:5, 2:5]
-    state = state.moved(step)
+        checked = free.integrated(modes, stated)[1][2:5, 2:5]
+    state, theta = state.moved(step), modes[0]
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(
         local_from_sfm=middle @ state.sim,

@@ -71,13 +71,22 @@ class MixedModel:
             np.asarray(np.linalg.inv(replace(self, least=0.0)._normal(theta)[0])),
         )
 
-    def integrated(self, mode: FloatArray, stated: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of the step over what the components may be, around the most likely ones."""
-        widths = self._widths(mode, stated)
-        draws = np.random.default_rng(0).standard_t(_PROPOSAL, (_SAMPLES, 4))
-        log_density = -0.5 * (_PROPOSAL + 1.0) * np.log1p(draws**2 / _PROPOSAL).sum(axis=1)
-        at = mode + widths * draws
-        log_weight = np.array([-0.5 * self.cost(theta, stated) for theta in at]) - log_density
+    def modes(self, start: FloatArray, stated: FloatArray) -> list[FloatArray]:
+        """The most likely components, best first: from those at hand, and as if all were drift or noise."""
+        away = np.array([[-1.0, -1.0, 3.0, 3.0], [-1.0, 1.0, 3.0, -1.0], [1.0, -1.0, -1.0, 3.0]])
+        starts = [start, *(prior_mean(stated) + away)]
+        found = [self.most_likely(at, stated) for at in starts]
+        return sorted(found, key=lambda theta: self.cost(theta, stated))
+
+    def integrated(self, modes: list[FloatArray], stated: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of the step over what the components may be."""
+        widths = np.array([self._widths(mode, stated) for mode in modes])
+        draws = np.random.default_rng(0).standard_t(_PROPOSAL, (len(modes), _SAMPLES // len(modes), 4))
+        at = (np.array(modes)[:, None] + widths[:, None] * draws).reshape(-1, 4)
+        off = (at[:, None] - np.array(modes)) / widths
+        parts = -0.5 * (_PROPOSAL + 1.0) * np.log1p(off**2 / _PROPOSAL).sum(axis=2)
+        density = np.logaddexp.reduce(parts - np.log(widths).sum(axis=1), axis=1)
+        log_weight = np.array([-0.5 * self.cost(theta, stated) for theta in at]) - density
         weights = np.exp(log_weight - log_weight.max())
         weights /= weights.sum()
         mean, spread = np.zeros(8), np.zeros((8, 8))
