@@ -6,7 +6,8 @@ For the horizontal axes and the vertical each: noise is independent, drift is a 
 the time of the flight, the bias that a flight shares cannot be told from the similarity's translation. What
 is left of the lens' error bends the reconstruction: without that shape, survey-grade positions would seem to
 drift (the map's own covariances have it). What positions say of themselves is a prior of these components of
-variance (`MixedModel`). Positions far out are left out.
+variance (`MixedModel`). Positions far out are found with weights of Student's t (Lange, Little, Taylor 1989)
+and then left out.
 """
 
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.positions.one_height import told_once
 from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean, stated_sigma
 
+_TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
 _ROUNDS = 12  # of weights and components; most settle in five
 _MOST_STEP = 0.5  # of the logarithm of the scale and of a turn; further it is not linear
 _SETTLED = 1e-3  # of a step over its standard deviation
@@ -224,22 +226,20 @@ def fit_noisy(
         held=held,
     )
     state, theta = _State(middle.inverse() @ start, 0.0), prior_mean(stated)
-    # What is far out at first is so for noise of the size that residuals have at the median.
-    squared = _relative(data, state.residual(data))
-    squared /= np.maximum(np.median(squared, axis=0) / chdtri(_SIZES, 0.5), _LEAST_M)
-    used, settled = np.zeros((len(centers), 2), dtype=np.bool_), False
-    for _ in range(_ROUNDS):
-        again = squared <= chdtri(_SIZES, 1.0 - _INSIDE)
+    weights = taken * _start_weights(data, state)
+    for _ in range(_ROUNDS):  # heavy tails: a start that nothing far out decides
+        state, theta, settled = _round(data, state, weights, theta)
+        weights = taken * _weights(_squared(data, state, weights, theta))
+        if settled:
+            break
+    used = np.zeros((len(centers), 2), dtype=np.bool_)
+    for _ in range(_ROUNDS):  # then normal ones, without what is far out
+        again = _squared(data, state, weights, theta) <= chdtri(_SIZES, 1.0 - _INSIDE)
         again |= (again & (taken > 0)).sum(axis=0) < _LEAST_PHOTOS
-        if settled and (again == used).all():
+        if (again == used).all():
             break
         used, weights = again, taken * again
-        problem = _at(data, state, weights)
-        theta = problem.most_likely(theta, stated)
-        step, covariance = problem.solution(theta)
-        settled = bool(np.abs(step / np.sqrt(np.diag(covariance))).max() < _SETTLED)
-        state = state.moved(step)
-        squared = _squared(data, state, weights, theta)
+        state, theta, _ = _round(data, state, weights, theta)
     problem = _at(data, state, weights)
     modes = problem.modes(theta, stated)
     step, covariance = problem.integrated(modes, stated)
@@ -258,6 +258,17 @@ def fit_noisy(
         used=used,
         log_chance=_log_chance(data, state, weights, int(taken.sum())),
     )
+
+
+def _round(
+    data: _Data, state: _State, weights: FloatArray, theta: FloatArray
+) -> tuple[_State, FloatArray, bool]:
+    """Components, then similarity; whether it has settled."""
+    problem = _at(data, state, weights)
+    theta = problem.most_likely(theta, data.stated)
+    step, covariance = problem.solution(theta)
+    settled = np.abs(step / np.sqrt(np.diag(covariance))).max() < _SETTLED
+    return state.moved(step), theta, bool(settled)
 
 
 def _speeds(centers: FloatArray, times_s: FloatArray) -> FloatArray:
@@ -342,6 +353,17 @@ def _relative(data: _Data, residual: FloatArray) -> FloatArray:
         ratio = data.sigmas[known][:, axes] / data.stated[group]
         result[known, group] = (residual[known][:, axes] ** 2 / ratio**2).sum(axis=1)
     return result
+
+
+def _start_weights(data: _Data, state: _State) -> FloatArray:
+    """As if all were noise of the size that residuals have at the median."""
+    squared = _relative(data, state.residual(data))
+    return _weights(squared / np.maximum(np.median(squared, axis=0) / chdtri(_SIZES, 0.5), _LEAST_M))
+
+
+def _weights(squared: FloatArray) -> FloatArray:
+    """Of Student's t."""
+    return np.asarray((_TAIL + _SIZES) / (_TAIL + squared))
 
 
 def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> float:
