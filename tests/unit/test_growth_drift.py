@@ -14,7 +14,6 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap.anchored import FixedPoints, Lenses, adjust_anchored
 from ingest.colmap.bridge import Model, with_observations
-from ingest.growth.map_places import SIGMAS_95
 from ingest.growth.place import drift
 from ingest.growth.place.drift import (
     PhotoSpread,
@@ -24,6 +23,7 @@ from ingest.growth.place.drift import (
     shared_turn,
     turning_covariance,
 )
+from ingest.growth.place.refine import loose_photos
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors
 
@@ -266,5 +266,5 @@ def test_a_flat_place_from_above_does_not_tell_a_lens_that_no_map_lends(
     )
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     spread = spread_of(new.model, list(new.keypoints().values()), fixed, kept, lenses)
-    off_m2 = np.linalg.eigvalsh(center_covariances(new.model, spread.poses))[:, -1]
-    assert (SIGMAS_95 * np.sqrt(off_m2) > 0.5).tolist() == [not told] * 2
+    loose = loose_photos(new.model, spread.poses, 0.5)
+    assert sorted(loose) == ([] if told else [0, 1])

@@ -1,6 +1,11 @@
-"""Photos that hang on others by little are named with their figures."""
+"""Photos that hang on others by little, or may be further off than allowed, are named with their figures."""
 
-from ingest.growth.place.refine import weak_photos
+from dataclasses import replace
+
+import numpy as np
+
+from featuredb.geometry.rigid3 import Rigid3
+from ingest.growth.place.refine import loose_photos, weak_photos
 from tests.support.posed_models import model_of
 
 
@@ -18,3 +23,20 @@ def test_what_hangs_on_a_photo_that_is_left_out_hangs_on_nothing() -> None:
     model = model_of(range(100), range(50, 150), range(100, 200))
     assert weak_photos(model, [], [0]) == {}
     assert sorted(weak_photos(model, [1], [0])) == [2]
+
+
+def test_photos_beyond_the_bound_are_named() -> None:
+    model = model_of(range(10), range(10), range(10))
+    model = replace(model, cam_from_sfm=(Rigid3.identity(),) * 3)
+    spread = np.stack([np.diag([1e-6] * 3 + [s**2] * 3) for s in (0.01, 0.3, 0.2)])
+    loose = loose_photos(model, spread, 0.5)
+    assert list(loose) == [1]
+    assert "0.59 m off, 0.50 m are allowed" in loose[1]
+    assert loose_photos(model, spread, 0.6) == {}
+
+
+def test_photos_that_see_nothing_are_loose_unless_none_was_asked() -> None:
+    model = model_of(range(10), range(10))
+    spread = np.stack([np.eye(6) * 1e-6, np.full((6, 6), np.nan)])
+    assert list(loose_photos(model, spread, 0.5)) == [1]
+    assert loose_photos(model, np.full((2, 6, 6), np.nan), 0.5) == {}

@@ -207,7 +207,7 @@ def grow_within_budget(
     refused = Refused(reason="", message="")
     for _ in range(_TRIES):
         try:
-            grown = grow_component(part, photos, features_of, localised, areas, identity)
+            grown = grow_component(part, photos, features_of, localised, areas, identity, budget_m)
         except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
             _LOG.exception("a reconstruction of %d photos", len(everything))
             text = f"{type(error).__name__}: {error}; the log tells where. Please report it"

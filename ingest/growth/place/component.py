@@ -18,7 +18,7 @@ from ingest.growth.place.localised import in_frame, with_lens
 from ingest.growth.place.placement import parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
 from ingest.growth.place.similarity_fit import find_correspondences
-from ingest.growth.values import LEAST_PHOTOS, FeaturesOf, LocalisedPhoto, Refused
+from ingest.growth.values import DRIFT_BUDGET_M, LEAST_PHOTOS, FeaturesOf, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
 from ingest.sfm.links import connected_parts, keep_photos
@@ -50,6 +50,7 @@ def grow_component(
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     identity: MapIdentity | None,
+    max_bound_m: float = DRIFT_BUDGET_M,
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
 
@@ -61,6 +62,7 @@ def grow_component(
         areas: of the active maps, as `localised` had them.
         identity: of the map; None: it is named by the photos that were tried, so that the same ones give the
             same map.
+        max_bound_m: photos that may be further off (95 %) are left out.
     """
     rows = tuple(int(r) for r in model.rows)
     mine = {r: localised[r] for r in rows if r in localised}
@@ -77,7 +79,7 @@ def grow_component(
     placement = place_by_maps(model, mine, correspondences, photos, near, frame)
     if placement.reason is not None:
         return Refused(reason=placement.reason, message=placement.message, rows=rows, gates=placement.gates)
-    refined = refine_placed(model, placement, correspondences, mine, keypoints, lenses)
+    refined = refine_placed(model, placement, correspondences, mine, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
     named = identity or _named([photos[r] for r in rows])

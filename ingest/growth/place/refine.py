@@ -1,8 +1,8 @@
 """Step: a placed reconstruction is adjusted to the existing points, and photos that do not hold are left out.
 
 The lenses of existing maps are adopted before. Photos are left out that contradict the placement before or
-after, and that hang on the others by little; the others are adjusted without them, and say anew how sure they
-are. Those that may be further off than the drift budget are left out by the graph of maps (`rows_within`).
+after, that hang on the others by little, and that may be further off than allowed; the others are adjusted
+without them, and say anew how sure they are.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,11 @@ from featuredb.index.area import Area
 from ingest.colmap.anchored import Anchored, FixedPoints, Lenses, adjust_anchored, pixel_scale
 from ingest.colmap.bridge import Model, with_observations
 from ingest.growth import gates
+from ingest.growth.map_places import SIGMAS_95
 from ingest.growth.place.contradictions import contradicting_photos
 from ingest.growth.place.drift import (
     bending_variance_m2,
+    center_covariances,
     photo_covariances,
     shared_turn,
     turning_covariance,
@@ -30,7 +32,7 @@ from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from ingest.sfm.links import bottleneck_share, select_photos
 
-# Reasons of photos that nothing holds any more, and of those that their own localisation has elsewhere.
+# Reasons of photos that nothing holds well enough, and of those that their own localisation has elsewhere.
 _LOOSE, _CONTRADICTS = "DRIFT_BUDGET", "CONTRADICTS"
 _SHOWS_LITTLE = "the photo shows too little of what existing maps say it should show from where it would be"
 _ELSEWHERE = "the photo by itself sees existing points elsewhere than the others put it"
@@ -101,12 +103,15 @@ def refine_placed(
     localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
     lenses: Lenses,
+    max_bound_m: float,
 ) -> Refinement | Refused:
     """Refine an accepted placement with the existing points held fixed.
 
     Args:
         localised: the model's photos that the existing maps localise, by row.
         keypoints: pixels of all features of the model's photos, in the order of its rows.
+        max_bound_m: photos that may be further off (95 %), against the existing points and with what their
+            lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
     """
     assert placement.local_from_sfm is not None
     assert placement.fit is not None
@@ -129,13 +134,23 @@ def refine_placed(
         fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
         inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
+        loose = {
+            k: message
+            for k, message in loose_photos(adjusted.model, spread.poses, max_bound_m).items()
+            if k not in outside and k not in against
+        }
         left_out |= {rows[k]: (_CONTRADICTS, message) for k, message in against.items()}
-        outside += sorted(against)
-        if not against or len(outside) > len(rows) - 2:
+        left_out |= {rows[k]: (_LOOSE, message) for k, message in loose.items()}
+        outside += sorted({**against, **loose})
+        if not (against or loose) or len(outside) > len(rows) - 2:
             break
-    if against:
-        message = f"photos contradict the others again and again: {next(iter(against.values()))}"
-        return Refused(reason=_CONTRADICTS, message=message, rows=rows, gates=placement.gates)
+    for reason, named, what in (
+        (_LOOSE, loose, "hardly a photo is held well enough"),
+        (_CONTRADICTS, against, "photos contradict the others again and again"),
+    ):
+        if named:
+            message = f"{what}: {next(iter(named.values()))}"
+            return Refused(reason=reason, message=message, rows=rows, gates=placement.gates)
     edges = edges_of(adjusted.model, fit, good, adjusted.fixed_kept)
     if {e.map_id for e in edges} != set(placement.parents):  # a parent that hardly held: as it was
         edges = placement.edges
@@ -183,6 +198,24 @@ def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> di
         f"{100 * LEAST_LINK:.0f} % needed: look-alike places tie photos so"
         for k in np.flatnonzero(firm < LEAST_LINK).tolist()
         if k not in outside
+    }
+
+
+def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, str]:
+    """Photos that may be further off than the bound (95 %) against the existing points, and how far.
+
+    Args:
+        spread: (k, 6, 6) of `PhotoSpread`; photos that see nothing any more are loose, unless none was asked.
+    """
+    if not np.isfinite(spread).any():
+        return {}
+    bounds = np.full(len(spread), np.inf)
+    seen = np.isfinite(spread[:, 0, 0])
+    centers = center_covariances(model, spread)[seen]
+    bounds[seen] = SIGMAS_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
+    return {
+        k: f"the photo may be {bounds[k]:.2f} m off, {max_bound_m:.2f} m are allowed"
+        for k in np.flatnonzero(bounds > max_bound_m).tolist()
     }
 
 
