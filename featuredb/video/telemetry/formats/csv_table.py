@@ -17,7 +17,7 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import assemble, check_count
 from featuredb.video.telemetry.formats.text import UNITS, column_name, decode_text, number, parse_wall_clock
 from featuredb.video.telemetry.values import Clock, Telemetry
 
@@ -314,10 +314,8 @@ def _telemetry(
     datum: HeightDatum = "unknown"
     if "ellipsoidal_height" in values:
         datum, values["height_m"] = "ellipsoidal", values["ellipsoidal_height"]
-    table = SampleTable()
-    table.extend(values, len(times.times_s))
     return assemble(
-        table,
+        values,
         source="CSV",
         origin=origin,
         clock=times.clock,

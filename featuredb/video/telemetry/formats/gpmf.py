@@ -24,7 +24,7 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import assemble, check_count
 from featuredb.video.telemetry.formats.klv import Klv, numbers, parse_klv
 from featuredb.video.telemetry.values import Telemetry
 
@@ -112,7 +112,7 @@ class Decoded:
     """The samples of one packet.
 
     Attributes:
-        columns: (n,) arrays by the names of `SampleTable`, without times.
+        columns: (n,) arrays as `assemble` takes them, without times; the same in all packets of a reader.
         count: n.
         clock_at_start_s: UTC of the packet's first sample where the samples have no clock of their own.
         datum: of the heights.
@@ -157,12 +157,11 @@ def read_gpmf(packets: Sequence[TimedPacket], origin: str = "GPMF track") -> Tel
             f"{origin}: expected a stream GPS9, GPS5 or GLPI, found none (entries: {', '.join(keys)[:300]}); "
             "was GPS switched off?"
         )
-    table = _timed(decoded, origin)
     datums = {samples.datum for _, samples in decoded}
     for _, samples in decoded:
         warnings += [line for line in samples.warnings if line not in warnings]
     return assemble(
-        table,
+        _timed(decoded, origin),
         source=f"GPMF {source}",
         origin=origin,
         clock="utc",
@@ -222,22 +221,23 @@ def _decode(
     return decoded
 
 
-def _timed(decoded: list[tuple[TimedPacket, Decoded]], origin: str) -> SampleTable:
-    """All samples with their times."""
+def _timed(decoded: list[tuple[TimedPacket, Decoded]], origin: str) -> dict[str, FloatArray]:
+    """The columns of all samples with their times."""
     check_count(sum(samples.count for _, samples in decoded), origin)
     steps = [packet.duration_s / samples.count for packet, samples in decoded]
     usual = float(np.median(steps))
-    table = SampleTable()
+    parts: list[dict[str, FloatArray]] = []
     for row, (packet, samples) in enumerate(decoded):
         step = min(steps[row], usual) if row == len(decoded) - 1 else steps[row]
         after: FloatArray = step * np.arange(samples.count, dtype=np.float64)
-        columns: dict[str, FloatArray] = {
-            "clock_s": samples.clock_at_start_s + after,
-            **samples.columns,
-            "times_s": packet.start_s + after,
-        }
-        table.extend(columns, samples.count)
-    return table
+        parts.append(
+            {
+                "clock_s": samples.clock_at_start_s + after,
+                **samples.columns,
+                "times_s": packet.start_s + after,
+            }
+        )
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _gps9(streams: list[Stream]) -> Decoded | None:

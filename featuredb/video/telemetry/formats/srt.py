@@ -13,7 +13,7 @@ import numpy as np
 
 from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import METRES_PER_DEGREE, SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import METRES_PER_DEGREE, assemble, check_count
 from featuredb.video.telemetry.axis_order import ThirdValue, decide_order
 from featuredb.video.telemetry.formats.srt_blocks import Subtitle, is_cut_off, lacks_words, split_blocks
 from featuredb.video.telemetry.formats.srt_fields import BlockFields, looks_like_telemetry, parse_block
@@ -62,14 +62,13 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
     step_m = METRES_PER_DEGREE * 10.0**-decimals
     if decimals >= 0 and step_m > _COARSE_M:
         warnings.append(f"coordinates are written in steps of {step_m:.0f} m")
-    table = SampleTable()
-    for time, clock, fields in zip(times, clocks, parsed, strict=True):
-        table.add({**fields.row, "times_s": time, "clock_s": clock})
+    names = {name for fields in parsed for name in fields.row}
+    columns = {name: np.array([fields.row.get(name, np.nan) for fields in parsed]) for name in names}
     dialects = list(dict.fromkeys(fields.dialect for fields in parsed if fields.dialect))
     if len(dialects) > 1:
         warnings.append(f"{len(dialects)} dialects in one file: recordings of several drones were joined")
     return assemble(
-        table,
+        columns | {"times_s": np.array(times), "clock_s": np.array(clocks)},
         source="SRT, " + " + ".join(dialects),
         origin=origin,
         clock="local",

@@ -44,7 +44,7 @@ class BlockFields:
 
     Attributes:
         dialect: its name in the table above, "" where nothing was understood.
-        row: named values, as `SampleTable.add` takes them.
+        row: named values, by the columns that `assemble` takes.
         pair: unnamed coordinates in degrees, in the order written; NaN without a fix.
         home: the same of the place of take-off.
         third: what follows the pair.
