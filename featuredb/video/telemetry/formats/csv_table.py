@@ -9,7 +9,6 @@ import csv
 import io
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +48,7 @@ _NAMES: dict[str, tuple[str, tuple[str, ...]]] = {
 _MAX_COLUMNS = 2000
 # A table in which so many coordinates are no numbers has other columns than their names say.
 _MOST = 0.5
+_NO_VALUE = ("n/a", "na", "nan", "null", "none", "-")
 
 _TIME_NAMES = (
     "datetime", "date_time", "utc", "utc_time", "time_utc", "timestamp_utc", "timestamp", "time", "time_s",
@@ -82,53 +82,44 @@ class _TimeColumn(NamedTuple):
     in_film: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class TimeColumns:
-    """The columns of a table that are times by their names."""
+def _times_of(
+    columns: list[_TimeColumn], cells: dict[int, list[str]], origin: str, warnings: list[str]
+) -> Times:
+    """The times of all rows, by the texts of the columns at their index.
 
-    columns: tuple[_TimeColumn, ...]
-
-    @property
-    def indices(self) -> list[int]:
-        return [column.at for column in self.columns]
-
-    def read(self, cells: dict[int, list[str]], origin: str, warnings: list[str]) -> Times:
-        """The times of all rows.
-
-        Args:
-            cells: texts of the columns by their index.
-            origin: the file's name, for messages.
-            warnings: receives what had to be decided.
-
-        Raises:
-            TelemetryError: no column can be read as times.
-        """
-        elapsed: FloatArray | None = None
-        in_film = False
-        clock: tuple[FloatArray, Clock] | None = None
-        for column in self.columns:
-            read = _read_column(cells[column.at], column)
-            if read is None:
-                continue
-            seconds, kind = read
-            if kind == "none":
-                if elapsed is None or (column.in_film and not in_film):
-                    _check_unit(seconds, column, origin)
-                    elapsed, in_film = seconds, column.in_film
-            elif clock is None:
-                clock = seconds, kind
-        if elapsed is None and clock is None:
-            names = ", ".join(repr(column.name) for column in self.columns)
-            example = next((text for text in cells[self.columns[0].at] if text.strip()), "")
-            raise TelemetryError(
-                f"{origin}: expected seconds in the column {names}, or dates with the year first like "
-                f"2024-05-31T12:00:00Z, found {example[:40]!r}"
-            )
-        return _joined(elapsed, clock, warnings)._replace(in_film=in_film)
+    Raises:
+        TelemetryError: no column can be read as times.
+    """
+    elapsed: FloatArray | None = None
+    in_film = False
+    clock: tuple[FloatArray, Clock] | None = None
+    for column in columns:
+        read = _read_column(cells[column.at], column)
+        if read is None:
+            continue
+        seconds, kind = read
+        if kind == "none":
+            if elapsed is None or (column.in_film and not in_film):
+                _check_unit(seconds, column, origin)
+                elapsed, in_film = seconds, column.in_film
+        elif clock is None:
+            clock = seconds, kind
+    if elapsed is not None:
+        if clock is None:
+            return Times(elapsed, np.full(len(elapsed), np.nan), "none", in_film=in_film)
+        return Times(elapsed, _refined(elapsed, clock[0], warnings), clock[1], in_film=in_film)
+    if clock is not None:
+        return Times(clock[0], *clock, from_clock=True)
+    names = ", ".join(repr(column.name) for column in columns)
+    example = next((text for text in cells[columns[0].at] if text.strip()), "")
+    raise TelemetryError(
+        f"{origin}: expected seconds in the column {names}, or dates with the year first like "
+        f"2024-05-31T12:00:00Z, found {example[:40]!r}"
+    )
 
 
-def time_columns(header: list[str], origin: str) -> TimeColumns | None:
-    """The time columns of a line of names, None where there is none.
+def _time_columns(header: list[str], origin: str) -> list[_TimeColumn]:
+    """The columns of a line of names that are times by them.
 
     Raises:
         TelemetryError: a time in a unit that is none.
@@ -144,7 +135,7 @@ def time_columns(header: list[str], origin: str) -> TimeColumns | None:
                 f"{origin}: the column {cell!r} has the unit {name.unit!r}, which is no time"
             )
         found.append(_TimeColumn(index, cell.strip(), name.unit, in_film))
-    return TimeColumns(tuple(found)) if found else None
+    return found
 
 
 def _read_column(texts: list[str], column: _TimeColumn) -> tuple[FloatArray, Clock] | None:
@@ -180,17 +171,6 @@ def _check_unit(seconds: FloatArray, column: _TimeColumn, origin: str) -> None:
         )
 
 
-def _joined(elapsed: FloatArray | None, clock: tuple[FloatArray, Clock] | None, warnings: list[str]) -> Times:
-    if elapsed is None:
-        assert clock is not None
-        seconds, kind = clock
-        return Times(seconds, seconds, kind, from_clock=True)
-    if clock is None:
-        return Times(elapsed, np.full(len(elapsed), np.nan), "none")
-    seconds, kind = clock
-    return Times(elapsed, _refined(elapsed, seconds, warnings), kind)
-
-
 def _refined(times_s: FloatArray, clock_s: FloatArray, warnings: list[str]) -> FloatArray:
     """The clock of every row; finer than written where it is cut to whole seconds and rows are closer."""
     both = np.isfinite(times_s) & np.isfinite(clock_s)
@@ -219,15 +199,16 @@ def read_csv(data: bytes, origin: str = "CSV") -> Telemetry:
     rows = _rows(decode_text(data), origin)
     header = next(rows, [])
     columns = _known_columns(header, origin)
-    timing = time_columns(header, origin)
+    timing = _time_columns(header, origin)
     missing = [name for name in ("latitude_deg", "longitude_deg") if name not in columns]
-    if missing or timing is None:
+    if missing or not timing:
         times = "time, timestamp, time_s, film_time_s or datetime(utc)"
         wanted = f"latitude or lat, longitude, lon or lng, and {times}"
         raise TelemetryError(
             f"{origin}: expected a first line with columns for {wanted}; found {', '.join(header)[:500]!r}"
         )
-    cells = _cells(rows, [*(index for index, _ in columns.values()), *timing.indices], len(header), origin)
+    indices = [*(index for index, _ in columns.values()), *(column.at for column in timing)]
+    cells = _cells(rows, indices, len(header), origin)
     if not cells:
         raise TelemetryError(f"{origin}: a table with names of columns and no rows")
     return _telemetry(cells, columns, timing, origin)
@@ -302,14 +283,14 @@ def _cells(rows: Iterator[list[str]], indices: list[int], width: int, origin: st
 
 
 def _telemetry(
-    cells: dict[int, list[str]], columns: dict[str, tuple[int, float]], timing: TimeColumns, origin: str
+    cells: dict[int, list[str]], columns: dict[str, tuple[int, float]], timing: list[_TimeColumn], origin: str
 ) -> Telemetry:
     warnings: list[str] = []
     values = {
         quantity: factor * _numbers(cells[index], quantity, origin, warnings)
         for quantity, (index, factor) in columns.items()
     }
-    times = timing.read(cells, origin, warnings)
+    times = _times_of(timing, cells, origin, warnings)
     values["times_s"], values["clock_s"] = times.times_s, times.clock_s
     datum: HeightDatum = "unknown"
     if "ellipsoidal_height" in values:
@@ -329,15 +310,14 @@ def _telemetry(
 
 def _numbers(texts: list[str], quantity: str, origin: str, warnings: list[str]) -> FloatArray:
     values = np.array([number(_with_point(text)) for text in texts])
-    words = sum(bool(text.strip()) for text in texts) - int(np.isfinite(values).sum())
-    missing = sum(text.strip().lower() in ("n/a", "na", "nan", "null", "none", "-") for text in texts)
-    if words - missing > _MOST * len(texts):
+    written = [text.strip() for text, value in zip(texts, values, strict=True) if np.isnan(value)]
+    words = [text for text in written if text and text.lower() not in _NO_VALUE]
+    if len(words) > _MOST * len(texts):
         raise TelemetryError(
-            f"{origin}: expected numbers in the column of {quantity}, found for example "
-            f"{next(text for text in texts if np.isnan(number(_with_point(text))) and text.strip())[:40]!r}"
+            f"{origin}: expected numbers in the column of {quantity}, found for example {words[0][:40]!r}"
         )
-    if words > missing:
-        warnings.append(f"{words - missing} values of {quantity} are no numbers and not used")
+    if words:
+        warnings.append(f"{len(words)} values of {quantity} are no numbers and not used")
     return values
 
 
