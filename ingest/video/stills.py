@@ -33,10 +33,9 @@ from ingest.video.motion import FrameKind, Motion, measure_motion
 from ingest.video.positions import (
     GimbalAngles,
     Position,
-    angles_at,
     digest_of_telemetry,
     lateness,
-    positions_at,
+    places_at,
 )
 from ingest.workspace import atomic_file, write_json
 
@@ -263,8 +262,7 @@ def make_stills(
             needed=options.positions,
         )
         notes += said
-    places, heights = positions_at(telemetry, choice, late_s)
-    angles = angles_at(telemetry, choice, late_s)
+    places, angles, heights = places_at(telemetry, choice, late_s)
     stretch, unnamed = _video_options(options, None), unnamed_model(content)
     write_keyframes(film, folder, choice, (places, angles), progress, video=stretch, unnamed=unnamed)
     burnt_in = clean_keyframes(folder, choice, _MOTION_SIDE_PX)
