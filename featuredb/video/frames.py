@@ -9,20 +9,9 @@ print(video.report.complaints())
 from pathlib import Path
 
 from featuredb.video.container import open_container
-from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport
+from featuredb.video.film import Video, VideoOptions
 from featuredb.video.folder import open_folder
-from featuredb.video.opening import Readable, Source
-
-__all__ = [
-    "Readable",
-    "Source",
-    "Video",
-    "VideoFrame",
-    "VideoInfo",
-    "VideoOptions",
-    "VideoReport",
-    "open_video",
-]
+from featuredb.video.opening import Source
 
 _DEFAULT = VideoOptions()
 
