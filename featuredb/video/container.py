@@ -173,7 +173,7 @@ class ContainerVideo(Video):
             index=index,
             time_s=time_s,
             gray=gray,
-            make_rgb=lambda: _converted(rgb, picture, name),
+            rgb=lambda: _converted(rgb, picture, name),
         )
 
 

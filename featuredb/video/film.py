@@ -102,13 +102,15 @@ class VideoFrame:
             there that could be decoded.
         time_s: seconds on the film's own clock, from the frame's own time stamp.
         gray: (h, w) uint8, 0 black to 255 white, read-only.
-        make_rgb: makes the colours; holds on to the decoded picture (1.5 bytes a pixel at full size).
+        rgb: makes the colours (h, w, 3) uint8, red first, anew at each call, from one thread at a time.
+            Raises VideoError where the picture's format cannot be converted, or its file is no longer there.
+            Holds on to the decoded picture (1.5 bytes a pixel at full size).
     """
 
     index: int
     time_s: float
     gray: NDArray[np.uint8]
-    make_rgb: Callable[[], NDArray[np.uint8]] = field(repr=False)
+    rgb: Callable[[], NDArray[np.uint8]] = field(repr=False)
 
     def __post_init__(self) -> None:
         if self.gray.ndim != 2 or self.gray.dtype != np.uint8 or not self.gray.size:
@@ -120,14 +122,6 @@ class VideoFrame:
                 f"expected an index from 0 and a finite time, found {self.index}, {self.time_s}"
             )
         self.gray.setflags(write=False)
-
-    def rgb(self) -> NDArray[np.uint8]:
-        """Colours (h, w, 3) uint8, red first; converted anew at each call, from one thread at a time.
-
-        Raises:
-            VideoError: the picture's format cannot be converted, or its file is no longer there.
-        """
-        return self.make_rgb()
 
 
 @dataclass(slots=True, kw_only=True)

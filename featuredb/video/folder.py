@@ -124,7 +124,7 @@ class FolderVideo(Video):
         if done.last_s is not None:
             done.longest_gap_s = max(done.longest_gap_s, time_s - done.last_s)
         done.last_s = time_s
-        return VideoFrame(index=index, time_s=time_s, gray=gray, make_rgb=lambda: self._rgb(name))
+        return VideoFrame(index=index, time_s=time_s, gray=gray, rgb=lambda: self._rgb(name))
 
     def _rgb(self, name: str) -> NDArray[np.uint8]:
         try:

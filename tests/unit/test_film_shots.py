@@ -84,7 +84,7 @@ def test_a_cut_is_found_under_a_logo() -> None:
     def frame(number: int, page: NDArray[np.uint8]) -> VideoFrame:
         gray = page[:, :, 0].copy()
         gray[190:230, 210:306] = logo
-        return VideoFrame(index=number, time_s=number / 25.0, gray=gray, make_rgb=lambda: page)
+        return VideoFrame(index=number, time_s=number / 25.0, gray=gray, rgb=lambda: page)
 
     pages = [_scene(k // 8, k) for k in range(16)]
     motion = measure_motion([frame(k, page) for k, page in enumerate(pages)])

@@ -225,7 +225,7 @@ def test_frames_check_themselves(wrong: dict[str, object]) -> None:
         "index": 0,
         "time_s": 0.0,
         "gray": np.zeros((2, 2), np.uint8),
-        "make_rgb": lambda: np.zeros((2, 2, 3), np.uint8),
+        "rgb": lambda: np.zeros((2, 2, 3), np.uint8),
     }
     VideoFrame(**right)  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="expected"):
