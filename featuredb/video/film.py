@@ -134,7 +134,6 @@ class VideoReport:
         damaged: frames that were handed out although parts of them are made up.
         out_of_order: frames that were dropped because their time is not after that of the frame before.
         times_guessed: frames without a time, which were given the next one at the nominal rate.
-        longest_gap_s: longest time between two decoded frames; 0 before the second one.
         last_s: time of the last decoded frame, or None.
         at_end: whether the end of the file, folder or stream was reached.
         packets: of the film that were read, whole or not.
@@ -148,7 +147,6 @@ class VideoReport:
     damaged: int = 0
     out_of_order: int = 0
     times_guessed: int = 0
-    longest_gap_s: float = 0.0
     last_s: float | None = None
     at_end: bool = False
     packets: int = 0

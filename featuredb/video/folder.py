@@ -121,8 +121,6 @@ class FolderVideo(Video):
             raise self._broken(name, error) from error
         done = self._report
         done.decoded += 1
-        if done.last_s is not None:
-            done.longest_gap_s = max(done.longest_gap_s, time_s - done.last_s)
         done.last_s = time_s
         return VideoFrame(index=index, time_s=time_s, gray=gray, rgb=lambda: self._rgb(name))
 
