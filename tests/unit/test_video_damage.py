@@ -57,7 +57,9 @@ def test_a_broken_stretch_is_passed_and_counted(tmp_path: Path, caplog: pytest.L
     assert [n for n in times if n < 18 or n >= 24] == [*range(18), *range(24, 48)]  # all that are whole
     assert all(shown(f.gray) == n for f, n in zip(frames, times, strict=True) if n < 18 or n >= 24)
     assert report.undecodable == 48 - len(frames) >= 4
-    assert max(np.diff([frame.time_s for frame in frames])) == pytest.approx((report.undecodable + 1) / 25, abs=0.041)
+    assert max(np.diff([frame.time_s for frame in frames])) == pytest.approx(
+        (report.undecodable + 1) / 25, abs=0.041
+    )
     assert not report.whole
     assert f"film.mp4: {report.undecodable} packets cannot be decoded" in caplog.text
     assert report.at_end
