@@ -201,15 +201,13 @@ def interpolate(
     times, known = times_s[rows], values[rows]
     after = np.searchsorted(times, wanted_s, side="left")
     left, right = np.clip(after - 1, 0, len(times) - 1), np.clip(after, 0, len(times) - 1)
-    gap = times[right] - times[left]
-    inside = (wanted_s >= times[0]) & (wanted_s <= times[-1])
-    joined = inside & (gap <= max_gap_s)
-    weight = np.where(joined, (wanted_s - times[left]) / np.where(gap > 0.0, gap, 1.0), 0.0)
     to_left, to_right = np.abs(wanted_s - times[left]), np.abs(times[right] - wanted_s)
-    near = np.minimum(to_left, to_right) <= reach_s
-    held = np.where(near, known[np.where(to_left <= to_right, left, right)], np.nan)
-    step = known[right] - known[left]
-    found = np.where(joined, known[left] + weight * (wrap_degrees(step) if circle else step), held)
+    held = np.where(
+        np.minimum(to_left, to_right) <= reach_s, known[np.where(to_left <= to_right, left, right)], np.nan
+    )
+    joined = (wanted_s >= times[0]) & (wanted_s <= times[-1]) & (times[right] - times[left] <= max_gap_s)
+    line = np.interp(wanted_s, times, np.unwrap(known, period=360.0) if circle else known)
+    found = np.where(joined, line, held)
     return wrap_degrees(found) if circle else found
 
 
