@@ -81,7 +81,8 @@ class PixelReader:
         rgb = self._scaled(
             self._rgb, picture, "rgb24", src_colorspace=matrix, dst_color_range=ColorRange.JPEG
         )
-        return np.ascontiguousarray(turned(rgb.to_ndarray(), self.clockwise_deg))
+        pixels = np.asarray(rgb.to_ndarray(), dtype=np.uint8)
+        return np.ascontiguousarray(turned(pixels, self.clockwise_deg))
 
     def _luma(self, picture: av.VideoFrame) -> NDArray[np.uint8]:
         """The luma plane as stored, made smaller; not a copy where the size stays."""

@@ -89,7 +89,7 @@ def places_at(
         heights = "not known: positions without heights are not used"
     places = np.stack([at.latitude_deg, at.longitude_deg, height], axis=1)
     ypr = np.column_stack([at.gimbal_ypr_deg[:, :2], np.nan_to_num(at.gimbal_ypr_deg[:, 2])])
-    turned = np.isfinite(ypr).all(axis=1) & ypr.any(axis=1)
+    turned = np.logical_and(np.isfinite(ypr).all(axis=1), ypr.any(axis=1))
     return _rows(places, known), _rows(ypr, turned), heights
 
 
