@@ -58,12 +58,11 @@ def assemble(
         sort: by time, for formats that do not promise an order.
 
     Raises:
-        TelemetryError: no samples, too many, or none with a position.
+        TelemetryError: no samples, or none with a position.
     """
     times = raw["times_s"]
     if not len(times):
         raise TelemetryError(f"{origin}: no samples of telemetry in it")
-    check_count(len(times), origin)
     unknown = np.full(len(times), np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
         if from_first:
