@@ -47,10 +47,10 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> Films:
     write_film(folder / "other.mp4", [_scene(0, k) for k in range(30)])
     (folder / "broken.mp4").write_bytes(b"no film")
     (folder / "notes.txt").write_text("of the editor")
-    found = find_films([folder, folder / "other.mp4"])
-    assert [path.name for path in found.paths] == ["broken.mp4", "edited.mkv", "other.mp4"]
-    assert "1 files are no films by their names" in found.notes[0]
-    return make_films(found.paths, lambda _: None, folder / "work", StillsOptions())
+    paths, notes = find_films([folder, folder / "other.mp4"])
+    assert [path.name for path in paths] == ["broken.mp4", "edited.mkv", "other.mp4"]
+    assert "1 files are no films by their names" in notes[0]
+    return make_films(paths, lambda _: None, folder / "work", StillsOptions())
 
 
 def test_films_are_split_at_cuts_and_every_frame_is_accounted_for(films: Films) -> None:
