@@ -24,7 +24,7 @@ def open_video(source: Source, options: VideoOptions = _DEFAULT) -> Video:
 
     Args:
         source: a film (mp4, mov, mkv, webm, avi, ts), a folder of pictures (see `folder.py`), a camera's
-            device, an address (rtsp://, http://, ...) or an open binary file.
+            device or an address (rtsp://, http://, ...).
 
     Raises:
         VideoError: it cannot be opened, holds no video that can be decoded, or is of a size or rotation that
