@@ -44,29 +44,26 @@ def assemble(
     height_datum: HeightDatum = "unknown",
     clock: Clock = "none",
     in_video_time: bool = True,
-    from_first: bool = False,
     sort: bool = False,
 ) -> Telemetry:
     """The telemetry of raw samples; for what is not said here see `Telemetry`.
 
     Args:
-        raw: columns (n,) float64 by the names of `_FIELDS`, `times_s` among them; NaN is "not known",
-            and a column left out is NaN throughout.
+        raw: columns (n,) float64 by the names of `_FIELDS`; NaN is "not known", and a column left out
+            is NaN throughout. Without `times_s` they are those of `clock_s` since the first sample.
         warnings: what the reader has found; receives what is found here.
         clock: of the samples that have a reading of it.
-        from_first: times are made to count from the first sample.
         sort: by time, for formats that do not promise an order.
 
     Raises:
         TelemetryError: no samples, or none with a position.
     """
-    times = raw["times_s"]
-    if not len(times):
+    given = raw["times_s"] if "times_s" in raw else raw["clock_s"]
+    if not len(given):
         raise TelemetryError(f"{origin}: no samples of telemetry in it")
-    unknown = np.full(len(times), np.nan)
+    unknown = np.full(len(given), np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
-        if from_first:
-            times = _since_first(times, sort)
+        times = given if "times_s" in raw else _since_first(given, sort)
         rows = _rows_in_time(times, sort, warnings)
         columns = {name: raw.get(name, unknown)[rows] for name in _FIELDS} | {"times_s": times[rows]}
         latitude, longitude = _positions(columns["latitude_deg"], columns["longitude_deg"], warnings)

@@ -65,16 +65,6 @@ _SINCE_1970 = ((1e9, 4.2e9, 1.0), (1e12, 4.2e12, 1e-3), (1e15, 4.2e15, 1e-6))
 _CUT_OFF_S = 0.5
 
 
-class Times(NamedTuple):
-    """Times of the rows: seconds of elapsed time, and the clock's; NaN where they are not known."""
-
-    times_s: FloatArray
-    clock_s: FloatArray
-    clock: Clock
-    from_clock: bool = False  # there is no elapsed time: times_s is clock_s
-    in_film: bool = False  # times_s counts from the film's beginning
-
-
 class _TimeColumn(NamedTuple):
     at: int
     name: str
@@ -84,8 +74,11 @@ class _TimeColumn(NamedTuple):
 
 def _times_of(
     columns: list[_TimeColumn], cells: dict[int, list[str]], origin: str, warnings: list[str]
-) -> Times:
-    """The times of all rows, by the texts of the columns at their index.
+) -> tuple[dict[str, FloatArray], Clock, bool]:
+    """Columns of the times of all rows, as `assemble` takes them; which clock; whether times are the film's.
+
+    Args:
+        cells: texts of the columns by their index.
 
     Raises:
         TelemetryError: no column can be read as times.
@@ -106,10 +99,11 @@ def _times_of(
             clock = seconds, kind
     if elapsed is not None:
         if clock is None:
-            return Times(elapsed, np.full(len(elapsed), np.nan), "none", in_film=in_film)
-        return Times(elapsed, _refined(elapsed, clock[0], warnings), clock[1], in_film=in_film)
+            return {"times_s": elapsed}, "none", in_film
+        finer = _refined(elapsed, clock[0], warnings)
+        return {"times_s": elapsed, "clock_s": finer}, clock[1], in_film
     if clock is not None:
-        return Times(clock[0], *clock, from_clock=True)
+        return {"clock_s": clock[0]}, clock[1], False
     names = ", ".join(repr(column.name) for column in columns)
     example = next((text for text in cells[columns[0].at] if text.strip()), "")
     raise TelemetryError(
@@ -290,19 +284,17 @@ def _telemetry(
         quantity: factor * _numbers(cells[index], quantity, origin, warnings)
         for quantity, (index, factor) in columns.items()
     }
-    times = _times_of(timing, cells, origin, warnings)
-    values["times_s"], values["clock_s"] = times.times_s, times.clock_s
+    times, clock, in_film = _times_of(timing, cells, origin, warnings)
     datum: HeightDatum = "unknown"
     if "ellipsoidal_height" in values:
         datum, values["height_m"] = "ellipsoidal", values["ellipsoidal_height"]
     return assemble(
-        values,
+        values | times,
         source="CSV",
         origin=origin,
-        clock=times.clock,
+        clock=clock,
         height_datum=datum,
-        in_video_time=times.in_film,
-        from_first=times.from_clock,
+        in_video_time=in_film,
         sort=True,
         warnings=warnings,
     )

@@ -114,7 +114,6 @@ class _Reader:
         clock, latitude, longitude, height = np.array(self._rows).T
         return assemble(
             {
-                "times_s": clock,
                 "clock_s": clock,
                 "latitude_deg": latitude,
                 "longitude_deg": longitude,
@@ -124,7 +123,6 @@ class _Reader:
             origin=self._origin,
             clock="utc",
             in_video_time=False,
-            from_first=True,
             sort=True,
             warnings=warnings,
         )
