@@ -270,7 +270,7 @@ def _info(
     opening: Opening,
     options: VideoOptions,
 ) -> VideoInfo:
-    clockwise_deg = _rotation(first, opening.name)
+    clockwise_deg = clockwise_from_display_matrix(_display_matrix(first), opening.name)
     size = (first.width, first.height)
     if clockwise_deg in (90, 270):
         size = size[::-1]
@@ -293,13 +293,9 @@ def _info(
     )
 
 
-def _rotation(first: av.VideoFrame, name: str) -> int:
-    side_data = cast("Mapping[str, Any]", first.side_data)
-    matrix = side_data.get("DISPLAYMATRIX")
-    try:
-        return clockwise_from_display_matrix(None if matrix is None else bytes(matrix))
-    except VideoError as error:
-        raise VideoError(f"{name}: {error}") from error
+def _display_matrix(picture: av.VideoFrame) -> bytes | None:
+    matrix = cast("Mapping[str, Any]", picture.side_data).get("DISPLAYMATRIX")
+    return None if matrix is None else bytes(matrix)
 
 
 def _first(tags: Mapping[str, str], names: tuple[str, ...]) -> str | None:
