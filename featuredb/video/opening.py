@@ -6,7 +6,7 @@ import stat
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from urllib.parse import urlsplit
 
 import av
@@ -115,7 +115,7 @@ def open_input(opening: Opening, options: VideoOptions) -> InputContainer:
         VideoError: it cannot be opened, in words that say why.
     """
     try:
-        container = av.open(
+        return av.open(
             opening.target,
             "r",
             format=opening.input_format,
@@ -128,7 +128,6 @@ def open_input(opening: Opening, options: VideoOptions) -> InputContainer:
         )
     except (av.FFmpegError, OSError, ValueError) as error:
         raise _refusal(opening, options, error) from error
-    return cast("InputContainer", container)
 
 
 def _refusal(opening: Opening, options: VideoOptions, error: Exception) -> VideoError:
