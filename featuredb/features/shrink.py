@@ -13,7 +13,7 @@ def fitted_size(width: int, height: int, max_side_px: int | None) -> tuple[int, 
     return max(1, round(width * max_side_px / longer)), max(1, round(height * max_side_px / longer))
 
 
-def shrunk(pixels: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
+def shrunk(pixels: NDArray[np.uint8], max_side_px: int | None) -> NDArray[np.uint8]:
     """Pixels (h, w) or (h, w, 3) whose sides are at most `max_side_px`; the same where they are."""
     height, width = pixels.shape[:2]
     size = fitted_size(width, height, max_side_px)

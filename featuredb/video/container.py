@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from fractions import Fraction
 from typing import Any, cast
@@ -173,7 +173,7 @@ class ContainerVideo(Video):
             index=index,
             time_s=time_s,
             gray=gray,
-            make_rgb=lambda: _converted(rgb, picture, name),
+            rgb=lambda: _converted(rgb, picture, name),
         )
 
 
@@ -270,13 +270,13 @@ def _info(
     opening: Opening,
     options: VideoOptions,
 ) -> VideoInfo:
-    clockwise_deg = _rotation(first, opening.name)
+    clockwise_deg = clockwise_from_display_matrix(_display_matrix(first), opening.name)
     size = (first.width, first.height)
     if clockwise_deg in (90, 270):
         size = size[::-1]
     frame_size = fitted_size(*size, options.max_side_px)
     texts = {**container.metadata, **stream.metadata}
-    camera = camera_tags({name.lower(): value for name, value in texts.items()})
+    tags = {name.lower(): value for name, value in texts.items()}
     return VideoInfo(
         name=opening.name,
         width=size[0],
@@ -286,38 +286,16 @@ def _info(
         rotation_deg=clockwise_deg,
         duration_s=None if opening.live else _duration_s(container, stream),
         frame_count=stream.frames if stream.frames > 0 else None,
-        creation_time=camera.creation_time,
-        make=camera.make,
-        model=camera.model,
+        creation_time=_creation_time(tags),
+        make=_first(tags, _MAKE) or _maker(tags),
+        model=_first(tags, _MODEL),
         live=opening.live,
     )
 
 
-def _rotation(first: av.VideoFrame, name: str) -> int:
-    side_data = cast("Mapping[str, Any]", first.side_data)
-    matrix = side_data.get("DISPLAYMATRIX")
-    try:
-        return clockwise_from_display_matrix(None if matrix is None else bytes(matrix))
-    except VideoError as error:
-        raise VideoError(f"{name}: {error}") from error
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraTags:
-    """Make and model of the camera and the time of recording; each None if not said."""
-
-    make: str | None
-    model: str | None
-    creation_time: datetime | None
-
-
-def camera_tags(tags: Mapping[str, str]) -> CameraTags:
-    """Read the tags, whose names are in lower case."""
-    return CameraTags(
-        make=_first(tags, _MAKE) or _maker(tags),
-        model=_first(tags, _MODEL),
-        creation_time=_creation_time(tags),
-    )
+def _display_matrix(picture: av.VideoFrame) -> bytes | None:
+    matrix = cast("Mapping[str, Any]", picture.side_data).get("DISPLAYMATRIX")
+    return None if matrix is None else bytes(matrix)
 
 
 def _first(tags: Mapping[str, str], names: tuple[str, ...]) -> str | None:

@@ -131,8 +131,6 @@ class Decoder:
                     )
                 continue
             backward = 0
-            if last_s is not None:
-                self._tally.longest_gap_s = max(self._tally.longest_gap_s, time_s - last_s)
             last_s = self._tally.last_s = time_s
             yield time_s, picture
 

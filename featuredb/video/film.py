@@ -102,13 +102,15 @@ class VideoFrame:
             there that could be decoded.
         time_s: seconds on the film's own clock, from the frame's own time stamp.
         gray: (h, w) uint8, 0 black to 255 white, read-only.
-        make_rgb: makes the colours; holds on to the decoded picture (1.5 bytes a pixel at full size).
+        rgb: makes the colours (h, w, 3) uint8, red first, anew at each call, from one thread at a time.
+            Raises VideoError where the picture's format cannot be converted, or its file is no longer there.
+            Holds on to the decoded picture (1.5 bytes a pixel at full size).
     """
 
     index: int
     time_s: float
     gray: NDArray[np.uint8]
-    make_rgb: Callable[[], NDArray[np.uint8]] = field(repr=False)
+    rgb: Callable[[], NDArray[np.uint8]] = field(repr=False)
 
     def __post_init__(self) -> None:
         if self.gray.ndim != 2 or self.gray.dtype != np.uint8 or not self.gray.size:
@@ -121,14 +123,6 @@ class VideoFrame:
             )
         self.gray.setflags(write=False)
 
-    def rgb(self) -> NDArray[np.uint8]:
-        """Colours (h, w, 3) uint8, red first; converted anew at each call, from one thread at a time.
-
-        Raises:
-            VideoError: the picture's format cannot be converted, or its file is no longer there.
-        """
-        return self.make_rgb()
-
 
 @dataclass(slots=True, kw_only=True)
 class VideoReport:
@@ -140,7 +134,6 @@ class VideoReport:
         damaged: frames that were handed out although parts of them are made up.
         out_of_order: frames that were dropped because their time is not after that of the frame before.
         times_guessed: frames without a time, which were given the next one at the nominal rate.
-        longest_gap_s: longest time between two decoded frames; 0 before the second one.
         last_s: time of the last decoded frame, or None.
         at_end: whether the end of the file, folder or stream was reached.
         packets: of the film that were read, whole or not.
@@ -154,7 +147,6 @@ class VideoReport:
     damaged: int = 0
     out_of_order: int = 0
     times_guessed: int = 0
-    longest_gap_s: float = 0.0
     last_s: float | None = None
     at_end: bool = False
     packets: int = 0

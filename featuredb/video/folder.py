@@ -9,21 +9,22 @@ Pixels come as stored, as of every other picture file: EXIF orientation is not a
 import csv
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, VideoError
 from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb, probe
 from featuredb.features.exif.read import ExifInfo, read_exif
-from featuredb.features.shrink import fitted_size
+from featuredb.features.shrink import fitted_size, shrunk
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
 
+_T = TypeVar("_T")
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".heic", ".heif", ".avif", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 _CSV_NAME = "timestamps.csv"
 _MAX_BYTES = 1 << 30  # of one picture: an uncompressed TIFF of the most pixels has 400 MB
@@ -72,7 +73,7 @@ class FolderVideo(Video):
     ) -> None:
         self._folder, self._timed, self._limits, self._options = folder, timed, limits, options
         self._size = self._stored_size(timed[0][1])
-        self._frame_size = fitted_size(*self._size, options.max_side_px)
+        frame_width, frame_height = fitted_size(*self._size, options.max_side_px)
         self._report = VideoReport()
         self._closed = False
         length_s = timed[-1][0] - timed[0][0]
@@ -83,8 +84,8 @@ class FolderVideo(Video):
                 name=folder.name or str(folder),
                 width=self._size[0],
                 height=self._size[1],
-                frame_width=self._frame_size[0],
-                frame_height=self._frame_size[1],
+                frame_width=frame_width,
+                frame_height=frame_height,
                 duration_s=len(timed) / rate if rate else None,
                 frame_count=len(timed),
                 make=exif.make or None,
@@ -115,34 +116,26 @@ class FolderVideo(Video):
         self._report.at_end = self._options.end_s is None
 
     def _frame(self, index: int, time_s: float, name: str) -> VideoFrame:
-        try:
-            gray = self._fitted(decode_gray(self._folder / name, self._limits))
-        except ImageError as error:
-            raise self._broken(name, error) from error
-        done = self._report
-        done.decoded += 1
-        if done.last_s is not None:
-            done.longest_gap_s = max(done.longest_gap_s, time_s - done.last_s)
-        done.last_s = time_s
-        return VideoFrame(index=index, time_s=time_s, gray=gray, make_rgb=lambda: self._rgb(name))
+        gray = self._pixels(decode_gray, name)
+        self._report.decoded += 1
+        self._report.last_s = time_s
+        return VideoFrame(index=index, time_s=time_s, gray=gray, rgb=lambda: self._pixels(decode_rgb, name))
 
-    def _rgb(self, name: str) -> NDArray[np.uint8]:
-        try:
-            return self._fitted(decode_rgb(self._folder / name, self._limits))
-        except ImageError as error:
-            raise self._broken(name, error) from error
-
-    def _fitted(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        if self._frame_size == self._size:
-            return pixels
-        return np.asarray(cv2.resize(pixels, self._frame_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    def _pixels(
+        self, decode: Callable[[Path, DecodeLimits], NDArray[np.uint8]], name: str
+    ) -> NDArray[np.uint8]:
+        return shrunk(self._read(decode, name), self._options.max_side_px)
 
     def _stored_size(self, name: str) -> tuple[int, int]:
-        try:
-            header = probe(self._folder / name, self._limits)
-        except ImageError as error:
-            raise self._broken(name, error) from error
+        header = self._read(probe, name)
         return header.width, header.height
+
+    def _read(self, read: Callable[[Path, DecodeLimits], _T], name: str) -> _T:
+        """What `read` makes of a picture's file."""
+        try:
+            return read(self._folder / name, self._limits)
+        except ImageError as error:
+            raise VideoError(f"{self._folder.name}: the picture {name} cannot be read: {error}") from error
 
     def _exif(self) -> ExifInfo:
         """What the first picture says of its camera, if one in the middle and the last say the same."""
@@ -152,9 +145,6 @@ class FolderVideo(Video):
         except OSError:
             return ExifInfo()  # whoever comes to that picture says what is wrong with it
         return said[0] if len({exif.camera_key for exif in said}) == 1 else ExifInfo()
-
-    def _broken(self, name: str, error: ImageError) -> VideoError:
-        return VideoError(f"{self._folder.name}: the picture {name} cannot be read: {error}")
 
 
 def _timed(folder: Path, names: list[str], fps: float | None) -> list[tuple[float, str]]:

@@ -9,20 +9,9 @@ print(video.report.complaints())
 from pathlib import Path
 
 from featuredb.video.container import open_container
-from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport
+from featuredb.video.film import Video, VideoOptions
 from featuredb.video.folder import open_folder
-from featuredb.video.opening import Readable, Source
-
-__all__ = [
-    "Readable",
-    "Source",
-    "Video",
-    "VideoFrame",
-    "VideoInfo",
-    "VideoOptions",
-    "VideoReport",
-    "open_video",
-]
+from featuredb.video.opening import Source
 
 _DEFAULT = VideoOptions()
 
@@ -35,7 +24,7 @@ def open_video(source: Source, options: VideoOptions = _DEFAULT) -> Video:
 
     Args:
         source: a film (mp4, mov, mkv, webm, avi, ts), a folder of pictures (see `folder.py`), a camera's
-            device, an address (rtsp://, http://, ...) or an open binary file.
+            device or an address (rtsp://, http://, ...).
 
     Raises:
         VideoError: it cannot be opened, holds no video that can be decoded, or is of a size or rotation that

@@ -6,7 +6,7 @@ import stat
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any
 from urllib.parse import urlsplit
 
 import av
@@ -26,13 +26,7 @@ _NETWORK_PROTOCOLS = ",".join((*_SCHEMES, "tls", "crypto", "httpproxy"))
 _BLOCK_PX = 128  # of AV1 and its like; half of it in H.265
 
 
-class Readable(Protocol):
-    """An open binary file; sought in if it can be."""
-
-    def read(self, size: int, /) -> bytes: ...
-
-
-Source = str | Path | Readable
+Source = str | Path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +35,7 @@ class Opening:
 
     Attributes:
         name: for messages, without password.
-        target: what `av.open` takes.
+        target: the address or path that `av.open` takes.
         path: the regular file that it is, or None.
         input_format: libav's name of the format where it cannot tell itself, or None.
         input_options: libav's, see VideoOptions.
@@ -49,7 +43,7 @@ class Opening:
     """
 
     name: str
-    target: Any
+    target: str
     input_options: dict[str, str]
     live: bool
     path: Path | None = None
@@ -64,15 +58,7 @@ def opening_of(source: Source, options: VideoOptions) -> Opening:
     """
     if isinstance(source, str) and re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", source):
         return _address(source, options)
-    if isinstance(source, str | Path):
-        return _file_or_device(Path(source), options)
-    seekable = getattr(source, "seekable", None)
-    return Opening(
-        name=str(getattr(source, "name", "the open file")),
-        target=source,
-        input_options={"format_whitelist": _FILE_FORMATS, **options.input_options},
-        live=not (callable(seekable) and seekable()),
-    )
+    return _file_or_device(Path(source), options)
 
 
 def _address(url: str, options: VideoOptions) -> Opening:
@@ -129,7 +115,7 @@ def open_input(opening: Opening, options: VideoOptions) -> InputContainer:
         VideoError: it cannot be opened, in words that say why.
     """
     try:
-        container = av.open(
+        return av.open(
             opening.target,
             "r",
             format=opening.input_format,
@@ -142,7 +128,6 @@ def open_input(opening: Opening, options: VideoOptions) -> InputContainer:
         )
     except (av.FFmpegError, OSError, ValueError) as error:
         raise _refusal(opening, options, error) from error
-    return cast("InputContainer", container)
 
 
 def _refusal(opening: Opening, options: VideoOptions, error: Exception) -> VideoError:

@@ -56,13 +56,16 @@ class PixelReader:
         if name not in _LUMA_PLANE and picture.format.components[0].is_luma:
             # Libav's own grey of these would weigh the colours anew by BT.601, whatever the film's matrix.
             matrix = _matrix(picture)
-            picture, name = self._smaller_yuv(self._gray_yuv, picture, "yuv420p", matrix), "yuv420p"
+            name = "yuv420p"
+            picture = self._scaled(
+                self._gray_yuv, picture, name, src_colorspace=matrix, dst_colorspace=matrix
+            )
         if name in _LUMA_PLANE and picture.planes[0].line_size >= picture.width:
             gray = self._luma(picture)
             if name not in _FULL_RANGE and picture.color_range != ColorRange.JPEG:
                 gray = np.asarray(cv2.LUT(gray, _FULL_FROM_LIMITED), dtype=np.uint8)
         else:
-            gray = self._converted(self._gray, picture, "gray")
+            gray = self._gray_of(picture)
         # A copy, unless turning or the table made one: the decoder goes on with the plane as its reference.
         return np.require(turned(gray, self.clockwise_deg), requirements=["C", "O"])
 
@@ -74,28 +77,12 @@ class PixelReader:
         """
         matrix = _matrix(picture)
         if picture.format.name in _LUMA_PLANE:  # smaller first, which leaves less to convert: 3 times as fast
-            picture = self._smaller_yuv(self._rgb_yuv, picture, None, matrix)
-        rgb = self._converted(self._rgb, picture, "rgb24", matrix)
-        return np.ascontiguousarray(turned(rgb, self.clockwise_deg))
-
-    def _smaller_yuv(
-        self,
-        reformatter: VideoReformatter,
-        picture: av.VideoFrame,
-        pixel_format: str | None,
-        matrix: Colorspace | None,
-    ) -> av.VideoFrame:
-        """The picture in its final size, in its own colours: of `matrix`, if it names none."""
-        return reformatter.reformat(
-            picture,
-            self.width,
-            self.height,
-            pixel_format,
-            src_colorspace=matrix,
-            dst_colorspace=matrix,
-            interpolation=Interpolation.AREA,
-            threads=1,
+            picture = self._scaled(self._rgb_yuv, picture, None, src_colorspace=matrix, dst_colorspace=matrix)
+        rgb = self._scaled(
+            self._rgb, picture, "rgb24", src_colorspace=matrix, dst_color_range=ColorRange.JPEG
         )
+        pixels = np.asarray(rgb.to_ndarray(), dtype=np.uint8)
+        return np.ascontiguousarray(turned(pixels, self.clockwise_deg))
 
     def _luma(self, picture: av.VideoFrame) -> NDArray[np.uint8]:
         """The luma plane as stored, made smaller; not a copy where the size stays."""
@@ -105,27 +92,26 @@ class PixelReader:
         luma = rows[:, : picture.width]
         if (picture.width, picture.height) == (self.width, self.height):
             return luma
-        return self._converted(self._gray, av.VideoFrame.from_numpy_buffer(luma, "gray"), "gray")
+        return self._gray_of(av.VideoFrame.from_numpy_buffer(luma, "gray"))
 
-    def _converted(
-        self,
-        reformatter: VideoReformatter,
-        picture: av.VideoFrame,
-        pixel_format: str,
-        matrix: Colorspace | None = None,
-    ) -> NDArray[np.uint8]:
-        # One thread: libav's default of one for each core takes three times as long on two busy cores.
-        converted = reformatter.reformat(
+    def _gray_of(self, picture: av.VideoFrame) -> NDArray[np.uint8]:
+        gray = self._scaled(self._gray, picture, "gray", dst_color_range=ColorRange.JPEG)
+        return np.asarray(gray.to_ndarray(), dtype=np.uint8)
+
+    def _scaled(
+        self, reformatter: VideoReformatter, picture: av.VideoFrame, pixel_format: str | None, **colours: Any
+    ) -> av.VideoFrame:
+        """The picture in its final size and another format."""
+        return reformatter.reformat(
             picture,
             self.width,
             self.height,
             pixel_format,
-            src_colorspace=matrix,
             interpolation=Interpolation.AREA,
-            dst_color_range=ColorRange.JPEG,
+            # libav's default of one for each core takes three times as long on two busy cores.
             threads=1,
+            **colours,
         )
-        return np.asarray(converted.to_ndarray(), dtype=np.uint8)
 
 
 def _matrix(picture: av.VideoFrame) -> Colorspace | None:

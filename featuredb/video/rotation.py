@@ -21,7 +21,7 @@ _MAX_OFF_DEG = 0.5
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 
-def clockwise_from_display_matrix(matrix: bytes | None) -> int:
+def clockwise_from_display_matrix(matrix: bytes | None, name: str) -> int:
     """Degrees, 0, 90, 180 or 270, by which stored pictures are turned clockwise to stand upright.
 
     The matrix (a b u; c d v; x y w) takes the stored point (p, q), y down, to (a p + c q + x, b p + d q + y)
@@ -29,6 +29,7 @@ def clockwise_from_display_matrix(matrix: bytes | None) -> int:
 
     Args:
         matrix: the side data DISPLAYMATRIX, 36 bytes, or None for a film without one.
+        name: of the film, for messages.
 
     Raises:
         VideoError: another angle, a mirrored picture, or no matrix of that size.
@@ -36,23 +37,23 @@ def clockwise_from_display_matrix(matrix: bytes | None) -> int:
     if matrix is None:
         return 0
     if len(matrix) != _MATRIX.size:
-        raise VideoError(f"expected a display matrix of {_MATRIX.size} bytes, found {len(matrix)}")
+        raise VideoError(f"{name}: expected a display matrix of {_MATRIX.size} bytes, found {len(matrix)}")
     a, b, _, c, d, *_ = (value / _ONE for value in _MATRIX.unpack(matrix))
     determinant = a * d - b * c
     if determinant == 0.0:
         raise VideoError(
-            f"the display matrix ({a:g} {b:g}; {c:g} {d:g}) shows no picture; encode the film again"
+            f"{name}: the display matrix ({a:g} {b:g}; {c:g} {d:g}) shows no picture; encode the film again"
         )
     if determinant < 0.0:
         raise VideoError(
-            "the display matrix mirrors the picture (as of a selfie camera), and scenes would come out "
-            "mirrored; switch mirroring off in the camera, or encode the film again as it is to be read"
+            f"{name}: the display matrix mirrors the picture (as of a selfie camera), and scenes would come "
+            "out mirrored; switch mirroring off in the camera, or encode the film again as it is to be read"
         )
     angles = (math.degrees(math.atan2(b, a)), math.degrees(math.atan2(-c, d)))
     turns = round(angles[0] / 90.0)
     if any(abs(math.remainder(angle - 90.0 * turns, 360.0)) > _MAX_OFF_DEG for angle in angles):
         raise VideoError(
-            f"the display matrix turns the picture by {angles[0] % 360.0:.1f} degrees, "
+            f"{name}: the display matrix turns the picture by {angles[0] % 360.0:.1f} degrees, "
             "expected 0, 90, 180 or 270; encode the film again without that rotation"
         )
     return turns % 4 * 90

@@ -75,13 +75,13 @@ def run_video(args: argparse.Namespace) -> int:
     from ingest.video.stills import StillsOptions
     from ingest.workspace import default_root
 
-    files = find_films(args.films)
-    _check_options(args, len(files.paths))
+    paths, notes = find_films(args.films)
+    _check_options(args, len(paths))
     options = StillsOptions(
         start_s=args.start,
         end_s=args.end,
         telemetry_late_s=args.telemetry_late,
-        film_start_s=_film_start(args, files.paths[0]),
+        film_start_s=_film_start(args, paths[0]),
         positions=args.gcp is None,
         keyframes=KeyframeOptions(most=args.keyframes, least=min(KeyframeOptions().least, args.keyframes)),
     )
@@ -89,11 +89,11 @@ def run_video(args: argparse.Namespace) -> int:
     database = place_for_database(args)
     root = args.work or default_root(database.url)
     with progress_bars(args.quiet) as progress:
-        films = make_films(files.paths, partial(_telemetry, args), root, options, progress)
-    sys.stdout.write(_text(films, files.notes))
+        films = make_films(paths, partial(_telemetry, args), root, options, progress)
+    sys.stdout.write(_text(films, notes))
     if args.height_datum == "unknown" and len(films.heights & set(HEIGHT_DATUMS)) == len(films.heights) == 1:
         (args.height_datum,) = films.heights
-    args.name = args.name or _name(args.films, len(files.paths))
+    args.name = args.name or _name(args.films, len(paths))
     if args.max_features is None:
         args.max_features = _FEATURES
     return ingest_folder(args, films.folder, films.outcomes)
@@ -163,7 +163,7 @@ def _name(named: list[Path], films: int) -> str:
     return first.stem if films == 1 else f"{first.stem} and {films - 1} more"
 
 
-def _text(films: "Films", notes: tuple[str, ...]) -> str:
+def _text(films: "Films", notes: list[str]) -> str:
     lines = [f"note: {text}" for text in notes]
     for film in films.outcomes:
         if film.status == "refused":

@@ -6,6 +6,7 @@ road straight ahead), so that only the slope along the motion counts; and where 
 (a horizon far away), nothing can be said, and nothing is.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -81,12 +82,12 @@ def find_burnt_in(pictures: Sequence[Gray], shots: Sequence[int]) -> dict[int, B
     Where a shot says nothing, since it is too short or hardly moves there, the whole film does: across a cut
     all of the scene is another.
     """
-    rows = {shot: [k for k, s in enumerate(shots) if s == shot] for shot in sorted(set(shots))}
     film_bars = _bars(pictures)
     sums, film = _Sums.of_pairs(pictures, shots)
     found = {}
-    for shot, mine in rows.items():
-        bars = film_bars if len(mine) < _LEAST else _bars([pictures[k] for k in mine])
+    for shot in sorted(set(shots)):
+        mine = [picture for picture, number in zip(pictures, shots, strict=True) if number == shot]
+        bars = film_bars if len(mine) < _LEAST else _bars(mine)
         own = sums.get(shot)
         edges = film.burnt_in()
         if own is not None:
@@ -113,8 +114,11 @@ class _Sums:
     def of_pairs(cls, pictures: Sequence[Gray], shots: Sequence[int]) -> tuple[dict[int, "_Sums"], "_Sums"]:
         """Sums of each shot and of the film."""
         shape = pictures[0].shape
-        film = cls(both=np.zeros(shape), each=np.zeros(shape), count=np.zeros(shape))
-        of_shot: dict[int, _Sums] = {}
+
+        def none_yet() -> "_Sums":
+            return cls(both=np.zeros(shape), each=np.zeros(shape), count=np.zeros(shape))
+
+        film, of_shot = none_yet(), defaultdict[int, _Sums](none_yet)
         features, slopes = extract(pictures[0], SCENE_FEATURES), _slopes(pictures[0])
         for k in range(1, len(pictures)):
             before, steep = features, slopes
@@ -128,10 +132,7 @@ class _Sums:
             moves = np.linalg.norm(flow, axis=0)
             way = flow / np.maximum(moves, 1e-6)
             one, other = ((s * way).sum(axis=0, keepdims=True) for s in (steep, slopes))
-            own = of_shot.setdefault(
-                shots[k], cls(both=np.zeros(shape), each=np.zeros(shape), count=np.zeros(shape))
-            )
-            for sums in (own, film):
+            for sums in (of_shot[shots[k]], film):
                 sums.add(one, other, moves >= _MOVED_PX)
         return of_shot, film
 

@@ -14,7 +14,6 @@ from featuredb.errors import TelemetryError
 from featuredb.video.telemetry.values import Telemetry
 from ingest.video.film_time import (
     FilmTime,
-    at_text,
     clock_offset_s,
     log_span,
     log_text,
@@ -22,7 +21,7 @@ from ingest.video.film_time import (
     possible_beginnings,
     utc_text,
 )
-from ingest.video.lag import Lag, not_clear
+from ingest.video.lag import Lag
 from ingest.video.match import Match, match_movement
 from ingest.video.motion import Motion
 
@@ -57,7 +56,7 @@ def check_overlap(film: FilmTime, telemetry: Telemetry) -> None:
         if film.told_s > high or film.told_s + film.duration_s < low:
             raise TelemetryError(
                 f"{log_text(telemetry)}; a film of {film.duration_s:.0f} s that begins "
-                f"{at_text(film.told_s, telemetry)} (--film-start) has no moment in common with it"
+                f"at {moment_text(film.told_s, telemetry)} (--film-start) has no moment in common with it"
             )
         return
     expected = possible_beginnings(film, telemetry)
@@ -86,9 +85,10 @@ def lay_on_film(motion: Motion, telemetry: Telemetry, film: FilmTime) -> Lag:
         # A person who is wrong by an hour can be told so, and need not be by a week.
         search = (max(search[0], film.told_s - _HALF_DAY_S), min(search[1], film.told_s + _HALF_DAY_S))
     elif high - low > _MAX_SEARCH_S:
-        return not_clear(
+        return Lag(
+            None,
             f"{log_text(telemetry)}: too long to look for a film in; cut it to the day of the flight, or "
-            f"{_OVERRIDE}"
+            f"{_OVERRIDE}",
         )
     match = match_movement(motion, telemetry, search, _LEAST_S) if search[0] < search[1] else None
     if match is not None and not (match.evidence > 0).any():
@@ -98,9 +98,10 @@ def lay_on_film(motion: Motion, telemetry: Telemetry, film: FilmTime) -> Lag:
         close = match_movement(motion, telemetry, near)
         return _near_told(match, close, telemetry, film, film.told_s)
     if match is None:
-        return not_clear(
+        return Lag(
+            None,
             f"{log_text(telemetry)}; {film.name} has less than {_LEAST_S:.0f} s of movement in "
-            f"common with it, too little to tell where in it the film begins: {_OVERRIDE}"
+            f"common with it, too little to tell where in it the film begins: {_OVERRIDE}",
         )
     return _found(match, telemetry, film)
 
@@ -109,31 +110,33 @@ def _found(match: Match, telemetry: Telemetry, film: FilmTime) -> Lag:
     """The beginning by the movements alone, if it is clear and the film's own clock can mean it."""
     found = best_beginning(match)
     start, correlation = found.lag_s, found.correlation
-    if found.lead < _MARGIN or correlation < _MIN_CORRELATION:
-        return not_clear(
+    begins = moment_text(start, telemetry)
+    if not found.is_clear:
+        return Lag(
+            None,
             f"the movements of picture and receiver do not tell where {film.name} begins in all of the log: "
-            f"they correlate by {correlation:.2f} if it does {at_text(start, telemetry)}, and by "
-            f"{found.rival_correlation:.2f} {at_text(found.rival_s, telemetry)}; {log_text(telemetry)}. "
-            f"Steady flights, repeated patterns and short films do not tell: {_OVERRIDE}",
-            correlation,
+            f"they correlate by {correlation:.2f} if it does at {begins}, and by "
+            f"{found.rival_correlation:.2f} at {moment_text(found.rival_s, telemetry)}; "
+            f"{log_text(telemetry)}. Steady flights, repeated patterns and short films do not tell: "
+            f"{_OVERRIDE}",
         )
-    said = f"the film begins {at_text(start, telemetry)} of the log by the movements of picture and receiver "
+    said = f"the film begins at {begins} of the log by the movements of picture and receiver "
     said += f"(correlation {correlation:.2f})"
     expected = possible_beginnings(film, telemetry)
     if expected is None:
-        return Lag(late_s=round(start, 3), correlation=correlation, message=said)
+        return Lag(round(start, 3), said)
     assert film.created is not None
     ahead = film.created.timestamp() - (clock_offset_s(telemetry) or 0.0) - start
     if np.abs(start - expected).min() > _DRIFT_S:
-        return not_clear(
+        return Lag(
+            None,
             f"{said}, but {film.name} was made at {utc_text(film.created.timestamp())} by its own clock, "
-            f"{ahead:+.0f} s from there, and that is no time zone; if that clock is wrong, give --film-start "
-            f"{moment_text(start, telemetry)}",
-            correlation,
+            f"{ahead:+.0f} s from there, and that is no time zone; if that clock is wrong, give "
+            f"--film-start {begins}",
         )
     if abs(ahead) > 0.5:
         said += f"; the time of making in its file is {ahead:+.1f} s from there"
-    return Lag(late_s=round(start, 3), correlation=correlation, message=said)
+    return Lag(round(start, 3), said)
 
 
 def _near_told(
@@ -142,33 +145,26 @@ def _near_told(
     """What a person tells: moved a little where movements are clear, refused where they clearly deny it."""
     if match is not None:
         far = best_beginning(match)
-        clear = far.lead >= _MARGIN and far.correlation >= _MIN_CORRELATION
-        if clear and abs(far.lag_s - told) > _TOLD_S:
-            return not_clear(
-                f"--film-start says that {film.name} begins {at_text(told, telemetry)}; picture and receiver "
-                f"move alike only if it begins {at_text(far.lag_s, telemetry)} (correlation "
-                f"{far.correlation:.2f}). Give --film-start {moment_text(far.lag_s, telemetry)}, or "
+        if far.is_clear and abs(far.lag_s - told) > _TOLD_S:
+            begins = moment_text(far.lag_s, telemetry)
+            return Lag(
+                None,
+                f"--film-start says that {film.name} begins at {moment_text(told, telemetry)}; picture and "
+                f"receiver move alike only if it begins at {begins} (correlation "
+                f"{far.correlation:.2f}). Give --film-start {begins}, or "
                 "--telemetry-late 0 beside yours if you are sure of it",
-                far.correlation,
             )
     found = None if close is None else best_beginning(close)
-    if (
-        found is None
-        or found.lead < _MARGIN
-        or found.correlation < _MIN_CORRELATION
-        # At the edge of what was looked at the best is not yet found.
-        or abs(found.lag_s - told) > _TOLD_S - 0.5
-    ):
+    # At the edge of what was looked at the best is not yet found.
+    if found is None or not found.is_clear or abs(found.lag_s - told) > _TOLD_S - 0.5:
         return Lag(
-            late_s=told,
-            correlation=float("nan"),
-            message=f"the film begins {at_text(told, telemetry)} of the log, as was told; the movements of "
+            told,
+            f"the film begins at {moment_text(told, telemetry)} of the log, as was told; the movements of "
             "picture and receiver neither confirm nor deny it",
         )
     return Lag(
-        late_s=round(found.lag_s, 3),
-        correlation=found.correlation,
-        message=f"the film begins {at_text(found.lag_s, telemetry)} of the log, {found.lag_s - told:+.2f} s "
+        round(found.lag_s, 3),
+        f"the film begins at {moment_text(found.lag_s, telemetry)} of the log, {found.lag_s - told:+.2f} s "
         f"from what was told, by the movements of picture and receiver (correlation {found.correlation:.2f})",
     )
 
@@ -188,6 +184,11 @@ class Beginning:
     rival_s: float
     rival_correlation: float
     lead: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the first is to be believed."""
+        return self.lead >= _MARGIN and self.correlation >= _MIN_CORRELATION
 
 
 def best_beginning(match: Match) -> Beginning:

@@ -107,18 +107,13 @@ def log_text(telemetry: Telemetry) -> str:
     return f"{name} has positions from {moment_text(low, telemetry)} to {moment_text(high, telemetry)}"
 
 
-def at_text(log_s: float, telemetry: Telemetry) -> str:
-    return f"at {moment_text(log_s, telemetry)}"
-
-
 def moment_text(log_s: float, telemetry: Telemetry) -> str:
     """A moment of the log as --film-start takes it."""
     offset = clock_offset_s(telemetry)
     if offset is None:
         return f"{log_s:.1f}"
-    return (
-        utc_text(log_s + offset) if telemetry.clock == "utc" else utc_text(log_s + offset).removesuffix("Z")
-    )
+    text = utc_text(log_s + offset)
+    return text if telemetry.clock == "utc" else text.removesuffix("Z")
 
 
 def utc_text(seconds: float) -> str:

@@ -20,19 +20,6 @@ FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".webm", ".avi", ".ts",
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FilmFiles:
-    """What the command names.
-
-    Attributes:
-        paths: films, each once; those of folders sorted by name.
-        notes: what in the folders is none.
-    """
-
-    paths: tuple[Path, ...]
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Films:
     """Keyframes of films, in one folder.
 
@@ -47,8 +34,10 @@ class Films:
     heights: frozenset[str]
 
 
-def find_films(named: Sequence[Path]) -> FilmFiles:
-    """Films among files and folders, searched through; nothing is opened.
+def find_films(named: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Films among files and folders, searched through, each once; nothing is opened.
+
+    Those of folders are sorted by name. Beside them: notes on what in the folders is none.
 
     Raises:
         IngestError: a folder cannot be listed.
@@ -75,7 +64,7 @@ def find_films(named: Sequence[Path]) -> FilmFiles:
             f"{', '.join(map(str, named))}: expected films, found none ({said}); folders of pictures go to "
             "`featuredb ingest photos`"
         )
-    return FilmFiles(paths=tuple(paths.values()), notes=tuple(notes))
+    return list(paths.values()), notes
 
 
 def make_films(

@@ -63,19 +63,13 @@ def choose_keyframes(motion: Motion, options: KeyframeOptions | None = None) -> 
     options = options or KeyframeOptions()
     shots = shots_of(motion)
     most = max(options.most // max(1, len(shots)), options.least, 2)
-    rows: list[int] = []
-    numbers: list[int] = []
-    steps: list[float] = []
-    for number, shot in enumerate(shots):
-        chosen, step = _of_shot(motion, shot, most, options)
-        rows += chosen
-        numbers += [number] * len(chosen)
-        steps.append(step)
+    chosen = [_of_shot(motion, shot, most, options) for shot in shots]
+    rows = [row for of_shot, _ in chosen for row in of_shot]
     return KeyframeChoice(
-        index=tuple(int(motion.index[r]) for r in rows),
-        time_s=tuple(float(motion.time_s[r]) for r in rows),
-        shot=tuple(numbers),
-        step=tuple(steps),
+        index=tuple(motion.index[rows].tolist()),
+        time_s=tuple(motion.time_s[rows].tolist()),
+        shot=tuple(number for number, (of_shot, _) in enumerate(chosen) for _ in of_shot),
+        step=tuple(step for _, step in chosen),
     )
 
 

@@ -5,7 +5,7 @@ picture's speed and the receiver's are the same curve, shifted. At a constant sp
 nothing is said.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,49 +18,40 @@ _MIN_CORRELATION = 0.8  # of the two curves at the best lag
 _MIN_DROP = 0.02  # how much less it is, half a second off to either side
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lag:
+class Lag(NamedTuple):
     """What was found.
 
     Attributes:
         late_s: telemetry shown at t + late_s is that of the picture at t; None: not known.
-        correlation: at the best lag, NaN where none could be tried.
         message: for people.
     """
 
     late_s: float | None
-    correlation: float
     message: str
-
-
-def not_clear(message: str, correlation: float = float("nan")) -> Lag:
-    """That the lag is not known, and why."""
-    return Lag(late_s=None, correlation=correlation, message=message)
 
 
 def estimate_lag(motion: Motion, telemetry: Telemetry) -> Lag:
     """The lag of the telemetry behind the picture."""
     match = match_movement(motion, telemetry, (-_MOST_S, _MOST_S))
     if match is None:
-        return not_clear("too few samples to tell the lag")
+        return Lag(None, "too few samples to tell the lag")
     lags, found = match.lags_s, match.speed
     if not np.isfinite(found).any():
-        return not_clear(f"picture and telemetry have no {LEAST_S:g} s in common to tell the lag by")
+        return Lag(None, f"picture and telemetry have no {LEAST_S:g} s in common to tell the lag by")
     best = int(np.nanargmax(found))
     aside = round(0.5 / STEP_S)
     drops = [found[best] - found[k] for k in (best - aside, best + aside) if 0 <= k < len(lags)]
     drop = float(np.nanmin(drops)) if np.isfinite(drops).any() else 0.0
     correlation = float(found[best])
     if len(drops) < 2 or correlation < _MIN_CORRELATION or drop < _MIN_DROP:
-        return not_clear(
+        return Lag(
+            None,
             f"speeds of picture and telemetry do not tell the lag (correlation {correlation:.2f}, "
             f"{drop:.3f} less half a second off)",
-            correlation,
         )
     late = round(float(lags[best]), 3)
     return Lag(
-        late_s=late,
-        correlation=correlation,
-        message=f"telemetry is {late:+.2f} s late by the speeds of picture and receiver (correlation "
+        late,
+        f"telemetry is {late:+.2f} s late by the speeds of picture and receiver (correlation "
         f"{correlation:.2f})",
     )

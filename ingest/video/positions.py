@@ -1,12 +1,15 @@
 """Where a film's keyframes were taken and how the camera was turned, by its telemetry."""
 
 import hashlib
+from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.values import Telemetry
+from featuredb.video.telemetry.values import Telemetry, TelemetrySamples
 from ingest.fingerprint import digest
 from ingest.video.clocks import lay_on_film
 from ingest.video.film_time import FilmTime
@@ -57,28 +60,23 @@ def digest_of_telemetry(telemetry: Telemetry | None) -> str:
     """Of all that positions and angles are made of."""
     if telemetry is None:
         return "none"
-    columns = (
-        telemetry.times_s,
-        telemetry.latitude_deg,
-        telemetry.longitude_deg,
-        telemetry.height_m,
-        telemetry.relative_height_m,
-        telemetry.clock_s,
-        telemetry.gimbal_ypr_deg,
-    )
+    columns = [getattr(telemetry, column.name) for column in fields(TelemetrySamples)]
     parts = [hashlib.sha256(np.ascontiguousarray(column).tobytes()).hexdigest() for column in columns]
     return digest(*parts, telemetry.height_datum, str(telemetry.in_video_time), telemetry.clock)
 
 
-def positions_at(
+def places_at(
     telemetry: Telemetry | None, choice: KeyframeChoice, late_s: float | None
-) -> tuple[list[Position | None], str]:
-    """Position of each keyframe, and what the heights count from, for people."""
-    nowhere: list[Position | None] = [None] * len(choice.index)
+) -> tuple[Sequence[Position | None], Sequence[GimbalAngles | None], str]:
+    """Position and gimbal's angles of each keyframe, and what the heights count from, for people.
+
+    No angles where yaw or pitch is not known, or all are zero.
+    """
+    nowhere = [None] * len(choice.index)
     if telemetry is None:
-        return nowhere, ""
+        return nowhere, nowhere, ""
     if late_s is None:
-        return nowhere, "not known: where in the log the film begins is not clear"
+        return nowhere, nowhere, "not known: where in the log the film begins is not clear"
     at = telemetry.at(np.array(choice.time_s) + late_s)
     height: FloatArray = at.height_m
     heights: str = telemetry.height_datum
@@ -86,25 +84,14 @@ def positions_at(
         height, heights = at.relative_height_m, RELATIVE_HEIGHTS
     known = at.has_position & np.isfinite(height)
     if not at.has_position.any():
-        return nowhere, "not known: the telemetry has no positions at the keyframes' times"
-    if not known.any():
-        return nowhere, "not known: positions without heights are not used"
-    return [
-        (float(at.latitude_deg[k]), float(at.longitude_deg[k]), float(height[k])) if known[k] else None
-        for k in range(len(choice.index))
-    ], heights
+        heights = "not known: the telemetry has no positions at the keyframes' times"
+    elif not known.any():
+        heights = "not known: positions without heights are not used"
+    places = np.stack([at.latitude_deg, at.longitude_deg, height], axis=1)
+    ypr = np.column_stack([at.gimbal_ypr_deg[:, :2], np.nan_to_num(at.gimbal_ypr_deg[:, 2])])
+    turned = np.logical_and(np.isfinite(ypr).all(axis=1), ypr.any(axis=1))
+    return _rows(places, known), _rows(ypr, turned), heights
 
 
-def angles_at(
-    telemetry: Telemetry | None, choice: KeyframeChoice, late_s: float | None
-) -> list[GimbalAngles | None]:
-    """The gimbal's angles at each keyframe; None where yaw or pitch is not known, or all are zero."""
-    if telemetry is None or late_s is None:
-        return [None] * len(choice.index)
-    angles = telemetry.at(np.array(choice.time_s) + late_s).gimbal_ypr_deg
-    return [
-        (float(yaw), float(pitch), float(np.nan_to_num(roll)))
-        if np.isfinite([yaw, pitch]).all() and np.nan_to_num([yaw, pitch, roll]).any()
-        else None
-        for yaw, pitch, roll in angles
-    ]
+def _rows(values: FloatArray, known: NDArray[np.bool_]) -> list[tuple[float, float, float] | None]:
+    return [(a, b, c) if told else None for (a, b, c), told in zip(values.tolist(), known, strict=True)]

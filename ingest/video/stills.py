@@ -1,10 +1,9 @@
 """From a film to photos: keyframes of its shots, written below the work folder."""
 
-import io
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 from pathlib import Path
 
@@ -33,10 +32,9 @@ from ingest.video.motion import FrameKind, Motion, measure_motion
 from ingest.video.positions import (
     GimbalAngles,
     Position,
-    angles_at,
     digest_of_telemetry,
     lateness,
-    positions_at,
+    places_at,
 )
 from ingest.workspace import atomic_file, write_json
 
@@ -76,8 +74,8 @@ def write_keyframes(
             if k is None:
                 continue
             camera = _camera(opened.info, unnamed, choice.shot[k])
-            with atomic_file(folder / keyframe_name(frame.index)) as file:
-                file.write_bytes(_jpeg(frame, opened.info, camera, told[0][k], told[1][k]))
+            exif, xmp = _properties(frame, opened.info, camera, told[0][k], told[1][k])
+            _save(folder / keyframe_name(frame.index), frame.rgb(), exif, xmp)
             left -= 1
             progress("keyframes", len(wanted) - left, len(wanted))
             if not left:
@@ -99,14 +97,14 @@ def _camera(info: VideoInfo, unnamed: str, shot: int) -> tuple[str, str]:
     return info.make or UNNAMED_MAKE, shot_model(info.model or unnamed, shot)
 
 
-def _jpeg(
+def _properties(
     frame: VideoFrame,
     info: VideoInfo,
     camera: tuple[str, str],
     place: Position | None,
     angles: GimbalAngles | None,
-) -> bytes:
-    """One keyframe, of a camera's make and model."""
+) -> tuple[Image.Exif, bytes]:
+    """EXIF and XMP of a keyframe, of a camera's make and model."""
     exif = Image.Exif()
     base = ExifTags.Base
     exif[base.Make.value], exif[base.Model.value] = camera
@@ -124,9 +122,12 @@ def _jpeg(
     if angles is not None:
         words = {f"drone-dji:{name}": f"{angle:+.2f}" for name, angle in zip(DJI_GIMBAL, angles, strict=True)}
         xmp = with_properties(b"", words)
-    out = io.BytesIO()
-    Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=_QUALITY, subsampling=0, exif=exif, xmp=xmp)
-    return out.getvalue()
+    return exif, xmp
+
+
+def _save(file: Path, rgb: NDArray[np.uint8], exif: Image.Exif, xmp: bytes) -> None:
+    with atomic_file(file) as target:
+        Image.fromarray(rgb).save(target, format="JPEG", quality=_QUALITY, subsampling=0, exif=exif, xmp=xmp)
 
 
 def clean_keyframes(folder: Path, choice: KeyframeChoice, side_px: int) -> dict[int, BurntIn]:
@@ -153,10 +154,7 @@ def _paint_over(file: Path, mask: NDArray[np.bool_]) -> None:
         rgb, exif, xmp = np.asarray(picture.convert("RGB")), picture.getexif(), picture.info.get("xmp", b"")
     size = (rgb.shape[1], rgb.shape[0])
     large = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    with atomic_file(file) as target:
-        Image.fromarray(painted_over(rgb, large)).save(
-            target, format="JPEG", quality=_QUALITY, subsampling=0, exif=exif, xmp=xmp
-        )
+    _save(file, painted_over(rgb, large), exif, xmp)
 
 
 def _shrunk(file: Path, side_px: int) -> NDArray[np.uint8]:
@@ -207,16 +205,6 @@ class Stills:
     late_s: float | None
     notes: tuple[str, ...]
 
-    @property
-    def photos(self) -> int:
-        """Number of keyframes."""
-        return sum(len(shot.keyframes) for shot in self.shots)
-
-    @property
-    def frames(self) -> int:
-        """Of the film that were looked at."""
-        return sum(shot.frames for shot in self.shots)
-
 
 def make_stills(
     film: Path,
@@ -242,33 +230,30 @@ def make_stills(
     if known is not None:
         return known
     with open_video(film, _video_options(options, _MOTION_SIDE_PX)) as video:
-        when = _film_time(video.info, options)
+        when = FilmTime(
+            name=video.info.name,
+            duration_s=video.info.duration_s or 0.0,
+            created=video.info.creation_time,
+            told_s=options.film_start_s,
+        )
         if telemetry is not None and options.positions and not telemetry.in_video_time:
             check_overlap(when, telemetry)
         progress("motion", 0, video.info.frame_count or 0)
         motion = measure_motion(video)
         notes = list(video.report.complaints())
     choice = choose_keyframes(motion, options.keyframes)
-    shots = _shots(motion, choice)
     if not choice.index:
-        raise VideoError(f"{film.name}: {len(motion)} frames, and none shows a place: {_dropped(shots)}")
+        said = _dropped(_shots(motion, choice, {}))
+        raise VideoError(f"{film.name}: {len(motion)} frames, and none shows a place: {said}")
     late_s: float | None = 0.0
     if telemetry is not None:
         notes += telemetry.warnings
-        late_s, said = lateness(
-            motion,
-            telemetry,
-            when,
-            options.telemetry_late_s,
-            needed=options.positions,
-        )
-        notes += said
-    places, heights = positions_at(telemetry, choice, late_s)
-    angles = angles_at(telemetry, choice, late_s)
+        late_s, found = lateness(motion, telemetry, when, options.telemetry_late_s, needed=options.positions)
+        notes += found
+    places, angles, heights = places_at(telemetry, choice, late_s)
     stretch, unnamed = _video_options(options, None), unnamed_model(content)
     write_keyframes(film, folder, choice, (places, angles), progress, video=stretch, unnamed=unnamed)
-    burnt_in = clean_keyframes(folder, choice, _MOTION_SIDE_PX)
-    shots = tuple(_with_findings(number, shot, burnt_in) for number, shot in enumerate(shots))
+    shots = _shots(motion, choice, clean_keyframes(folder, choice, _MOTION_SIDE_PX))
     made = Stills(
         folder=folder,
         shots=shots,
@@ -298,8 +283,10 @@ def _known(folder: Path) -> Stills | None:
     return Stills(**{**record, "folder": folder, "shots": shots, "notes": tuple(record["notes"])})
 
 
-def _shots(motion: Motion, choice: KeyframeChoice) -> tuple[ShotOutcome, ...]:
-    """Every shot, with the names of its keyframes and what its other frames are."""
+def _shots(
+    motion: Motion, choice: KeyframeChoice, burnt_in: Mapping[int, BurntIn]
+) -> tuple[ShotOutcome, ...]:
+    """Every shot, with the names of its keyframes, what its other frames are, and what is burnt into it."""
     chosen = set(choice.index)
     # A frame that neither the one before nor the one after hangs on.
     alone = motion.broken & np.append(motion.broken[1:], True)
@@ -316,6 +303,7 @@ def _shots(motion: Motion, choice: KeyframeChoice) -> tuple[ShotOutcome, ...]:
             for index, shot in zip(choice.index, choice.shot, strict=True)
             if shot == number
         ]
+        found = burnt_in.get(number)
         shots.append(
             ShotOutcome(
                 start_s=round(float(motion.time_s[rows[0]]), 3),
@@ -324,16 +312,11 @@ def _shots(motion: Motion, choice: KeyframeChoice) -> tuple[ShotOutcome, ...]:
                 keyframes=tuple(names),
                 step=round(choice.step[number], 4),
                 dropped=dict(other),
+                bars=(0.0, 0.0, 0.0, 0.0) if found is None else found.bar_shares,
+                overlay_share=0.0 if found is None else round(found.overlay_share, 4),
             )
         )
     return tuple(shots)
-
-
-def _with_findings(number: int, shot: ShotOutcome, burnt_in: Mapping[int, BurntIn]) -> ShotOutcome:
-    if number not in burnt_in:
-        return shot
-    found = burnt_in[number]
-    return replace(shot, bars=found.bar_shares, overlay_share=round(found.overlay_share, 4))
 
 
 def _dropped(shots: tuple[ShotOutcome, ...]) -> str:
@@ -341,15 +324,6 @@ def _dropped(shots: tuple[ShotOutcome, ...]) -> str:
     for shot in shots:
         total.update(shot.dropped)
     return ", ".join(f"{count} {code}" for code, count in total.most_common()) or "there are none"
-
-
-def _film_time(info: VideoInfo, options: StillsOptions) -> FilmTime:
-    return FilmTime(
-        name=info.name,
-        duration_s=info.duration_s or 0.0,
-        created=info.creation_time,
-        told_s=options.film_start_s,
-    )
 
 
 def _digest_of(film: Path) -> str:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from featuredb.errors import ServiceError, VideoError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.film import VideoOptions
-from featuredb.video.frames import Source, open_video
+from featuredb.video.frames import open_video
+from featuredb.video.opening import Source
 from reloc.client.client import Client
 from reloc.client.live import LiveTrack
 from reloc.tracking.film_end import until_it_ends

@@ -19,7 +19,8 @@ from featuredb.file_digest import file_sha256
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions
-from featuredb.video.frames import Source, open_video
+from featuredb.video.frames import open_video
+from featuredb.video.opening import Source
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.film_end import until_it_ends

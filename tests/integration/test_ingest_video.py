@@ -20,7 +20,7 @@ from featuredb.video.writer import VideoWriter
 from ingest.video import stills as keyframe_files
 from ingest.video.film_time import film_start
 from ingest.video.keyframes import KeyframeOptions
-from ingest.video.stills import StillsOptions, make_stills
+from ingest.video.stills import Stills, StillsOptions, make_stills
 from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.planar_map import field_texture, view
 from tests.support.remembered import remembered
@@ -100,13 +100,17 @@ def test_a_film_becomes_a_map_where_its_telemetry_says(
     assert len(Database.open(tmp_path / "db").snapshot().maps()) == 1
 
 
+def _photos(stills: Stills) -> int:
+    return sum(len(shot.keyframes) for shot in stills.shots)
+
+
 def test_stills_are_photos_of_one_camera_with_positions(film: Path, tmp_path: Path) -> None:
     telemetry = read_telemetry(film.with_suffix(".srt"))
     options = StillsOptions(keyframes=KeyframeOptions(step=0.2, window=0, least=0))
     stills = make_stills(film, telemetry, tmp_path, options)
     files = sorted(stills.folder.glob("*.jpg"))
-    assert len(files) == stills.photos == stills.positions
-    assert stills.frames == 48
+    assert len(files) == _photos(stills) == stills.positions
+    assert sum(shot.frames for shot in stills.shots) == 48
     told = [read_exif(f.read_bytes()) for f in files]
     assert len({t.camera_key for t in told}) == 1
     assert told[0].camera_key.startswith("film|")
@@ -171,11 +175,11 @@ def test_other_telemetry_and_other_names_are_made_anew(film: Path, tmp_path: Pat
     renamed.write_bytes(film.read_bytes())
     for name in (film, renamed):
         stills = make_stills(name, None, tmp_path / "work")
-        assert len(list(stills.folder.glob("*.jpg"))) == stills.photos
+        assert len(list(stills.folder.glob("*.jpg"))) == _photos(stills)
     # A photo that somebody deleted is made again.
     next(iter(first.folder.glob("*.jpg"))).unlink()
     again = make_stills(film, telemetry, tmp_path / "work")
-    assert len(list(again.folder.glob("*.jpg"))) == first.photos
+    assert len(list(again.folder.glob("*.jpg"))) == _photos(first)
 
 
 def test_telemetry_that_cannot_place_the_film_is_refused_at_once(
@@ -248,7 +252,7 @@ def test_a_log_places_the_film_where_it_is_told_to_begin(film: Path, tmp_path: P
     options = StillsOptions(film_start_s=begins, keyframes=_FEW)
     stills = make_stills(film, telemetry, tmp_path, options)
     assert stills.late_s == 3.0
-    assert stills.positions == stills.photos > 2
+    assert stills.positions == _photos(stills) > 2
     assert any("as was told" in note for note in stills.notes)
     for file in stills.folder.glob("*.jpg"):
         # Between rows a second apart the drone flies straight, but for one corner of its way.
@@ -281,7 +285,7 @@ def test_a_table_in_the_films_time_needs_no_clock(film: Path, tmp_path: Path) ->
     stills = make_stills(
         film, telemetry, tmp_path / "work", StillsOptions(telemetry_late_s=0.0, keyframes=_FEW)
     )
-    assert stills.positions == stills.photos
+    assert stills.positions == _photos(stills)
 
 
 def test_a_film_that_stands_still_is_one_photo_and_no_map(

@@ -323,7 +323,7 @@ def test_a_camera_that_turns_clockwise_turns_its_picture_the_other_way() -> None
         for k in range(6)  # OpenCV's positive angles are counter-clockwise
     ]
     motion = measure_motion(
-        VideoFrame(index=k, time_s=0.1 * k, gray=np.ascontiguousarray(f[:, :, 0]), make_rgb=lambda f=f: f)  # type: ignore[misc]
+        VideoFrame(index=k, time_s=0.1 * k, gray=np.ascontiguousarray(f[:, :, 0]), rgb=lambda f=f: f)  # type: ignore[misc]
         for k, f in enumerate(frames)
     )
     np.testing.assert_allclose(_picture_turn(motion).values, np.radians(5.0), rtol=0.05)

@@ -47,10 +47,10 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> Films:
     write_film(folder / "other.mp4", [_scene(0, k) for k in range(30)])
     (folder / "broken.mp4").write_bytes(b"no film")
     (folder / "notes.txt").write_text("of the editor")
-    found = find_films([folder, folder / "other.mp4"])
-    assert [path.name for path in found.paths] == ["broken.mp4", "edited.mkv", "other.mp4"]
-    assert "1 files are no films by their names" in found.notes[0]
-    return make_films(found.paths, lambda _: None, folder / "work", StillsOptions())
+    paths, notes = find_films([folder, folder / "other.mp4"])
+    assert [path.name for path in paths] == ["broken.mp4", "edited.mkv", "other.mp4"]
+    assert "1 files are no films by their names" in notes[0]
+    return make_films(paths, lambda _: None, folder / "work", StillsOptions())
 
 
 def test_films_are_split_at_cuts_and_every_frame_is_accounted_for(films: Films) -> None:
@@ -84,7 +84,7 @@ def test_a_cut_is_found_under_a_logo() -> None:
     def frame(number: int, page: NDArray[np.uint8]) -> VideoFrame:
         gray = page[:, :, 0].copy()
         gray[190:230, 210:306] = logo
-        return VideoFrame(index=number, time_s=number / 25.0, gray=gray, make_rgb=lambda: page)
+        return VideoFrame(index=number, time_s=number / 25.0, gray=gray, rgb=lambda: page)
 
     pages = [_scene(k // 8, k) for k in range(16)]
     motion = measure_motion([frame(k, page) for k, page in enumerate(pages)])

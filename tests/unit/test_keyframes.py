@@ -104,7 +104,7 @@ def test_bad_options_are_refused(bad: dict[str, float]) -> None:
 
 def _frames(pictures: list[np.ndarray]) -> list[VideoFrame]:
     return [
-        VideoFrame(index=k, time_s=k / 25.0, gray=np.ascontiguousarray(p[:, :, 0]), make_rgb=lambda p=p: p)  # type: ignore[misc]
+        VideoFrame(index=k, time_s=k / 25.0, gray=np.ascontiguousarray(p[:, :, 0]), rgb=lambda p=p: p)  # type: ignore[misc]
         for k, p in enumerate(pictures)
     ]
 

@@ -84,7 +84,7 @@ def test_other_display_matrices_are_refused(tmp_path: Path, matrix: tuple[float,
 
 def test_a_matrix_of_another_size_is_refused() -> None:
     with pytest.raises(VideoError, match="36 bytes, found 35"):
-        clockwise_from_display_matrix(bytes(35))
+        clockwise_from_display_matrix(bytes(35), "film.mp4")
 
 
 def test_rotated_films_are_made_smaller_upright(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ Nothing is invented and nothing is repaired: a position out of range, at 0, 0 or
 whose time does not advance are left out. A file without any position is refused.
 """
 
-from array import array
 from collections.abc import Mapping
 
 import numpy as np
@@ -36,36 +35,8 @@ _CLOCK_JUMP_S = 2.0
 _LEAP_M, _LEAP_M_S = 50.0, 150.0
 
 
-class SampleTable:
-    """Columns of raw samples; a field that a row does not give is NaN."""
-
-    def __init__(self) -> None:
-        self._columns = {name: array("d") for name in _FIELDS}
-
-    def __len__(self) -> int:
-        return len(self._columns["times_s"])
-
-    def add(self, row: Mapping[str, float]) -> None:
-        """One sample: fields of `TelemetrySamples`, angles as gimbal_yaw, gimbal_pitch, gimbal_roll."""
-        for name, column in self._columns.items():
-            column.append(row.get(name, float("nan")))
-
-    def extend(self, columns: Mapping[str, FloatArray], n: int) -> None:
-        """`n` samples by columns of shape (n,)."""
-        for name, column in self._columns.items():
-            given = columns.get(name)
-            filled = np.full(n, np.nan)
-            if given is not None:
-                filled[:] = given
-            column.frombytes(filled.tobytes())
-
-    def column(self, name: str) -> FloatArray:
-        """A copy of one column, (n,) float64."""
-        return np.array(self._columns[name], dtype=np.float64)
-
-
 def assemble(
-    table: SampleTable,
+    raw: Mapping[str, FloatArray],
     *,
     source: str,
     origin: str,
@@ -73,29 +44,28 @@ def assemble(
     height_datum: HeightDatum = "unknown",
     clock: Clock = "none",
     in_video_time: bool = True,
-    from_first: bool = False,
     sort: bool = False,
 ) -> Telemetry:
     """The telemetry of raw samples; for what is not said here see `Telemetry`.
 
     Args:
+        raw: columns (n,) float64 by the names of `_FIELDS`; NaN is "not known", and a column left out
+            is NaN throughout. Without `times_s` they are those of `clock_s` since the first sample.
         warnings: what the reader has found; receives what is found here.
         clock: of the samples that have a reading of it.
-        from_first: times are made to count from the first sample.
         sort: by time, for formats that do not promise an order.
 
     Raises:
-        TelemetryError: no samples, too many, or none with a position.
+        TelemetryError: no samples, or none with a position.
     """
-    if not len(table):
+    given = raw["times_s"] if "times_s" in raw else raw["clock_s"]
+    if not len(given):
         raise TelemetryError(f"{origin}: no samples of telemetry in it")
-    check_count(len(table), origin)
+    unknown = np.full(len(given), np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
-        times = table.column("times_s")
-        if from_first:
-            times = _since_first(times, sort)
+        times = given if "times_s" in raw else _since_first(given, sort)
         rows = _rows_in_time(times, sort, warnings)
-        columns = {name: table.column(name)[rows] for name in _FIELDS} | {"times_s": times[rows]}
+        columns = {name: raw.get(name, unknown)[rows] for name in _FIELDS} | {"times_s": times[rows]}
         latitude, longitude = _positions(columns["latitude_deg"], columns["longitude_deg"], warnings)
         if not np.isfinite(latitude).any():
             reasons = "; ".join(warnings[:3])

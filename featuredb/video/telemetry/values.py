@@ -17,7 +17,7 @@ CLOCKS: tuple[Clock, ...] = get_args(Clock)
 # in 3 s, as much as its receiver does.
 _MAX_GAP_S = 3.0
 
-_SCALARS = ("height_m", "relative_height_m", "clock_s")
+_OPTIONAL = ("height_m", "relative_height_m", "clock_s")
 
 
 def _not_known() -> FloatArray:
@@ -49,10 +49,8 @@ class TelemetrySamples:
         times = frozen_array("TelemetrySamples.times_s", self.times_s, (None,))
         n = len(times)
         checked: dict[str, FloatArray] = {"times_s": times}
-        for name in ("latitude_deg", "longitude_deg"):
-            checked[name] = _column(name, getattr(self, name), (n,))
-        for name in _SCALARS:
-            checked[name] = _column(name, getattr(self, name), (n,), optional=True)
+        for name in ("latitude_deg", "longitude_deg", *_OPTIONAL):
+            checked[name] = _column(name, getattr(self, name), (n,), optional=name in _OPTIONAL)
         checked["gimbal_ypr_deg"] = _column("gimbal_ypr_deg", self.gimbal_ypr_deg, (n, 3), optional=True)
         _check_positions(checked["latitude_deg"], checked["longitude_deg"])
         for name, value in checked.items():
@@ -126,9 +124,7 @@ class Telemetry(TelemetrySamples):
         reach = 0.5 * float(np.median(np.diff(self.times_s))) if len(self) > 1 else 0.0
 
         def line(values: FloatArray, circle: bool = False) -> FloatArray:
-            return interpolate(
-                self.times_s, values, wanted, max_gap_s=_MAX_GAP_S, reach_s=reach, circle=circle
-            )
+            return _interpolated(self.times_s, values, wanted, reach, circle)
 
         return TelemetrySamples(
             times_s=wanted,
@@ -173,27 +169,15 @@ def _check_positions(latitude_deg: FloatArray, longitude_deg: FloatArray) -> Non
         )
 
 
-def interpolate(
-    times_s: FloatArray,
-    values: FloatArray,
-    wanted_s: FloatArray,
-    *,
-    max_gap_s: float,
-    reach_s: float,
-    circle: bool = False,
+def _interpolated(
+    times_s: FloatArray, values: FloatArray, wanted_s: FloatArray, reach_s: float, circle: bool
 ) -> FloatArray:
-    """Values at the wanted times: linear between known samples, held for a moment at their ends.
+    """One column of `Telemetry.at`: (m,) float64, NaN where nothing is known.
 
     Args:
-        times_s: (n,) seconds, strictly increasing.
         values: (n,), NaN where not known.
-        wanted_s: (m,) seconds, finite, any order.
-        max_gap_s: no interpolation between known samples that lie farther apart than this.
         reach_s: before the first, after the last and at the edges of longer gaps a value holds this long.
         circle: values are degrees; between two the shorter way is taken, answers lie in [-180, 180).
-
-    Returns:
-        (m,) float64, NaN where nothing is known.
     """
     rows = np.flatnonzero(np.isfinite(values))
     if not rows.size:
@@ -201,15 +185,13 @@ def interpolate(
     times, known = times_s[rows], values[rows]
     after = np.searchsorted(times, wanted_s, side="left")
     left, right = np.clip(after - 1, 0, len(times) - 1), np.clip(after, 0, len(times) - 1)
-    gap = times[right] - times[left]
-    inside = (wanted_s >= times[0]) & (wanted_s <= times[-1])
-    joined = inside & (gap <= max_gap_s)
-    weight = np.where(joined, (wanted_s - times[left]) / np.where(gap > 0.0, gap, 1.0), 0.0)
     to_left, to_right = np.abs(wanted_s - times[left]), np.abs(times[right] - wanted_s)
-    near = np.minimum(to_left, to_right) <= reach_s
-    held = np.where(near, known[np.where(to_left <= to_right, left, right)], np.nan)
-    step = known[right] - known[left]
-    found = np.where(joined, known[left] + weight * (wrap_degrees(step) if circle else step), held)
+    held = np.where(
+        np.minimum(to_left, to_right) <= reach_s, known[np.where(to_left <= to_right, left, right)], np.nan
+    )
+    joined = (wanted_s >= times[0]) & (wanted_s <= times[-1]) & (times[right] - times[left] <= _MAX_GAP_S)
+    line = np.interp(wanted_s, times, np.unwrap(known, period=360.0) if circle else known)
+    found = np.where(joined, line, held)
     return wrap_degrees(found) if circle else found
 
 

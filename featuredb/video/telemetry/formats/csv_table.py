@@ -9,7 +9,6 @@ import csv
 import io
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import assemble, check_count
 from featuredb.video.telemetry.formats.text import UNITS, column_name, decode_text, number, parse_wall_clock
 from featuredb.video.telemetry.values import Clock, Telemetry
 
@@ -49,6 +48,7 @@ _NAMES: dict[str, tuple[str, tuple[str, ...]]] = {
 _MAX_COLUMNS = 2000
 # A table in which so many coordinates are no numbers has other columns than their names say.
 _MOST = 0.5
+_NO_VALUE = ("n/a", "na", "nan", "null", "none", "-")
 
 _TIME_NAMES = (
     "datetime", "date_time", "utc", "utc_time", "time_utc", "timestamp_utc", "timestamp", "time", "time_s",
@@ -65,16 +65,6 @@ _SINCE_1970 = ((1e9, 4.2e9, 1.0), (1e12, 4.2e12, 1e-3), (1e15, 4.2e15, 1e-6))
 _CUT_OFF_S = 0.5
 
 
-class Times(NamedTuple):
-    """Times of the rows: seconds of elapsed time, and the clock's; NaN where they are not known."""
-
-    times_s: FloatArray
-    clock_s: FloatArray
-    clock: Clock
-    from_clock: bool = False  # there is no elapsed time: times_s is clock_s
-    in_film: bool = False  # times_s counts from the film's beginning
-
-
 class _TimeColumn(NamedTuple):
     at: int
     name: str
@@ -82,53 +72,48 @@ class _TimeColumn(NamedTuple):
     in_film: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class TimeColumns:
-    """The columns of a table that are times by their names."""
+def _times_of(
+    columns: list[_TimeColumn], cells: dict[int, list[str]], origin: str, warnings: list[str]
+) -> tuple[dict[str, FloatArray], Clock, bool]:
+    """Columns of the times of all rows, as `assemble` takes them; which clock; whether times are the film's.
 
-    columns: tuple[_TimeColumn, ...]
+    Args:
+        cells: texts of the columns by their index.
 
-    @property
-    def indices(self) -> list[int]:
-        return [column.at for column in self.columns]
-
-    def read(self, cells: dict[int, list[str]], origin: str, warnings: list[str]) -> Times:
-        """The times of all rows.
-
-        Args:
-            cells: texts of the columns by their index.
-            origin: the file's name, for messages.
-            warnings: receives what had to be decided.
-
-        Raises:
-            TelemetryError: no column can be read as times.
-        """
-        elapsed: FloatArray | None = None
-        in_film = False
-        clock: tuple[FloatArray, Clock] | None = None
-        for column in self.columns:
-            read = _read_column(cells[column.at], column)
-            if read is None:
-                continue
-            seconds, kind = read
-            if kind == "none":
-                if elapsed is None or (column.in_film and not in_film):
-                    _check_unit(seconds, column, origin)
-                    elapsed, in_film = seconds, column.in_film
-            elif clock is None:
-                clock = seconds, kind
-        if elapsed is None and clock is None:
-            names = ", ".join(repr(column.name) for column in self.columns)
-            example = next((text for text in cells[self.columns[0].at] if text.strip()), "")
-            raise TelemetryError(
-                f"{origin}: expected seconds in the column {names}, or dates with the year first like "
-                f"2024-05-31T12:00:00Z, found {example[:40]!r}"
-            )
-        return _joined(elapsed, clock, warnings)._replace(in_film=in_film)
+    Raises:
+        TelemetryError: no column can be read as times.
+    """
+    elapsed: FloatArray | None = None
+    in_film = False
+    clock: tuple[FloatArray, Clock] | None = None
+    for column in columns:
+        read = _read_column(cells[column.at], column)
+        if read is None:
+            continue
+        seconds, kind = read
+        if kind == "none":
+            if elapsed is None or (column.in_film and not in_film):
+                _check_unit(seconds, column, origin)
+                elapsed, in_film = seconds, column.in_film
+        elif clock is None:
+            clock = seconds, kind
+    if elapsed is not None:
+        if clock is None:
+            return {"times_s": elapsed}, "none", in_film
+        finer = _refined(elapsed, clock[0], warnings)
+        return {"times_s": elapsed, "clock_s": finer}, clock[1], in_film
+    if clock is not None:
+        return {"clock_s": clock[0]}, clock[1], False
+    names = ", ".join(repr(column.name) for column in columns)
+    example = next((text for text in cells[columns[0].at] if text.strip()), "")
+    raise TelemetryError(
+        f"{origin}: expected seconds in the column {names}, or dates with the year first like "
+        f"2024-05-31T12:00:00Z, found {example[:40]!r}"
+    )
 
 
-def time_columns(header: list[str], origin: str) -> TimeColumns | None:
-    """The time columns of a line of names, None where there is none.
+def _time_columns(header: list[str], origin: str) -> list[_TimeColumn]:
+    """The columns of a line of names that are times by them.
 
     Raises:
         TelemetryError: a time in a unit that is none.
@@ -144,7 +129,7 @@ def time_columns(header: list[str], origin: str) -> TimeColumns | None:
                 f"{origin}: the column {cell!r} has the unit {name.unit!r}, which is no time"
             )
         found.append(_TimeColumn(index, cell.strip(), name.unit, in_film))
-    return TimeColumns(tuple(found)) if found else None
+    return found
 
 
 def _read_column(texts: list[str], column: _TimeColumn) -> tuple[FloatArray, Clock] | None:
@@ -180,17 +165,6 @@ def _check_unit(seconds: FloatArray, column: _TimeColumn, origin: str) -> None:
         )
 
 
-def _joined(elapsed: FloatArray | None, clock: tuple[FloatArray, Clock] | None, warnings: list[str]) -> Times:
-    if elapsed is None:
-        assert clock is not None
-        seconds, kind = clock
-        return Times(seconds, seconds, kind, from_clock=True)
-    if clock is None:
-        return Times(elapsed, np.full(len(elapsed), np.nan), "none")
-    seconds, kind = clock
-    return Times(elapsed, _refined(elapsed, seconds, warnings), kind)
-
-
 def _refined(times_s: FloatArray, clock_s: FloatArray, warnings: list[str]) -> FloatArray:
     """The clock of every row; finer than written where it is cut to whole seconds and rows are closer."""
     both = np.isfinite(times_s) & np.isfinite(clock_s)
@@ -219,15 +193,16 @@ def read_csv(data: bytes, origin: str = "CSV") -> Telemetry:
     rows = _rows(decode_text(data), origin)
     header = next(rows, [])
     columns = _known_columns(header, origin)
-    timing = time_columns(header, origin)
+    timing = _time_columns(header, origin)
     missing = [name for name in ("latitude_deg", "longitude_deg") if name not in columns]
-    if missing or timing is None:
+    if missing or not timing:
         times = "time, timestamp, time_s, film_time_s or datetime(utc)"
         wanted = f"latitude or lat, longitude, lon or lng, and {times}"
         raise TelemetryError(
             f"{origin}: expected a first line with columns for {wanted}; found {', '.join(header)[:500]!r}"
         )
-    cells = _cells(rows, [*(index for index, _ in columns.values()), *timing.indices], len(header), origin)
+    indices = [*(index for index, _ in columns.values()), *(column.at for column in timing)]
+    cells = _cells(rows, indices, len(header), origin)
     if not cells:
         raise TelemetryError(f"{origin}: a table with names of columns and no rows")
     return _telemetry(cells, columns, timing, origin)
@@ -302,28 +277,24 @@ def _cells(rows: Iterator[list[str]], indices: list[int], width: int, origin: st
 
 
 def _telemetry(
-    cells: dict[int, list[str]], columns: dict[str, tuple[int, float]], timing: TimeColumns, origin: str
+    cells: dict[int, list[str]], columns: dict[str, tuple[int, float]], timing: list[_TimeColumn], origin: str
 ) -> Telemetry:
     warnings: list[str] = []
     values = {
         quantity: factor * _numbers(cells[index], quantity, origin, warnings)
         for quantity, (index, factor) in columns.items()
     }
-    times = timing.read(cells, origin, warnings)
-    values["times_s"], values["clock_s"] = times.times_s, times.clock_s
+    times, clock, in_film = _times_of(timing, cells, origin, warnings)
     datum: HeightDatum = "unknown"
     if "ellipsoidal_height" in values:
         datum, values["height_m"] = "ellipsoidal", values["ellipsoidal_height"]
-    table = SampleTable()
-    table.extend(values, len(times.times_s))
     return assemble(
-        table,
+        values | times,
         source="CSV",
         origin=origin,
-        clock=times.clock,
+        clock=clock,
         height_datum=datum,
-        in_video_time=times.in_film,
-        from_first=times.from_clock,
+        in_video_time=in_film,
         sort=True,
         warnings=warnings,
     )
@@ -331,15 +302,14 @@ def _telemetry(
 
 def _numbers(texts: list[str], quantity: str, origin: str, warnings: list[str]) -> FloatArray:
     values = np.array([number(_with_point(text)) for text in texts])
-    words = sum(bool(text.strip()) for text in texts) - int(np.isfinite(values).sum())
-    missing = sum(text.strip().lower() in ("n/a", "na", "nan", "null", "none", "-") for text in texts)
-    if words - missing > _MOST * len(texts):
+    written = [text.strip() for text, value in zip(texts, values, strict=True) if np.isnan(value)]
+    words = [text for text in written if text and text.lower() not in _NO_VALUE]
+    if len(words) > _MOST * len(texts):
         raise TelemetryError(
-            f"{origin}: expected numbers in the column of {quantity}, found for example "
-            f"{next(text for text in texts if np.isnan(number(_with_point(text))) and text.strip())[:40]!r}"
+            f"{origin}: expected numbers in the column of {quantity}, found for example {words[0][:40]!r}"
         )
-    if words > missing:
-        warnings.append(f"{words - missing} values of {quantity} are no numbers and not used")
+    if words:
+        warnings.append(f"{len(words)} values of {quantity} are no numbers and not used")
     return values
 
 

@@ -18,13 +18,14 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from typing import TypeVar
 
 import numpy as np
 
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import assemble, check_count
 from featuredb.video.telemetry.formats.klv import Klv, numbers, parse_klv
 from featuredb.video.telemetry.values import Telemetry
 
@@ -34,6 +35,8 @@ _FIX_3D = 3
 _GPSU = re.compile(r"([0-9]{12})(?:\.([0-9]{1,3}))?")
 
 Stream = dict[str, Klv]
+_S = TypeVar("_S")
+_T = TypeVar("_T")
 
 # What the units of these streams must begin with; a stream whose latitude is no angle is something else.
 _ANGLES_FIRST = {"GPS5": 0, "GPS9": 0, "GLPI": 1, "GPRI": 1}
@@ -73,12 +76,12 @@ def scaled(stream: Stream, key: str, fields: int) -> FloatArray | None:
         return np.asarray(values / scale, dtype=np.float64)
 
 
-def find(streams: list[Stream], key: str, fields: int) -> FloatArray | None:
-    """`scaled` of the first stream that has samples of that key."""
+def find(streams: list[Stream], key: str, fields: int) -> tuple[Stream, FloatArray] | None:
+    """The first stream that has samples of that key, and its `scaled`."""
     for stream in streams:
         values = scaled(stream, key, fields)
         if values is not None:
-            return values
+            return stream, values
     return None
 
 
@@ -112,18 +115,19 @@ class Decoded:
     """The samples of one packet.
 
     Attributes:
-        columns: (n,) arrays by the names of `SampleTable`, without times.
-        count: n.
+        columns: (n,) arrays as `assemble` takes them, without times; the same in all packets of a reader.
         clock_at_start_s: UTC of the packet's first sample where the samples have no clock of their own.
         datum: of the heights.
         warnings: what was found odd.
     """
 
     columns: dict[str, FloatArray]
-    count: int
     clock_at_start_s: float = float("nan")
     datum: HeightDatum = "unknown"
     warnings: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.columns["latitude_deg"])
 
 
 def has_positions(packets: Sequence[TimedPacket]) -> bool:
@@ -157,12 +161,11 @@ def read_gpmf(packets: Sequence[TimedPacket], origin: str = "GPMF track") -> Tel
             f"{origin}: expected a stream GPS9, GPS5 or GLPI, found none (entries: {', '.join(keys)[:300]}); "
             "was GPS switched off?"
         )
-    table = _timed(decoded, origin)
     datums = {samples.datum for _, samples in decoded}
     for _, samples in decoded:
         warnings += [line for line in samples.warnings if line not in warnings]
     return assemble(
-        table,
+        _timed(decoded, origin),
         source=f"GPMF {source}",
         origin=origin,
         clock="utc",
@@ -171,16 +174,23 @@ def read_gpmf(packets: Sequence[TimedPacket], origin: str = "GPMF track") -> Tel
     )
 
 
+def _tried(
+    packets: Sequence[tuple[TimedPacket, _S]], read: Callable[[_S], _T]
+) -> tuple[list[tuple[TimedPacket, _T]], list[str]]:
+    """What is read of each packet, and why others cannot be read."""
+    made, reasons = [], []
+    for packet, content in packets:
+        try:
+            made.append((packet, read(content)))
+        except TelemetryError as error:
+            reasons.append(str(error))
+    return made, reasons
+
+
 def _parse_packets(
     packets: Sequence[TimedPacket], origin: str, warnings: list[str]
 ) -> list[tuple[TimedPacket, list[Stream]]]:
-    parsed = []
-    reasons = []
-    for packet in packets:
-        try:
-            parsed.append((packet, streams_of(packet.data)))
-        except TelemetryError as error:
-            reasons.append(str(error))
+    parsed, reasons = _tried([(packet, packet.data) for packet in packets], streams_of)
     if not parsed:
         reason = f" ({reasons[0]})" if reasons else ""
         raise TelemetryError(f"{origin}: none of {len(packets)} packets can be read{reason}")
@@ -191,16 +201,14 @@ def _parse_packets(
 
 def _karma_clock(parsed: list[tuple[TimedPacket, list[Stream]]], warnings: list[str]) -> float:
     """Seconds to add to Karma's boot time for UTC, NaN where no packet tells."""
-    offsets: list[float] = []
-    try:
-        for _, streams in parsed:
-            clock = find(streams, "SYST", 2)  # boot time, seconds since 1970
-            if clock is not None:
-                offsets += (clock[:, 1] - clock[:, 0]).tolist()
-    except TelemetryError as error:
-        warnings.append(f"Karma's clock cannot be read ({error})")
+    found, reasons = _tried(parsed, lambda streams: find(streams, "SYST", 2))
+    if reasons:
+        warnings.append(f"Karma's clock cannot be read ({reasons[0]})")
         return float("nan")
-    return float(np.median(offsets)) if offsets else float("nan")
+    clocks = [clock[1] for _, clock in found if clock is not None]  # boot time, seconds since 1970
+    if not clocks:
+        return float("nan")
+    return float(np.median(np.concatenate([clock[:, 1] - clock[:, 0] for clock in clocks])))
 
 
 def _decode(
@@ -208,70 +216,57 @@ def _decode(
     reader: Callable[[list[Stream]], Decoded | None],
     warnings: list[str],
 ) -> list[tuple[TimedPacket, Decoded]]:
-    decoded, reasons = [], []
-    for packet, streams in parsed:
-        try:
-            samples = reader(streams)
-        except TelemetryError as error:
-            reasons.append(str(error))
-            continue
-        if samples is not None and samples.count:
-            decoded.append((packet, samples))
+    decoded, reasons = _tried(parsed, reader)
     if reasons:
         warnings.append(f"the GPS stream of {len(reasons)} packets cannot be read ({reasons[0]})")
-    return decoded
+    return [(packet, samples) for packet, samples in decoded if samples is not None]
 
 
-def _timed(decoded: list[tuple[TimedPacket, Decoded]], origin: str) -> SampleTable:
-    """All samples with their times."""
-    check_count(sum(samples.count for _, samples in decoded), origin)
-    steps = [packet.duration_s / samples.count for packet, samples in decoded]
+def _timed(decoded: list[tuple[TimedPacket, Decoded]], origin: str) -> dict[str, FloatArray]:
+    """The columns of all samples with their times."""
+    check_count(sum(len(samples) for _, samples in decoded), origin)
+    steps = [packet.duration_s / len(samples) for packet, samples in decoded]
     usual = float(np.median(steps))
-    table = SampleTable()
+    parts: list[dict[str, FloatArray]] = []
     for row, (packet, samples) in enumerate(decoded):
         step = min(steps[row], usual) if row == len(decoded) - 1 else steps[row]
-        after: FloatArray = step * np.arange(samples.count, dtype=np.float64)
-        columns: dict[str, FloatArray] = {
-            "clock_s": samples.clock_at_start_s + after,
-            **samples.columns,
-            "times_s": packet.start_s + after,
-        }
-        table.extend(columns, samples.count)
-    return table
+        after: FloatArray = step * np.arange(len(samples), dtype=np.float64)
+        parts.append(
+            {
+                "clock_s": samples.clock_at_start_s + after,
+                **samples.columns,
+                "times_s": packet.start_s + after,
+            }
+        )
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _gps9(streams: list[Stream]) -> Decoded | None:
     """Latitude, longitude, height, two speeds, days since 2000, second of the day, DOP, fix."""
-    for stream in streams:
-        values = scaled(stream, "GPS9", 9)
-        if values is None:
-            continue
-        fix = values[:, 8]
-        columns = _fixed(values, fix)
-        columns["clock_s"] = np.where(
-            fix >= _MIN_FIX, _EPOCH_2000_S + 86_400.0 * values[:, 5] + values[:, 6], np.nan
-        )
-        datum, warnings = _datum(stream, "unknown")
-        return Decoded(columns, len(values), datum=datum, warnings=warnings)
-    return None
+    found = find(streams, "GPS9", 9)
+    if found is None:
+        return None
+    stream, values = found
+    fix = values[:, 8]
+    clock = _EPOCH_2000_S + 86_400.0 * values[:, 5] + values[:, 6]
+    columns = _fixed(values, fix) | {"clock_s": np.where(fix >= _MIN_FIX, clock, np.nan)}
+    datum, warnings = _datum(stream, "unknown")
+    return Decoded(columns, datum=datum, warnings=warnings)
 
 
 def _gps5(streams: list[Stream]) -> Decoded | None:
     """Latitude, longitude, height, two speeds; fix and time once for the packet."""
-    for stream in streams:
-        values = scaled(stream, "GPS5", 5)
-        if values is None:
-            continue
-        datum, warnings = _datum(stream, "ellipsoidal")
-        fix = first_number(stream, "GPSF")
-        if np.isnan(fix):
-            warnings.append("GPS5 without its fix status (GPSF): whether positions are fresh is not known")
-            fix = _FIX_3D
-        n = len(values)
-        columns = _fixed(values, np.full(n, fix))
-        start = _utc(stream.get("GPSU")) if fix >= _MIN_FIX else float("nan")
-        return Decoded(columns, n, start, datum, warnings)
-    return None
+    found = find(streams, "GPS5", 5)
+    if found is None:
+        return None
+    stream, values = found
+    datum, warnings = _datum(stream, "ellipsoidal")
+    fix = first_number(stream, "GPSF")
+    if np.isnan(fix):
+        warnings.append("GPS5 without its fix status (GPSF): whether positions are fresh is not known")
+        fix = _FIX_3D
+    start = _utc(stream.get("GPSU")) if fix >= _MIN_FIX else float("nan")
+    return Decoded(_fixed(values, np.full(len(values), fix)), start, datum, warnings)
 
 
 def _fixed(values: FloatArray, fix: FloatArray) -> dict[str, FloatArray]:
@@ -305,10 +300,11 @@ def _utc(entry: Klv | None) -> float:
 
 def _karma(streams: list[Stream], boot_to_utc_s: float) -> Decoded | None:
     """Boot time, latitude, longitude, height, relative height; fix of the receiver throughout the packet."""
-    place, receiver = find(streams, "GLPI", 9), find(streams, "GPRI", 10)
-    if place is None:
+    found, receiver = find(streams, "GLPI", 9), find(streams, "GPRI", 10)
+    if found is None:
         return None
-    fixed = receiver is None or bool((receiver[:, 8] >= _MIN_FIX).all())
+    place = found[1]
+    fixed = receiver is None or bool((receiver[1][:, 8] >= _MIN_FIX).all())
     columns = {
         "latitude_deg": place[:, 1] if fixed else np.full(len(place), np.nan),
         "longitude_deg": place[:, 2] if fixed else np.full(len(place), np.nan),
@@ -316,4 +312,4 @@ def _karma(streams: list[Stream], boot_to_utc_s: float) -> Decoded | None:
         "relative_height_m": place[:, 4],
         "clock_s": place[:, 0] + boot_to_utc_s,
     }
-    return Decoded(columns, len(place))
+    return Decoded(columns)

@@ -7,8 +7,10 @@ the memory or to a file of this machine, need. Heights (`ele`) are of unknown da
 import math
 from xml.parsers import expat
 
+import numpy as np
+
 from featuredb.errors import TelemetryError
-from featuredb.video.telemetry.assemble import SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import assemble, check_count
 from featuredb.video.telemetry.formats.text import number, parse_wall_clock
 from featuredb.video.telemetry.values import Telemetry
 
@@ -48,8 +50,8 @@ class _Reader:
         self._origin = origin
         self._path: list[str] = []
         self._point: dict[str, str] | None = None
-        self._table = SampleTable()
-        self._points, self._timeless, self._local = 0, 0, 0
+        self._rows: list[tuple[float, float, float, float]] = []  # clock, latitude, longitude, height
+        self._points, self._local = 0, 0
 
     def doctype(self, *_: object) -> None:
         raise TelemetryError(
@@ -86,43 +88,41 @@ class _Reader:
         check_count(self._points, self._origin)
         clock = parse_wall_clock(point.get("time", ""))
         if clock is None:
-            self._timeless += 1
             return
         self._local += not clock.is_utc
         fixed = point.get("fix", "").strip() != "none"
-        self._table.add(
-            {
-                "times_s": clock.seconds,
-                "clock_s": clock.seconds,
-                "latitude_deg": number(point["lat"]) if fixed else math.nan,
-                "longitude_deg": number(point["lon"]) if fixed else math.nan,
-                "height_m": number(point.get("ele", "")),
-            }
-        )
+        latitude, longitude = (number(point[name]) if fixed else math.nan for name in ("lat", "lon"))
+        self._rows.append((clock.seconds, latitude, longitude, number(point.get("ele", ""))))
 
     def telemetry(self) -> Telemetry:
         if not self._points:
             raise TelemetryError(
                 f"{self._origin}: a GPX file without track points (<trkpt>); waypoints have no times"
             )
-        if not len(self._table):
+        if not self._rows:
             raise TelemetryError(
                 f"{self._origin}: none of {self._points} track points has a <time>; export it with times"
             )
         warnings = []
-        if self._timeless:
-            warnings.append(f"{self._timeless} of {self._points} track points have no time and are left out")
+        timeless = self._points - len(self._rows)
+        if timeless:
+            warnings.append(f"{timeless} of {self._points} track points have no time and are left out")
         if self._local:
             warnings.append(
                 f"{self._local} times name no zone; GPX's times are UTC, so they are taken for it"
             )
+        clock, latitude, longitude, height = np.array(self._rows).T
         return assemble(
-            self._table,
+            {
+                "clock_s": clock,
+                "latitude_deg": latitude,
+                "longitude_deg": longitude,
+                "height_m": height,
+            },
             source="GPX",
             origin=self._origin,
             clock="utc",
             in_video_time=False,
-            from_first=True,
             sort=True,
             warnings=warnings,
         )

@@ -6,6 +6,7 @@ is there, so that a damaged or hostile packet ends in `TelemetryError`: nothing 
 every entry takes at least eight bytes, and nesting is bounded.
 """
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ _NUMBERS = {
 }  # fmt: skip
 _FIXED_POINT = {"q": 2.0**-16, "Q": 2.0**-32}
 _MAX_FIELDS = 255  # a sample has at most 255 bytes
+_FIELD = re.compile(r"([^][])(\[0*([1-9][0-9]{0,2})\])?")  # of a structure, and how often it is repeated
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,20 +142,12 @@ def numbers(entry: Klv, structure: str = "") -> FloatArray:
 
 def _expand(structure: str) -> list[str]:
     """The characters of a structure with its repetitions written out: "f[3]L" is f, f, f, L."""
-    kinds: list[str] = []
-    at = 0
-    while at < len(structure):
-        kind, at = structure[at], at + 1
-        times = 1
-        if structure[at : at + 1] == "[":
-            end = structure.find("]", at)
-            digits = structure[at + 1 : end] if end > 0 else ""
-            if not (digits.isascii() and digits.isdigit() and 0 < int(digits[:4]) <= _MAX_FIELDS):
-                raise TelemetryError(f"GPMF: the structure {structure[:40]!r} cannot be read")
-            times, at = int(digits[:4]), end + 1
-        kinds += [kind] * times
-        if len(kinds) > _MAX_FIELDS:
-            raise TelemetryError(f"GPMF: the structure {structure[:40]!r} has more than {_MAX_FIELDS} fields")
-    if not kinds:
+    if not structure:
         raise TelemetryError("GPMF: a structure was expected before an entry of type '?', found none")
+    parts = _FIELD.findall(structure)
+    if "".join(kind + repeated for kind, repeated, _ in parts) != structure:
+        raise TelemetryError(f"GPMF: the structure {structure[:40]!r} cannot be read")
+    kinds = [kind for kind, _, times in parts for _ in range(int(times or 1))]
+    if len(kinds) > _MAX_FIELDS:
+        raise TelemetryError(f"GPMF: the structure {structure[:40]!r} has more than {_MAX_FIELDS} fields")
     return kinds

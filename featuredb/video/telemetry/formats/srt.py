@@ -13,7 +13,7 @@ import numpy as np
 
 from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import METRES_PER_DEGREE, SampleTable, assemble, check_count
+from featuredb.video.telemetry.assemble import METRES_PER_DEGREE, assemble, check_count
 from featuredb.video.telemetry.axis_order import ThirdValue, decide_order
 from featuredb.video.telemetry.formats.srt_blocks import Subtitle, is_cut_off, lacks_words, split_blocks
 from featuredb.video.telemetry.formats.srt_fields import BlockFields, looks_like_telemetry, parse_block
@@ -50,31 +50,28 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
         )
     parsed = [parse_block(block.text) for block in blocks]
     warnings: list[str] = []
-    whole = _whole_blocks(blocks, parsed, warnings)
+    whole = _whole(blocks, parsed, warnings)
     if not whole:
         raise TelemetryError(f"{origin}: its only subtitle is cut off; was the recording interrupted?")
-    blocks, parsed = [blocks[row] for row in whole], [parsed[row] for row in whole]
-    clocks = _clocks(blocks)
-    times, in_video_time = _times(blocks, clocks, origin, warnings)
+    blocks, parsed = blocks[:whole], parsed[:whole]
+    times = _times(blocks, origin, warnings)
     decimals = max(fields.decimals for fields in parsed)
     _place_pairs(parsed, origin, warnings)
     _tell_heights(parsed, warnings)
     step_m = METRES_PER_DEGREE * 10.0**-decimals
     if decimals >= 0 and step_m > _COARSE_M:
         warnings.append(f"coordinates are written in steps of {step_m:.0f} m")
-    table = SampleTable()
-    for time, clock, fields in zip(times, clocks, parsed, strict=True):
-        table.add({**fields.row, "times_s": time, "clock_s": clock})
+    names = {name for fields in parsed for name in fields.row}
+    columns = {name: np.array([fields.row.get(name, np.nan) for fields in parsed]) for name in names}
     dialects = list(dict.fromkeys(fields.dialect for fields in parsed if fields.dialect))
     if len(dialects) > 1:
         warnings.append(f"{len(dialects)} dialects in one file: recordings of several drones were joined")
     return assemble(
-        table,
+        columns | times,
         source="SRT, " + " + ".join(dialects),
         origin=origin,
         clock="local",
-        in_video_time=in_video_time,
-        from_first=not in_video_time,
+        in_video_time="times_s" in times,
         warnings=warnings,
     )
 
@@ -84,9 +81,9 @@ def _sample_of(blocks: Sequence[Subtitle]) -> str:
     return f"; the first says {text[:60]!r}" if text else ""
 
 
-def _whole_blocks(blocks: Sequence[Subtitle], parsed: list[BlockFields], warnings: list[str]) -> list[int]:
-    """Rows of the blocks without a cut-off last one. Damaged ones before it stay, without what they lost."""
-    rows = list(range(len(blocks)))
+def _whole(blocks: Sequence[Subtitle], parsed: list[BlockFields], warnings: list[str]) -> int:
+    """Number of blocks without a cut-off last one. Damaged ones before it stay, without what they lost."""
+    whole = len(blocks)
     last = blocks[-1].text
     # A cut may have left a block that looks like another kind: then it is compared with the one before it.
     kinds = [fields.dialect for fields in parsed[:-1] if fields.dialect]
@@ -95,29 +92,24 @@ def _whole_blocks(blocks: Sequence[Subtitle], parsed: list[BlockFields], warning
     same = [text for text in same if not is_cut_off(text)]
     if is_cut_off(last) or lacks_words(last, same):
         warnings.append("the last block is cut off and left out")
-        rows.pop()
-    damaged = sum(is_cut_off(blocks[row].text) for row in rows)
+        whole -= 1
+    damaged = sum(is_cut_off(block.text) for block in blocks[:whole])
     if damaged:
         warnings.append(f"{damaged} of {len(blocks)} blocks are damaged; what is left of them is used")
-    return rows
+    return whole
 
 
-def _clocks(blocks: Sequence[Subtitle]) -> list[float]:
+def _times(blocks: Sequence[Subtitle], origin: str, warnings: list[str]) -> dict[str, FloatArray]:
+    """Seconds of the clock, and of the video in files with such times; columns for `assemble`."""
     found = [parse_wall_clock(block.text) for block in blocks]
-    return [clock.seconds if clock else math.nan for clock in found]
-
-
-def _times(
-    blocks: Sequence[Subtitle], clocks: list[float], origin: str, warnings: list[str]
-) -> tuple[list[float], bool]:
-    """Seconds of the video, or of the clock in files without such times; and which of them it is."""
-    times = [block.start_s for block in blocks]
-    if any(math.isfinite(time) for time in times):
-        return times, True
-    if not any(math.isfinite(clock) for clock in clocks):
+    clocks = np.array([clock.seconds if clock else math.nan for clock in found])
+    times = np.array([block.start_s for block in blocks])
+    if np.isfinite(times).any():
+        return {"times_s": times, "clock_s": clocks}
+    if not np.isfinite(clocks).any():
         raise TelemetryError(f"{origin}: its blocks have neither times of the video nor a clock")
     warnings.append("no times of the video: times are those of its clock since the first sample")
-    return clocks, False
+    return {"clock_s": clocks}
 
 
 def _place_pairs(parsed: list[BlockFields], origin: str, warnings: list[str]) -> None:

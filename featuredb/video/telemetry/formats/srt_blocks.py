@@ -1,5 +1,6 @@
 """Subtitles as blocks: the time at which each begins, and its text without markup."""
 
+import math
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -35,21 +36,19 @@ def split_blocks(text: str) -> list[Subtitle]:
     begins a block.
     """
     lines = re.split(r"\r\n|\r|\n", text)
-    starts = [(row, match) for row, line in enumerate(lines) if (match := _TIMES.match(line))]
+    starts = [(row, _start_s(match)) for row, line in enumerate(lines) if (match := _TIMES.match(line))]
     if not starts:
-        numbered = [row for row, line in enumerate(lines) if _NUMBER_LINE.match(line)]
-        ends = [*numbered, len(lines)][1:]
-        return [
-            Subtitle(float("nan"), plain_text(lines[row + 1 : end]))
-            for row, end in zip(numbered, ends, strict=True)
-        ]
-    blocks = []
-    ends = [*(row for row, _ in starts[1:]), len(lines)]
-    for (row, match), end in zip(starts, ends, strict=True):
-        hours, minutes, seconds = (float(match[part]) for part in (1, 2, 3))
-        start = 3600.0 * hours + 60.0 * minutes + seconds + float(f"0.{match[4]}")
-        blocks.append(Subtitle(start, plain_text(_without_number(lines[row + 1 : end]))))
-    return blocks
+        starts = [(row, math.nan) for row, line in enumerate(lines) if _NUMBER_LINE.match(line)]
+    ends = [*(row for row, _ in starts), len(lines)][1:]
+    return [
+        Subtitle(start_s, plain_text(_without_number(lines[row + 1 : end])))
+        for (row, start_s), end in zip(starts, ends, strict=True)
+    ]
+
+
+def _start_s(match: re.Match[str]) -> float:
+    hours, minutes, seconds = (float(match[part]) for part in (1, 2, 3))
+    return 3600.0 * hours + 60.0 * minutes + seconds + float(f"0.{match[4]}")
 
 
 def has_times(text: str) -> bool:

@@ -44,7 +44,7 @@ class BlockFields:
 
     Attributes:
         dialect: its name in the table above, "" where nothing was understood.
-        row: named values, as `SampleTable.add` takes them.
+        row: named values, by the columns that `assemble` takes.
         pair: unnamed coordinates in degrees, in the order written; NaN without a fix.
         home: the same of the place of take-off.
         third: what follows the pair.
@@ -108,41 +108,34 @@ def _read_tuple(name: str, parts: list[str], fields: BlockFields) -> None:
         return
     if len(parts) > 3:  # decimal commas, for example; what is then a number is not to be guessed
         return
-    matches = [_COORDINATE.match(part.strip()) for part in parts]
-    first, second = [*matches, None, None][:2]
-    if name == "GPS" and len(matches) == 3:
-        _read_third(matches[2], fields)
+    first, second, third = [*(_COORDINATE.match(part.strip()) for part in parts), None, None][:3]
+    if name == "GPS" and third and not third[1]:
+        fields.third_value = float(third[2])
+        fields.third = "metres" if third[3] else "decimal" if "." in third[2] else "count"
     if first is None or second is None or first[3] or second[3]:
         return
-    if first[1] and second[1]:
-        if name == "GPS":
-            _read_compass(first, second, fields)
-        return
-    pair = float(first[2]), float(second[2])
+    pair, named = (float(first[2]), float(second[2])), first[1] and second[1]
     if name == "HOME":
-        fields.home = pair
-    else:
-        fields.pair = pair
-        fields.decimals = max(len(m[2].partition(".")[2]) for m in (first, second))
-
-
-def _read_third(match: re.Match[str] | None, fields: BlockFields) -> None:
-    if match is None or match[1]:
+        fields.home = fields.home if named else pair
         return
-    fields.third_value = float(match[2])
-    fields.third = "metres" if match[3] else "decimal" if "." in match[2] else "count"
+    if not named:
+        fields.pair = pair
+    elif not _read_compass((first[1] + second[1]).upper(), pair, fields):
+        return
+    fields.decimals = max(len(match[2].partition(".")[2]) for match in (first, second))
 
 
-def _read_compass(first: re.Match[str], second: re.Match[str], fields: BlockFields) -> None:
-    values = {}
-    for match in (first, second):
-        letter, value = match[1].upper(), float(match[2])
-        name = "latitude_deg" if letter in "NS" else "longitude_deg"
-        values[name] = -value if letter in "SW" else value
-    if len(values) == 2:  # N and S, or E and W, twice is damage
-        fields.dialect = "compass letters"
-        fields.row.update(values)
-        fields.decimals = max(len(m[2].partition(".")[2]) for m in (first, second))
+def _read_compass(letters: str, pair: tuple[float, float], fields: BlockFields) -> bool:
+    """Coordinates with their letters; False for N and S, or E and W, twice, which is damage."""
+    values = {
+        "latitude_deg" if letter in "NS" else "longitude_deg": -value if letter in "SW" else value
+        for letter, value in zip(letters, pair, strict=True)
+    }
+    if len(values) < 2:
+        return False
+    fields.dialect = "compass letters"
+    fields.row.update(values)
+    return True
 
 
 def _dialect_of_tuple(text: str, fields: BlockFields) -> str:
