@@ -20,7 +20,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.geometry.similarity import refined_similarity
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.index.nearest import nearest
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
@@ -211,13 +211,15 @@ def _judged(
     source: RenderSource,
 ) -> FoundFromAbove | None:
     """Fitted to the matches within the tolerance, with how sure that is; None where too few are."""
-    if sim is None:
-        return None
     for _ in range(_ROUNDS):
+        if sim is None:
+            return None
         fits = np.linalg.norm(sim.act(own) - local, axis=1) <= tolerance_m
         if fits.sum() <= _SAMPLE:
             return None
-        sim = refined_similarity(sim, own[fits], local[fits], 1.0)
+        sim = similarity_closed_form(own[fits], local[fits])
+    if sim is None:
+        return None
     placed = sim.act(own[fits])
     variance = float(np.square(placed - local[fits]).sum()) / (3.0 * int(fits.sum()) - 7.0)
     jacobian = point_jacobian(placed).reshape(-1, 7)
