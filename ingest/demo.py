@@ -172,7 +172,7 @@ def table(answers: Sequence[DemoAnswer]) -> str:
         answered = sum(a.reply.status == "localised" for a in mine)
         wall_ms = sorted(a.wall_ms for a in mine)[len(mine) // 2]
         figures: tuple[object, ...] = (None, None, None, None, answered)  # no true place
-        if group in ("drone", "street"):
+        if answered and group in ("drone", "street"):
             found = summarise([a.error for a in mine])
             figures = (*found.position_m, *found.angle_deg, found.wrong)
         shown = (f"{f:.3f}" if isinstance(f, float) else f for f in figures)
