@@ -314,6 +314,15 @@ def test_damage_is_found(database: Database, tmp_path: Path) -> None:
     assert f"scan {scan.scan_id}" in {p.where for p in verify(database).problems}
 
 
+def test_points_in_a_wrong_tile_are_found(database: Database, tmp_path: Path) -> None:
+    """Their coordinates are as committed, and yet nobody who asks for a part of the scan gets them."""
+    scan = add_scan(database, [write_scan(tmp_path / "scan.las", grid_points())]).scan
+    DeltaTable(f"{database.url}/lidar_points").update(updates={"tile": "'E009999_N99999'"})
+    assert [p.where for p in verify(database).problems if "in another tile" in p.what] == [
+        f"scan {scan.scan_id}"
+    ]
+
+
 def test_sql_sees_scans(database: Database, tmp_path: Path) -> None:
     Database.create(database.url)
     with SqlSession(database.snapshot(), database) as session:

@@ -1,5 +1,6 @@
 """How many frames are tried before a map is given up."""
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,13 +12,15 @@ from ingest.register.anchor.frames import try_frames
 _COLOURED, _BARE = SimpleNamespace(rgb=True), SimpleNamespace(rgb=None)
 
 
-def tried(monkeypatch: pytest.MonkeyPatch, registered: list[bool]) -> int:
-    """How many of frames that are registered or not, in their order, are tried."""
+def tried(monkeypatch: pytest.MonkeyPatch, registered: Sequence[bool | None]) -> int:
+    """How many of frames that are registered or not, or cannot be read (None), in their order, are tried."""
     images = [SimpleNamespace(image_id=k, name=str(k)) for k in range(len(registered))]
     proposals = [SimpleNamespace(image=image) for image in images]
 
     def try_one(_map: Any, _cloud: Any, proposal: Any, *_: Any) -> Any:
         accepted = registered[proposal.image.image_id]
+        if accepted is None:
+            return None
         return SimpleNamespace(image=proposal.image, registration=SimpleNamespace(accepted=accepted))
 
     monkeypatch.setattr(frames, "height_shift", lambda *_: None)
@@ -39,10 +42,11 @@ def tried(monkeypatch: pytest.MonkeyPatch, registered: list[bool]) -> int:
         ([True, False, False, False] * 10, 9),
         ([False] * 6 + [True] * 20, 6),
         ([True, False], 2),
+        ([None] * 8 + [True, True, True, False], 3),
     ],
 )
 def test_once_a_frame_is_registered_others_have_more_tries(
-    monkeypatch: pytest.MonkeyPatch, registered: list[bool], count: int
+    monkeypatch: pytest.MonkeyPatch, registered: list[bool | None], count: int
 ) -> None:
     assert tried(monkeypatch, registered) == count
 

@@ -41,7 +41,13 @@ def control_html(placement: GcpPlacement) -> str:
     points = [["" if cell is None else str(cell) for cell in row] for row in _rows(placement)]
     parts.append(table(_HEADER, points, numbers=(2, 3, 4, 5, 6), names=(0,)))
     marks = [
-        (m.mark.point, m.mark.photo, str(m.mark.line), *(f"{v:.3f}" for v in m.residual_px), _word(m.used))
+        (
+            m.mark.point,
+            m.mark.photo,
+            str(m.mark.line),
+            *(f"{v:.3f}" if np.isfinite(v) else "" for v in m.residual_px),
+            _word(m.used),
+        )
         for m in placement.marks
     ]
     mark_head = ("point", "photo", "line", "x, px", "y, px", "")
