@@ -105,8 +105,8 @@ def residual_exaggeration(residuals_m: FloatArray, extent_m: float) -> int:
 
 
 def _box(plan: PlanView) -> tuple[FloatArray, FloatArray]:
-    """Corners (2,) around cameras, residuals and all but the outermost points, with a margin."""
-    ends = np.concatenate([plan.places[plan.used], (plan.places + plan.residuals)[plan.used]])[:, :2]
+    """Corners (2,) around cameras, places, residuals in use and all but the outermost points, with a margin."""
+    ends = np.concatenate([plan.places, (plan.places + plan.residuals)[plan.used]])[:, :2]
     corners = [plan.cameras[:, :2], ends[np.isfinite(ends).all(axis=1)]]
     if len(plan.points):
         corners.append(np.percentile(plan.points[:, :2], (1, 99), axis=0))
