@@ -105,7 +105,7 @@ def residual_exaggeration(residuals_m: FloatArray, extent_m: float) -> int:
 
 
 def _box(plan: PlanView) -> tuple[FloatArray, FloatArray]:
-    """Corners (2,) around cameras, places, residuals in use and all but the outermost points, with a margin."""
+    """Corners (2,) around cameras, places, used residuals and all but the outermost points, with a margin."""
     ends = np.concatenate([plan.places, (plan.places + plan.residuals)[plan.used]])[:, :2]
     corners = [plan.cameras[:, :2], ends[np.isfinite(ends).all(axis=1)]]
     if len(plan.points):

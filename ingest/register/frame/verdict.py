@@ -40,9 +40,9 @@ _MIN_PLACES_ELSEWHERE = 1
 # leaves 4.3.
 _MIN_WEIGHED_LOG_NFA = 5.0
 # Less is enough where shaded relief was asked, too, and has its say: right windows of `autzen` have 4.8 and
-# more so. Of crossings in other towns one had 6.5 by intensities, and 1 of 78 pieces of relief agreed. It is a
-# limit against chance; none of 400 photos was accepted on another town's scan (row `frames-on-scan`), so that
-# the rate of error is below 0.75 % (95 % confidence).
+# more so. Of crossings in other towns one had 6.5 by intensities, and 1 of 78 pieces of relief agreed.
+# A limit against chance; none of 400 photos was accepted on another town's scan (row `frames-on-scan`), so
+# that the rate of error is below 0.75 % (95 % confidence).
 _MIN_WITH_RELIEF = 4.0
 _RIVAL_SHARE = 0.5  # a pose elsewhere with this share of the inliers makes the registration ambiguous
 # Largest distance from the prior, in its own standard deviations over all six axes together. Generous: people
