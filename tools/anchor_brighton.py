@@ -71,7 +71,8 @@ def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
     """What the map's own lens and shape are worth against the scan's, whatever its place."""
     snapshot = database.snapshot()
     feature_map = snapshot.load_map(snapshot.maps()[0].map_id)
-    scan_px = truth.camera.focal_px
+    first = feature_map.images[0]
+    focal_px, scan_px = feature_map.cameras[first.camera_id].focal_px, truth.cameras[first.name].focal_px
     own = np.array([image.cam_from_local.center for image in feature_map.images])
     wanted = np.array([truth.poses[image.name].center for image in feature_map.images])
     fit = similarity_closed_form(truth.frame.enu_from(feature_map.frame).act(own), wanted)
@@ -79,7 +80,6 @@ def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
     if fit is None or uncertainty is None:
         raise SystemExit("the map has no lens uncertainty, or its cameras lie on one point")
     rest = fit.act(truth.frame.enu_from(feature_map.frame).act(own)) - wanted
-    focal_px = feature_map.cameras[0].focal_px
     return {
         "gps_focal_px": focal_px,
         "scan_focal_px": scan_px,

@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         view = view_of(localiser, (args.photos / name).read_bytes())
         if view is None:
             continue
-        pixels, places = _truth(scan, truth.camera, truth.poses[name], rng)
+        pixels, places = _truth(scan, truth.cameras[name], truth.poses[name], rng)
         true = view.frame.enu_from(truth.frame).act(places)
         asked, photos = asked + len(pixels), photos + 1
         for kind, surface in _surfaces(database, localiser, view).items():

@@ -3,10 +3,11 @@
     python -m tools.scan_poses SCAN.laz PHOTO_FOLDER --poses poses.json
 
 Registers every photo of the folder (tools/scan_to_photo.py, which shares no code with the map, with
-anchoring or with localisation), estimates one camera over all of them, and measures its own accuracy:
+anchoring or with localisation), estimates one lens over the photos of each camera
+(`ExifInfo.camera_key`), and measures its own accuracy:
 
 - halves of the correspondences: each photo's pose from two disjoint sets of picture blocks;
-- halves of the photos: poses from two disjoint sets of photos, each with a camera of its own. This is the
+- halves of the photos: poses from two disjoint sets of photos, each with a lens of its own. This is the
   larger one, for it shows how far focal length, principal point and height trade.
 """
 
@@ -20,9 +21,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from featuredb.features.exif.read import read_exif
 from tools.scan_to_photo import (
-    ColouredScan,
     Lens,
     PosedPicture,
     adjust,
@@ -40,7 +42,7 @@ _ROUNDS = ((0, 3), (0, 1, 2, 3, 4), tuple(range(7)))  # lens parameters that are
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("scan", type=Path, metavar="SCAN", help="LAS or LAZ with colour, and its CRS")
-    parser.add_argument("photos", type=Path, metavar="FOLDER", help="photos of one camera")
+    parser.add_argument("photos", type=Path, metavar="FOLDER", help="its photos")
     parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="write there")
     args = parser.parse_args(argv)
     cv2.setNumThreads(1)
@@ -49,54 +51,57 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def register(scan_path: Path, folder: Path) -> dict[str, Any]:
-    """Poses of all photos of a folder that register, with the camera and the accuracy, JSON-able."""
+    """Poses of all photos of a folder that register, with the cameras and the accuracy, JSON-able."""
     scan = read_scan(scan_path)
     raster = nadir_raster(scan)
     features = raster_features(raster)
-    photos, lens = [], None
+    of_camera: dict[str, list[PosedPicture]] = {}
     for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png")):
         gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        height, width = gray.shape
-        if lens is None:
-            # Any focal length will do for a start: over nearly flat ground the height takes it up.
-            lens = Lens(width, height, 0.6 * width, width / 2 - 0.5, height / 2 - 0.5)
-        if (width, height) != (lens.width, lens.height):
-            raise SystemExit(
-                f"{path}: {width}x{height}, but one camera of {lens.width}x{lens.height} is assumed"
-            )
-        pose = first_pose(gray, lens, raster, features)
+        pose = first_pose(gray, _start(gray), raster, features)
         _say(f"{path.name}: {'no pose' if pose is None else 'first pose'}")
         if pose is not None:
-            photos.append(PosedPicture(path.name, gray, pose))
-    if lens is None or len(photos) < 2:
-        raise SystemExit(f"{folder}: fewer than two photos register to {scan_path}")
-    for free in _ROUNDS:
-        photos = [correspond(photo, lens, scan) for photo in photos]
-        photos, lens = adjust(photos, lens, free)
-        _say(f"{sum(len(p.world) for p in photos)} correspondences, focal length {lens.f:.1f} px")
-    return _plain(photos, lens, scan)
+            key = read_exif(path.read_bytes()).camera_key
+            of_camera.setdefault(key, []).append(PosedPicture(path.name, gray, pose))
+    cameras, poses = {}, {}
+    for key, photos in of_camera.items():
+        if len(photos) < 2:
+            raise SystemExit(
+                f"{folder}: only {photos[0].name} of the camera {key!r} registers to {scan_path}"
+            )
+        lens = _start(photos[0].gray)
+        for free in _ROUNDS:
+            photos = [correspond(photo, lens, scan) for photo in photos]
+            photos, lens = adjust(photos, lens, free)
+            _say(f"{sum(len(p.world) for p in photos)} correspondences, focal length {lens.f:.1f} px")
+        cameras[key] = _camera(photos, lens)
+        poses |= {photo.name: _pose(photo, key) for photo in photos}
+    return {"crs": scan.crs, "origin": list(scan.origin), "cameras": cameras, "poses": poses}
 
 
-def _plain(photos: list[PosedPicture], lens: Lens, scan: ColouredScan) -> dict[str, Any]:
+def _start(gray: NDArray[np.uint8]) -> Lens:
+    """Any focal length will do for a start: over nearly flat ground the height takes it up."""
+    height, width = gray.shape
+    return Lens(width, height, 0.6 * width, width / 2 - 0.5, height / 2 - 0.5)
+
+
+def _camera(photos: list[PosedPicture], lens: Lens) -> dict[str, Any]:
     return {
-        "crs": scan.crs,
-        "origin": list(scan.origin),
-        "camera": {
-            "model": "OPENCV",
-            "width": lens.width,
-            "height": lens.height,
-            # COLMAP's pixels: centre of the top-left pixel at (0.5, 0.5).
-            "params": [lens.f, lens.f, lens.cx + 0.5, lens.cy + 0.5, lens.k1, lens.k2, lens.p1, lens.p2],
-        },
+        "model": "OPENCV",
+        "width": lens.width,
+        "height": lens.height,
+        # COLMAP's pixels: centre of the top-left pixel at (0.5, 0.5).
+        "params": [lens.f, lens.f, lens.cx + 0.5, lens.cy + 0.5, lens.k1, lens.k2, lens.p1, lens.p2],
         "halves_of_correspondences": halves_of_correspondences(photos, lens),
         "halves_of_photos": halves_of_photos(photos, lens),
-        "poses": {
-            photo.name: {
-                "cam_from_local_rotation": cv2.Rodrigues(photo.pose[:3])[0].tolist(),
-                "cam_from_local_translation": photo.pose[3:].tolist(),
-            }
-            for photo in photos
-        },
+    }
+
+
+def _pose(photo: PosedPicture, key: str) -> dict[str, Any]:
+    return {
+        "camera": key,
+        "cam_from_local_rotation": cv2.Rodrigues(photo.pose[:3])[0].tolist(),
+        "cam_from_local_translation": photo.pose[3:].tolist(),
     }
 
 

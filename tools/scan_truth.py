@@ -16,11 +16,11 @@ from tools.figures import study_parser
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScanTruth:
-    """Camera of all photos, and poses `cam_from_local` by name, in a local frame; epsg: of the scan."""
+    """Cameras and poses `cam_from_local` of photos by name, in a local frame; epsg: of the scan."""
 
     frame: LocalFrame
     epsg: int
-    camera: Camera
+    cameras: dict[str, Camera]
     poses: dict[str, Rigid3]
 
 
@@ -37,16 +37,15 @@ def scan_truth(args: argparse.Namespace) -> ScanTruth:
         scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
     document = json.loads(args.poses.read_text(encoding="utf-8"))
     easting, northing, height = document["origin"]
-    epsg, camera = int(document["crs"].removeprefix("EPSG:")), document["camera"]
+    epsg = int(document["crs"].removeprefix("EPSG:"))
+    cameras = {
+        key: Camera(model=one["model"], width=one["width"], height=one["height"], params=tuple(one["params"]))
+        for key, one in document["cameras"].items()
+    }
     return ScanTruth(
         frame=LocalFrame.from_utm(easting, northing, height, epsg),
         epsg=epsg,
-        camera=Camera(
-            model=camera["model"],
-            width=camera["width"],
-            height=camera["height"],
-            params=tuple(camera["params"]),
-        ),
+        cameras={name: cameras[entry["camera"]] for name, entry in document["poses"].items()},
         poses={
             name: Rigid3(
                 rotation=np.array(entry["cam_from_local_rotation"]),

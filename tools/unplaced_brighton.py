@@ -71,7 +71,7 @@ def _draw(number: int, work: Path, map_id: str, scan: Scan, truth: ScanTruth) ->
     rng = np.random.default_rng((_SEED, number))
     photos = work / "photos"
     image = str(rng.choice([name for name in photo_names(photos) if name in truth.poses]))
-    drawn = picks(scan, truth.camera, truth.poses[image], rng, _SIGMA_PX)
+    drawn = picks(scan, truth.cameras[image], truth.poses[image], rng, _SIGMA_PX)
     file = write_picks(work / f"picks-{number}.csv", image, *drawn)
     database = newest_copy(work / "db", work / "placed")
     return placed_by(database, map_id, work, truth, "--picks", str(file), "--image", image)

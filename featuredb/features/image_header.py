@@ -111,6 +111,7 @@ def _jpeg(data: bytes) -> ImageHeader:
     frame: tuple[int, int] | None = None
     exif: tuple[int, int] | None = None
     xmp: tuple[int, int] | None = None
+    jfif = False
     while True:
         if scans:  # entropy-coded data: the next marker that is neither stuffing nor a restart
             found = _JPEG_IN_SCAN.search(data, at)
@@ -131,7 +132,14 @@ def _jpeg(data: bytes) -> ImageHeader:
                 raise ImageError("the JPEG ends before any picture", "broken")
             width, height = frame
             return ImageHeader(
-                format="JPEG", width=width, height=height, exif=exif, xmp=xmp, scans=scans, end=at + 2
+                format="JPEG",
+                width=width,
+                height=height,
+                exif=exif,
+                xmp=xmp,
+                jfif=jfif,
+                scans=scans,
+                end=at + 2,
             )
         body, stop = at + 4, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if max(body, stop) > len(data):
@@ -142,6 +150,8 @@ def _jpeg(data: bytes) -> ImageHeader:
             if frame is not None:
                 raise ImageError("the JPEG has two frame headers", "broken")
             frame = _jpeg_frame(marker, data[body:stop])
+        elif marker == 0xE0 and data[body : body + 5] == b"JFIF\0":
+            jfif = True
         elif marker == 0xE1 and exif is None and data[body : body + 6] == b"Exif\0\0":
             exif = (body + 6, stop)
         elif marker == 0xE1 and xmp is None and data[body : body + 29] == b"http://ns.adobe.com/xap/1.0/\0":

@@ -10,6 +10,8 @@ class ImageHeader:
     Attributes:
         format: JPEG, PNG, WEBP, TIFF, BMP, HEIC or AVIF.
         width, height: pixels as stored, before EXIF orientation.
+        jfif: the JPEG has a JFIF header. Cameras write EXIF in its place (Exif 2.3, 4.5.4: directly after the
+            start), programs that save a photo anew write both.
         orientation: 1..8 where the format says it in place of EXIF, or None.
         exif: (start, stop) of the TIFF stream with the EXIF in the file's bytes, or None.
         xmp: (start, stop) of the XMP packet, or None.
@@ -25,3 +27,4 @@ class ImageHeader:
     scans: int = 1
     end: int = 0
     orientation: int | None = None
+    jfif: bool = False

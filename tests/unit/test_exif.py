@@ -4,6 +4,7 @@ import io
 import math
 import random
 import struct
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
@@ -321,9 +322,25 @@ def test_camera_key_tells_zoom_positions_and_bodies_apart() -> None:
         camera_key("Maker", "Model", 300, 400, 277.4),
         camera_key("Maker", "Model", 400, 300, None),
         camera_key("Maker", "Model", 400, 300, 277.4, "S1"),
+        camera_key("Maker", "Model", 400, 300, 277.4, resaved=True),
     ]
-    assert len({key, *others}) == 5
+    assert len({key, *others}) == 6
     assert camera_key("", " ", 400, 300, 277.4) == ""
+
+
+def test_photos_that_a_program_saved_anew_are_a_camera_of_their_own() -> None:
+    """Cameras write EXIF first; a program that turns a picture writes a JFIF header and no turn."""
+    exif = Image.Exif()
+    exif[271], exif[272] = "Maker", "Model"
+    buffer = io.BytesIO()
+    Image.new("RGB", (400, 300)).save(buffer, "JPEG", exif=exif)
+    anew = buffer.getvalue()
+    length = int.from_bytes(anew[4:6], "big")
+    assert anew[6:11] == b"JFIF\0"
+    camera = anew[:2] + anew[4 + length :]
+    assert read_exif(camera).camera_key == "maker|model|400x300|unknown"
+    assert read_exif(anew).camera_key == "maker|model|400x300|unknown|jfif"
+    assert replace(read_exif(anew), resaved=False) == read_exif(camera)
 
 
 def _directory(entries: list[tuple[int, int, int, int]], next_ifd: int = 0) -> bytes:

@@ -5,7 +5,7 @@ Nothing here raises on bad metadata: a wrong value becomes None, with a line in 
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, timezone
 
 from featuredb.errors import ImageError, InvalidValueError
@@ -85,6 +85,7 @@ class ExifInfo:
         width, height: size of the stored image, pixels.
         make, model, serial: camera maker, model, body serial number.
         orientation: EXIF orientation 1..8.
+        resaved: a program has saved the photo anew (`ImageHeader.jfif`), perhaps turned by 180 degrees.
         focal_px: focal length in pixels of the image as stored.
         capture_time: when taken; timezone-aware only where the photo gives its offset.
         latitude_deg, longitude_deg: WGS84 degrees, both or none.
@@ -102,6 +103,7 @@ class ExifInfo:
     model: str = ""
     serial: str = ""
     orientation: int = 1
+    resaved: bool = False
     focal_px: float | None = None
     capture_time: datetime | None = None
     latitude_deg: float | None = None
@@ -119,7 +121,15 @@ class ExifInfo:
     @property
     def camera_key(self) -> str:
         """Name of the intrinsics shared with other photos of the same camera, "" where it is unknown."""
-        return camera_key(self.make, self.model, self.width, self.height, self.focal_px, self.serial)
+        return camera_key(
+            self.make,
+            self.model,
+            self.width,
+            self.height,
+            self.focal_px,
+            self.serial,
+            resaved=self.resaved,
+        )
 
 
 def read_exif(data: bytes, header: ImageHeader | None = None) -> ExifInfo:
@@ -136,7 +146,8 @@ def read_exif(data: bytes, header: ImageHeader | None = None) -> ExifInfo:
             return ExifInfo(warnings=(f"no metadata: {error}",))
     tiff = data[slice(*header.exif)] if header.exif else b""
     xmp = data[slice(*header.xmp)] if header.xmp else b""
-    return parse_exif(tiff, xmp, header.width, header.height, header.orientation)
+    found = parse_exif(tiff, xmp, header.width, header.height, header.orientation)
+    return replace(found, resaved=header.jfif)
 
 
 def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: int | None = None) -> ExifInfo:
@@ -178,17 +189,27 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: in
 
 
 def camera_key(
-    make: str, model: str, width: int, height: int, focal_px: float | None, serial: str = ""
+    make: str,
+    model: str,
+    width: int,
+    height: int,
+    focal_px: float | None,
+    serial: str = "",
+    *,
+    resaved: bool = False,
 ) -> str:
     """Name of the intrinsics that a photo shares with others of the same camera; "" for an unknown camera.
 
-    The focal length counts to three digits, so that zoom positions differ and rounding does not.
+    The focal length counts to three digits, so that zoom positions differ and rounding does not. Photos that
+    a program has saved anew are a camera of their own: pictures turned by 180 degrees have their principal
+    point on the other side, and nothing else in the file tells it.
     """
     if not (make.strip() or model.strip()):
         return ""
     focal = f"{focal_px:.3g}" if focal_px else "unknown"
     parts = [make.strip(), model.strip(), f"{width}x{height}", f"f{float(focal):.0f}" if focal_px else focal]
-    return "|".join([*parts, serial.strip()] if serial.strip() else parts).lower()
+    parts += [serial.strip()] if serial.strip() else []
+    return "|".join([*parts, "jfif"] if resaved else parts).lower()
 
 
 def _directories(tiff: bytes) -> tuple[Ifd, Ifd, Ifd, list[str]]:
