@@ -1,12 +1,13 @@
 """A map without a place, placed by one that shows the same: how right, and is a strange one left alone?
 
-    python -m tools.unplaced_grown --photos FOLDER --scan LAZ --poses poses.json --work DIR --strange FOLDER
+    python -m tools.unplaced_grown --photos FOLDER --work DIR --strange FOLDER
 
 1. Every second photo, with its GPS, is a map; the others, without any position, are one without a place, and
    so are the first ten photos of --strange, which show another town.
 2. `featuredb grow` places what it can.
-3. The photos of both maps of the place are compared with the poses of tools/scan_poses.py, once these lie
-   where the map by GPS has its own photos: what is left is what growing adds, not what GPS does not know.
+3. The photos of both maps of the place are compared with those of one map of all photos with their GPS, once
+   it lies where the map by GPS has its own photos: what is left is what growing adds, not what GPS does not
+   know.
 
 """
 
@@ -24,15 +25,15 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from tools.commands import featuredb
-from tools.figures import spread, write_figures
+from tools.figures import spread, study_parser, write_figures
 from tools.made_maps import copied, photo_names
-from tools.scan_truth import ScanTruth, scan_parser, scan_truth
+from tools.real_photos import ingest, reference
 
 _STRANGE = 10
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = scan_parser(__doc__, "--work")
+    parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--strange", type=Path, required=True, metavar="FOLDER", help="photos of elsewhere")
     args = parser.parse_args(argv)
     write_figures(args.json, grown(args, args.work))
@@ -41,7 +42,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
     """Maps made in a folder, and what growing made of them."""
-    truth = scan_truth(args)
     names, url = photo_names(args.photos), str(work / "db")
     copied(args.photos, names[::2], work / "placed", strip=False)
     copied(args.photos, names[1::2], work / "loose", strip=True)
@@ -49,6 +49,8 @@ def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
     for folder in ("placed", "loose", "strange"):
         featuredb("ingest", "photos", url, str(work / folder), "--quiet", may_refuse=True)
     featuredb("grow", url)
+    ingest(work / "whole", args.photos, ())
+    truth = reference(work / "whole")
     snapshot = Database.open(url).snapshot()
     maps = {m.name: snapshot.load_map(m.map_id) for m in snapshot.maps()}
     figures: dict[str, object] = {
@@ -56,36 +58,36 @@ def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
         "grown": len(maps["loose"].images) if "loose" in maps else 0,
         "strange_placed": int("strange" in maps),
     }
-    move = placed_like(maps["placed"], truth)
+    poses = placed_like(maps["placed"], truth)
     for name in ("placed", "loose"):
         if name in maps:
-            figures |= {f"{name}_{what}": v for what, v in errors(maps[name], truth, move).items()}
+            figures |= {f"{name}_{what}": v for what, v in errors(maps[name], truth.frame, poses).items()}
     if "loose" in maps:
         figures["bound_m"] = maps["loose"].placement.evidence["growth"]["drift_m"]
     return figures
 
 
-def placed_like(feature_map: FeatureMap, truth: ScanTruth) -> Sim3:
-    """The similarity that lays the true poses where a map has the photos, turned as orientations say."""
-    mine, poses = _poses(feature_map, truth.frame), truth.poses
+def placed_like(feature_map: FeatureMap, truth: FeatureMap) -> dict[str, Rigid3]:
+    """The poses of the truth, moved by a similarity to where a map has its photos, turned as these are."""
+    mine, poses = _poses(feature_map, truth.frame), _poses(truth, truth.frame)
     shared = [name for name in mine if name in poses]
     turn = Rotation.from_matrix([mine[n].rotation.T @ poses[n].rotation for n in shared]).mean().as_matrix()
     true = np.array([turn @ poses[n].center for n in shared])
     there = np.array([mine[n].center for n in shared])
     a, b = true - true.mean(axis=0), there - there.mean(axis=0)
     scale = float((a * b).sum() / (a * a).sum())
-    return Sim3(scale=scale, rotation=turn, translation=there.mean(axis=0) - scale * true.mean(axis=0))
+    move = Sim3(scale=scale, rotation=turn, translation=there.mean(axis=0) - scale * true.mean(axis=0))
+    return {name: move.act_on_pose(pose) for name, pose in poses.items()}
 
 
-def errors(feature_map: FeatureMap, truth: ScanTruth, move: Sim3) -> dict[str, float]:
-    """Of the photos' centres (metres) and orientations (degrees) from the moved true poses."""
+def errors(feature_map: FeatureMap, frame: LocalFrame, true: dict[str, Rigid3]) -> dict[str, float]:
+    """Of the photos' centres (metres) and orientations (degrees) from the true poses in a frame."""
     metres: list[float] = []
     degrees: list[float] = []
-    for name, pose in _poses(feature_map, truth.frame).items():
-        if name in truth.poses:
-            true = move.act_on_pose(truth.poses[name])
-            metres.append(float(np.linalg.norm(true.center - pose.center)))
-            degrees.append(pose.angle_to_deg(true))
+    for name, pose in _poses(feature_map, frame).items():
+        if name in true:
+            metres.append(float(np.linalg.norm(true[name].center - pose.center)))
+            degrees.append(pose.angle_to_deg(true[name]))
     return spread(metres, degrees)
 
 

@@ -157,9 +157,9 @@ REAL: tuple[Row, ...] = (
     _row(
         name="brighton-grown",
         claim="`brighton`: every second photo a map by GPS, the others without GPS placed by it, ten "
-        "photos of `lewis` not; against scan poses laid on the first map",
-        commands=f"tools.unplaced_grown --photos {BRIGHTON} --scan {SCAN} --strange {{data}}/lewis/images "
-        f"--poses {POSES} --work {{work}}/maps {OUT}",
+        "photos of `lewis` not; against a map of all by GPS, laid on the first",
+        commands=f"tools.unplaced_grown --photos {BRIGHTON} --strange {{data}}/lewis/images "
+        f"--work {{work}}/maps {OUT}",
         figures=same("bound_m"),
         text="{grown} of {photos} placed, median {loose_median_m:.2f} m and {loose_median_deg:.2f} degrees, "
         "largest {loose_largest_m:.2f} m; the map by GPS {placed_median_m:.2f} m",
