@@ -111,15 +111,13 @@ def surface_at(rendering: Rendering, cloud: PointCloud, pixels: FloatArray) -> S
     depth = rendering.depth[window].reshape(len(rows), _WINDOW**2)
     centre = rendering.depth[row[rows], column[rows]]
     near = (index >= 0) & (np.abs(depth / centre[:, None] - 1.0) <= 4 * _MAX_STEP_REL)
-    index = np.where(near, index, -1)
-    ordered = np.sort(index, axis=1)
-    first = np.concatenate(
-        [ordered[:, :1] >= 0, (ordered[:, 1:] != ordered[:, :-1]) & (ordered[:, 1:] >= 0)], axis=1
-    )
+    ordered = np.sort(np.where(near, index, -1), axis=1)
+    ordered[:, 1:][ordered[:, 1:] == ordered[:, :-1]] = -1  # each scan point once
+    points = (ordered >= 0).sum(axis=1)
     shown = np.count_nonzero(rendering.index >= 0) / max(int(np.count_nonzero(rendering.valid)), 1)
-    enough = (first.sum(axis=1) >= _MIN_WINDOW_POINTS) & (near.mean(axis=1) >= _MIN_WINDOW_SHARE * shown)
-    rows, ordered, first = rows[enough], ordered[enough], first[enough]
-    return _intersect(rendering, cloud, pixels, rows, ordered, first)
+    enough = (points >= _MIN_WINDOW_POINTS) & (near.mean(axis=1) >= _MIN_WINDOW_SHARE * shown)
+    rows, ordered = rows[enough], np.sort(ordered[enough], axis=1)
+    return _intersect(rendering, cloud, pixels, rows, ordered[:, -int(points.max(initial=0)) :])
 
 
 def _intersect(
@@ -128,15 +126,14 @@ def _intersect(
     pixels: FloatArray,
     rows: NDArray[np.intp],
     index: NDArray[np.int32],
-    weight: NDArray[np.bool_],
 ) -> SurfaceHits:
-    """Planes through the weighted scan points of each row, met by the rays of `pixels[rows]`."""
+    """Planes through the scan points of each row of `index` (-1: none), met by the rays of `pixels[rows]`."""
     total = len(pixels)
     valid = np.zeros(total, dtype=bool)
     points, normals = np.full((total, 3), np.nan), np.full((total, 3), np.nan)
     sigma, depths = np.full(total, np.nan), np.full(total, np.nan)
     pose = rendering.cam_from_local
-    mean, count, values, vectors = _principal_axes(cloud, index, weight)
+    mean, count, values, vectors = _principal_axes(cloud, index)
     normal = vectors[:, :, 0]
     rays_cam = np.column_stack([rendering.camera.unproject(pixels[rows]), np.ones(len(rows))])
     rays = rays_cam @ pose.rotation
@@ -163,11 +160,12 @@ def _intersect(
 
 
 def _principal_axes(
-    cloud: PointCloud, index: NDArray[np.int32], weight: NDArray[np.bool_]
+    cloud: PointCloud, index: NDArray[np.int32]
 ) -> tuple[FloatArray, NDArray[np.int64], FloatArray, FloatArray]:
-    """Mean (n, 3), number (n,), variances (n, 3) and axes (n, 3, 3) of the points chosen in each row."""
+    """Mean (n, 3), number (n,), variances (n, 3) and axes (n, 3, 3) of each row's points; -1 is none."""
+    weight = index >= 0
     count = weight.sum(axis=1)
-    points = cloud.xyz[np.where(weight, index, 0)].astype(np.float64)
+    points = cloud.xyz[index].astype(np.float64)
     mean = (weight[:, None, :] @ points)[:, 0] / count[:, None]
     points -= mean[:, None]
     points *= weight[:, :, None]

@@ -23,7 +23,10 @@ _SETTLED = 0.003  # standard deviations of a step; rounds that follow add up to 
 _SAMPLES = 300  # of three pairs, at most. With half of the pairs wrong, these miss all-inlier samples
 _MISSED = 1e-17  # so often; with fewer wrong pairs, fewer samples miss as rarely.
 _SCORE_PAIRS = 800  # pairs that score a sample; more only take longer
-_ROUNDS = 20  # of reweighting; the weights settle within ten
+
+_ROUNDS = 100  # of reweighting, at most: ten are usual, sixty where a wrong lens bends the map
+# Steps of reweighting fall short, most where pairs say little; up to twice as far they still go downhill.
+_STRIDE = 1.4
 _SEED = 0  # of the samples
 
 
@@ -32,7 +35,7 @@ class Pairs:
     """3D/3D pairs of a map and a scan, in the scan's local frame, metres.
 
     Attributes:
-        frame_of: (n,) index of the registered frame.
+        frame_of: (n,) index of the registered frame, ascending.
         source: (n, 3) map point at its present place.
         target: (n, 3) where the frame sees it on the scan.
         covariance: (n, 3, 3) of the pair's own error, square metres.
@@ -116,24 +119,31 @@ def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
     Geman-McClure weights at their robust spread; how far neighbours err alike dilutes them all.
     """
     root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(pairs.covariance)), 1, 2)
-    sim, frames = start, np.zeros((len(pairs.frame_covariance), 6))
-    dilution = 1.0
-    for _ in range(2):  # the dilution is known after the first
+    cell = np.unique(pairs.cell_of, return_inverse=True)[1]
+    prior = _prior(pairs.frame_covariance)
+    sim = start
+    solution: FloatArray = np.zeros(len(prior))
+    for _ in range(2):  # linear about the start, then about what that came to
+        lines = _linearised(sim, pairs, root)
+        solution[:7] = 0.0
         for _ in range(_ROUNDS):
-            residual = _whiten(root, _residuals(sim, frames, pairs))
+            residual = _residuals(lines, solution)
             weights, spread = _weights(residual)
-            normal, gradient = _equations(sim, frames, residual, pairs, root, weights / dilution)
-            step = np.linalg.solve(normal, gradient)
-            sim = Sim3.exp(step[:7]) @ sim
-            frames = frames + step[7:].reshape(-1, 6)
+            factor = _neighbours_factor(residual, weights, cell, spread)
+            normal, wanted = _equations(lines, weights / (max(spread, 1.0) ** 2 * factor))
+            normal += prior
+            solved = np.asarray(np.linalg.solve(normal, wanted), dtype=np.float64)
+            step = solved - solution
             if step @ normal @ step < _SETTLED**2:
                 break
-        factor = _neighbours_factor(residual, weights, pairs, spread)
-        dilution = max(spread, 1.0) ** 2 * factor
-    normal, _ = _equations(sim, frames, residual, pairs, root, weights / dilution)
+            solution = solution + _STRIDE * step
+        solution = solved
+        sim = Sim3.exp(solution[:7]) @ sim
     covariance = np.linalg.inv(normal)[:7, :7]
-    residual = _residuals(sim, frames, pairs)
-    squared = (_whiten(root, residual) ** 2).sum(axis=1)
+    frames = solution[7:].reshape(-1, 6)
+    moved = np.einsum("nij,nj->ni", pairs.by_frame, frames[pairs.frame_of])
+    residual = pairs.target + moved - sim.act(pairs.source)
+    squared = ((root @ residual[:, :, None]) ** 2).sum(axis=(1, 2))
     return SimilarityFit(
         target_from_source=sim,
         covariance=np.asarray((covariance + covariance.T) / 2),
@@ -145,10 +155,38 @@ def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
     )
 
 
-def _residuals(sim: Sim3, frames: FloatArray, pairs: Pairs) -> FloatArray:
-    """(n, 3) target, moved by its frame's correction, minus placed source."""
-    moved = np.einsum("nij,nj->ni", pairs.by_frame, frames[pairs.frame_of])
-    return np.asarray(pairs.target + moved - sim.act(pairs.source))
+def _prior(frame_covariance: FloatArray) -> FloatArray:
+    """(7 + 6 f, 7 + 6 f) what is known of the frames' poses, as a normal matrix."""
+    prior = np.zeros((7 + 6 * len(frame_covariance),) * 2)
+    for first, covariance in enumerate(frame_covariance):
+        own = slice(7 + 6 * first, 13 + 6 * first)
+        prior[own, own] = np.linalg.inv(covariance)
+    return prior
+
+
+def _linearised(sim: Sim3, pairs: Pairs, root: FloatArray) -> list[FloatArray]:
+    """(14, 3 m) of each frame's m pairs, whitened: derivatives, and what they are to explain.
+
+    Derivatives of placed source minus moved target, by the similarity (7) and by the frame (6); then target
+    minus placed source.
+
+    Args:
+        root: (n, 3, 3) that whitens.
+    """
+    placed = sim.act(pairs.source)
+    columns = [point_jacobian(placed), -pairs.by_frame, (pairs.target - placed)[:, :, None]]
+    whitened = root @ np.concatenate(columns, axis=2)
+    frames = range(len(pairs.frame_covariance))
+    return [np.ascontiguousarray(whitened[pairs.frame_of == f].reshape(-1, 14).T) for f in frames]
+
+
+def _residuals(lines: list[FloatArray], solution: FloatArray) -> FloatArray:
+    """(n, 3) whitened, target, moved by its frame's correction, minus placed source."""
+    parts = []
+    for frame, of in enumerate(lines):
+        own = np.concatenate([solution[:7], solution[7 + 6 * frame : 13 + 6 * frame]])
+        parts.append(of[13] - own @ of[:13])
+    return np.concatenate(parts).reshape(-1, 3)
 
 
 def _weights(whitened: FloatArray) -> tuple[FloatArray, float]:
@@ -158,42 +196,34 @@ def _weights(whitened: FloatArray) -> tuple[FloatArray, float]:
     return 1.0 / (1.0 + squared / (_CHI2_3_95 * spread**2)) ** 2, spread
 
 
-def _whiten(root: FloatArray, residual: FloatArray) -> FloatArray:
-    return np.asarray((root @ residual[:, :, None])[:, :, 0])
+def _equations(lines: list[FloatArray], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normal matrix and right side over (similarity, frame 0, frame 1, ...), (7 + 6 f), of the pairs."""
+    size = 7 + 6 * len(lines)
+    normal, wanted = np.zeros((size, size)), np.zeros(size)
+    root = np.repeat(np.sqrt(weights), 3)
+    first = 0
+    for frame, of in enumerate(lines):
+        rows = of * root[first : first + of.shape[1]]
+        product = rows @ rows.T
+        first += of.shape[1]
+        shared, own = slice(0, 7), slice(7 + 6 * frame, 13 + 6 * frame)
+        normal[shared, shared] += product[:7, :7]
+        normal[shared, own] = product[:7, 7:13]
+        normal[own, shared] = product[7:13, :7]
+        normal[own, own] = product[7:13, 7:13]
+        wanted[shared] += product[:7, 13]
+        wanted[own] = product[7:13, 13]
+    return normal, wanted
 
 
-def _equations(
-    sim: Sim3, frames: FloatArray, residual: FloatArray, pairs: Pairs, root: FloatArray, weights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Normal matrix and gradient over (similarity, frame 0, frame 1, ...), (7 + 6 f).
-
-    Args:
-        residual: (n, 3) whitened. root: (n, 3, 3) that whitens.
-    """
-    size = 7 + 6 * len(frames)
-    normal, gradient = np.zeros((size, size)), np.zeros(size)
-    by_both = np.concatenate([point_jacobian(sim.act(pairs.source)), -pairs.by_frame], axis=2)
-    weight = np.sqrt(weights)[:, None]
-    design, wanted = root @ by_both * weight[:, :, None], residual * weight
-    for frame, prior in enumerate(pairs.frame_covariance):
-        own = pairs.frame_of == frame
-        rows = design[own].reshape(-1, 13)
-        at = np.r_[0:7, 7 + 6 * frame : 13 + 6 * frame]
-        normal[np.ix_(at, at)] += rows.T @ rows
-        gradient[at] += rows.T @ wanted[own].ravel()
-        knowledge = np.linalg.inv(prior)
-        normal[np.ix_(at[7:], at[7:])] += knowledge
-        gradient[at[7:]] -= knowledge @ frames[frame]
-    return normal, gradient
-
-
-def _neighbours_factor(residual: FloatArray, weights: FloatArray, pairs: Pairs, spread: float) -> float:
+def _neighbours_factor(
+    residual: FloatArray, weights: FloatArray, cell: NDArray[np.int64], spread: float
+) -> float:
     """Design effect: variance of weighted sums over cells, over that of independent errors; at least 1.
 
     Args:
-        residual: (n, 3) whitened.
+        residual: (n, 3) whitened. cell: (n,) of each, numbered from 0 without gaps.
     """
-    cell = np.unique(pairs.cell_of, return_inverse=True)[1]
     whitened = np.sqrt(weights)[:, None] * residual / spread
     sums = np.stack([np.bincount(cell, weights=whitened[:, k]) for k in range(3)], axis=1)
     expected = float((whitened**2).sum())
