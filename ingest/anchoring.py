@@ -191,8 +191,9 @@ def _finished(
     if result.feature_map is None:
         return done
     map_id = job.summary.map_id
-    (committed,) = database.commit_maps(
-        [result.feature_map],
+    rest = [] if job.first is None or job.first.rest is None else [job.first.rest]
+    committed, *_ = database.commit_maps(
+        [result.feature_map, *rest],
         replaces=(map_id,),
         based_on={map_id: job.summary.write_id},
         reasons={map_id: _BY_OUTLINES} if on_fronts else None,

@@ -4,7 +4,8 @@
 
 Of each town, 60 photos by ten people, a third of them with geotags of 10 m (`tools.worlds.street_people`),
 are ingested, and each map of ten photos and more is placed by `featuredb anchor --near --auto` on the town's
-scan; then the same on the scan of another town, where nothing may be placed.
+scan, what that leaves as a map without a place likewise; then the same on the scan of another town, where
+nothing may be placed.
 What is found of a town is kept in DIR.
 """
 
@@ -89,18 +90,25 @@ def _town(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
 
 
 def _placed(made: Path, scan: Path, album: Path, work: Path) -> list[dict[str, Any]]:
-    """Of each map of enough photos: how many these are, and how far off they are where it is placed."""
+    """Of each map of enough photos: how many these are, and how far off they are where they are placed."""
     database = newest_copy(made, work / "placed")
     featuredb("lidar", "add", str(database), str(scan), "--quiet")
     truth = read_truth(album)
-    near = f"{truth.frame.latitude_deg!r},{truth.frame.longitude_deg!r},{_RADIUS_M!r}"
+    near = f"--near={truth.frame.latitude_deg!r},{truth.frame.longitude_deg!r},{_RADIUS_M!r}"
     found = []
     for one in Database.open(database).snapshot().unplaced_maps():
         if one.images < _LEAST_PHOTOS:
             continue
         off: list[tuple[float, float, float]] = []
-        if anchor(database, one.map_id, album, work / "anchor", f"--near={near}", refusals=(1, 2)):
-            off = _off(Database.open(database).snapshot().load_map(one.map_id), truth)
+        map_id, left = one.map_id, one.images
+        while left >= _LEAST_PHOTOS:
+            if not anchor(database, map_id, album, work / "anchor", near, refusals=(1, 2)):
+                break
+            snapshot = Database.open(database).snapshot()
+            off += _off(snapshot.load_map(map_id), truth)
+            rest = {m.map_id: m.images for m in snapshot.unplaced_maps()}
+            map_id = f"{map_id}-rest"
+            left = rest.get(map_id, 0)
         found.append({"photos": one.images, "off": off})
     return found
 

@@ -13,6 +13,7 @@ from featuredb.maps.feature_map import GeoPrior, MapObservations
 from featuredb.maps.unplaced_map import OwnFrame, OwnPoints, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.camera.shot import look_pose
+from ingest.register.anchor.ground.parts import halves
 from ingest.register.anchor.ground.place import place_on_outlines
 from ingest.register.anchor.ground.street_plan import looks_level
 from tests.support.maps import random_unplaced_map
@@ -128,6 +129,38 @@ def _street_map(mirrored: bool) -> UnplacedMap:
     )
 
 
+_JOIN = Sim3(scale=1.0, rotation=so3_exp([0.0, 0.0, 1.3]), translation=np.array([60.0, 25.0, 0.0]))
+
+
+def _joined_wrongly(one: UnplacedMap) -> UnplacedMap:
+    """A map with its own copy at another place of its frame, tied by points that a photo of each sees."""
+    points, seen = len(one.points), one.observations
+    again = [
+        replace(i, image_id=i.image_id + 16, name=f"again {i.name}", gps=None,
+                cam_from_local=_JOIN.act_on_pose(i.cam_from_local))
+        for i in one.images
+    ]  # fmt: skip
+    tie = np.flatnonzero(seen.image_id == 0)[:20]
+    rows = np.concatenate([np.arange(len(seen.point_index)), np.arange(len(seen.point_index)), tie])
+    both = seen.take(rows)
+    index, image = both.point_index.copy(), both.image_id.copy()
+    second = slice(len(seen.point_index), 2 * len(seen.point_index))
+    index[second] += points
+    image[second] += 16
+    image[second.stop :] = 16
+    columns = {
+        name: np.concatenate([getattr(one.points, name)] * 2)
+        for name in ("rgb", "track_length", "error_px", "covariance")
+    }
+    xyz = np.vstack([one.points.xyz, _JOIN.act(one.points.xyz)])
+    return replace(
+        one,
+        images=(*one.images, *again),
+        points=OwnPoints(xyz=xyz, **columns),
+        observations=replace(both, point_index=index, image_id=image),
+    )
+
+
 def test_a_street_is_found_within_its_covariance(cloud: PointCloud) -> None:
     unplaced = _street_map(mirrored=False)
     assert looks_level(unplaced)
@@ -143,6 +176,23 @@ def test_a_street_is_found_within_its_covariance(cloud: PointCloud) -> None:
         jacobian = point_jacobian(there)
         assert np.linalg.norm(off) < 0.3
         assert off @ np.linalg.solve(jacobian @ found.covariance @ jacobian.T, off) < chi2.isf(1e-3, 3)
+
+
+def test_a_part_is_placed_where_look_alikes_have_joined_two(cloud: PointCloud) -> None:
+    """Sixteen photos of the street, and as many of it by people who were held for standing in another one."""
+    street = _street_map(mirrored=False)
+    joined = _joined_wrongly(street)
+    first = halves(joined)[0]
+    assert {image.image_id // 16 for image in first.images} in ({0}, {1})
+    assert len(first.images) == 16
+    found = place_on_outlines(joined, cloud)
+    assert found.reason is None, found.message
+    assert found.local_from_own is not None
+    assert len(found.image_ids) >= 14
+    assert len({image_id // 16 for image_id in found.image_ids}) == 1
+    truth = _OWN_FROM_LOCAL.inverse() if min(found.image_ids) < 16 else (_JOIN @ _OWN_FROM_LOCAL).inverse()
+    center = joined.images[found.image_ids[0]].cam_from_local.center
+    assert np.linalg.norm(found.local_from_own.act(center) - truth.act(center)) < 0.5
 
 
 def test_its_mirror_image_is_refused(cloud: PointCloud) -> None:

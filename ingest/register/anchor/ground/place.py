@@ -2,7 +2,7 @@
 
 Search in plan, then points to planes of the solid that the scan shows. Photos whose points lie elsewhere are
 left out: maps of fronts that look alike are joined wrongly. Other places of the same search say how often as
-many points agree by chance.
+many points agree by chance. Where a map as a whole lies nowhere, its parts are tried.
 """
 
 import logging
@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom, norm
+from scipy.stats import binom
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
@@ -20,6 +20,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.ground.fit import SolidFit, fitted
+from ingest.register.anchor.ground.parts import halves
 from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, shape_of
 from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
 from ingest.register.anchor.ground.street_plan import StreetPlan, street_plan
@@ -33,8 +34,8 @@ _AGREE_M, _NEAR_M = 0.3, 1.0  # of a point from the solid: across its plane, and
 _ABOVE_M = 1.0  # over the ground: the ground agrees everywhere
 _PLACE_M, _BLOCK_M = 1.0, 3.0  # sides of what counts as one place, and of what errs together
 _EYE_M = 1.6  # of people over the ground, from which a fit starts
-_NEAREST_M, _FURTHEST_M = 5.0, 40.0  # medians from which people take photos of fronts
-_COARSE, _FINE = 400, 4000  # points of a fit
+_NEAREST_M, _FURTHEST_M = 3.0, 100.0  # medians from which people take photos of fronts
+_COARSE, _ASKED, _FINE = 400, 1500, 4000  # points of a fit, of a place's evidence, of the last fit
 _COARSE_WIDTHS_M = (2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5)
 _FINE_WIDTHS_M = (1.5, 1.0, 0.7, 0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3)
 _START_SIGMA = (0.1, 0.03, 0.03, 0.1)  # of size and angles of a start
@@ -48,6 +49,10 @@ _TIED = 0.5  # of a photo's points that others see which stay
 _LEAST_PHOTOS = 10  # of two maps of eight one was accepted outside its 99.9 % bound
 _RIVALS = 20  # the best of other places that are compared one by one
 _LEAST_TRIES = 20  # elsewhere: fewer do not tell what chance gives
+_LIKE_SIZE = (
+    0.5  # logarithm: sizes at which chance is alike; the smaller a map, the more of it agrees anywhere
+)
+_TAIL = 0.15  # share of the places elsewhere whose scores are taken for the tail of what chance gives
 _WALL_SIGMA_M = 0.15  # of all outlines together, outwards: eaves, and a laser's footprint
 _LEAST_SIGMA_M = 0.05  # of a point
 
@@ -88,18 +93,27 @@ class _Tried:
     above: NDArray[np.bool_]
     evidence: JointEvidence
 
-    def over(self, rate: float) -> float:
-        """By how many deviations more agree than chance gives."""
-        expected = rate * self.evidence.places
-        return float((self.evidence.agreeing - expected) / np.sqrt(max(expected * (1.0 - rate), 1.0)))
 
-
-def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud) -> GroundPlace:
-    """Place a map of street photos on a scan.
+def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud, tried: int = 0) -> GroundPlace:
+    """Place a map of street photos on a scan, or else the first of its parts that lies somewhere.
 
     Args:
         cloud: all of the scan on which the map may lie.
+        tried: parts so far: so many more times chance may deceive.
     """
+    whole = _place(unplaced, cloud, tried + 1)
+    if whole.reason is None or len(unplaced.images) <= _LEAST_PHOTOS:
+        return whole
+    for part in halves(unplaced):
+        if len(part.images) >= _LEAST_PHOTOS:
+            tried += 1
+            found = place_on_outlines(part, cloud, tried)
+            if found.reason is None:
+                return found
+    return whole
+
+
+def _place(unplaced: UnplacedMap, cloud: PointCloud, tests: int) -> GroundPlace:
     tags = geotags_of(unplaced, cloud)
     around = None if tags is None else tags.around(_AROUND_M)
     plan, shape = street_plan(unplaced), shape_of(cloud, around)
@@ -107,13 +121,10 @@ def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud) -> GroundPlace:
         return GroundPlace(reason="STRUCTURE", message="it shows no fronts")
     if shape is None or not len(shape.walls):
         return GroundPlace(reason="NO_SCAN", message="the scan shows no fronts")
-    search = PlanSearch(shape)
-    there = _tried(plan, shape, search, tags)
+    there = _tried(plan, shape, PlanSearch(shape), tags)
     if len(there) < _LEAST_TRIES:
         return GroundPlace(reason="STRUCTURE", message="it fits hardly anywhere on the scan")
-    rate = float(np.mean([t.evidence.agreeing / max(t.evidence.places, 1) for t in there]))
-    best = max(there, key=lambda one: one.over(rate))
-    return _judged(unplaced, plan, shape, best, there, rate)
+    return _judged(unplaced, plan, shape, there, tests)
 
 
 def geotags_of(unplaced: UnplacedMap, cloud: PointCloud) -> Geotags | None:
@@ -136,7 +147,23 @@ def _tried(plan: StreetPlan, shape: ScanShape, search: PlanSearch, tags: Geotags
     rows = np.random.default_rng(0).permutation(len(plan.points))[:_COARSE]
     found = search.tries(plan, sizes.tolist(), turns.tolist(), tags)
     fits = [_fitted(plan, shape, _start(plan, shape, one), rows, _COARSE_WIDTHS_M) for one in found]
-    return [_asked(shape, fit) for fit in fits]
+    asked = np.random.default_rng(0).permutation(len(plan.points))[:_ASKED]
+    return [_asked(shape, _only_asked(plan, shape, fit.local_from_own, asked)) for fit in fits]
+
+
+def _chance(there: Sequence[_Tried]) -> FloatArray:
+    """(n,) share of a map's places that agrees by chance, at the size of each of the tries."""
+    size = np.log([one.fit.local_from_own.scale for one in there])
+    alike = np.exp(-0.5 * np.square((size[:, None] - size) / _LIKE_SIZE))
+    agreeing = np.array([one.evidence.agreeing for one in there])
+    places = np.array([one.evidence.places for one in there], dtype=np.float64)
+    return np.asarray(alike @ agreeing / np.maximum(alike @ places, 1.0))
+
+
+def _over(one: _Tried, rate: float) -> float:
+    """By how many deviations more agree than chance gives."""
+    expected = rate * one.evidence.places
+    return float((one.evidence.agreeing - expected) / np.sqrt(max(expected * (1.0 - rate), 1.0)))
 
 
 def _start(plan: StreetPlan, shape: ScanShape, one: PlanTry) -> Sim3:
@@ -166,16 +193,15 @@ def _asked(shape: ScanShape, fit: SolidFit) -> _Tried:
 
 
 def _judged(
-    unplaced: UnplacedMap,
-    plan: StreetPlan,
-    shape: ScanShape,
-    best: _Tried,
-    there: Sequence[_Tried],
-    rate: float,
+    unplaced: UnplacedMap, plan: StreetPlan, shape: ScanShape, there: Sequence[_Tried], tests: int
 ) -> GroundPlace:
     """The photos that lie there, fitted, and whether another place explains them as well."""
+    chance = _chance(there)
+    scores = np.array([_over(one, share) for one, share in zip(there, chance, strict=True)])
+    first = int(scores.argmax())
+    rate = float(chance[first])
     kept = np.ones(len(unplaced.images), dtype=bool)
-    final = _best_around(plan, shape, best, rate)
+    final = _best_around(plan, shape, there[first], rate)
     sim = final.fit.local_from_own
     for _ in range(_ROUNDS):
         rows = _rows_seen(unplaced, plan, kept)
@@ -192,9 +218,9 @@ def _judged(
             figures=figures,
         )
     rows = _rows_seen(unplaced, plan, kept)
-    away = [_away_m(plan, rows, sim, one.fit.local_from_own) for one in there]
-    over = np.array([one.over(rate) for one, far in zip(there, away, strict=True) if far > _ELSEWHERE_M])
-    log_nfa = _log_nfa(best.over(rate), over)
+    away = np.array([_away_m(plan, rows, sim, one.fit.local_from_own) for one in there])
+    elsewhere = scores[away > _ELSEWHERE_M]
+    log_nfa = _log_nfa(scores[first], elsewhere) - float(np.log10(tests))
     others = [
         one
         for one, far in zip(there, away, strict=True)
@@ -202,15 +228,15 @@ def _judged(
     ]
     rivals = [
         _rival_p(plan, shape, rows, sim, one.fit.local_from_own)
-        for one in sorted(others, key=lambda one: one.over(rate))[-_RIVALS:]
+        for one in sorted(others, key=lambda one: _over(one, rate))[-_RIVALS:]
     ]
     figures |= {
         "places": final.evidence.places,
         "agreeing": final.evidence.agreeing,
         "log_nfa": log_nfa,
-        "over_chance": best.over(rate),
-        "elsewhere": len(over),
-        "elsewhere_over_chance": float(over.max(initial=-np.inf)),
+        "over_chance": float(scores[first]),
+        "elsewhere": len(elsewhere),
+        "elsewhere_over_chance": float(elsewhere.max(initial=-np.inf)),
         "rival": max(rivals, default=0.0),
         "camera_height_m": float(_eye_heights(shape, sim.act(plan.centers[kept])).mean()),
     }
@@ -237,13 +263,12 @@ def _judged(
 
 
 def _log_nfa(best: float, elsewhere: FloatArray) -> float:
-    """-log10 of how many of so many places elsewhere would agree as well: normal, by their upper half."""
+    """-log10 of how many of so many places elsewhere would agree as well: their tail is exponential."""
     if len(elsewhere) < _LEAST_TRIES:
         return 0.0
-    middle = float(np.median(elsewhere))
-    spread = float(np.sqrt(np.mean(np.square(elsewhere[elsewhere >= middle] - middle))))
-    deviations = (best - middle) / max(spread, 1.0)
-    return float(max(-norm.logsf(deviations) / np.log(10.0) - np.log10(len(elsewhere)), 0.0))
+    start = float(np.quantile(elsewhere, 1.0 - _TAIL))
+    mean = max(float(elsewhere[elsewhere >= start].mean()) - start, 1.0)
+    return float((best - start) / mean / np.log(10.0) - np.log10(_TAIL * len(elsewhere)))
 
 
 def _refused(found: GroundPlace, reason: GroundReason, message: str) -> GroundPlace:
@@ -273,7 +298,7 @@ def _best_around(plan: StreetPlan, shape: ScanShape, best: _Tried, rate: float) 
         about = Sim3(scale=1.0, rotation=np.eye(3), translation=best.fit.middle)
         starts.append(about @ Sim3.exp([size, *[0.0] * 6]) @ about.inverse() @ sim)
     tried = [_asked(shape, _fitted(plan, shape, start, rows, _COARSE_WIDTHS_M)) for start in starts]
-    return max(tried, key=lambda one: one.over(rate))
+    return max(tried, key=lambda one: _over(one, rate))
 
 
 def _rows_seen(unplaced: UnplacedMap, plan: StreetPlan, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
