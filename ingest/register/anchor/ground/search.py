@@ -107,13 +107,14 @@ class PlanSearch:
         ways = [(size, turn) for size in sizes for turn in turns]
         costs = [0.0 if tags is None else tags.cost(plan, size, turn) for size, turn in ways]
         allowed = min(costs) + (0.0 if tags is None else _WRONG * max(2.0, len(tags.rows) / 3.0))
-        cells = {size: _cells(plan, size) for size in sizes}
         for size in sizes:
             at_size: list[PlanTry] = []
-            for (other, turn), cost in zip(ways, costs, strict=True):
-                if other == size and cost <= allowed:
-                    circle = None if tags is None else tags.circle(plan, size, turn)
-                    at_size += self._best(*cells[size], size, turn, circle)
+            near = [t for (of, t), cost in zip(ways, costs, strict=True) if of == size and cost <= allowed]
+            if near:
+                cells = _cells(plan, size)
+            for turn in near:
+                circle = None if tags is None else tags.circle(plan, size, turn)
+                at_size += self._best(*cells, size, turn, circle)
             found += best_tries(at_size, _OF_SIZE)
         return found
 
@@ -198,9 +199,8 @@ def _cells(plan: StreetPlan, size: float) -> tuple[FloatArray, FloatArray]:
     """Fronts (k, 5): x, y, way out, weight, one for each metre; and open cells (j, 3): x, y, weight."""
     xy, out = size * plan.fronts[:, :2], plan.fronts[:, 3:5]
     turned = np.round(np.arctan2(out[:, 1], out[:, 0]) / (np.pi / 4)).astype(np.int64) % 8
-    keys = np.column_stack([np.floor(xy / _CELL_M).astype(np.int64), turned])
-    _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
+    keys = 8 * _numbered(np.floor(xy / _CELL_M).astype(np.int64)) + turned
+    _, group, count = np.unique(keys, return_inverse=True, return_counts=True)
     sums = [np.bincount(group, of) for of in (xy[:, 0], xy[:, 1], out[:, 0], out[:, 1])]
     way = np.column_stack(sums[2:]).astype(np.float64)
     way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
@@ -210,7 +210,12 @@ def _cells(plan: StreetPlan, size: float) -> tuple[FloatArray, FloatArray]:
     shares = np.linspace(0.0, 1.0, 40)[:, None, None]
     along = (start + shares * (end - start)).reshape(-1, 2)
     along = along[np.hypot(along[:, 0], along[:, 1]) < _REACH_CELLS * _CELL_M]
-    cells, seen = np.unique(np.floor(along / _CELL_M).astype(np.int64), axis=0, return_counts=True)
-    often = seen >= 3
-    open_cells = np.column_stack([(cells[often] + 0.5) * _CELL_M, np.ones(np.count_nonzero(often))])
-    return fronts[near], open_cells
+    cells = np.floor(along / _CELL_M).astype(np.int64)
+    _, first, seen = np.unique(_numbered(cells), return_index=True, return_counts=True)
+    often = cells[first[seen >= 3]]
+    return fronts[near], np.column_stack([(often + 0.5) * _CELL_M, np.ones(len(often))])
+
+
+def _numbered(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n,) a number for each of cells (n, 2), within a million of the middle, in the order of x, then y."""
+    return np.asarray((cells[:, 0] << 21) + cells[:, 1])
