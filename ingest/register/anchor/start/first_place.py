@@ -209,16 +209,14 @@ def first_place(
     scans = scans_of_one_zone(database, scan_ids)
     ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
     started: list[StartedImage] = []
-    by_look = on_outlines = False
+    by_look, on_outlines = False, files.near is not None and looks_level(unplaced)
     rest: UnplacedMap | None = None
-    if files.near is not None:
-        placed = _on_outlines(database, unplaced, files.near, ids) if looks_level(unplaced) else ""
-        on_outlines = not isinstance(placed, str)
-        if isinstance(placed, str):
-            feature_map, note, by_look = _found_near(database, unplaced, files.near, ids, photos, placed)
-            notes: tuple[str, ...] = (note,)
-        else:
-            feature_map, rest, notes = placed
+    notes: tuple[str, ...]
+    if files.near is not None and on_outlines:
+        feature_map, rest, notes = _on_outlines(database, unplaced, files.near, ids)
+    elif files.near is not None:
+        feature_map, note, by_look = _found_near(database, unplaced, files.near, ids, photos)
+        notes = (note,)
     else:
         told = files.read()
         east, north, up = np.median(np.vstack([one.utm for one in told]), axis=0).tolist()
@@ -240,12 +238,21 @@ def first_place(
 
 def _on_outlines(
     database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...]
-) -> tuple[FeatureMap, UnplacedMap | None, tuple[str, ...]] | str:
-    """The street photos that lie where fronts and outlines agree, those that do not, lines; or why none."""
+) -> tuple[FeatureMap, UnplacedMap | None, tuple[str, ...]]:
+    """The street photos that lie where fronts and outlines agree, those that do not, and lines on both.
+
+    Raises:
+        RegistrationError: they agree nowhere.
+    """
     cloud = _cloud_near(database, near, scan_ids)
     found = place_on_outlines(unplaced, cloud)
     if found.local_from_own is None or found.covariance is None or found.reason is not None:
-        return f"; by what its photos see of fronts: {found.reason}: {found.message}"
+        raise RegistrationError(
+            f"map {unplaced.map_id}, of photos from the street, is not found within {near.radius_m:.0f} m of "
+            f"{near.lat:.6f}, {near.lon:.6f} by the fronts that it shows: {found.reason}: {found.message}. A "
+            "smaller radius has fewer places that look alike (--near=LAT,LON,RADIUS_M); or say where a photo "
+            "is: --page, --picks FILE, --pose FILE"
+        )
     placement = Placement(
         method="lidar",
         local_from_sfm=found.local_from_own,
@@ -299,13 +306,8 @@ def _found_near(
     near: Circle,
     scan_ids: tuple[str, ...],
     photos: PhotoFiles,
-    before: str,
 ) -> tuple[FeatureMap, str, bool]:
-    """The map where the scans near a place show the same, a line on it, and whether it was only its look.
-
-    Args:
-        before: what was tried in vain, for the message.
-    """
+    """The map where the scans near a place show the same, a line on it, and whether it was only its look."""
     cloud, reach = _cloud_near(database, near, scan_ids), near.radius_m
     if cloud.rgb is None and cloud.intensity is None:
         raise RegistrationError(
@@ -322,7 +324,7 @@ def _found_near(
             words = f"{by_features.words()}, which chance gives, too"
         raise RegistrationError(
             f"map {unplaced.map_id} is not found within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}: "
-            f"{words}{before}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show "
+            f"{words}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show "
             "more than intensities; or say where one photo is: --page, --picks FILE, --pose FILE"
         )
     placement = Placement(
