@@ -6,170 +6,30 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import so3_exp
-from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.maps.feature_map import GeoPrior, MapObservations
-from featuredb.maps.unplaced_map import OwnFrame, OwnPoints, UnplacedMap
+from featuredb.geometry.sim3 import point_jacobian
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.camera.shot import look_pose
 from ingest.register.anchor.ground.parts import halves
 from ingest.register.anchor.ground.place import place_on_outlines
 from ingest.register.anchor.ground.street_plan import looks_level
-from tests.support.maps import random_unplaced_map
-from tests.support.scanned_map import FRAME, plain_cloud
-
-# West, south, east, north, height of houses around a crossing, metres.
-_HOUSES = (
-    (-40.0, 6.0, -22.0, 18.0, 7.0),
-    (-17.0, 8.0, -4.0, 20.0, 11.0),
-    (5.0, 5.0, 13.0, 24.0, 9.0),
-    (17.0, 7.5, 38.0, 17.0, 6.0),
-    (-36.0, -20.0, -12.0, -6.0, 8.5),
-    (-8.0, -17.0, -3.0, -5.0, 5.0),
-    (6.0, -22.0, 26.0, -7.0, 12.0),
-    (30.0, -16.0, 41.0, -5.0, 7.5),
-)
-_TILT = so3_exp([0.02, -0.03, 0.0])
-_OWN_FROM_LOCAL = Sim3(
-    scale=2.7, rotation=_TILT @ so3_exp([0.0, 0.0, 1.9]), translation=np.array([30.0, -80.0, 12.0])
-)
-
-
-def _ground(xy: FloatArray) -> FloatArray:
-    return np.asarray(0.02 * xy[:, 0] - 0.01 * xy[:, 1])
+from tests.support.scanned_map import plain_cloud
+from tests.support.street_map import OWN_FROM_LOCAL, joined_wrongly, street_map, street_scan
 
 
 @pytest.fixture(scope="module")
 def cloud() -> PointCloud:
-    rng = np.random.default_rng(3)
-    xy = rng.uniform(-70.0, 70.0, (110_000, 2))
-    z = _ground(xy)
-    for west, south, east, north, high in _HOUSES:
-        inside = (xy[:, 0] > west) & (xy[:, 0] < east) & (xy[:, 1] > south) & (xy[:, 1] < north)
-        z[inside] = high
-    return plain_cloud(np.column_stack([xy, z + rng.normal(0, 0.02, len(z))]))
-
-
-def _street_points(rng: np.random.Generator) -> FloatArray:
-    """(n, 3) on the fronts along the street from west to east, and on its ground."""
-    parts = []
-    for west, south, east, north, high in _HOUSES:
-        y = south if south > 0 else north
-        along = rng.uniform(west, east, 260)
-        parts.append(np.column_stack([along, np.full(260, y), rng.uniform(0.3, high, 260)]))
-        for x in (west, east):
-            deep = y + np.sign(y) * rng.uniform(0.0, 5.0, 60)
-            parts.append(np.column_stack([np.full(60, x), deep, rng.uniform(0.3, high, 60)]))
-    ground = np.column_stack([rng.uniform(-38, 38, 400), rng.uniform(-4.5, 4.5, 400), np.zeros(400)])
-    ground[:, 2] = _ground(ground[:, :2])
-    return np.vstack([*parts, ground])
-
-
-def _street_map(mirrored: bool) -> UnplacedMap:
-    """Sixteen photos of the street, level within two degrees, geotags of 10 m on a half of them."""
-    rng = np.random.default_rng(5)
-    points = _street_points(rng)
-    points += rng.normal(0, 0.02, points.shape)
-    poses = [
-        look_pose(
-            np.array([x, rng.uniform(-3, 3), 1.6 + 0.02 * x]), 0.0 if k % 2 else 180.0, rng.normal(3, 2)
-        )
-        for k, x in enumerate(np.linspace(-32.0, 32.0, 16))
-    ]
-    observed = [
-        np.flatnonzero((points @ pose.rotation[2] > pose.center @ pose.rotation[2] + 1.0)
-                       & (np.linalg.norm(points - pose.center, axis=1) < 22.0))
-        for pose in poses
-    ]  # fmt: skip
-    flip = np.array([-1.0, 1.0, 1.0]) if mirrored else np.ones(3)
-    base = random_unplaced_map()
-    images = []
-    for k, pose in enumerate(poses):
-        lat, lon, _ = FRAME.geodetic_from_enu(pose.center + rng.normal(0, (10.0, 10.0, 0.0)))
-        tag = GeoPrior(
-            latitude_deg=float(lat),
-            longitude_deg=float(lon),
-            height_m=None,
-            sigma_horizontal_m=10.0,
-            sigma_vertical_m=30.0,
-        )
-        turned = replace(pose, translation=-pose.rotation @ (pose.center * flip))
-        images.append(
-            replace(
-                base.images[0],
-                image_id=k,
-                name=f"{k}.jpg",
-                cam_from_local=_OWN_FROM_LOCAL.act_on_pose(turned),
-                covariance=None,
-                gps=tag if k % 2 else None,
-            )
-        )
-    n = sum(map(len, observed))
-    return replace(
-        base,
-        frame=OwnFrame(metric=False, upright=True),
-        images=tuple(images),
-        points=OwnPoints(
-            xyz=_OWN_FROM_LOCAL.act(points * flip),
-            rgb=np.zeros((len(points), 3), np.uint8),
-            track_length=np.full(len(points), 3, np.int32),
-            error_px=np.full(len(points), 0.5, np.float32),
-            covariance=np.zeros((len(points), 6), np.float32),
-        ),
-        observations=MapObservations(
-            point_index=np.concatenate(observed),
-            image_id=np.repeat(np.arange(16), [len(seen) for seen in observed]).astype(np.int32),
-            xy=np.zeros((n, 2), np.float32),
-            scale=np.ones(n, np.float32),
-            angle=np.zeros(n, np.float32),
-            has_descriptor=np.zeros(n, dtype=bool),
-            descriptors=np.zeros((n, 128), np.uint8),
-        ),
-    )
-
-
-_JOIN = Sim3(scale=1.0, rotation=so3_exp([0.0, 0.0, 1.3]), translation=np.array([60.0, 25.0, 0.0]))
-
-
-def _joined_wrongly(one: UnplacedMap) -> UnplacedMap:
-    """A map with its own copy at another place of its frame, tied by points that a photo of each sees."""
-    points, seen = len(one.points), one.observations
-    again = [
-        replace(i, image_id=i.image_id + 16, name=f"again {i.name}", gps=None,
-                cam_from_local=_JOIN.act_on_pose(i.cam_from_local))
-        for i in one.images
-    ]  # fmt: skip
-    tie = np.flatnonzero(seen.image_id == 0)[:20]
-    rows = np.concatenate([np.arange(len(seen.point_index)), np.arange(len(seen.point_index)), tie])
-    both = seen.take(rows)
-    index, image = both.point_index.copy(), both.image_id.copy()
-    second = slice(len(seen.point_index), 2 * len(seen.point_index))
-    index[second] += points
-    image[second] += 16
-    image[second.stop :] = 16
-    columns = {
-        name: np.concatenate([getattr(one.points, name)] * 2)
-        for name in ("rgb", "track_length", "error_px", "covariance")
-    }
-    xyz = np.vstack([one.points.xyz, _JOIN.act(one.points.xyz)])
-    return replace(
-        one,
-        images=(*one.images, *again),
-        points=OwnPoints(xyz=xyz, **columns),
-        observations=replace(both, point_index=index, image_id=image),
-    )
+    return plain_cloud(street_scan())
 
 
 def test_a_street_is_found_within_its_covariance(cloud: PointCloud) -> None:
-    unplaced = _street_map(mirrored=False)
+    unplaced = street_map(mirrored=False)
     assert looks_level(unplaced)
     found = place_on_outlines(unplaced, cloud)
     assert found.reason is None, found.message
     assert found.local_from_own is not None
     assert found.covariance is not None
     assert len(found.image_ids) == 16
-    truth = _OWN_FROM_LOCAL.inverse()
+    truth = OWN_FROM_LOCAL.inverse()
     for image in unplaced.images:
         there = found.local_from_own.act(image.cam_from_local.center)
         off = there - truth.act(image.cam_from_local.center)
@@ -178,37 +38,26 @@ def test_a_street_is_found_within_its_covariance(cloud: PointCloud) -> None:
         assert off @ np.linalg.solve(jacobian @ found.covariance @ jacobian.T, off) < chi2.isf(1e-3, 3)
 
 
-def test_a_part_is_placed_where_look_alikes_have_joined_two(cloud: PointCloud) -> None:
-    """Sixteen photos of the street, and as many of it by people who were held for standing in another one."""
-    street = _street_map(mirrored=False)
-    joined = _joined_wrongly(street)
-    first = halves(joined)[0]
-    assert {image.image_id // 16 for image in first.images} in ({0}, {1})
-    assert len(first.images) == 16
-    found = place_on_outlines(joined, cloud)
-    assert found.reason is None, found.message
-    assert found.local_from_own is not None
-    assert len(found.image_ids) >= 14
-    assert len({image_id // 16 for image_id in found.image_ids}) == 1
-    truth = _OWN_FROM_LOCAL.inverse() if min(found.image_ids) < 16 else (_JOIN @ _OWN_FROM_LOCAL).inverse()
-    center = joined.images[found.image_ids[0]].cam_from_local.center
-    assert np.linalg.norm(found.local_from_own.act(center) - truth.act(center)) < 0.5
+def test_look_alikes_are_parted_where_they_were_joined() -> None:
+    first, second = halves(joined_wrongly(street_map(mirrored=False)))
+    sides = [{image.image_id // 16 for image in part.images} for part in (first, second)]
+    assert sides in ([{0}, {1}], [{1}, {0}])
 
 
 def test_its_mirror_image_is_refused(cloud: PointCloud) -> None:
-    found = place_on_outlines(_street_map(mirrored=True), cloud)
+    found = place_on_outlines(street_map(mirrored=True), cloud)
     assert found.reason in ("STRUCTURE", "AMBIGUOUS", "TOO_FEW_FRAMES"), found.message
 
 
 def test_it_is_refused_on_another_scan(cloud: PointCloud) -> None:
     xyz = cloud.xyz.astype(np.float64)
     turned = plain_cloud(np.column_stack([xyz[:, 1] * 0.8 + 9.0, -xyz[:, 0] * 1.3, xyz[:, 2]]))
-    found = place_on_outlines(_street_map(mirrored=False), turned)
+    found = place_on_outlines(street_map(mirrored=False), turned)
     assert found.reason in ("STRUCTURE", "AMBIGUOUS", "TOO_FEW_FRAMES"), found.message
 
 
 def test_photos_that_look_down_are_not_asked() -> None:
-    street = _street_map(mirrored=False)
+    street = street_map(mirrored=False)
     centers = [image.cam_from_local.center for image in street.images]
     down = [
         replace(image, cam_from_local=look_pose(center, 20.0 * k, -85.0))
