@@ -23,6 +23,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import list_scans
 from ingest.executor import Progress, no_progress
+from ingest.growth.unplaced import left_over
 from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, on_outlines, place_map
 from ingest.register.anchor.files import PhotoFiles, find_photos, load_proposals, save_proposals
 from ingest.register.anchor.frames import TriedFrames, try_frames
@@ -40,6 +41,7 @@ from ingest.register.anchor.start.priors import image_named
 from ingest.register.frame_registration import FramePrior
 
 _CONFIRM = "--confirm"
+_NOT_THERE = "they do not lie there"
 _BY_OUTLINES = "placed by outlines of a scan; nothing has confirmed it"
 
 
@@ -101,6 +103,7 @@ class _Job:
     request: AnchorRequest
     snapshot: Snapshot
     summary: MapSummary | UnplacedSummary
+    unplaced: UnplacedMap | None
     feature_map: FeatureMap
     first: FirstPlace | None
     files: PhotoFiles
@@ -163,6 +166,8 @@ def _finished(
     database: Database, job: _Job, tried: TriedFrames, result: AnchorResult | None, notes: Sequence[str]
 ) -> Anchoring:
     """Write everything down, then commit."""
+    rest, lines = _rest_of(job)
+    notes = [*notes, *lines]
     report = AnchorReport(
         map_id=job.summary.map_id,
         map_name=job.summary.name,
@@ -191,7 +196,6 @@ def _finished(
     if result.feature_map is None:
         return done
     map_id = job.summary.map_id
-    rest = [] if job.first is None or job.first.rest is None else [job.first.rest]
     committed, *_ = database.commit_maps(
         [result.feature_map, *rest],
         replaces=(map_id,),
@@ -205,6 +209,17 @@ def _finished(
         version_before=job.snapshot.version,
         flagged=committed.flagged,
     )
+
+
+def _rest_of(job: _Job) -> tuple[list[UnplacedMap], list[str]]:
+    """What does not lie where a part of a map without a place was found, where it is a map still; lines."""
+    left = 0 if job.unplaced is None else len(job.unplaced.images) - len(job.feature_map.images)
+    if job.unplaced is None or not left:
+        return [], []
+    rest = left_over(job.unplaced, job.feature_map, by="outlines of a scan", code="LEFT_OUT", why=_NOT_THERE)
+    if not rest:
+        return [], [f"{left} photos do not lie there, too few for a map of their own: they are left out"]
+    return rest, [f"the other {left} photos become map {rest[0].map_id}, without a place"]
 
 
 def _confirm_command(database: Database, job: _Job, decision: str) -> str:
@@ -252,6 +267,7 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
         request=request,
         snapshot=snapshot,
         summary=summary,
+        unplaced=loaded if isinstance(loaded, UnplacedMap) else None,
         feature_map=feature_map,
         first=first,
         files=files,

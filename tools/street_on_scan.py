@@ -106,9 +106,8 @@ def _placed(made: Path, scan: Path, album: Path, work: Path) -> list[dict[str, A
                 break
             snapshot = Database.open(database).snapshot()
             off += _off(snapshot.load_map(map_id), truth)
-            rest = {m.map_id: m.images for m in snapshot.unplaced_maps()}
-            map_id = f"{map_id}-rest"
-            left = rest.get(map_id, 0)
+            rest = [m for m in snapshot.unplaced_maps() if m.map_id.startswith(f"{map_id}-")]
+            map_id, left = (rest[0].map_id, rest[0].images) if rest else (map_id, 0)
         found.append({"photos": one.images, "off": off})
     return found
 

@@ -7,7 +7,7 @@ believe it. It keeps its id, and what could not be taken along stays a map witho
 
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -92,7 +92,9 @@ def _place(
     seen = grown.feature_map.observations
     real = seen.has_descriptor & seen.descriptors.any(axis=1)
     feature_map = replace(grown.feature_map, observations=replace(seen, has_descriptor=real))
-    rest = left_over(unplaced, feature_map, grown.left_out)
+    said = Counter(grown.left_out.values()).most_common(1)
+    code, why = said[0][0] if said else ("DRIFT_BUDGET", "they may be further off than the budget of drift")
+    rest = left_over(unplaced, feature_map, by=", ".join(feature_map.parents), code=code, why=why)
     try:
         database.commit_maps(
             [feature_map, *rest],
@@ -143,12 +145,12 @@ def _grown(
 
 
 def left_over(
-    unplaced: UnplacedMap, placed: FeatureMap, left_out: Mapping[int, tuple[str, str]]
+    unplaced: UnplacedMap, placed: FeatureMap, *, by: str, code: str, why: str
 ) -> list[UnplacedMap]:
     """What was not taken along, where it is a map still: a map without a place, under an id of its own.
 
     Args:
-        left_out: why photos of the map, by row, are not in the placed one: code and message.
+        by: what placed the others. code, why: the photos of the map are not in the placed one.
     """
     taken = {image.name for image in placed.images}
     left = [image for image in unplaced.images if image.name not in taken]
@@ -157,16 +159,17 @@ def left_over(
     rest = only_images(unplaced, [image.image_id for image in left])
     if not len(rest.points):
         return []
-    said = Counter(left_out.values()).most_common(1)
-    code, why = said[0][0] if said else ("DRIFT_BUDGET", "they may be further off than the budget of drift")
-    reason = f"left out when map {unplaced.map_id} was placed by {', '.join(placed.parents)}: {why}"
     key = digest(unplaced.map_id, *sorted(image.sha256 or image.name for image in left))[:12]
     return [
         replace(
             rest,
             map_id=f"{unplaced.map_id}-{key}",
             name=f"{unplaced.name}, the rest",
-            no_place=NoPlace(reason_code=code, reason=reason, ways=unplaced.no_place.ways),
+            no_place=NoPlace(
+                reason_code=code,
+                reason=f"left out when map {unplaced.map_id} was placed by {by}: {why}",
+                ways=unplaced.no_place.ways,
+            ),
         )
     ]
 

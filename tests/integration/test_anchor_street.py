@@ -46,6 +46,7 @@ def test_a_part_is_placed_where_look_alikes_have_joined_two(
     for image in placed.images:
         there = to_here.act(image.cam_from_local.center)
         assert np.linalg.norm(there - truth.act(own[image.name])) < 0.5
-    rest = snapshot.load_unplaced(f"{joined.map_id}-rest")
+    (rest,) = (snapshot.load_unplaced(m.map_id) for m in snapshot.unplaced_maps())
+    assert rest.no_place.reason_code == "LEFT_OUT"
     assert {i.name for i in rest.images} | {i.name for i in placed.images} == set(own)
     assert len(rest.images) + len(placed.images) == len(own)

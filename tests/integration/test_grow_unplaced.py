@@ -78,13 +78,14 @@ def test_photos_that_are_not_taken_along_stay_a_map_without_a_place() -> None:
         method="map", local_from_sfm=Sim3.identity(), covariance=np.eye(7) * 1e-6, residual_rms_m=0.0
     )
     whole = replace(placed_map(unplaced, here, FRAME, "unknown"), parents=("old",))
-    (rest,) = left_over(unplaced, only_images(whole, [0]), {1: ("CONTRADICTS", "it lies elsewhere")})
+    why = {"by": "map-1", "code": "CONTRADICTS", "why": "they lie elsewhere"}
+    (rest,) = left_over(unplaced, only_images(whole, [0]), **why)
     assert [image.name for image in rest.images] == [f"new-{k}.jpg" for k in (1, 2, 3)]
     assert rest.map_id.startswith("loose-")
     assert rest.no_place.reason_code == "CONTRADICTS"
     assert "placed by old: it lies elsewhere" in rest.no_place.reason
     assert rest.no_place.ways == ("picks",)
-    assert left_over(unplaced, only_images(whole, [0, 1]), {}) == []  # two photos are no map
+    assert left_over(unplaced, only_images(whole, [0, 1]), **why) == []  # two photos are no map
 
 
 def test_what_the_gates_refuse_stays_without_a_place(database: Database, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.camera.shot import look_pose
-from ingest.register.anchor.ground.parts import halves
+from ingest.register.anchor.ground.parts import halves, weakest_cut
 from ingest.register.anchor.ground.place import place_on_outlines
 from ingest.register.anchor.ground.street_plan import looks_level
 from tests.support.scanned_map import plain_cloud
@@ -39,7 +39,10 @@ def test_a_street_is_found_within_its_covariance(cloud: PointCloud) -> None:
 
 
 def test_look_alikes_are_parted_where_they_were_joined() -> None:
-    first, second = halves(joined_wrongly(street_map(mirrored=False)))
+    street = street_map(mirrored=False)
+    joined = joined_wrongly(street)
+    assert weakest_cut(joined)[1] < 0.5 * weakest_cut(street)[1]
+    first, second = halves(joined)
     sides = [{image.image_id // 16 for image in part.images} for part in (first, second)]
     assert sides in ([{0}, {1}], [{1}, {0}])
 

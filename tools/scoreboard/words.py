@@ -3,7 +3,7 @@
 HELD_OUT = "DJI_0020.JPG DJI_0025.JPG DJI_0030.JPG DJI_0033.JPG"
 BRIGHTON = "{data}/brighton/images"
 SCAN = "{data}/brighton/model.laz"
-POSES = "{cache}/brighton-poses.json"
+POSES = "{cache}/brighton-scan-poses.json"
 # Of all 18 photos, by bundle adjustment.
 BRIGHTON_LENS = "SIMPLE_RADIAL:2916.2,2011.0,1153.6,0.02"
 OUT = "--json {work}/figures.json"

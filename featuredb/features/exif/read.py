@@ -59,6 +59,7 @@ _XMP_VALUE = re.compile(
 # How the lenses of films are named that do not say their camera: by the film's bytes, and the shot.
 UNNAMED_MAKE = "film"
 _SHOT = "shot"
+_SOFTWARE = "featuredb"  # of EXIF, in pictures of films
 
 
 def unnamed_model(sha256: str) -> str:
@@ -147,7 +148,12 @@ def read_exif(data: bytes, header: ImageHeader | None = None) -> ExifInfo:
     tiff = data[slice(*header.exif)] if header.exif else b""
     xmp = data[slice(*header.xmp)] if header.xmp else b""
     found = parse_exif(tiff, xmp, header.width, header.height, header.orientation)
-    return replace(found, resaved=header.jfif)
+    return replace(found, resaved=header.jfif and not _of_featuredb(tiff))
+
+
+def _of_featuredb(tiff: bytes) -> bool:
+    """Whether it is a picture of a film that featuredb saved, unturned."""
+    return _directories(tiff)[0].text(305) == _SOFTWARE
 
 
 def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: int | None = None) -> ExifInfo:

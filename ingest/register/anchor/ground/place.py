@@ -20,7 +20,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.ground.fit import SolidFit, fitted
-from ingest.register.anchor.ground.parts import halves
+from ingest.register.anchor.ground.parts import parts
 from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, shape_of
 from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
 from ingest.register.anchor.ground.street_plan import StreetPlan, street_plan
@@ -52,7 +52,7 @@ _LEAST_TRIES = 20  # elsewhere: fewer do not tell what chance gives
 _LIKE_SIZE = (
     0.5  # logarithm: sizes at which chance is alike; the smaller a map, the more of it agrees anywhere
 )
-_TAIL = 0.15  # share of the places elsewhere whose scores are taken for the tail of what chance gives
+_TAIL = 0.25  # share of the places elsewhere whose scores are taken for the tail of what chance gives
 _WALL_SIGMA_M = 0.15  # of all outlines together, outwards: eaves, and a laser's footprint
 _LEAST_SIGMA_M = 0.05  # of a point
 
@@ -94,26 +94,24 @@ class _Tried:
     evidence: JointEvidence
 
 
-def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud, tried: int = 0) -> GroundPlace:
+def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud) -> GroundPlace:
     """Place a map of street photos on a scan, or else the first of its parts that lies somewhere.
 
     Args:
         cloud: all of the scan on which the map may lie.
-        tried: parts so far: so many more times chance may deceive.
     """
-    whole = _place(unplaced, cloud, tried + 1)
-    if whole.reason is None or len(unplaced.images) <= _LEAST_PHOTOS:
-        return whole
-    for part in halves(unplaced):
-        if len(part.images) >= _LEAST_PHOTOS:
-            tried += 1
-            found = place_on_outlines(part, cloud, tried)
-            if found.reason is None:
-                return found
+    whole: GroundPlace | None = None
+    for number, part in enumerate(parts(unplaced, _LEAST_PHOTOS), start=1):
+        found = _place(part, cloud, number * (number + 1))  # the inverses of these add up to one
+        if found.reason is None:
+            return found
+        whole = whole or found
+    assert whole is not None
     return whole
 
 
 def _place(unplaced: UnplacedMap, cloud: PointCloud, tests: int) -> GroundPlace:
+    """Place it as a whole; `tests`: so many times more may chance deceive."""
     tags = geotags_of(unplaced, cloud)
     around = None if tags is None else tags.around(_AROUND_M)
     plan, shape = street_plan(unplaced), shape_of(cloud, around)
@@ -263,12 +261,17 @@ def _judged(
 
 
 def _log_nfa(best: float, elsewhere: FloatArray) -> float:
-    """-log10 of how many of so many places elsewhere would agree as well: their tail is exponential."""
+    """-log10 of how many of so many places elsewhere would agree as well.
+
+    Their tail is exponential, by a mean that its members tell no better than so many can (Lomax).
+    """
     if len(elsewhere) < _LEAST_TRIES:
         return 0.0
     start = float(np.quantile(elsewhere, 1.0 - _TAIL))
-    mean = max(float(elsewhere[elsewhere >= start].mean()) - start, 1.0)
-    return float((best - start) / mean / np.log(10.0) - np.log10(_TAIL * len(elsewhere)))
+    tail = elsewhere[elsewhere >= start] - start
+    mean = max(float(tail.mean()), 1.0)
+    further = max(best - start, 0.0) / (len(tail) * mean)
+    return float(len(tail) * np.log10(1.0 + further) - np.log10(len(tail)))
 
 
 def _refused(found: GroundPlace, reason: GroundReason, message: str) -> GroundPlace:

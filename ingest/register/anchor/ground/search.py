@@ -217,5 +217,6 @@ def _cells(plan: StreetPlan, size: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _numbered(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) a number for each of cells (n, 2), within a million of the middle, in the order of x, then y."""
-    return np.asarray((cells[:, 0] << 21) + cells[:, 1])
+    """(n,) a number for each of cells (n, 2), in the order of x, then y; beyond a million they are one."""
+    near = np.clip(cells, -(1 << 20), (1 << 20) - 1)
+    return np.asarray((near[:, 0] << 21) + near[:, 1])

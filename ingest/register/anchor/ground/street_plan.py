@@ -17,7 +17,9 @@ _PRIOR = 0.02  # of the vertical, against fronts: mean square of a normal's rise
 _LEVEL, _LEVEL_ROUNDS = 0.2, 5  # rise of a photo's level side, at most
 _ON_EDGE = 0.05  # what is held against a photo on edge, as a rise: most are not
 _VOXEL_SHARE = 0.02  # of the median distance at which cameras see points: side of what counts as one
-_STEEPEST, _MOST_RISE = 0.4, 0.25  # sine of a level view; of the cameras, over their spread
+# Sine of a level view: maps of the simulated towns have 0.03 to 0.18 in the median, a drone that looks 15
+# degrees down 0.26. Rise of the cameras, over their spread.
+_STEEPEST, _MOST_RISE = 0.25, 0.25
 _RAYS = 4000
 _BEFORE = 0.9  # of a ray is open ground
 

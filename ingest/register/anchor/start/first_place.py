@@ -1,7 +1,7 @@
 """Where a person's help puts frames of a map, and with them a map that has no place yet."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -14,7 +14,7 @@ from featuredb.lidar.load import chosen_scans, load_cloud
 from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
 from featuredb.maps.move import placed_map
 from featuredb.maps.subset import only_images
-from featuredb.maps.unplaced_map import AnyMap, NoPlace, UnplacedMap
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary
@@ -132,7 +132,6 @@ class FirstPlace:
         starts: priors of the person's photos by image id. notes: a line on each, or on how it was found.
         by_look: it was put where its picture from above is most like the scan's, which chance may be.
         on_outlines: it was placed by what street photos and the scan have in common; its frames need none.
-        rest: what does not lie there, as a map of its own without a place.
     """
 
     feature_map: FeatureMap
@@ -142,7 +141,6 @@ class FirstPlace:
     notes: tuple[str, ...]
     by_look: bool = False
     on_outlines: bool = False
-    rest: UnplacedMap | None = None
 
 
 def started_images(
@@ -210,13 +208,12 @@ def first_place(
     ids, epsg = tuple(scan.scan_id for scan in scans), scans[0].epsg
     started: list[StartedImage] = []
     by_look, on_outlines = False, files.near is not None and looks_level(unplaced)
-    rest: UnplacedMap | None = None
-    notes: tuple[str, ...]
-    if files.near is not None and on_outlines:
-        feature_map, rest, notes = _on_outlines(database, unplaced, files.near, ids)
-    elif files.near is not None:
-        feature_map, note, by_look = _found_near(database, unplaced, files.near, ids, photos)
-        notes = (note,)
+    if files.near is not None:
+        if on_outlines:
+            feature_map, note = _on_outlines(database, unplaced, files.near, ids)
+        else:
+            feature_map, note, by_look = _found_near(database, unplaced, files.near, ids, photos)
+        notes: tuple[str, ...] = (note,)
     else:
         told = files.read()
         east, north, up = np.median(np.vstack([one.utm for one in told]), axis=0).tolist()
@@ -232,14 +229,13 @@ def first_place(
         notes=notes,
         by_look=by_look,
         on_outlines=on_outlines,
-        rest=rest,
     )
 
 
 def _on_outlines(
     database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...]
-) -> tuple[FeatureMap, UnplacedMap | None, tuple[str, ...]]:
-    """The street photos that lie where fronts and outlines agree, those that do not, and lines on both.
+) -> tuple[FeatureMap, str]:
+    """The street photos that lie where fronts and the scan's outlines agree, with a line.
 
     Raises:
         RegistrationError: they agree nowhere.
@@ -262,25 +258,7 @@ def _on_outlines(
     )
     kept = only_images(unplaced, found.image_ids)
     placed = placed_map(kept, placement, cloud.frame, cloud.height_datum)
-    rest, note = _rest_of(unplaced, found.image_ids), f"placed by outlines: {found.message}"
-    if rest is None:
-        return placed, None, (note,)
-    others = f"the other {len(rest.images)} photos become map {rest.map_id}, without a place"
-    return placed, rest, (note, others)
-
-
-def _rest_of(unplaced: UnplacedMap, image_ids: Sequence[int]) -> UnplacedMap | None:
-    """The map without these images; None where no point is left."""
-    others = sorted({image.image_id for image in unplaced.images} - set(image_ids))
-    if not others:
-        return None
-    rest = only_images(unplaced, others)
-    no_place = NoPlace(
-        reason_code="LEFT_OUT",
-        reason=f"a scan's outlines placed other photos of map {unplaced.map_id}; these do not lie there",
-        ways=unplaced.no_place.ways,
-    )
-    return replace(rest, map_id=f"{unplaced.map_id}-rest", no_place=no_place) if len(rest.points) else None
+    return placed, f"placed by outlines: {found.message}"
 
 
 def _cloud_near(database: Database, near: Circle, scan_ids: tuple[str, ...]) -> PointCloud:
