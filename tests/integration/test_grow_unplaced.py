@@ -83,7 +83,7 @@ def test_photos_that_are_not_taken_along_stay_a_map_without_a_place() -> None:
     assert [image.name for image in rest.images] == [f"new-{k}.jpg" for k in (1, 2, 3)]
     assert rest.map_id.startswith("loose-")
     assert rest.no_place.reason_code == "CONTRADICTS"
-    assert "placed by old: it lies elsewhere" in rest.no_place.reason
+    assert "placed by map-1: they lie elsewhere" in rest.no_place.reason
     assert rest.no_place.ways == ("picks",)
     assert left_over(unplaced, only_images(whole, [0, 1]), **why) == []  # two photos are no map
 
