@@ -224,8 +224,8 @@ class MapParts:
         observations: of `points`, by `images`.
         extractor_fingerprint: of all descriptors.
         status: one of `statuses`.
-        camera_keys: for each camera the EXIF key (make, model, size, focal) that a query may share, ""
-            where the camera belongs to one image only; same length as cameras, or empty.
+        camera_keys: for each camera the EXIF key (make, model, size, focal, saved anew) that a query may
+            share, "" where the camera belongs to one image only; same length as cameras, or empty.
         parents: map ids that placed this one.
         provenance: options and versions that made it, JSON-able.
 

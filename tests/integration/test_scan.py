@@ -74,7 +74,7 @@ def test_every_entry_has_its_outcome_in_the_order_of_names(tmp_path: Path) -> No
     assert result.skipped == {"hidden": 2, "truncated": 1, "not_an_image": 2, "unreadable": 1, "too_small": 1}
     b = by_name(result.photos)["b.jpg"]
     assert (b.width, b.height, b.make, b.model) == (640, 480, "Maker", "Model")
-    assert b.camera_key == f"maker|model|640x480|f{float(f'{b.focal_px:.3g}'):.0f}"
+    assert b.camera_key == f"maker|model|640x480|f{float(f'{b.focal_px:.3g}'):.0f}|jfif"
     assert b.gps is not None
     assert (b.gps.latitude_deg, b.gps.height_m) == (pytest.approx(48.1), None)
     assert by_name(result.photos)["no_extension"].camera_key == ""
