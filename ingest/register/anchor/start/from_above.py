@@ -108,7 +108,9 @@ def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> Fo
         _judged(_most_fitting(own, local, upwards, tolerance), own, local, point, tolerance, area_m2, source)
         for tolerance in (px * wide_m / _SIDE_PX for px in _TOLERANCES_PX)
     ]
-    return max((one for one in judged if one is not None), key=lambda one: one.log_nfa, default=None)
+    # Fitted to all of its matches a place on flat ground may have turned over, cameras underground.
+    above = [one for one in judged if one is not None and one.local_from_own.rotation[2] @ upwards > 0.0]
+    return max(above, key=lambda one: one.log_nfa, default=None)
 
 
 def _wide_m(cloud: PointCloud) -> float:
