@@ -150,7 +150,7 @@ def left_over(
     """What was not taken along, where it is a map still: a map without a place, under an id of its own.
 
     Args:
-        by: what placed the others. code, why: the photos of the map are not in the placed one.
+        by: what placed the others. code, why: reason for which these photos were not placed with them.
     """
     taken = {image.name for image in placed.images}
     left = [image for image in unplaced.images if image.name not in taken]

@@ -104,13 +104,11 @@ def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> Fo
     centers = np.array([image.cam_from_local.center for image in unplaced.images])
     upwards = np.median(centers, axis=0) - np.median(unplaced.points.xyz, axis=0)
     area_m2 = float(np.prod(np.ptp(places[:, :2], axis=0)))
-    judged = [
-        _judged(_most_fitting(own, local, upwards, tolerance), own, local, point, tolerance, area_m2, source)
-        for tolerance in (px * wide_m / _SIDE_PX for px in _TOLERANCES_PX)
-    ]
-    # Fitted to all of its matches a place on flat ground may have turned over, cameras underground.
-    above = [one for one in judged if one is not None and one.local_from_own.rotation[2] @ upwards > 0.0]
-    return max(above, key=lambda one: one.log_nfa, default=None)
+    judged = []
+    for tolerance_m in (px * wide_m / _SIDE_PX for px in _TOLERANCES_PX):
+        sim = _most_fitting(own, local, upwards, tolerance_m)
+        judged.append(_judged(sim, own, local, upwards, point, tolerance_m, area_m2, source))
+    return max((one for one in judged if one is not None), key=lambda one: one.log_nfa, default=None)
 
 
 def _wide_m(cloud: PointCloud) -> float:
@@ -207,12 +205,20 @@ def _judged(
     sim: Sim3 | None,
     own: FloatArray,
     local: FloatArray,
+    upwards: FloatArray,
     point: NDArray[np.int64],
     tolerance_m: float,
     area_m2: float,
     source: RenderSource,
 ) -> FoundFromAbove | None:
-    """Fitted to the matches within the tolerance, with how sure that is; None where too few are."""
+    """Fitted to the matches within the tolerance, with how sure that is; None where too few are.
+
+    The fit may turn a place over flat ground upside down: None, too, where it leaves cameras underground.
+
+    Args:
+        own, local: (n, 3) points of the map and of the scan that match. upwards: as in `_most_fitting`.
+        point: (n,) the map's points. area_m2: of the scan in plan.
+    """
     for _ in range(_ROUNDS):
         if sim is None:
             return None
@@ -220,7 +226,7 @@ def _judged(
         if fits.sum() <= _SAMPLE:
             return None
         sim = similarity_closed_form(own[fits], local[fits])
-    if sim is None:
+    if sim is None or sim.rotation[2] @ upwards <= 0.0:
         return None
     placed = sim.act(own[fits])
     variance = float(np.square(placed - local[fits]).sum()) / (3.0 * int(fits.sum()) - 7.0)
