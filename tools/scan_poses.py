@@ -3,8 +3,8 @@
     python -m tools.scan_poses SCAN.laz PHOTO_FOLDER --poses poses.json
 
 Registers every photo of the folder (tools/scan_to_photo.py, which shares no code with the map, with
-anchoring or with localisation; only cameras are told apart by the same EXIF), estimates one lens over the photos of each camera
-(`ExifInfo.camera_key`), and measures its own accuracy:
+anchoring or with localisation), estimates one lens over the photos of each camera, which EXIF tells apart
+as in a map (`ExifInfo.camera_key`), and measures its own accuracy:
 
 - halves of the correspondences: each photo's pose from two disjoint sets of picture blocks;
 - halves of the photos: poses from two disjoint sets of photos, each with a lens of its own. This is the
