@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
@@ -14,7 +15,7 @@ from featuredb.geometry.rotation import rotation_to_up
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NOMINAL_DISTANCE, OwnFrame
 from ingest.colmap.bridge import Model
-from ingest.positions.position_noise import Held
+from ingest.positions.held import Held
 
 # What gives a map without a place its place; for people.
 WAYS_TO_A_PLACE = (
@@ -25,6 +26,8 @@ WAYS_TO_A_PLACE = (
 )
 # A frame is called upright where the standard error of its vertical is below this about both horizontal axes.
 _UPRIGHT_SIGMA_RAD = np.radians(2.0)
+_LEAST_CAMERAS = 4
+_BY_CHANCE = 0.01  # maps whose cameras seem to agree on their vertical because few of them happen to
 _ROBUST_ROUNDS = 5
 _ASKEW_RAD = np.radians(15.0)  # of one photo: then they are not held level
 _COMMON_ROLL_RAD = np.radians(1.5)  # of all photos by one gimbal or hand
@@ -63,20 +66,27 @@ def vertical_of(poses: Sequence[Rigid3]) -> FloatArray | None:
     return np.asarray(up if float((_down(poses)[kept] @ up).mean()) < 0 else -up)
 
 
-def held_of(poses: Sequence[Rigid3], angles: Sequence[CameraAngles | None] = ()) -> Held | None:
+def held_of(
+    poses: Sequence[Rigid3],
+    angles: Sequence[CameraAngles | None] = (),
+    camera_of: NDArray[np.int64] | None = None,
+) -> Held | None:
     """How photos are held, for a placement; None where nothing tells.
 
     Tilts that photos tell come first; where less than three do, photos are taken to be held level, unless
-    most of them are not. What photos have in common does not average out, wherever they look: a gimbal that
-    is off stays off, for a strip or for all. `brighton` is 1.4 degrees to one side over twelve photos, then
-    1.7 to the other.
+    most of them are not. What the photos by one camera have in common does not average out, wherever they
+    look: a gimbal that is off stays off, and leans with the wind as the aircraft turns.
 
     Args:
         angles: of each photo, or none at all.
+        camera_of: (n,) which camera, or whose, took each photo; None: one took all.
     """
+    camera_of = np.zeros(len(poses), dtype=np.int64) if camera_of is None else camera_of
     told = [(pose.rotation, one) for pose, one in zip(poses, angles, strict=False) if one is not None]
     tilted = [(turn, one) for turn, one in told if one.pitch_deg is not None]
-    parts = [part for part in (_by_yaw(told), _by_tilt(tilted) or _level(poses)) if part is not None]
+    parts = [
+        part for part in (_by_yaw(told), _by_tilt(tilted) or _level(poses, camera_of)) if part is not None
+    ]
     if not parts:
         return None
     rows = ("directions", "across", "along", "sigma_rad", "joint_rad")
@@ -100,6 +110,7 @@ def _by_tilt(photos: Sequence[tuple[FloatArray, CameraAngles]]) -> Held | None:
         joint_rad=np.repeat(_joint(sigma), 2),
         down=-up.mean(axis=0),
         told=True,
+        checked=True,
     )
 
 
@@ -129,6 +140,7 @@ def _by_yaw(photos: Sequence[tuple[FloatArray, CameraAngles]]) -> Held | None:
         joint_rad=_joint(np.array(sigma)),
         down=np.zeros(3),
         told=True,
+        checked=True,
     )
 
 
@@ -138,21 +150,39 @@ def _joint(sigma: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(own + len(sigma) * _COMMON_SHARE * sigma**2))
 
 
-def _level(poses: Sequence[Rigid3]) -> Held | None:
+def _level(poses: Sequence[Rigid3], camera_of: NDArray[np.int64]) -> Held | None:
     found = _held_level(poses)
     if found is None or found[1] > _ASKEW_RAD:
         return None
     kept, sigma, _, _ = found
-    count = int(kept.sum())
+    across = np.array([pose.rotation[0] for pose in poses])[kept]
+    _, row, counts = np.unique(camera_of[kept], return_inverse=True, return_counts=True)
+    by_one = counts[row]
     return Held(
-        directions=np.array([pose.rotation[0] for pose in poses])[kept],
-        across=np.tile(np.eye(3)[2], (count, 1)),
-        along=np.zeros((count, 3)),
-        sigma_rad=np.full(count, np.hypot(sigma, _COMMON_ROLL_RAD)),
-        joint_rad=np.full(count, np.sqrt(sigma**2 + count * _COMMON_ROLL_RAD**2)),
+        directions=across,
+        across=np.tile(np.eye(3)[2], (len(across), 1)),
+        along=np.zeros((len(across), 3)),
+        sigma_rad=np.full(len(across), np.hypot(sigma, _COMMON_ROLL_RAD)),
+        joint_rad=np.sqrt(sigma**2 + by_one * _COMMON_ROLL_RAD**2),
         down=_down(poses)[kept].mean(axis=0),
         told=False,
+        checked=_agree(across / np.sqrt(by_one)[:, None], len(counts)),
     )
+
+
+def _agree(across: FloatArray, cameras: int) -> bool:
+    """Whether so many cameras look so many ways that the vertical is theirs, and hardly by chance.
+
+    By the standard error of a principal axis (Anderson 1963), as large as the cameras allow it to be.
+
+    Args:
+        across: (n, 3) horizontal image axes, of such a length that each camera counts once.
+    """
+    if cameras < _LEAST_CAMERAS:
+        return False
+    least, second = np.linalg.eigvalsh(across.T @ across)[:2].tolist()
+    most = max(least, 0.0) / chdtri(cameras - 2, 1.0 - _BY_CHANCE)
+    return bool(np.sqrt(most * second) <= _UPRIGHT_SIGMA_RAD * (second - least))
 
 
 def _held_level(poses: Sequence[Rigid3]) -> tuple[NDArray[np.bool_], float, FloatArray, float] | None:

@@ -15,7 +15,7 @@ from ingest.colmap.bridge import Model
 from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE, held_of
-from ingest.photos.photo import Photo, capture_seconds, gps_priors, local_frame_of
+from ingest.photos.photo import Photo, capture_seconds, gps_priors, local_frame_of, whose_cameras
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.register.block import block_of_model, model_of_block
 from ingest.register.control.maps import Survey, place_by_survey, vertical_of
@@ -117,7 +117,7 @@ def placed_by_gps(
     positions, sigmas = gps_priors(chosen, frame)
     with_gps = np.flatnonzero(np.isfinite(positions).all(axis=1))
     times_s = capture_seconds([chosen[i] for i in with_gps.tolist()])
-    held = held_of(model.cam_from_sfm, [photo.angles for photo in chosen])
+    held = held_of(model.cam_from_sfm, [photo.angles for photo in chosen], whose_cameras(chosen))
     placed = place_by_gps(
         model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options, times_s, held
     )

@@ -125,6 +125,14 @@ def shared_key(photo: Photo, sharing: CameraSharing) -> str:
     return f"unnamed camera of {whose}, {day}, {photo.width} x {photo.height}{focal}"
 
 
+def whose_cameras(photos: Sequence[Photo]) -> NDArray[np.int64]:
+    """(n,) numbers of whose and which camera took each photo; photos that name neither: by their size."""
+    numbers: dict[tuple[str | int, ...], int] = {}
+    named = [(p.contributor, p.owner, p.make, p.model, p.film) for p in photos]
+    keys = [name if any(name) else (p.width, p.height) for p, name in zip(photos, named, strict=True)]
+    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
+
+
 def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
     """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
     gps = _geodetic(photos)

@@ -18,6 +18,7 @@ from scipy.special import chdtri, gammaln
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from ingest.positions.held import ANGLES_WRONG, Held
 from ingest.positions.one_height import told_once
 from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean, stated_sigma
 
@@ -31,9 +32,9 @@ _LEAST_M = 1e-6
 _LEAST_PHOTOS = 3
 _LEAST_SHARE = 0.02  # of a stated sigma: the least noise that counts where chance is judged
 _LAG_SHARE = 0.5  # of a stated sigma that may be a lag
-ANGLES_WRONG = 4.0  # standard deviations
 _MOST_LAG_S = 1.0  # standard deviation of a lag
 _STEADY_S = 20.0
+_MOST_SMOOTH = 0.95  # correlation of neighbours
 _SHAPE = 1e-3  # of the centres' distance from their middle: 0.9e-3 on entry-P10, 0.7e-3 on fountain-P11
 _MOST_POSITIONS = 400  # more are thinned out evenly in time
 _TURNS = 8.0  # local maxima of the likelihood over turns: each is a chance of its own
@@ -56,50 +57,6 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Held:
-    """How photos are held: directions of the reconstruction that are square to a local axis.
-
-    Level photos: their horizontal image axes, to up. Photos that tell their tilt: where they say that up is,
-    to east and to north. Photos that tell their yaw: where they say that north is, to east.
-
-    Attributes:
-        directions: (m, 3) unit vectors in the reconstruction's frame.
-        across: (m, 3) local axes that they are square to.
-        along: (m, 3) local axes that they point along; 0 where either side will do.
-        sigma_rad: (m,) how far one is off.
-        joint_rad: (m,) the same, so widened that all of them are worth no more than what they have in common.
-        down: (3,) about downwards, in the reconstruction's frame.
-        told: the photos say so; otherwise it is assumed.
-    """
-
-    directions: FloatArray
-    across: FloatArray
-    along: FloatArray
-    sigma_rad: FloatArray
-    joint_rad: FloatArray
-    down: FloatArray
-    told: bool
-
-    @property
-    def by_yaw(self) -> NDArray[np.bool_]:
-        """(m,) those that tell the turn about up, and nothing else."""
-        return np.asarray((self.across[:, 2] == 0.0) & (self.along[:, 2] == 0.0))
-
-    def terms(self, rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Residuals (m,), their derivatives (m, 3) by a turn, and how far each is off (m,), radians.
-
-        Args:
-            rotation: (3, 3) from the reconstruction to the local frame.
-        """
-        placed = self.directions @ rotation.T
-        off = (placed * self.across).sum(axis=1)
-        slope = np.cross(placed, self.across)
-        slope[self.by_yaw, :2] = 0.0
-        turned = np.where((placed * self.along).sum(axis=1) < 0.0, np.pi, 0.0)
-        return off, slope, np.abs(turned - np.arcsin(np.clip(np.abs(off), 0.0, 1.0)))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoisyFit:
     """The similarity and what it is worth.
 
@@ -108,10 +65,11 @@ class NoisyFit:
         covariance: (7, 7) of its left perturbation about the local origin, without the bias.
         noise: its most likely components.
         lag_s: by which positions are late.
-        checked_turn_rad: largest standard deviation of its turn, were nothing assumed of how photos are held.
+        checked_turn_rad: the same of its turn, without what is only assumed of how photos are held; largest.
         used: (n, 2) horizontal and vertical; others are so far out that one of a thousand honest ones is.
         log_chance: natural logarithm of how often positions that know nothing of the reconstruction fit as
             well, by the ratio of the likelihoods, both with their own components.
+        log_chance_of_way: the same of positions along another smooth way, where fewer count.
     """
 
     local_from_sfm: Sim3
@@ -121,6 +79,7 @@ class NoisyFit:
     checked_turn_rad: float
     used: NDArray[np.bool_]
     log_chance: float
+    log_chance_of_way: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -244,10 +203,11 @@ def fit_noisy(
     modes = problem.modes(theta, stated)
     step, covariance = problem.integrated(modes, stated)
     checked = covariance[2:5, 2:5]
-    if held is not None and not held.told:
+    if held is not None and not held.checked:
         free = _at(replace(data, held=None), state, weights)
         checked = free.integrated(modes, stated)[1][2:5, 2:5]
     state, theta = state.moved(step), modes[0]
+    chance = _log_chance(data, state, weights, int(taken.sum()))
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(
         local_from_sfm=middle @ state.sim,
@@ -256,7 +216,8 @@ def fit_noisy(
         lag_s=state.lag_s,
         checked_turn_rad=float(np.sqrt(np.linalg.eigvalsh(checked)[-1])),
         used=used,
-        log_chance=_log_chance(data, state, weights, int(taken.sum())),
+        log_chance=chance[0],
+        log_chance_of_way=chance[1],
     )
 
 
@@ -366,9 +327,8 @@ def _weights(squared: FloatArray) -> FloatArray:
     return np.asarray((_TAIL + _SIZES) / (_TAIL + squared))
 
 
-def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> float:
-    """See `NoisyFit`: four of the degrees of freedom are the scale's and the turn's, so that the ratio of the
-    sums of squares, which is the likelihoods', has a beta distribution. A lag counts as two.
+def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> tuple[float, float]:
+    """See `NoisyFit`: of positions that have nothing in common, and of positions along another way.
 
     Args:
         total: positions before any was left out.
@@ -376,23 +336,56 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
     shift = np.broadcast_to(np.eye(3), (len(data.centers), 3, 3))
     known = np.isfinite(data.sigmas) & (weights > 0)[:, [0, 0, 1]]
     off = np.where(np.isfinite(data.sigmas), data.positions, 0.0)
-    costs = []
+    costs, theta = [], np.zeros(4)
     for residual in (state.residual(data), off - np.median(off, axis=0)):
         problem = MixedModel(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
         spread = [np.square(residual[known[:, axes[0]]][:, axes]) for axes in _AXES]
         size = np.array([float(np.sqrt(of.mean())) if of.size else 1.0 for of in spread])
         size = np.maximum(size, _LEAST_SHARE * data.stated)  # heights that are all the same are told in steps
         start = np.log(np.concatenate([size, size]))
-        least = np.log(_LEAST_SHARE * data.stated)
-        costs.append(problem.cost(problem.most_likely(start, None, least), None))
+        theta = problem.most_likely(start, None, np.log(_LEAST_SHARE * data.stated))
+        costs.append(problem.cost(theta, None))
     freedom, taken_up = int(known.sum()) - 3, 6 if data.speed.any() else 4
+    log_ratio = min((costs[0] - costs[1]) / freedom, 0.0) if freedom > 0 else 0.0
+    kept = int((weights > 0).all(axis=1).sum())
+    ways = gammaln(total + 1) - gammaln(kept + 1) - gammaln(total - kept + 1) + np.log(_TURNS)
+    count = _own_share(data, off, known, theta) * freedom
+    return _log_beta_tail(log_ratio, freedom, taken_up, ways), _log_beta_tail(
+        log_ratio, count, taken_up, ways
+    )
+
+
+def _log_beta_tail(log_ratio: float, freedom: float, taken_up: int, log_tries: float) -> float:
+    """Logarithm of how often a ratio of sums of squares is as small, in so many tries.
+
+    Four of the degrees of freedom are the scale's and the turn's, so that the ratio, which is the
+    likelihoods', has a beta distribution. A lag counts as two.
+    """
     half = (freedom - taken_up) / 2.0
     if half <= 0:
         return 0.0
-    log_ratio = min((costs[0] - costs[1]) / freedom, 0.0)
     rest = half * -np.expm1(log_ratio)
     beta = 1.0 + rest + (0.0 if taken_up == 4 else 0.5 * (1.0 + 1.0 / half) * rest**2)
-    tail = half * log_ratio + np.log(beta)  # of beta(half, taken_up / 2)
-    kept = int((weights > 0).all(axis=1).sum())
-    ways = gammaln(total + 1) - gammaln(kept + 1) - gammaln(total - kept + 1)
-    return float(min(tail + ways + np.log(_TURNS), 0.0))
+    return float(min(half * log_ratio + np.log(beta) + log_tries, 0.0))
+
+
+def _own_share(data: _Data, residual: FloatArray, known: NDArray[np.bool_], theta: FloatArray) -> float:
+    """How many of residuals (n, 3) count, as a share: those of a smooth way follow from the ones before.
+
+    Of an autoregressive process of first order, after noise and walk are whitened in the order of time.
+    """
+    order = np.argsort(np.diag(data.walk), kind="stable")
+    together, alone = 0.0, _LEAST_M**2
+    for group, axes in enumerate(_AXES):
+        for axis in axes.tolist():
+            rows = order[known[order, axis]]
+            if len(rows) < _LEAST_PHOTOS:
+                continue
+            ratio = data.sigmas[rows, axis] / data.stated[group]
+            own = np.exp(2.0 * theta[2 + group]) * data.walk[np.ix_(rows, rows)]
+            factor = np.linalg.cholesky(own + np.diag(np.exp(2.0 * theta[group]) * ratio**2))
+            white = np.linalg.solve(factor, np.column_stack([residual[rows, axis], np.ones(len(rows))]))
+            left = white[:, 0] - white[:, 1] * (white[:, 1] @ white[:, 0]) / (white[:, 1] @ white[:, 1])
+            together, alone = together + float(left[1:] @ left[:-1]), alone + float(left @ left)
+    follows = min(max(together / alone, 0.0), _MOST_SMOOTH)
+    return (1.0 - follows) / (1.0 + follows)

@@ -5,7 +5,8 @@ leaves of the stated sigmas is taken for a bias that all positions share. Two te
 
 - chance: how often would positions that have nothing to do with the reconstruction fit as well? It follows
   from the ratio of the likelihoods, times the number of ways to leave out the positions that were left out.
-  A map answers where it is less than one in a thousand.
+  A map answers where it is less than one in a thousand. Noise that one receiver in twenty exceeds may be that
+  of another way: then neighbours count by as much as they do not follow from each other.
 - contradiction: noise above what one receiver in a thousand has; or in twenty, where chance fits as well in
   one case of twenty.
 """
@@ -23,7 +24,8 @@ from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGM
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.positions.position_noise import ANGLES_WRONG, Held, NoisyFit, fit_noisy
+from ingest.positions.held import ANGLES_WRONG, Held
+from ingest.positions.position_noise import NoisyFit, fit_noisy
 from ingest.positions.variance_components import NOISE_SHARE, stated_sigma
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
@@ -50,7 +52,7 @@ class GpsOptions:
     wrong: float = 0.001
     no_place: float = 0.05
     answers: float = 0.001
-    max_scale_sigma: float = 0.1
+    max_scale_sigma: float = 0.3
     max_turn_deg: float = 25.0
     answers_turn_deg: float = 10.0
     max_ransac_samples: int = 500
@@ -153,7 +155,12 @@ def _judged(
     bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0))
     covariance = fit.covariance.copy()
     covariance[4:, 4:] += np.diag(bias**2)
-    chance = fit.log_chance
+    rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]
+    usual = np.maximum(stated, _PLAIN_M)[known.any(axis=0)] * NOISE_SHARE
+    above = float(np.log(rms / usual).max())  # standard deviations of a receiver's noise
+    # Where positions are noisier than usual, those along another way would be, too: fewer of them count.
+    unusual = above > -ndtri(options.no_place)
+    chance = fit.log_chance_of_way if unusual else fit.log_chance
     inliers = np.asarray(fit.used.all(axis=1))
     turn_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])))
     checked_deg = max(turn_deg, float(np.degrees(fit.checked_turn_rad)))
@@ -185,9 +192,6 @@ def _judged(
             figures=figures,
         )
 
-    rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]
-    usual = np.maximum(stated, _PLAIN_M)[known.any(axis=0)] * NOISE_SHARE
-    above = float(np.log(rms / usual).max())  # standard deviations of a receiver's noise
     refused = -ndtri(options.wrong if chance <= np.log(options.no_place) else options.no_place)
     if above > refused or inliers.sum() < _LEAST_PHOTOS:
         height = f" and {rms[2]:.0f} m in height" if len(rms) == 3 else ""

@@ -13,7 +13,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation, so3_exp
 from featuredb.geometry.similarity import similarity_closed_form
 from ingest.own_frame import held_of
-from ingest.positions.position_noise import Held
+from ingest.positions.held import Held
 from ingest.register.gps import GpsPlacement, place_by_gps
 from ingest.report.page import FIGURES, figure_rows
 from tests.support.gps_flights import OPTIONS, TRUE, flight, place
@@ -317,3 +317,52 @@ def test_figures_of_heights_that_nobody_told_are_not_known() -> None:
     assert [value is None for value in figures["bias_sigma_m"]] == [False, False, True]
     (row,) = [value for name, value, _ in figure_rows(figures) if name == "noise_m"]
     assert row.endswith(", not known")
+
+
+def _crowd(count: int) -> tuple[FloatArray, list[Rigid3]]:
+    """Photographers along a square, who all look at one front, each with a roll of a degree."""
+    rng = np.random.default_rng(8)
+    local = np.column_stack(
+        [rng.uniform(-60, 60, count), rng.normal(0, 12, count), rng.normal(1.6, 0.2, count)]
+    )
+    held = []
+    for _ in range(count):
+        cam = cam_from_enu(rng.normal(0.0, 10.0), rng.normal(8.0, 3.0), rng.normal(0.0, 1.0))
+        held.append(Rigid3(rotation=nearest_rotation(cam @ TRUE.rotation), translation=np.zeros(3)))
+    return local, held
+
+
+def test_photos_of_many_people_who_look_one_way_tell_the_vertical_and_those_of_one_do_not() -> None:
+    local, held = _crowd(40)
+    sigmas = np.tile([4.0, 4.0, np.inf], (40, 1))
+    tagged = local + np.random.default_rng(9).normal(0, 5.0, local.shape)
+    by_many, by_one = (
+        place_by_gps(TRUE.inverse().act(local), tagged, sigmas, OPTIONS, held=held_of(held, (), camera_of))
+        for camera_of in (np.arange(40), np.zeros(40, dtype=np.int64))
+    )
+    assert (by_many.reason, by_many.provisional) == (None, "")
+    assert by_many.figures["turn_sigma_deg"] < 6.0
+    assert _turn_deg(by_many) < 3.0 * by_many.figures["turn_sigma_deg"]
+    assert by_one.reason == "DEGENERATE_LINE" or "no camera angles" in by_one.provisional
+
+
+def test_positions_close_together_place_a_map_whose_scale_is_wide() -> None:
+    positions = flight(30) * 0.1
+    placed = place(positions, np.random.default_rng(4).normal(0, 4.0, positions.shape), np.full((30, 3), 4.0))
+    assert placed.reason is None
+    assert placed.covariance is not None
+    assert placed.local_from_sfm is not None
+    assert 0.1 < placed.figures["scale_sigma"] < 0.3
+    error = (TRUE @ placed.local_from_sfm.inverse()).log()
+    assert float(error @ np.linalg.solve(placed.covariance, error)) < chi2.ppf(0.999, 7)
+
+
+def test_positions_along_another_way_are_no_place() -> None:
+    """Two ways without corners resemble each other far more often than as many single positions."""
+    x = np.linspace(-60, 60, 9)
+    strips = np.array([(v, 30.0 * k, 60.0) for k in range(2) for v in (x if k == 0 else x[::-1])])
+    turn = np.linspace(0.0, 2.0 * np.pi, 24)[:18]
+    orbit = np.column_stack([40 * np.cos(turn), 30 * np.sin(turn), 25 + 5 * np.sin(3 * turn)])
+    sigmas = np.tile([4.0, 4.0, 10.0], (18, 1))
+    placed = place_by_gps(TRUE.inverse().act(strips), orbit, sigmas, OPTIONS, 4.0 * np.arange(18.0))
+    assert placed.reason == "RESIDUALS"
