@@ -117,10 +117,10 @@ def placed_by_gps(
     positions, sigmas = gps_priors(chosen, frame)
     with_gps = np.flatnonzero(np.isfinite(positions).all(axis=1))
     times_s = capture_seconds([chosen[i] for i in with_gps.tolist()])
-    held = held_of(model.cam_from_sfm, [photo.angles for photo in chosen], whose_cameras(chosen))
-    placed = place_by_gps(
-        model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options, times_s, held
-    )
+    camera_of = whose_cameras(chosen)
+    held = held_of(model.cam_from_sfm, [photo.angles for photo in chosen], camera_of)
+    centers, told_by = model.centers()[with_gps], camera_of[with_gps]
+    placed = place_by_gps(centers, positions[with_gps], sigmas[with_gps], options, times_s, held, told_by)
     return frame, tuple(with_gps.tolist()), placed
 
 
@@ -205,7 +205,7 @@ def _component(
     held_back = (
         placed.provisional
         or impossible_lens(model, chosen, float(feature_map.provenance.get("picture_shear", 0.0)))
-        or impossible_shear(feature_map)
+        or impossible_shear(feature_map, chosen)
         or (HINTS if any(hints) else "")
     )
     if held_back:
@@ -231,8 +231,14 @@ def impossible_lens(model: Model, chosen: Sequence[Photo], shear: float) -> str:
     )
 
 
-def impossible_shear(feature_map: FeatureMap) -> str:
-    """That the pictures are sheared as no lens shears them; "" where they are not."""
+def impossible_shear(feature_map: FeatureMap, chosen: Sequence[Photo]) -> str:
+    """That the pictures are sheared as no lens shears them; "" where they are not.
+
+    Nor where no camera took half of them: one that moves while it reads out bends a map, and pictures that
+    many people cut and stretch do not.
+    """
+    if 2 * int(np.bincount(whose_cameras(chosen)).max()) < len(chosen):
+        return ""
     size = float(feature_map.provenance.get("picture_shear", 0.0))
     return (
         f"{shear_words(size)}: the map is bent more than its positions can tell" if size > IMPOSSIBLE else ""

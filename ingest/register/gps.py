@@ -1,7 +1,8 @@
 """Placement by positions of any quality: the similarity, how wide it is, and whether it may be by chance.
 
 How noisy the positions are is estimated with the similarity (`ingest.positions.position_noise`). What noise
-leaves of the stated sigmas is taken for a bias that all positions share. Two tests, each by a rate of error:
+leaves of the stated sigmas is taken for a bias that all positions by one camera share. Two tests, each by a
+rate of error:
 
 - chance: how often would positions that have nothing to do with the reconstruction fit as well? It follows
   from the ratio of the likelihoods, times the number of ways to leave out the positions that were left out.
@@ -96,6 +97,7 @@ def place_by_gps(
     options: GpsOptions,
     times_s: FloatArray | None = None,
     held: Held | None = None,
+    camera_of: NDArray[np.int64] | None = None,
 ) -> GpsPlacement:
     """Robust similarity from camera centres to GPS positions.
 
@@ -106,6 +108,7 @@ def place_by_gps(
             that is not known.
         times_s: (n,) of capture; None: in the order given.
         held: how the photos are held.
+        camera_of: (n,) whose and which camera took the photo; None: one took all.
     """
     count = len(centers_sfm)
     figures: dict[str, Any] = {"photos_with_gps": count, "options": asdict(options)}
@@ -123,7 +126,9 @@ def place_by_gps(
             fit = over
     if held is not None:
         figures["angles"] = _angles(fit, held)
-    return _judged(fit, centers_sfm, positions_local, sigmas_m, figures, options)
+    _, by_one = np.unique(np.zeros(count) if camera_of is None else camera_of, return_counts=True)
+    receivers = count**2 / float((by_one**2).sum())
+    return _judged(fit, centers_sfm, positions_local, sigmas_m, receivers, figures, options)
 
 
 def _angles(fit: NoisyFit, held: Held) -> dict[str, Any]:
@@ -144,15 +149,20 @@ def _judged(
     centers: FloatArray,
     positions: FloatArray,
     sigmas: FloatArray,
+    receivers: float,
     figures: dict[str, Any],
     options: GpsOptions,
 ) -> GpsPlacement:
-    """Covariance, figures and tests of an estimated similarity."""
+    """Covariance, figures and tests of an estimated similarity.
+
+    Args:
+        receivers: how many have told positions, each with a bias of its own, were they shared out evenly.
+    """
     known = np.isfinite(sigmas)
     residuals = np.where(known, positions - fit.local_from_sfm.act(centers), np.nan)
     stated = np.array([stated_sigma(sigmas[:, k]) for k in range(3)])
     white, drift = (np.array([of[0], of[0], of[1]]) for of in (fit.noise.white, fit.noise.drift))
-    bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0))
+    bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0) / receivers)
     covariance = fit.covariance.copy()
     covariance[4:, 4:] += np.diag(bias**2)
     rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]

@@ -366,3 +366,16 @@ def test_positions_along_another_way_are_no_place() -> None:
     sigmas = np.tile([4.0, 4.0, 10.0], (18, 1))
     placed = place_by_gps(TRUE.inverse().act(strips), orbit, sigmas, OPTIONS, 4.0 * np.arange(18.0))
     assert placed.reason == "RESIDUALS"
+
+
+def test_positions_by_many_receivers_share_no_bias() -> None:
+    """Geotags said to be good to 20 m that agree to 2 m: of one receiver all may be off, of forty not."""
+    positions = flight(40)
+    tagged = positions + np.random.default_rng(6).normal(0, 2.0, positions.shape)
+    sigmas = np.full((40, 3), 20.0)
+    by_many, by_one = (
+        place_by_gps(TRUE.inverse().act(positions), tagged, sigmas, OPTIONS, camera_of=camera_of)
+        for camera_of in (np.arange(40), None)
+    )
+    assert by_many.figures["bias_sigma_m"][0] < 4.0
+    assert by_one.figures["bias_sigma_m"][0] > 15.0

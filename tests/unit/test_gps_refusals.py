@@ -51,10 +51,10 @@ def test_three_positions_are_too_few_to_answer_by() -> None:
     assert "too few" in placed.provisional
 
 
-def test_a_flight_that_is_smaller_than_its_noise_is_refused() -> None:
-    positions = flight(12) * 0.1
-    noise = np.random.default_rng(4).normal(0, 1, (12, 3)) * 3.0
-    assert place(positions, noise, np.full((12, 3), 3.0)).reason is not None
+def test_a_flight_that_is_as_small_as_its_noise_waits_and_a_smaller_one_is_refused() -> None:
+    noise, sigmas = np.random.default_rng(4).normal(0, 1, (12, 3)) * 3.0, np.full((12, 3), 3.0)
+    assert place(flight(12) * 0.1, noise, sigmas).provisional
+    assert place(flight(12) * 0.03, noise, sigmas).reason is not None
 
 
 def test_positions_without_heights_place_a_map() -> None:
