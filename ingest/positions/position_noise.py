@@ -88,7 +88,8 @@ class _Data:
 
     Attributes:
         positions, sigmas: (n, 3), a coordinate that nobody knows has an infinite sigma.
-        walk: (n, n) covariance of a walk of unit variance at its end.
+        walk: (n, n) covariance of walks, of unit variance at the end of the longest.
+        order: (n,) rows in the order of time.
         stated: (2,) median sigma, horizontal and vertical.
         speed: (n, 3) metres of the reconstruction a second; 0 where it is not known.
         shape_m: standard deviation of a centre's coordinate by the reconstruction's own shape.
@@ -100,6 +101,7 @@ class _Data:
     positions: FloatArray
     sigmas: FloatArray
     walk: FloatArray
+    order: NDArray[np.intp]
     stated: FloatArray
     speed: FloatArray
     shape_m: float
@@ -153,6 +155,7 @@ def fit_noisy(
     sigmas: FloatArray,
     times_s: FloatArray | None = None,
     held: Held | None = None,
+    camera_of: NDArray[np.int64] | None = None,
 ) -> NoisyFit:
     """The similarity with all components of variance.
 
@@ -162,6 +165,7 @@ def fit_noisy(
         sigmas: (n, 3) as stated, of the whole error; infinite where a coordinate is not known.
         times_s: (n,) of capture; None: in the order given, and nothing is known of a lag.
         held: how the photos are held.
+        camera_of: (n,) whose receivers drift each by itself; None: there is one.
     """
     stated = np.array([stated_sigma(sigmas[:, axes]) for axes in _AXES])
     middle = Sim3(scale=1.0, rotation=np.eye(3), translation=np.median(np.nan_to_num(positions), axis=0))
@@ -177,7 +181,8 @@ def fit_noisy(
         centers=centers,
         positions=middle.inverse().act(positions),
         sigmas=sigmas,
-        walk=_walk(order),
+        walk=_walk(order, np.zeros(len(centers)) if camera_of is None else camera_of),
+        order=np.argsort(order, kind="stable"),
         stated=stated,
         speed=speed,
         shape_m=_SHAPE * start.scale * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()),
@@ -244,14 +249,17 @@ def _speeds(centers: FloatArray, times_s: FloatArray) -> FloatArray:
     return speed
 
 
-def _walk(times_s: FloatArray) -> FloatArray:
-    """Covariance (n, n) of a drift that is nothing at the first time and of unit variance at the last."""
-    since = times_s - times_s.min()
+def _walk(times_s: FloatArray, camera_of: NDArray[np.floating | np.integer]) -> FloatArray:
+    """Covariance (n, n) of drifts by camera: nothing at first, of unit variance at the end of the longest."""
+    since = times_s.copy()
+    for camera in np.unique(camera_of):
+        since[camera_of == camera] -= times_s[camera_of == camera].min()
     last = float(since.max())
     if last == 0:
         return np.zeros((len(since), len(since)))
     share = np.asarray(since / last)
-    return np.asarray((1.0 - _TREND) * np.minimum(share[:, None], share) + _TREND * np.outer(share, share))
+    walk = (1.0 - _TREND) * np.minimum(share[:, None], share) + _TREND * np.outer(share, share)
+    return np.asarray(np.where(camera_of[:, None] == camera_of, walk, 0.0))
 
 
 def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: FloatArray) -> list[ModelAxis]:
@@ -374,7 +382,7 @@ def _own_share(data: _Data, residual: FloatArray, known: NDArray[np.bool_], thet
 
     Of an autoregressive process of first order, after noise and walk are whitened in the order of time.
     """
-    order = np.argsort(np.diag(data.walk), kind="stable")
+    order = data.order
     together, alone = 0.0, _LEAST_M**2
     for group, axes in enumerate(_AXES):
         for axis in axes.tolist():

@@ -118,10 +118,10 @@ def place_by_gps(
     start = _start(centers_sfm, positions_local, sigmas_m, options)
     if start is None:
         return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
-    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, held)
+    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, held, camera_of)
     if held is not None and (fit.local_from_sfm.rotation @ held.down)[2] > 0:  # a line, the wrong side up
         turned = _turned_over(fit.local_from_sfm, centers_sfm)
-        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, held)
+        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, held, camera_of)
         if over.log_chance <= fit.log_chance + np.log(1.0 / options.wrong):  # else pictures are upside down
             fit = over
     if held is not None:
