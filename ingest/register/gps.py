@@ -32,6 +32,7 @@ from ingest.positions.variance_components import NOISE_SHARE, stated_sigma
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
 _LEAST_PHOTOS = 3  # fix a similarity
+_SEVERAL = 4.0  # receivers
 _PLAIN_M = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 
 
@@ -163,6 +164,8 @@ def _judged(
     stated = np.array([stated_sigma(sigmas[:, k]) for k in range(3)])
     white, drift = (np.array([of[0], of[0], of[1]]) for of in (fit.noise.white, fit.noise.drift))
     bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0) / receivers)
+    if receivers >= _SEVERAL:  # then what they are off by shows among them
+        bias = np.minimum(bias, white / np.sqrt(receivers - 1.0))
     covariance = fit.covariance.copy()
     covariance[4:, 4:] += np.diag(bias**2)
     rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]

@@ -214,6 +214,20 @@ REAL: tuple[Row, ...] = (
         limits="0.9 <= share, placed <= 0",
         minutes=15,
     ),
+    _row(
+        name="reichstag-geotags",
+        claim="`reichstag`, a third of its photos with geotags off by 8 m: an active map; and geotags drawn "
+        "again, of 5 to 25 photos, some far out or on the landmark, against the bounds of the placement",
+        commands=f"tools.landmark_tags --photos {{data}}/reichstag/images --work {{work}}/maps {OUT}",
+        text="{active} of {photos} in an active map, {off_m:.1f} m off, shape {shape_m:.2f} m; of "
+        "{draws:.0f} draws {answering:.0%} answer, {waiting:.0%} wait; inside 68 and 95 %: position "
+        "{answering_position_68:.0%} and {answering_position_95:.1%}, orientation "
+        "{answering_orientation_68:.0%} and {answering_orientation_95:.1%}; those that wait "
+        "{waiting_position_95:.1%} and {waiting_orientation_95:.1%}",
+        limits="0.9 <= share, off_m <= 10, shape_m <= 0.5, 0.92 <= answering_position_95, "
+        "0.92 <= answering_orientation_95, 0.9 <= waiting_position_95, far <= 3",
+        minutes=10,
+    ),
     _laser("fountain-P11", 9, "quick", "map_deg <= 0.1, "),
     _laser("entry-P10", 8, "full"),
     _row(

@@ -1,0 +1,180 @@
+"""One landmark by many people, a third of whom say where they were: placed as well as that allows?
+
+    python -m tools.landmark_tags --photos FOLDER --work DIR [--draws 40] [--json FILE]
+
+1. The photos, without positions, become a map. It is the truth, with its cameras spread over 120 m.
+2. A third of its photos get geotags that are off by 8 m, in a table that says nothing of accuracy. The table
+   is ingested by `featuredb ingest photos --trust-geotags`.
+3. Geotags are drawn many times, for 5, 8, 15 and 25 photos: off by 8 m; a fifth of them anywhere within some
+   hundred metres; three in ten on the landmark instead of where the camera was; off by 15 m. How many draws
+   have a place, answer, and lie inside the 68 % and 95 % bounds that the placement gives them.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from threadpoolctl import threadpool_limits
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import point_jacobian
+from featuredb.store import Database
+from ingest.own_frame import held_of
+from ingest.photos.photo import Photo, whose_cameras
+from ingest.register.gps import GpsOptions, place_by_gps
+from tools.commands import featuredb
+from tools.figures import laid_on, study_parser, write_figures
+from tools.made_maps import all_maps, copied, make, photo_names, position_table
+
+_EXTENT_M, _OFF_M, _STATED_M = 120.0, 8.0, 30.0
+_FRAME = LocalFrame(latitude_deg=52.5186, longitude_deg=13.3750, height_m=75.0)
+_COUNTS = (5, 8, 15, 25)
+_KINDS = {
+    "8 m": (8.0, 0.0, 0.0),
+    "far out": (8.0, 0.2, 0.0),
+    "pinned": (8.0, 0.0, 0.3),
+    "15 m": (15.0, 0.0, 0.0),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landmark:
+    """Cameras of a map, in metres: names, poses, whose they are (n,), and the middle of its points (3,)."""
+
+    names: tuple[str, ...]
+    poses: tuple[Rigid3, ...]
+    camera_of: NDArray[np.int64]
+    middle: FloatArray
+
+    @property
+    def xyz(self) -> FloatArray:
+        """(n, 3) where they are."""
+        return np.array([pose.center for pose in self.poses])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = study_parser(__doc__, "--photos", "--work", "--seed")
+    parser.add_argument("--draws", type=int, default=40, help="of each kind and number")
+    args = parser.parse_args(argv)
+    make(args.work / "untagged", "photos", args.photos)
+    landmark = true_landmark(args.work / "untagged")
+    figures = ingested(landmark, args.photos, args.work, args.seed)
+    with threadpool_limits(1):  # matrices are small
+        figures |= drawn(landmark, args.draws, args.seed)
+    write_figures(args.json, figures)
+    return 0
+
+
+def true_landmark(database: Path) -> Landmark:
+    """The largest map, which has no place, in metres."""
+    largest = max(all_maps(database), key=lambda one: len(one.images))
+    poses = [image.cam_from_local for image in largest.images]
+    extent = np.linalg.norm(np.ptp([pose.center for pose in poses], axis=0)[:2])
+    scale = _EXTENT_M / float(extent)
+    sizes = [largest.cameras[image.camera_id] for image in largest.images]
+    names = tuple(Path(image.name).name for image in largest.images)
+    photos = [
+        Photo(name=n, path=Path(n), width=c.width, height=c.height) for n, c in zip(names, sizes, strict=True)
+    ]
+    return Landmark(
+        names=names,
+        poses=tuple(Rigid3(rotation=p.rotation, translation=scale * p.translation) for p in poses),
+        camera_of=whose_cameras(photos),
+        middle=scale * np.median(largest.points.xyz, axis=0),
+    )
+
+
+def ingested(landmark: Landmark, photos: Path, work: Path, seed: int) -> dict[str, float]:
+    """What the command makes of a table in which a third of the photos have a geotag."""
+    folder = copied(photos, photo_names(photos), work / "tagged", strip=False)
+    rng = np.random.default_rng(seed)
+    rows = rng.choice(len(landmark.names), len(landmark.names) // 3, replace=False)
+    tags = _FRAME.geodetic_from_enu(landmark.xyz[rows] + rng.normal(0.0, _OFF_M, (len(rows), 3)))
+    told = {landmark.names[k]: (f"{tag[0]:.7f}", f"{tag[1]:.7f}") for k, tag in zip(rows, tags, strict=True)}
+    names = photo_names(photos)
+    table = position_table(folder, [(name, *told.get(name, ("", "")), "", "", "") for name in names])
+    featuredb("ingest", "photos", str(work / "db"), str(table), "--trust-geotags", "--quiet", may_refuse=True)
+    snapshot = Database.open(work / "db").snapshot()
+    places: dict[str, FloatArray] = {}
+    for summary in snapshot.maps():
+        if summary.status == "active":
+            one = snapshot.load_map(summary.map_id)
+            to_ours = _FRAME.enu_from(one.frame)
+            places |= {Path(i.name).name: to_ours.act(i.cam_from_local.center) for i in one.images}
+    true = dict(zip(landmark.names, landmark.xyz, strict=True))
+    both = sorted(true.keys() & places.keys())
+    aligned = laid_on(places, true)
+    off = [np.linalg.norm((places[n] - true[n])[:2]) for n in both]
+    shape = [] if aligned is None else [np.linalg.norm(aligned.act(places[n]) - true[n]) for n in both]
+    return {
+        "photos": len(landmark.names),
+        "tagged": len(rows),
+        "active": len(both),
+        "share": len(both) / len(landmark.names),
+        "off_m": float(np.median(off)) if off else float("nan"),
+        "shape_m": float(np.median(shape)) if shape else float("nan"),
+    }
+
+
+def drawn(landmark: Landmark, draws: int, seed: int) -> dict[str, float]:
+    """Places by drawn geotags, as ingest makes them: squared errors over their covariances."""
+    scores: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
+    tried = 0
+    for number, (kind, (off_m, far, pinned)) in enumerate(_KINDS.items()):
+        for count in _COUNTS:
+            here = {True: 0, False: 0}
+            for draw in range(draws):
+                rng = np.random.default_rng((seed, number, count, draw))
+                rows = np.sort(rng.choice(len(landmark.names), count, replace=False))
+                tags = landmark.xyz[rows] + rng.normal(0.0, off_m, (count, 3))
+                out, on = rng.random(count) < far, rng.random(count) < pinned
+                tags[out, :2] += rng.normal(0.0, 150.0, (int(out.sum()), 2))
+                tags[on] = landmark.middle + rng.normal(0.0, 15.0, (int(on.sum()), 3))
+                sigmas = np.tile([_STATED_M, _STATED_M, np.inf if draw % 2 else _STATED_M], (count, 1))
+                held = held_of(landmark.poses, (), landmark.camera_of)
+                placed = place_by_gps(
+                    landmark.xyz[rows], tags, sigmas, GpsOptions(), None, held, landmark.camera_of[rows]
+                )
+                if placed.reason is None:
+                    assert placed.local_from_sfm is not None
+                    assert placed.covariance is not None
+                    answers = not placed.provisional
+                    here[answers] += 1
+                    error = placed.local_from_sfm.inverse().log()
+                    camera = point_jacobian(landmark.xyz[[rng.integers(len(landmark.names))]])[0, :2]
+                    parts = [camera, np.eye(7)[1:4]]
+                    scores[answers].append(_squares(error, placed.covariance, parts))
+            tried += draws
+            sys.stdout.write(
+                f"{kind:<8} {count:>3} tags: {here[True]} answer, {here[False]} wait, of {draws}\n"
+            )
+    result = {"draws": float(tried)}
+    for name, of in (("answering", scores[True]), ("waiting", scores[False])):
+        result[name] = len(of) / tried
+        for k, (part, size) in enumerate((("position", 2), ("orientation", 3))):
+            for level in (0.68, 0.95):
+                inside = [score[k] <= chi2.ppf(level, size) for score in of]
+                result[f"{name}_{part}_{100 * level:.0f}"] = (
+                    float(np.mean(inside)) if inside else float("nan")
+                )
+    result["far"] = float(
+        sum(p > 2 * chi2.ppf(0.999, 2) or o > 2 * chi2.ppf(0.999, 3) for p, o in scores[True])
+    )
+    return result
+
+
+def _squares(error: FloatArray, covariance: FloatArray, parts: Sequence[FloatArray]) -> tuple[float, float]:
+    position, orientation = (
+        float((rows @ error) @ np.linalg.solve(rows @ covariance @ rows.T, rows @ error)) for rows in parts
+    )
+    return position, orientation
+
+
+if __name__ == "__main__":
+    sys.exit(main())
