@@ -102,7 +102,7 @@ def build_unplaced_map(
     options: MapOptions,
 ) -> UnplacedMap | None:
     """The map of a model whose place nobody knows, in a frame of its own; arguments as in `build_map`."""
-    own_from_sfm, frame = own_frame_of(model)
+    own_from_sfm, frame = own_frame_of(model, [photo.orientation for photo in photos])
     parts = _parts(model, own_from_sfm, photos, features, identity, options)
     if parts is None:
         return None

@@ -33,23 +33,46 @@ _ASKEW_RAD = np.radians(15.0)  # of one photo: then they are not held level
 _COMMON_ROLL_RAD = np.radians(1.5)  # of all photos by one gimbal or hand
 _COMMON_SHARE = 0.6  # of the variance of angles that photos tell: 1.5 of 2 degrees, squared; `brighton` again
 _LEAST_TOLD = 3
+_TURNED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # stored lying on a side
+_LOOKED_AT = {
+    **dict.fromkeys((1, 2), np.eye(3)),
+    **dict.fromkeys((3, 4), _TURNED @ _TURNED),
+    **dict.fromkeys((5, 6), _TURNED),
+    **dict.fromkeys((7, 8), _TURNED.T),
+}
 _KEPT_SIGMAS = 3.0  # photos that were held askew do not tell the vertical
 
 
-def own_frame_of(model: Model) -> tuple[Sim3, OwnFrame]:
+def own_frame_of(model: Model, orientations: Sequence[int] = ()) -> tuple[Sim3, OwnFrame]:
     """The similarity own_from_sfm, and what the own frame is.
 
     The scale sets the median distance from a camera to its points to `NOMINAL_DISTANCE`, the origin is the
     points' median. People and gimbals hold cameras level: the direction across all photos' horizontal image
     axes is the vertical, if these axes point far enough apart; then z is up.
+
+    Args:
+        orientations: of the photos by EXIF, or none at all.
     """
     median = float(np.median(model.distances()))
     scale = NOMINAL_DISTANCE / median if median > 0 else 1.0
-    up = vertical_of(model.cam_from_sfm)
+    up = vertical_of(as_looked_at(model.cam_from_sfm, orientations))
     rotation = np.eye(3) if up is None else rotation_to_up(up)
     middle = np.median(model.xyz, axis=0)
     own_from_sfm = Sim3(scale=scale, rotation=rotation, translation=-scale * rotation @ middle)
     return own_from_sfm, OwnFrame(metric=False, upright=up is not None)
+
+
+def as_looked_at(poses: Sequence[Rigid3], orientations: Sequence[int]) -> list[Rigid3]:
+    """Poses with x to the right and y down as photos are looked at, by EXIF's orientations, if there are any.
+
+    Which way a mirrored photo's x points is not told; nothing here asks.
+    """
+    if not len(orientations):
+        return list(poses)
+    return [
+        Rigid3(rotation=turn @ pose.rotation, translation=turn @ pose.translation)
+        for pose, turn in zip(poses, (_LOOKED_AT[one] for one in orientations), strict=True)
+    ]
 
 
 def vertical_of(poses: Sequence[Rigid3]) -> FloatArray | None:
@@ -70,6 +93,7 @@ def held_of(
     poses: Sequence[Rigid3],
     angles: Sequence[CameraAngles | None] = (),
     camera_of: NDArray[np.int64] | None = None,
+    orientations: Sequence[int] = (),
 ) -> Held | None:
     """How photos are held, for a placement; None where nothing tells.
 
@@ -80,12 +104,15 @@ def held_of(
     Args:
         angles: of each photo, or none at all.
         camera_of: (n,) which camera, or whose, took each photo; None: one took all.
+        orientations: of the photos by EXIF, or none at all.
     """
     camera_of = np.zeros(len(poses), dtype=np.int64) if camera_of is None else camera_of
     told = [(pose.rotation, one) for pose, one in zip(poses, angles, strict=False) if one is not None]
     tilted = [(turn, one) for turn, one in told if one.pitch_deg is not None]
     parts = [
-        part for part in (_by_yaw(told), _by_tilt(tilted) or _level(poses, camera_of)) if part is not None
+        part
+        for part in (_by_yaw(told), _by_tilt(tilted) or _level(as_looked_at(poses, orientations), camera_of))
+        if part is not None
     ]
     if not parts:
         return None

@@ -118,7 +118,8 @@ def placed_by_gps(
     with_gps = np.flatnonzero(np.isfinite(positions).all(axis=1))
     times_s = capture_seconds([chosen[i] for i in with_gps.tolist()])
     camera_of = whose_cameras(chosen)
-    held = held_of(model.cam_from_sfm, [photo.angles for photo in chosen], camera_of)
+    angles, orientations = [photo.angles for photo in chosen], [photo.orientation for photo in chosen]
+    held = held_of(model.cam_from_sfm, angles, camera_of, orientations)
     centers, told_by = model.centers()[with_gps], camera_of[with_gps]
     placed = place_by_gps(centers, positions[with_gps], sigmas[with_gps], options, times_s, held, told_by)
     return frame, tuple(with_gps.tolist()), placed
