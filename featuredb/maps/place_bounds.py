@@ -10,7 +10,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.sim3 import point_jacobian
 
-_NO_HEIGHT_M = 1e4  # no place is so high; where no photo tells a height, 1e5 m and more are left open
+NO_HEIGHT_M = 1e4  # no place is so high; where no photo tells a height, 1e5 m and more are left open
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +53,7 @@ class PlaceBounds:
         """Place and turn, a sentence each."""
         rise_m = 100.0 * math.tan(math.radians(min(self.tilt_deg, 45.0)))
         height = f"and {self.vertical_m:.2f} m vertically (95 %)"
-        if self.vertical_m > _NO_HEIGHT_M:
+        if self.vertical_m > NO_HEIGHT_M:
             height = "(95 %); its height is not known"
         return (
             f"place: right to {self.horizontal_m:.2f} m horizontally {height}",

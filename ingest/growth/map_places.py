@@ -11,6 +11,7 @@ from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
+from featuredb.maps.place_bounds import NO_HEIGHT_M
 
 # 95 % of a normal error along the worst axis.
 SIGMAS_95 = 1.96
@@ -90,8 +91,16 @@ def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> Floa
     """(7, 7) that turns and shifts the map in all directions as much as the given one in its worst.
 
     About the middle of its photos; not less, anywhere that the map answers for, than the given one says for
-    the worst direction there. The covariance is of the placement's left perturbation, in the map's frame.
+    the worst direction there. A height that nobody knows is no such direction. The covariance is of the
+    placement's left perturbation, in the map's frame.
     """
+    unknown_m2 = float(covariance[6, 6])
+    if unknown_m2 > NO_HEIGHT_M**2:
+        covariance = covariance.copy()
+        covariance[6], covariance[:, 6] = 0.0, 0.0
+        covariance[6, 6] = covariance[4:6, 4:6].diagonal().max()
+        alike = isotropic_inflation(feature_map, covariance)
+        return alike + np.diag([0.0] * 6 + [unknown_m2])
     middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
     jacobian = point_jacobian(middle)
     shift_m2 = float(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1])

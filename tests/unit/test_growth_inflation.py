@@ -49,3 +49,13 @@ def test_what_is_alike_already_stays() -> None:
     once = inflated(feature_map).placement.covariance
     np.testing.assert_allclose(again, once, rtol=1e-6, atol=1e-12)
     assert drift_m(once, places_of(feature_map)) == pytest.approx(1.96 * 0.3, rel=0.02)
+
+
+def test_a_height_that_nobody_knows_leaves_the_place_in_plan() -> None:
+    feature_map, given = existing(), weak_in_height()
+    given[6, 6] = 1e10
+    alike = isotropic_inflation(feature_map, given)
+    assert alike[6, 6] >= 1e10
+    middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
+    in_plan = (point_jacobian(middle) @ alike @ point_jacobian(middle).T)[:2, :2]
+    assert np.sqrt(np.linalg.eigvalsh(in_plan)[-1]) < 3.0

@@ -16,6 +16,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.move import covariance_in_frame, in_frame
+from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.store import Snapshot
 from featuredb.store.changes import is_imported
 from featuredb.store.decode import frame_of, placement_of
@@ -26,7 +27,15 @@ from ingest.growth import gates
 from ingest.growth.graph.pose_graph import WORLD, GraphEdge, GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, map_drift_m, with_growth
 from ingest.growth.place.component import GrownMap, grow_component
-from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
+from ingest.growth.values import (
+    LEAST_PHOTOS,
+    OF_THE_PLACE,
+    Edge,
+    FeaturesOf,
+    LocalisedPhoto,
+    Refused,
+    tied_together,
+)
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.links import keep_photos
@@ -203,6 +212,7 @@ def grow_within_budget(
         reconstruction and not the others of the run, nor the next run.
     """
     part, everything = model, tuple(model.rows.tolist())
+    budget_m = max(budget_m, _as_wide_a_place_allows(part, localised, maps))
     beyond: dict[int, tuple[str, str]] = {}
     refused = Refused(reason="", message="")
     for _ in range(_TRIES):
@@ -228,6 +238,19 @@ def grow_within_budget(
         beyond |= {r: grown.left_out.get(r, (gate.reason, gate.message)) for r in gone}
         part = left
     return refused
+
+
+def _as_wide_a_place_allows(
+    model: Model, localised: Mapping[int, LocalisedPhoto], maps: Mapping[str, PlacedMap]
+) -> float:
+    """A drift that adds hardly to what the maps that hold the photos leave open themselves, metres."""
+    holding = {localised[r].map_ids[0] for r in model.rows.tolist() if r in localised}
+    bounds = [
+        PlaceBounds.of(maps[m].placement.covariance, maps[m].corners.mean(axis=0)).horizontal_m
+        for m in holding
+        if m in maps and len(maps[m].corners)
+    ]
+    return OF_THE_PLACE * min(bounds, default=0.0)
 
 
 def with_drift(

@@ -181,7 +181,7 @@ def _examine(
 def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Promotion | None:
     """What keeps a map in quarantine before anybody is asked."""
     active = {m.map_id for m in snapshot.maps() if m.status == "active"}
-    gate = gates.drift(summary.drift_m or 0.0, budget_m)
+    gate = gates.drift(summary.drift_m or 0.0, max(budget_m, summary.budget_m or 0.0))
     code, text = gate.reason, gate.message
     if is_imported(summary.status, summary.status_reason):
         code, text = "IMPORTED", summary.status_reason
