@@ -16,6 +16,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NOMINAL_DISTANCE, OwnFrame
 from ingest.colmap.bridge import Model
 from ingest.positions.held import Held
+from ingest.positions.receivers import receivers
 
 # What gives a map without a place its place; for people.
 WAYS_TO_A_PLACE = (
@@ -26,7 +27,6 @@ WAYS_TO_A_PLACE = (
 )
 # A frame is called upright where the standard error of its vertical is below this about both horizontal axes.
 _UPRIGHT_SIGMA_RAD = np.radians(2.0)
-_LEAST_CAMERAS = 4
 _BY_CHANCE = 0.01  # maps whose cameras seem to agree on their vertical because few of them happen to
 _ROBUST_ROUNDS = 5
 _ASKEW_RAD = np.radians(15.0)  # of one photo: then they are not held level
@@ -99,7 +99,7 @@ def held_of(
 
     Tilts that photos tell come first; where less than three do, photos are taken to be held level, unless
     most of them are not. What the photos by one camera have in common does not average out, wherever they
-    look: a gimbal that is off stays off, and leans with the wind as the aircraft turns.
+    look: a gimbal that is off stays off, and leans with the wind as the aircraft turns. Many people's do.
 
     Args:
         angles: of each photo, or none at all.
@@ -183,30 +183,28 @@ def _level(poses: Sequence[Rigid3], camera_of: NDArray[np.int64]) -> Held | None
         return None
     kept, sigma, _, _ = found
     across = np.array([pose.rotation[0] for pose in poses])[kept]
-    _, row, counts = np.unique(camera_of[kept], return_inverse=True, return_counts=True)
-    by_one = counts[row]
+    by = receivers(camera_of[kept], len(across))
+    by_one = len(across) / by  # photos that have a roll in common
     return Held(
         directions=across,
         across=np.tile(np.eye(3)[2], (len(across), 1)),
         along=np.zeros((len(across), 3)),
         sigma_rad=np.full(len(across), np.hypot(sigma, _COMMON_ROLL_RAD)),
-        joint_rad=np.sqrt(sigma**2 + by_one * _COMMON_ROLL_RAD**2),
+        joint_rad=np.full(len(across), np.sqrt(sigma**2 + by_one * _COMMON_ROLL_RAD**2)),
         down=_down(poses)[kept].mean(axis=0),
         told=False,
-        checked=_agree(across / np.sqrt(by_one)[:, None], len(counts)),
+        checked=by > 1.0 and _agree(across, by),
     )
 
 
-def _agree(across: FloatArray, cameras: int) -> bool:
+def _agree(across: FloatArray, cameras: float) -> bool:
     """Whether so many cameras look so many ways that the vertical is theirs, and hardly by chance.
 
     By the standard error of a principal axis (Anderson 1963), as large as the cameras allow it to be.
 
     Args:
-        across: (n, 3) horizontal image axes, of such a length that each camera counts once.
+        across: (n, 3) horizontal image axes. cameras: how many of them are independent.
     """
-    if cameras < _LEAST_CAMERAS:
-        return False
     least, second = np.linalg.eigvalsh(across.T @ across)[:2].tolist()
     most = max(least, 0.0) / chdtri(cameras - 2, 1.0 - _BY_CHANCE)
     return bool(np.sqrt(most * second) <= _UPRIGHT_SIGMA_RAD * (second - least))

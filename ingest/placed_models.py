@@ -16,6 +16,7 @@ from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE, held_of
 from ingest.photos.photo import Photo, capture_seconds, gps_priors, local_frame_of, whose_cameras
+from ingest.positions.receivers import receivers
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.register.block import block_of_model, model_of_block
 from ingest.register.control.maps import Survey, place_by_survey, vertical_of
@@ -117,7 +118,7 @@ def placed_by_gps(
     positions, sigmas = gps_priors(chosen, frame)
     with_gps = np.flatnonzero(np.isfinite(positions).all(axis=1))
     times_s = capture_seconds([chosen[i] for i in with_gps.tolist()])
-    camera_of = whose_cameras(chosen)
+    camera_of = whose_cameras(chosen, [model.cameras[int(c)].focal_px for c in model.camera_of])
     angles, orientations = [photo.angles for photo in chosen], [photo.orientation for photo in chosen]
     held = held_of(model.cam_from_sfm, angles, camera_of, orientations)
     centers, told_by = model.centers()[with_gps], camera_of[with_gps]
@@ -235,10 +236,10 @@ def impossible_lens(model: Model, chosen: Sequence[Photo], shear: float) -> str:
 def impossible_shear(feature_map: FeatureMap, chosen: Sequence[Photo]) -> str:
     """That the pictures are sheared as no lens shears them; "" where they are not.
 
-    Nor where no camera took half of them: one that moves while it reads out bends a map, and pictures that
-    many people cut and stretch do not.
+    Nor where many people took them: a camera that moves while it reads out bends a map, and pictures that
+    each cut and stretched in his own way do not.
     """
-    if 2 * int(np.bincount(whose_cameras(chosen)).max()) < len(chosen):
+    if receivers(whose_cameras(chosen), len(chosen)) > 1.0:
         return ""
     size = float(feature_map.provenance.get("picture_shear", 0.0))
     return (

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.features.exif.gps import AltitudeReference
+from featuredb.features.exif.read import UNNAMED_MAKE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -84,6 +85,7 @@ CameraSharing = Literal["shared", "per-image"]
 
 # 1.2 times the longer side is a field of view of 45 degrees, COLMAP's guess without EXIF.
 _DEFAULT_FOCAL_OVER_SIDE = 1.2
+_ONE_LENS = 0.2  # of the logarithm: what one lens comes to, found anew for each photo from above
 
 
 def photo_cameras(
@@ -125,11 +127,29 @@ def shared_key(photo: Photo, sharing: CameraSharing) -> str:
     return f"unnamed camera of {whose}, {day}, {photo.width} x {photo.height}{focal}"
 
 
-def whose_cameras(photos: Sequence[Photo]) -> NDArray[np.int64]:
-    """(n,) numbers of whose and which camera took each photo; photos that name neither: by their size."""
-    numbers: dict[tuple[str | int, ...], int] = {}
-    named = [(p.contributor, p.owner, p.make, p.model, p.film) for p in photos]
-    keys = [name if any(name) else (p.width, p.height) for p, name in zip(photos, named, strict=True)]
+def whose_cameras(photos: Sequence[Photo], focals_px: Sequence[float] = ()) -> NDArray[np.int64]:
+    """(n,) numbers of whose and which camera took each photo.
+
+    By who contributed it; else by owner, make and model; else by film. Photos that name nothing are by as
+    many cameras as they have sizes, but by one where their focal lengths agree: programs cut and resize.
+
+    Args:
+        focals_px: (n,) as reconstructed; none: sizes must do.
+    """
+    named: list[tuple[str, ...]] = [
+        (p.contributor,) if p.contributor else (p.owner, "" if p.make == UNNAMED_MAKE else p.make, p.model)
+        for p in photos
+    ]
+    keys = [name if any(name) else (p.film,) for p, name in zip(photos, named, strict=True)]
+    rows = [k for k, key in enumerate(keys) if not any(key)]
+    sides = np.array([max(photos[k].width, photos[k].height) for k in rows])
+    if len(focals_px) and rows:
+        relative = np.log(np.asarray(focals_px, dtype=np.float64)[rows] / sides)
+        if 1.4826 * float(np.median(np.abs(relative - np.median(relative)))) < _ONE_LENS:
+            rows = []
+    for k in rows:
+        keys[k] = f"{photos[k].width} x {photos[k].height}", ""
+    numbers: dict[tuple[str, ...], int] = {}
     return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
 
 

@@ -20,6 +20,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.positions.held import ANGLES_WRONG, Held
 from ingest.positions.one_height import told_once
+from ingest.positions.receivers import places_apart
 from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean, stated_sigma
 
 _TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
@@ -29,7 +30,8 @@ _SETTLED = 1e-3  # of a step over its standard deviation
 _TREND = 0.75  # of the variance of a drift at its end: what has one slope all along
 _UNKNOWN_SCALE, _UNKNOWN_TURN, _UNKNOWN_M = 1.0, 1.8, 1e5  # logarithm, radians: nothing is known
 _LEAST_M = 1e-6
-_LEAST_PHOTOS = 3
+_LEAST_PHOTOS, _ONE_PLACE = 3, 2.0  # standard deviations of a position
+_LEAST_PLACES = 4  # of many people: two fix a similarity in plan, and as many are left to check it by
 _LEAST_SHARE = 0.02  # of a stated sigma: the least noise that counts where chance is judged
 _LAG_SHARE = 0.5  # of a stated sigma that may be a lag
 _MOST_LAG_S = 1.0  # standard deviation of a lag
@@ -88,7 +90,8 @@ class _Data:
 
     Attributes:
         positions, sigmas: (n, 3), a coordinate that nobody knows has an infinite sigma.
-        walk: (n, n) covariance of walks, of unit variance at the end of the longest.
+        walk: (n, n) covariance of a walk of unit variance at its end.
+        many: people told the positions.
         order: (n,) rows in the order of time.
         stated: (2,) median sigma, horizontal and vertical.
         speed: (n, 3) metres of the reconstruction a second; 0 where it is not known.
@@ -101,6 +104,7 @@ class _Data:
     positions: FloatArray
     sigmas: FloatArray
     walk: FloatArray
+    many: bool
     order: NDArray[np.intp]
     stated: FloatArray
     speed: FloatArray
@@ -155,7 +159,7 @@ def fit_noisy(
     sigmas: FloatArray,
     times_s: FloatArray | None = None,
     held: Held | None = None,
-    camera_of: NDArray[np.int64] | None = None,
+    many: bool = False,
 ) -> NoisyFit:
     """The similarity with all components of variance.
 
@@ -165,7 +169,7 @@ def fit_noisy(
         sigmas: (n, 3) as stated, of the whole error; infinite where a coordinate is not known.
         times_s: (n,) of capture; None: in the order given, and nothing is known of a lag.
         held: how the photos are held.
-        camera_of: (n,) whose receivers drift each by itself; None: there is one.
+        many: people told the positions, about one each: there is no drift that they share.
     """
     stated = np.array([stated_sigma(sigmas[:, axes]) for axes in _AXES])
     middle = Sim3(scale=1.0, rotation=np.eye(3), translation=np.median(np.nan_to_num(positions), axis=0))
@@ -181,7 +185,8 @@ def fit_noisy(
         centers=centers,
         positions=middle.inverse().act(positions),
         sigmas=sigmas,
-        walk=_walk(order, np.zeros(len(centers)) if camera_of is None else camera_of),
+        walk=np.zeros((len(centers), len(centers))) if many else _walk(order),
+        many=many,
         order=np.argsort(order, kind="stable"),
         stated=stated,
         speed=speed,
@@ -249,17 +254,14 @@ def _speeds(centers: FloatArray, times_s: FloatArray) -> FloatArray:
     return speed
 
 
-def _walk(times_s: FloatArray, camera_of: NDArray[np.floating | np.integer]) -> FloatArray:
-    """Covariance (n, n) of drifts by camera: nothing at first, of unit variance at the end of the longest."""
-    since = times_s.copy()
-    for camera in np.unique(camera_of):
-        since[camera_of == camera] -= times_s[camera_of == camera].min()
+def _walk(times_s: FloatArray) -> FloatArray:
+    """Covariance (n, n) of a drift that is nothing at the first time and of unit variance at the last."""
+    since = times_s - times_s.min()
     last = float(since.max())
     if last == 0:
         return np.zeros((len(since), len(since)))
     share = np.asarray(since / last)
-    walk = (1.0 - _TREND) * np.minimum(share[:, None], share) + _TREND * np.outer(share, share)
-    return np.asarray(np.where(camera_of[:, None] == camera_of, walk, 0.0))
+    return np.asarray((1.0 - _TREND) * np.minimum(share[:, None], share) + _TREND * np.outer(share, share))
 
 
 def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: FloatArray) -> list[ModelAxis]:
@@ -336,15 +338,11 @@ def _weights(squared: FloatArray) -> FloatArray:
 
 
 def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> tuple[float, float]:
-    """See `NoisyFit`: of positions that have nothing in common, and of positions along another way.
-
-    Args:
-        total: positions before any was left out.
-    """
+    """See `NoisyFit`: of positions that have nothing in common, and along another way; total: of all."""
     shift = np.broadcast_to(np.eye(3), (len(data.centers), 3, 3))
     known = np.isfinite(data.sigmas) & (weights > 0)[:, [0, 0, 1]]
     off = np.where(np.isfinite(data.sigmas), data.positions, 0.0)
-    costs, theta = [], np.zeros(4)
+    costs, theta, places = [], np.zeros(4), _LEAST_PLACES
     for residual in (state.residual(data), off - np.median(off, axis=0)):
         problem = MixedModel(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
         spread = [np.square(residual[known[:, axes[0]]][:, axes]) for axes in _AXES]
@@ -353,6 +351,10 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
         start = np.log(np.concatenate([size, size]))
         theta = problem.most_likely(start, None, np.log(_LEAST_SHARE * data.stated))
         costs.append(problem.cost(theta, None))
+        if data.many and len(costs) == 1:
+            places = places_apart(state.sim.act(data.centers)[known[:, 0]], _ONE_PLACE * np.exp(theta[0]))
+    if places < _LEAST_PLACES:
+        return 0.0, 0.0
     freedom, taken_up = int(known.sum()) - 3, 6 if data.speed.any() else 4
     log_ratio = min((costs[0] - costs[1]) / freedom, 0.0) if freedom > 0 else 0.0
     kept = int((weights > 0).all(axis=1).sum())
@@ -364,10 +366,9 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
 
 
 def _log_beta_tail(log_ratio: float, freedom: float, taken_up: int, log_tries: float) -> float:
-    """Logarithm of how often a ratio of sums of squares is as small, in so many tries.
+    """Logarithm of how often a ratio of sums of squares, or of likelihoods, is as small, in so many tries.
 
-    Four of the degrees of freedom are the scale's and the turn's, so that the ratio, which is the
-    likelihoods', has a beta distribution. A lag counts as two.
+    It has a beta distribution: four degrees of freedom are the scale's and the turn's, two a lag's.
     """
     half = (freedom - taken_up) / 2.0
     if half <= 0:

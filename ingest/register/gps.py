@@ -1,8 +1,8 @@
 """Placement by positions of any quality: the similarity, how wide it is, and whether it may be by chance.
 
 How noisy the positions are is estimated with the similarity (`ingest.positions.position_noise`). What noise
-leaves of the stated sigmas is taken for a bias that all positions by one camera share. Two tests, each by a
-rate of error:
+leaves of the stated sigmas is taken for a bias that all positions share, unless many people told them. Two
+tests, each by a rate of error:
 
 - chance: how often would positions that have nothing to do with the reconstruction fit as well? It follows
   from the ratio of the likelihoods, times the number of ways to leave out the positions that were left out.
@@ -27,12 +27,13 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from ingest.positions.held import ANGLES_WRONG, Held
 from ingest.positions.position_noise import NoisyFit, fit_noisy
+from ingest.positions.receivers import receivers
 from ingest.positions.variance_components import NOISE_SHARE, stated_sigma
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
 _LEAST_PHOTOS = 3  # fix a similarity
-_SEVERAL = 4.0  # receivers
+_MANY_SHARE = 0.1  # of what they state, of many people's positions: pins on one map, which may be off
 _PLAIN_M = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 
 
@@ -119,17 +120,18 @@ def place_by_gps(
     start = _start(centers_sfm, positions_local, sigmas_m, options)
     if start is None:
         return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
-    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, held, camera_of)
+    many = receivers(camera_of, count) > 1.0
+    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, held, many)
     if held is not None and (fit.local_from_sfm.rotation @ held.down)[2] > 0:  # a line, the wrong side up
         turned = _turned_over(fit.local_from_sfm, centers_sfm)
-        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, held, camera_of)
+        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, held, many)
         if over.log_chance <= fit.log_chance + np.log(1.0 / options.wrong):  # else pictures are upside down
             fit = over
     if held is not None:
         figures["angles"] = _angles(fit, held)
-    _, by_one = np.unique(np.zeros(count) if camera_of is None else camera_of, return_counts=True)
-    receivers = count**2 / float((by_one**2).sum())
-    return _judged(fit, centers_sfm, positions_local, sigmas_m, receivers, figures, options)
+    inner = fit.used.all(axis=1)
+    by = receivers(None if camera_of is None else camera_of[inner], int(inner.sum()))
+    return _judged(fit, centers_sfm, positions_local, sigmas_m, by, figures, options)
 
 
 def _angles(fit: NoisyFit, held: Held) -> dict[str, Any]:
@@ -150,22 +152,23 @@ def _judged(
     centers: FloatArray,
     positions: FloatArray,
     sigmas: FloatArray,
-    receivers: float,
+    by: float,
     figures: dict[str, Any],
     options: GpsOptions,
 ) -> GpsPlacement:
     """Covariance, figures and tests of an estimated similarity.
 
     Args:
-        receivers: how many have told positions, each with a bias of its own, were they shared out evenly.
+        by: `receivers` of the positions that agree.
     """
     known = np.isfinite(sigmas)
     residuals = np.where(known, positions - fit.local_from_sfm.act(centers), np.nan)
     stated = np.array([stated_sigma(sigmas[:, k]) for k in range(3)])
     white, drift = (np.array([of[0], of[0], of[1]]) for of in (fit.noise.white, fit.noise.drift))
-    bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0) / receivers)
-    if receivers >= _SEVERAL:  # then what they are off by shows among them
-        bias = np.minimum(bias, white / np.sqrt(receivers - 1.0))
+    bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0))
+    if by > 1.0:  # what each is off by shows among them, but not what all share: a datum of heights, a map
+        shared = np.hypot(np.minimum(bias, white) / np.sqrt(by - 1.0), _MANY_SHARE * stated)
+        bias[:2] = np.minimum(bias, shared)[:2]
     covariance = fit.covariance.copy()
     covariance[4:, 4:] += np.diag(bias**2)
     rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]

@@ -379,3 +379,43 @@ def test_positions_by_many_receivers_share_no_bias() -> None:
     )
     assert by_many.figures["bias_sigma_m"][0] < 4.0
     assert by_one.figures["bias_sigma_m"][0] > 15.0
+
+
+@pytest.mark.parametrize("drones", [2, 4])
+def test_drones_that_share_a_block_are_as_uncertain_as_one(drones: int) -> None:
+    """Each has its own bias, and flies a part of the block after the others: four draws of each."""
+    for seed in range(4):
+        rng = np.random.default_rng((seed, drones))
+        positions = flight(12 * drones, seed)
+        positions = positions[np.argsort(positions[:, 0])]
+        camera_of = np.repeat(np.arange(drones), 12)
+        bias = rng.normal(0.0, 1.0, (drones, 3)) * [2.0, 2.0, 5.0]
+        told = positions + bias[camera_of] + rng.normal(0, 0.5, positions.shape)
+        sigmas, times = np.tile([4.0, 4.0, 10.0], (len(positions), 1)), 4.0 * np.arange(len(positions))
+        placed = place_by_gps(
+            TRUE.inverse().act(positions), told, sigmas, OPTIONS, times + 600.0 * camera_of, None, camera_of
+        )
+        if placed.reason is None:
+            assert placed.local_from_sfm is not None
+            assert placed.covariance is not None
+            error = (TRUE @ placed.local_from_sfm.inverse()).log()[1:4]
+            assert float(error @ np.linalg.solve(placed.covariance[1:4, 1:4], error)) < chi2.ppf(0.999, 3)
+
+
+def test_people_who_stand_at_two_places_leave_nothing_to_check_by() -> None:
+    rng = np.random.default_rng(12)
+    at = rng.integers(0, 2, 40)
+    local = np.array([[-40.0, 0, 1.6], [40.0, 5, 1.6]])[at] + rng.normal(0, 0.5, (40, 3))
+    tagged = np.array([[10.0, 60, 0], [-20.0, -30, 0]])[at] + rng.normal(0, 4.0, (40, 3))
+    _, held = _crowd(40)
+    sigmas = np.tile([4.0, 4.0, np.inf], (40, 1))
+    placed = place_by_gps(
+        TRUE.inverse().act(local),
+        tagged,
+        sigmas,
+        OPTIONS,
+        None,
+        held_of(held, (), np.arange(40)),
+        np.arange(40),
+    )
+    assert placed.reason is not None or placed.provisional
