@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.states import OPERATOR
 from ingest.growth.gates import SIGMAS
@@ -148,7 +149,8 @@ def _spread(photo: LocalisedPhoto) -> float:
 def _center_variance(other: FeatureMap, image: MapImage) -> float:
     """Of a map image's centre on Earth, roughly: its own, and its map's placement."""
     own = 0.0 if image.covariance is None else float(np.trace(image.covariance[3:, 3:]))
-    return own + float(np.linalg.eigvalsh(other.placement.covariance[4:, 4:])[-1])
+    jacobian = point_jacobian(image.cam_from_local.center)
+    return own + float(np.linalg.eigvalsh(jacobian @ other.placement.covariance @ jacobian.T)[-1])
 
 
 def _images_around(
