@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.sim3 import Sim3
@@ -118,7 +119,7 @@ def placed_by_gps(
     positions, sigmas = gps_priors(chosen, frame)
     with_gps = np.flatnonzero(np.isfinite(positions).all(axis=1))
     times_s = capture_seconds([chosen[i] for i in with_gps.tolist()])
-    camera_of = whose_cameras(chosen, [model.cameras[int(c)].focal_px for c in model.camera_of])
+    camera_of = _whose_cameras(model, chosen)
     angles, orientations = [photo.angles for photo in chosen], [photo.orientation for photo in chosen]
     held = held_of(model.cam_from_sfm, angles, camera_of, orientations)
     centers, told_by = model.centers()[with_gps], camera_of[with_gps]
@@ -204,15 +205,20 @@ def _component(
             reason_code="NO_POINTS",
             reason="no point is placed well enough: the photos' rays are parallel",
         )
+    camera_of = _whose_cameras(model, chosen)
     held_back = (
         placed.provisional
         or impossible_lens(model, chosen, float(feature_map.provenance.get("picture_shear", 0.0)))
-        or impossible_shear(feature_map, chosen)
+        or impossible_shear(feature_map, camera_of)
         or (HINTS if any(hints) else "")
     )
     if held_back:
         feature_map = replace(feature_map, status="quarantined")
     return replace(component, feature_map=feature_map, reason_code="", reason=held_back)
+
+
+def _whose_cameras(model: Model, chosen: Sequence[Photo]) -> NDArray[np.int64]:
+    return whose_cameras(chosen, [model.cameras[int(c)].focal_px for c in model.camera_of])
 
 
 def impossible_lens(model: Model, chosen: Sequence[Photo], shear: float) -> str:
@@ -233,13 +239,16 @@ def impossible_lens(model: Model, chosen: Sequence[Photo], shear: float) -> str:
     )
 
 
-def impossible_shear(feature_map: FeatureMap, chosen: Sequence[Photo]) -> str:
+def impossible_shear(feature_map: FeatureMap, camera_of: NDArray[np.int64]) -> str:
     """That the pictures are sheared as no lens shears them; "" where they are not.
 
     Nor where many people took them: a camera that moves while it reads out bends a map, and pictures that
     each cut and stretched in his own way do not.
+
+    Args:
+        camera_of: (n,) `whose_cameras` of its photos.
     """
-    if receivers(whose_cameras(chosen), len(chosen)) > 1.0:
+    if receivers(camera_of, len(camera_of)) > 1.0:
         return ""
     size = float(feature_map.provenance.get("picture_shear", 0.0))
     return (

@@ -94,15 +94,17 @@ def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> Floa
     the worst direction there. A height that nobody knows is no such direction. The covariance is of the
     placement's left perturbation, in the map's frame.
     """
-    unknown_m2 = float(covariance[6, 6])
-    if unknown_m2 > NO_HEIGHT_M**2:
-        covariance = covariance.copy()
-        covariance[6], covariance[:, 6] = 0.0, 0.0
-        covariance[6, 6] = covariance[4:6, 4:6].diagonal().max()
-        alike = isotropic_inflation(feature_map, covariance)
-        return alike + np.diag([0.0] * 6 + [unknown_m2])
     middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
     jacobian = point_jacobian(middle)
+    unknown_m2 = float(covariance[6, 6])
+    if unknown_m2 > NO_HEIGHT_M**2:
+        about_middle = np.vstack([np.eye(4, 7), jacobian])
+        covariance = about_middle @ covariance @ about_middle.T
+        covariance[6], covariance[:, 6] = 0.0, 0.0
+        covariance[6, 6] = covariance[4:6, 4:6].diagonal().max()
+        back = np.linalg.inv(about_middle)
+        alike = isotropic_inflation(feature_map, back @ covariance @ back.T)
+        return alike + np.diag([0.0] * 6 + [unknown_m2])
     shift_m2 = float(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1])
     turn = float(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])
     about = turns_about(middle)

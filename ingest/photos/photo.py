@@ -130,25 +130,25 @@ def shared_key(photo: Photo, sharing: CameraSharing) -> str:
 def whose_cameras(photos: Sequence[Photo], focals_px: Sequence[float] = ()) -> NDArray[np.int64]:
     """(n,) numbers of whose and which camera took each photo.
 
-    By who contributed it; else by owner, make and model; else by film. Photos that name nothing are by as
-    many cameras as they have sizes, but by one where their focal lengths agree: programs cut and resize.
+    By who contributed it; else by owner; else by make and model. Photos that name nothing are by as many
+    cameras as there are films and sizes, but by one where their focal lengths agree: programs cut and resize.
 
     Args:
         focals_px: (n,) as reconstructed; none: sizes must do.
     """
-    named: list[tuple[str, ...]] = [
-        (p.contributor,) if p.contributor else (p.owner, "" if p.make == UNNAMED_MAKE else p.make, p.model)
-        for p in photos
+    keys: list[tuple[str, ...]] = [
+        (p.contributor or p.owner,) if p.contributor or p.owner else (p.make, p.model) for p in photos
     ]
-    keys = [name if any(name) else (p.film,) for p, name in zip(photos, named, strict=True)]
-    rows = [k for k, key in enumerate(keys) if not any(key)]
+    rows = [k for k, p in enumerate(photos) if not any(keys[k]) or keys[k][0] == UNNAMED_MAKE]
     sides = np.array([max(photos[k].width, photos[k].height) for k in rows])
     if len(focals_px) and rows:
         relative = np.log(np.asarray(focals_px, dtype=np.float64)[rows] / sides)
         if 1.4826 * float(np.median(np.abs(relative - np.median(relative)))) < _ONE_LENS:
+            for k in rows:
+                keys[k] = ("one lens",)
             rows = []
     for k in rows:
-        keys[k] = f"{photos[k].width} x {photos[k].height}", ""
+        keys[k] = (photos[k].film or f"{photos[k].width} x {photos[k].height}",)
     numbers: dict[tuple[str, ...], int] = {}
     return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
 

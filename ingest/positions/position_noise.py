@@ -30,8 +30,8 @@ _SETTLED = 1e-3  # of a step over its standard deviation
 _TREND = 0.75  # of the variance of a drift at its end: what has one slope all along
 _UNKNOWN_SCALE, _UNKNOWN_TURN, _UNKNOWN_M = 1.0, 1.8, 1e5  # logarithm, radians: nothing is known
 _LEAST_M = 1e-6
-_LEAST_PHOTOS, _ONE_PLACE = 3, 2.0  # standard deviations of a position
-_LEAST_PLACES = 4  # of many people: two fix a similarity in plan, and as many are left to check it by
+_LEAST_PHOTOS = 3
+_ONE_PLACE = 2.0  # standard deviations of a position: many people who stand so close tell one
 _LEAST_SHARE = 0.02  # of a stated sigma: the least noise that counts where chance is judged
 _LAG_SHARE = 0.5  # of a stated sigma that may be a lag
 _MOST_LAG_S = 1.0  # standard deviation of a lag
@@ -342,7 +342,7 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
     shift = np.broadcast_to(np.eye(3), (len(data.centers), 3, 3))
     known = np.isfinite(data.sigmas) & (weights > 0)[:, [0, 0, 1]]
     off = np.where(np.isfinite(data.sigmas), data.positions, 0.0)
-    costs, theta, places = [], np.zeros(4), _LEAST_PLACES
+    costs, theta, places = [], np.zeros(4), len(data.centers)
     for residual in (state.residual(data), off - np.median(off, axis=0)):
         problem = MixedModel(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
         spread = [np.square(residual[known[:, axes[0]]][:, axes]) for axes in _AXES]
@@ -353,16 +353,15 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
         costs.append(problem.cost(theta, None))
         if data.many and len(costs) == 1:
             places = places_apart(state.sim.act(data.centers)[known[:, 0]], _ONE_PLACE * np.exp(theta[0]))
-    if places < _LEAST_PLACES:
-        return 0.0, 0.0
-    freedom, taken_up = int(known.sum()) - 3, 6 if data.speed.any() else 4
-    log_ratio = min((costs[0] - costs[1]) / freedom, 0.0) if freedom > 0 else 0.0
+    apart = min(places / max(int(known[:, 0].sum()), 1), 1.0)
+    freedom, taken_up = apart * (int(known.sum()) - 3), 6 if data.speed.any() else 4
+    # The noise of a place's mean is less than that of one who stands there.
+    log_ratio = apart * (costs[0] - costs[1]) / freedom + np.log(apart) if freedom > 0 else 0.0
     kept = int((weights > 0).all(axis=1).sum())
     ways = gammaln(total + 1) - gammaln(kept + 1) - gammaln(total - kept + 1) + np.log(_TURNS)
     count = _own_share(data, off, known, theta) * freedom
-    return _log_beta_tail(log_ratio, freedom, taken_up, ways), _log_beta_tail(
-        log_ratio, count, taken_up, ways
-    )
+    own, way = (_log_beta_tail(log_ratio, of, taken_up, ways) for of in (freedom, count))
+    return own, way
 
 
 def _log_beta_tail(log_ratio: float, freedom: float, taken_up: int, log_tries: float) -> float:
@@ -373,6 +372,7 @@ def _log_beta_tail(log_ratio: float, freedom: float, taken_up: int, log_tries: f
     half = (freedom - taken_up) / 2.0
     if half <= 0:
         return 0.0
+    log_ratio = min(log_ratio, 0.0)
     rest = half * -np.expm1(log_ratio)
     beta = 1.0 + rest + (0.0 if taken_up == 4 else 0.5 * (1.0 + 1.0 / half) * rest**2)
     return float(min(half * log_ratio + np.log(beta) + log_tries, 0.0))

@@ -169,7 +169,8 @@ def _judged(
     if by > 1.0:  # what each is off by shows among them, but not what all share: a datum of heights, a map
         shared = np.hypot(np.minimum(bias, white) / np.sqrt(by - 1.0), _MANY_SHARE * stated)
         bias[:2] = np.minimum(bias, shared)[:2]
-    covariance = fit.covariance.copy()
+    each = int(fit.used.all(axis=1).sum()) / by if by > 1.0 else 1.0  # positions by one of many
+    covariance = each * fit.covariance
     covariance[4:, 4:] += np.diag(bias**2)
     rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]
     usual = np.maximum(stated, _PLAIN_M)[known.any(axis=0)] * NOISE_SHARE

@@ -6,7 +6,7 @@ its digest of place differs, and the edge has to be measured again.
 
 import hashlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -212,7 +212,8 @@ def grow_within_budget(
         reconstruction and not the others of the run, nor the next run.
     """
     part, everything = model, tuple(model.rows.tolist())
-    budget_m = max(budget_m, _as_wide_a_place_allows(part, localised, maps))
+    holding = {localised[r].map_ids[0] for r in everything if r in localised}
+    budget_m = allowed_m(holding, maps, budget_m)
     beyond: dict[int, tuple[str, str]] = {}
     refused = Refused(reason="", message="")
     for _ in range(_TRIES):
@@ -240,17 +241,28 @@ def grow_within_budget(
     return refused
 
 
-def _as_wide_a_place_allows(
-    model: Model, localised: Mapping[int, LocalisedPhoto], maps: Mapping[str, PlacedMap]
-) -> float:
-    """A drift that adds hardly to what the maps that hold the photos leave open themselves, metres."""
-    holding = {localised[r].map_ids[0] for r in model.rows.tolist() if r in localised}
+def allowed_m(holding: Iterable[str], maps: Mapping[str, PlacedMap], budget_m: float) -> float:
+    """The budget of a map, metres: more where it adds hardly to what its anchors' own places leave open.
+
+    Args:
+        holding: maps that hold it, whose anchors are its own.
+    """
+    anchors: list[PlacedMap] = []
+    seen, left = set(), [m for m in holding if m in maps]
+    while left:
+        map_id = left.pop()
+        if map_id in seen:
+            continue
+        seen.add(map_id)
+        if maps[map_id].is_anchor:
+            anchors.append(maps[map_id])
+        left += [m for m in maps[map_id].parents if m in maps]
     bounds = [
-        PlaceBounds.of(maps[m].placement.covariance, maps[m].corners.mean(axis=0)).horizontal_m
-        for m in holding
-        if m in maps and len(maps[m].corners)
+        PlaceBounds.of(one.placement.covariance, one.corners.mean(axis=0)).horizontal_m
+        for one in anchors
+        if len(one.corners)
     ]
-    return OF_THE_PLACE * min(bounds, default=0.0)
+    return max(budget_m, OF_THE_PLACE * min(bounds, default=0.0))
 
 
 def with_drift(

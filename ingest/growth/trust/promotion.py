@@ -57,7 +57,12 @@ class Promotion:
 
 
 def promote_confirmed(
-    database: Database, localiser: Localiser, options: GrowthOptions, work: Path, new: NewPhotos | None = None
+    database: Database,
+    localiser: Localiser,
+    options: GrowthOptions,
+    work: Path,
+    new: NewPhotos | None = None,
+    allowed_m: Callable[[Sequence[str]], float] | None = None,
 ) -> list[Promotion]:
     """Try every quarantined map that growth has made; those that have drifted beyond the budget stay.
 
@@ -65,6 +70,7 @@ def promote_confirmed(
         localiser: of the active maps of the newest snapshot.
         work: work folder, where it is kept what was found out: without anything new nothing is asked again.
         new: photos that may corroborate a map, beside the images of other maps.
+        allowed_m: how far a map with these parents may have drifted; None: the budget.
 
     Raises:
         StoreError
@@ -79,7 +85,8 @@ def promote_confirmed(
         if summary.status != "quarantined" or summary.method != "map":
             continue
         known = recall(work, "maps", summary.map_id, asked)
-        stays = _held_back(summary, snapshot, options.drift_budget_m)
+        budget_m = options.drift_budget_m if allowed_m is None else allowed_m(summary.parents)
+        stays = _held_back(summary, snapshot, budget_m)
         stays = stays or (Promotion(**known) if known else None)
         if stays is None:
             open_maps.append(summary)
@@ -181,7 +188,7 @@ def _examine(
 def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Promotion | None:
     """What keeps a map in quarantine before anybody is asked."""
     active = {m.map_id for m in snapshot.maps() if m.status == "active"}
-    gate = gates.drift(summary.drift_m or 0.0, max(budget_m, summary.budget_m or 0.0))
+    gate = gates.drift(summary.drift_m or 0.0, budget_m)
     code, text = gate.reason, gate.message
     if is_imported(summary.status, summary.status_reason):
         code, text = "IMPORTED", summary.status_reason
