@@ -85,7 +85,7 @@ def true_landmark(database: Path) -> Landmark:
     return Landmark(
         names=names,
         poses=tuple(Rigid3(rotation=p.rotation, translation=scale * p.translation) for p in poses),
-        camera_of=whose_cameras(photos),
+        camera_of=whose_cameras(photos, [camera.focal_px for camera in sizes]),
         middle=scale * np.median(largest.points.xyz, axis=0),
     )
 
