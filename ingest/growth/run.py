@@ -179,16 +179,9 @@ class _Run:
         outside = NewPhotos(
             given=self.new, rows=self._open_rows(), localised=self.localised, heard=self.heard
         )
-        outcomes = promote_confirmed(
-            self.database,
-            self.localiser,
-            self.options,
-            self.work,
-            outside,
-            partial(
-                allowed_m, maps=placed_maps(self.database.snapshot()), budget_m=self.options.drift_budget_m
-            ),
-        )
+        maps, budget_m = placed_maps(self.database.snapshot()), self.options.drift_budget_m
+        allowed = partial(allowed_m, maps=maps, budget_m=budget_m)
+        outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside, allowed)
         for outcome in outcomes:
             self.promotions[outcome.map_id] = outcome
             entry = self.entries.get(outcome.map_id)

@@ -71,7 +71,7 @@ class NoisyFit:
         used: (n, 2) horizontal and vertical; others are so far out that one of a thousand honest ones is.
         log_chance: natural logarithm of how often positions that know nothing of the reconstruction fit as
             well, by the ratio of the likelihoods, both with their own components.
-        log_chance_of_way: the same of positions along another smooth way, where fewer count.
+        log_chance_of_path: the same of positions along another smooth way, where fewer count.
     """
 
     local_from_sfm: Sim3
@@ -81,7 +81,7 @@ class NoisyFit:
     checked_turn_rad: float
     used: NDArray[np.bool_]
     log_chance: float
-    log_chance_of_way: float
+    log_chance_of_path: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -227,7 +227,7 @@ def fit_noisy(
         checked_turn_rad=float(np.sqrt(np.linalg.eigvalsh(checked)[-1])),
         used=used,
         log_chance=chance[0],
-        log_chance_of_way=chance[1],
+        log_chance_of_path=chance[1],
     )
 
 

@@ -177,7 +177,7 @@ def _judged(
     above = float(np.log(rms / usual).max())  # standard deviations of a receiver's noise
     # Where positions are noisier than usual, those along another way would be, too: fewer of them count.
     unusual = above > -ndtri(options.no_place)
-    chance = fit.log_chance_of_way if unusual else fit.log_chance
+    chance = fit.log_chance_of_path if unusual else fit.log_chance
     inliers = np.asarray(fit.used.all(axis=1))
     turn_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])))
     checked_deg = max(turn_deg, float(np.degrees(fit.checked_turn_rad)))
