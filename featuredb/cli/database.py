@@ -94,8 +94,7 @@ def run_maps(args: argparse.Namespace) -> int:
         rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
         write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
         return 0
-    bounds = {m.map_id: snapshot.place_bounds(m.map_id) for m in maps}
-    sys.stdout.write(maps_table(maps, bounds) + unplaced_text(unplaced))
+    sys.stdout.write(maps_table(maps, snapshot.place_bounds()) + unplaced_text(unplaced))
     return 0
 
 

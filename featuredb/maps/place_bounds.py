@@ -18,7 +18,7 @@ class PlaceBounds:
     """What holds 95 % of the errors of a placement, by its covariance.
 
     Attributes:
-        horizontal_m, vertical_m: of the map's middle, metres.
+        horizontal_m, vertical_m: of the middle of the map's cameras, metres.
         tilt_deg: of the map's up against the true one.
         heading_deg: of the map about up.
     """
@@ -34,7 +34,7 @@ class PlaceBounds:
         Args:
             covariance: (7, 7) of a placement: scale, turn (3), place (3) along the local axes, about the
                 origin.
-            middle: (3,) of the map, in the local frame, metres.
+            middle: (3,) of the map's cameras, in the local frame, metres.
         """
         jacobian = point_jacobian(middle)
         place, turn = jacobian @ covariance @ jacobian.T, covariance[1:4, 1:4]

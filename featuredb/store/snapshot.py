@@ -1,5 +1,6 @@
 """One version of a database, for reading. Nothing that is committed later shows in it."""
 
+import itertools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 
 from featuredb.errors import MapNotFoundError, UnplacedMapError
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
 from featuredb.maps.place_bounds import PlaceBounds
@@ -19,7 +21,7 @@ from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_pl
 from featuredb.store.delta import Table
 from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
-from featuredb.store.tables import BOUNDS, CHILD_TABLES
+from featuredb.store.tables import BOUNDS, CHILD_TABLES, IMAGES, UTM_COORDINATES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,15 +156,40 @@ class Snapshot:
             raise _without_place(row)
         return _summary(row)
 
-    def place_bounds(self, map_id: str) -> PlaceBounds:
-        """What holds 95 % of the errors of a placement, at the middle of the map's points.
+    def place_bounds(self) -> dict[str, PlaceBounds]:
+        """What holds 95 % of the errors of each placement, by map, at the middle of the map's cameras."""
+        middles = self.camera_middles()
+        return {
+            map_id: PlaceBounds.of(
+                np.reshape(row["placement_covariance"], (7, 7)), middles.get(map_id, np.zeros(3))
+            )
+            for map_id, row in self._rows.items()
+            if has_place(row)
+        }
+
+    def camera_middles(self) -> dict[str, FloatArray]:
+        """Medians (3,) of the camera centres of the placed maps that have any, in their local frames, metres.
+
+        Not of the points: a few far ones move the middle of those by hundreds of metres.
 
         Raises:
-            MapNotFoundError, UnplacedMapError: as `get`.
+            StoreError: photos' rows are unreadable.
         """
-        box, row = self.get(map_id).box, self._row(map_id)
-        middle = np.zeros(3) if box is None else frame_of(row).enu_from_utm(box.middle, row["epsg"])
-        return PlaceBounds.of(np.reshape(row["placement_covariance"], (7, 7)), middle)
+        with read_errors("cannot read where the photos were taken"):
+            found = self._children[IMAGES].dataset().to_table(["write_id", *UTM_COORDINATES])
+        utm = np.column_stack([found[name].to_numpy() for name in UTM_COORDINATES])
+        encoded = found["write_id"].combine_chunks().dictionary_encode()
+        group = encoded.indices.to_numpy()
+        order = np.argsort(group, kind="stable")
+        ends = np.searchsorted(group[order], np.arange(len(encoded.dictionary) + 1))
+        at = dict(zip(encoded.dictionary.to_pylist(), itertools.pairwise(ends), strict=True))
+        medians = {}
+        for map_id, row in self._rows.items():
+            if has_place(row) and row["write_id"] in at:
+                start, end = at[row["write_id"]]
+                middle = np.median(utm[order[start:end]], axis=0)
+                medians[map_id] = frame_of(row).enu_from_utm(middle, row["epsg"])
+        return medians
 
     def get_any(self, map_id: str) -> MapSummary | UnplacedSummary:
         """The summary of one map, retired or not.

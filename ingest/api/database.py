@@ -63,7 +63,7 @@ class FeatureDatabase:
         return ListedMaps(
             placed=placed,
             unplaced=tuple(snapshot.unplaced_maps()),
-            bounds={m.map_id: snapshot.place_bounds(m.map_id) for m in placed},
+            bounds=snapshot.place_bounds(),
         )
 
     def __repr__(self) -> str:

@@ -79,9 +79,8 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
 
 
 def _middle(feature_map: FeatureMap) -> FloatArray:
-    """(3,) of the box of its points, in its frame."""
-    utm = feature_map.points.utm
-    return feature_map.frame.enu_from_utm((utm.min(axis=0) + utm.max(axis=0)) / 2, feature_map.epsg)
+    """(3,) median of the cameras' centres, in its frame."""
+    return np.median([image.cam_from_local.center for image in feature_map.images], axis=0)
 
 
 def _map_of(component: Component) -> AnyMap | None:

@@ -53,7 +53,7 @@ def test_maps_and_history(db: str, capsys: pytest.CaptureFixture[str]) -> None:
     lines = out.splitlines()
     assert lines[0].split()[:4] == ["map", "name", "status", "method"]
     assert [line.split()[0] for line in lines[2:-1]] == ["map-1", "map-2", "map-3"]
-    bounds = Database.open(db).snapshot().place_bounds("map-1")
+    bounds = Database.open(db).snapshot().place_bounds()["map-1"]
     column = lines[0].split().index("tilt_95_deg") - len(lines[0].split())
     assert lines[2].split()[column - 1] == str(round(bounds.tilt_deg, 2))  # "committed" has two words
     assert lines[-1].startswith("place_95_m, tilt_95_deg, heading_95_deg: 95 of 100 maps")

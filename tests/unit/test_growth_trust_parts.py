@@ -52,6 +52,7 @@ def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
         placement=feature_map.placement,
         place=_place_of(feature_map),
         corners=places_of(feature_map),
+        middle=places_of(feature_map).mean(axis=0),
         edges=tuple(Edge.from_json(e) for e in growth.get("edges", ())),
     )
 

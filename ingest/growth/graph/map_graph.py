@@ -54,6 +54,7 @@ class PlacedMap:
     Attributes:
         place: digest of where it lies.
         corners: (8, 3) of its points' box in its own frame, metres; empty for a map without points.
+        middle: (3,) of its cameras, in its own frame, metres.
         edges: overlaps that were measured when it was placed.
     """
 
@@ -67,6 +68,7 @@ class PlacedMap:
     placement: Placement
     place: str
     corners: FloatArray
+    middle: FloatArray
     edges: tuple[Edge, ...]
 
     @property
@@ -87,10 +89,15 @@ class PlacedMap:
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
     """Maps with a place, by id, but retired ones and imports that nobody vouches for: edges may be forged."""
     placed = {m.map_id for m in snapshot.maps() if not is_imported(m.status, m.status_reason)}
-    return {row["map_id"]: _placed(row) for row in snapshot.rows() if row["map_id"] in placed}
+    middles = snapshot.camera_middles()
+    return {
+        row["map_id"]: _placed(row, middles.get(row["map_id"], np.zeros(3)))
+        for row in snapshot.rows()
+        if row["map_id"] in placed
+    }
 
 
-def _placed(row: Row) -> PlacedMap:
+def _placed(row: Row, middle: FloatArray) -> PlacedMap:
     frame, placement = frame_of(row), placement_of(row)
     return PlacedMap(
         map_id=row["map_id"],
@@ -103,6 +110,7 @@ def _placed(row: Row) -> PlacedMap:
         placement=placement,
         place=place_key(frame, placement),
         corners=_corners(row, frame),
+        middle=middle,
         edges=tuple(Edge.from_json(edge) for edge in growth_of(placement.evidence).get("edges", ())),
     )
 
@@ -257,11 +265,7 @@ def allowed_m(holding: Iterable[str], maps: Mapping[str, PlacedMap], budget_m: f
         if maps[map_id].is_anchor:
             anchors.append(maps[map_id])
         left += [m for m in maps[map_id].parents if m in maps]
-    bounds = [
-        PlaceBounds.of(one.placement.covariance, one.corners.mean(axis=0)).horizontal_m
-        for one in anchors
-        if len(one.corners)
-    ]
+    bounds = [PlaceBounds.of(one.placement.covariance, one.middle).horizontal_m for one in anchors]
     return max(budget_m, OF_THE_PLACE * min(bounds, default=0.0))
 
 
