@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from featuredb.atomic import atomic_file
 from featuredb.errors import CandidateNotFoundError, FeatureDbError
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.store import Database
@@ -21,7 +22,7 @@ from ingest.growth.values import GrowthOptions, GrowthPhotos, no_photos
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
-from ingest.workspace import Workspace, atomic_file, default_root, remove_leftovers
+from ingest.workspace import Workspace, default_root, remove_leftovers
 from reloc.answered_view import geo_prior
 from reloc.wire.query import PriorRequest
 

@@ -8,10 +8,8 @@ reconstructions of neighbourhoods in which nothing changed.
 
 import hashlib
 import json
-import os
 import shutil
 import time
-import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,9 +21,8 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.atomic import TEMPORARY, atomic_file, user_cache
 from featuredb.errors import IngestError
-
-_TEMPORARY = ".tmp-"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,46 +55,8 @@ def default_root(database_url: str) -> Path:
     the address.
     """
     if "://" in database_url and not database_url.startswith("file://"):
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        return cache / "featuredb" / "work" / hashlib.sha256(database_url.encode()).hexdigest()[:16]
+        return user_cache() / "work" / hashlib.sha256(database_url.encode()).hexdigest()[:16]
     return Path(database_url.removeprefix("file://")) / "_work"
-
-
-@contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary path in the same folder; on success it is flushed and takes the name `path`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex}-{path.name}")
-    try:
-        yield temporary
-        _flush(temporary)
-        os.replace(temporary, path)  # noqa: PTH105 (the name says what it does)
-    finally:
-        temporary.unlink(missing_ok=True)
-    _flush(path.parent)
-
-
-@contextmanager
-def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yields a temporary folder; on success its files are flushed and it takes the name `path`.
-
-    Another process that finishes the same folder first wins: both made it of the same inputs.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex}-{path.name}")
-    temporary.mkdir()
-    try:
-        yield temporary
-        for file in sorted(temporary.rglob("*")):
-            _flush(file)
-        try:
-            temporary.rename(path)
-        except OSError:
-            if not path.is_dir():
-                raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    _flush(path.parent)
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -154,21 +113,9 @@ def remove_leftovers(root: Path) -> int:
     """Delete temporary files of killed jobs under `root` that are older than a day; how many there were."""
     count = 0
     now = time.time()
-    for path in root.rglob(f"{_TEMPORARY}*"):
+    for path in root.rglob(f"{TEMPORARY}*"):
         # A day: no stage of one photo or pair takes that long.
         if path.exists() and now - path.stat().st_mtime > 86_400.0:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
             count += 1
     return count
-
-
-def _flush(path: Path) -> None:
-    """Force a file's or folder's content to the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError:  # some file systems cannot flush a folder; the rename is still atomic
-        if not path.is_dir():
-            raise
-    finally:
-        os.close(handle)

@@ -22,12 +22,15 @@ from featuredb.errors import (
 )
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.sim3 import Sim3
+from featuredb.index.area import Area, join_segments
+from featuredb.index.segment import Segment, segment_of
+from featuredb.index.segment_files import SegmentFiles
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import MapLineage
 from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database, MapSummary, Snapshot
-from reloc.localise.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.localise.localise import localise
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult, PoseInMap
@@ -166,12 +169,15 @@ class Localiser:
         taken = [m for m in snapshot.maps() if m.status == "active" or m.map_id in also]
         active = [m for m in taken if m.descriptors and m.box]
         known = previous._loaded if previous else {}
-        loaded = {}
+        loaded: dict[tuple[str, ...], Area] = {}
         trial = instead or {}
         for group in _group(active):
             key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
             tried = any(m.map_id in trial for m in group)
-            loaded[key] = known[key] if key in known and not tried else _load(snapshot, group, trial)
+            if key in known and not tried:
+                loaded[key] = known[key].area
+            else:
+                loaded[key] = _load(database.url, snapshot, group, trial)
         had = {d.write_id: d for d in previous._unplaced.values()} if previous else {}
         unplaced = {
             m.map_id: had.get(m.write_id) or OnDemand(m.write_id, partial(_own_area, snapshot, m.map_id))
@@ -180,11 +186,13 @@ class Localiser:
         }
         held = {d.write_id: d for d in previous._provisional.values()} if previous else {}
         provisional = {
-            m.map_id: held.get(m.write_id) or OnDemand(m.write_id, partial(_load, snapshot, [m], {}))
+            m.map_id: held.get(m.write_id)
+            or OnDemand(m.write_id, partial(_load_alone, database.url, snapshot, m))
             for m in snapshot.maps()
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
-        return cls(loaded, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
+        served = dict(zip(loaded, indexed_together(list(loaded.values())), strict=True))
+        return cls(served, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
 
     def areas_of(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
         """All areas, or those of the named maps, of which only these are searched.
@@ -265,11 +273,27 @@ def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
     return replace(unplaced, observations=unplaced.observations.none()), indexed
 
 
-def _load(snapshot: Snapshot, group: Sequence[MapSummary], instead: Mapping[str, FeatureMap]) -> IndexedArea:
-    indexed = IndexedArea.of([instead.get(m.map_id) or snapshot.load_map(m.map_id) for m in group])
-    points, images = len(indexed.area.points), len(indexed.area.image_map)
-    _LOG.info("area of %d maps: %d points, %d images", len(group), points, images)
-    return indexed
+def _load(
+    url: str, snapshot: Snapshot, group: Sequence[MapSummary], instead: Mapping[str, FeatureMap]
+) -> Area:
+    """The area of some maps; what was laid out before is not again."""
+    files = SegmentFiles()
+    outlines = snapshot.load_outlines([m.map_id for m in group if m.map_id not in instead])
+    outlines |= {map_id: feature_map.outline() for map_id, feature_map in instead.items()}
+
+    def segment(summary: MapSummary) -> Segment:
+        if summary.map_id in instead:
+            return segment_of(instead[summary.map_id])
+        return files.get(url, summary.write_id, lambda: segment_of(snapshot.load_map(summary.map_id)))
+
+    segments = [segment(summary) for summary in group]
+    area = join_segments([outlines[m.map_id] for m in group], segments)
+    _LOG.info("area of %d maps: %d points, %d images", len(group), len(area.points), len(area.image_map))
+    return area
+
+
+def _load_alone(url: str, snapshot: Snapshot, summary: MapSummary) -> IndexedArea:
+    return indexed_together([_load(url, snapshot, [summary], {})])[0]
 
 
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:

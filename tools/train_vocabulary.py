@@ -1,4 +1,4 @@
-"""Train, once, visual words for retrieval of similar photos, or the centres of inverted lists.
+"""Train, once, visual words for retrieval of similar photos, the centres of inverted lists, or short codes.
 
     featuredb simworld world --size full
     uv run python tools/train_vocabulary.py world/drone world/street world/negatives/other_town --every 4 \\
@@ -10,7 +10,8 @@ thread.
     uv run python tools/train_vocabulary.py brighton/images lewis/images seneca/images copr/images \\
         reichstag/images sacre_coeur/mapping --lists 2048 --out featuredb/index/data/list_centers.npz
 
-made the centres of the inverted lists (`featuredb.index.descriptor_index`), of real photos of many kinds.
+made the centres of the inverted lists (`featuredb.index.descriptor_index`), of real photos of many kinds; and
+of the same photos `--codes --out featuredb/index/data/code_centers.npz` the centres of the codes.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.features.features import DESCRIPTOR_SIZE
-from featuredb.index.descriptor_index import use_threads
+from featuredb.index.descriptor_index import CODE_PARTS, use_threads
 from featuredb.index.vocabulary import Vocabulary
 from ingest.executor import InProcessExecutor
 from ingest.photos.scan import ScanOptions, scan_folder
@@ -42,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="of each folder's photos, each Nth")
     parser.add_argument("--lists", type=int, default=None, metavar="K", help="centres of K inverted lists")
+    parser.add_argument("--codes", action="store_true", help="centres of the parts of a product code")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args(argv)
     use_threads(1)
@@ -56,6 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.lists is not None:
         np.savez_compressed(args.out, centers=train_lists(descriptors, args.lists))
         sys.stdout.write(f"{args.out}: {args.lists} lists from {len(photos)} photos\n")
+        return 0
+    if args.codes:
+        np.savez_compressed(args.out, centers=train_codes(descriptors))
+        sys.stdout.write(f"{args.out}: codes from {len(photos)} photos\n")
         return 0
     vocabulary = train_vocabulary(descriptors)
     np.savez(args.out, **{name: getattr(vocabulary, name) for name in ("mean", "projection", "words")})
@@ -95,6 +101,13 @@ def train_lists(descriptors: Sequence[NDArray[np.uint8]], lists: int) -> NDArray
     """Centres (lists, 128) of inverted lists, rounded as descriptors are; arguments as there."""
     centers = _kmeans(_samples(descriptors, lists, 0), lists, 0, iterations=10)
     return np.asarray(np.clip(np.rint(centers), 0, 255), dtype=np.uint8)
+
+
+def train_codes(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+    """Centres (parts, 16, 128 / parts) of a product code of 4 bits a part; see `train_vocabulary`."""
+    samples = _samples(descriptors, CODE_PARTS * 16, 0)
+    parts = np.split(samples, CODE_PARTS, axis=1)
+    return np.array([_kmeans(part, 16, 0, iterations=25) for part in parts], dtype=np.float32)
 
 
 def _samples(descriptors: Sequence[NDArray[np.uint8]], clusters: int, seed: int) -> NDArray[np.float32]:

@@ -15,12 +15,12 @@ class ViewCones:
     """The sides from which points were seen.
 
     Attributes:
-        direction: (p, 3) float64, mean unit vector from the point to the cameras that saw it.
-        spread_cos: (p,) float64, cosine of the angle between that mean and the outermost view; 1 without any.
+        direction: (p, 3), mean unit vector from the point to the cameras that saw it.
+        spread_cos: (p,), cosine of the angle between that mean and the outermost view; 1 without any.
     """
 
-    direction: FloatArray
-    spread_cos: FloatArray
+    direction: NDArray[np.floating]
+    spread_cos: NDArray[np.floating]
 
 
 def view_cones(

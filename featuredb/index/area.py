@@ -1,7 +1,6 @@
 """Several maps of one neighbourhood in one local frame, laid out for searching.
 
-An area is derived from maps and can be rebuilt at any time. Only points that carry descriptors are
-in it.
+An area is derived from maps and can be rebuilt at any time; what takes long of that is in their segments.
 """
 
 import logging
@@ -9,7 +8,6 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,37 +18,33 @@ from featuredb.features.exif.read import is_of_film
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.view_cones import view_cones
+from featuredb.geometry.sim3 import Sim3
+from featuredb.index.descriptor_index import DescriptorCodes
+from featuredb.index.segment import Segment, segment_of
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.move import full_covariances
+from featuredb.maps.move import full_covariances, moved_covariances
 
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class Area:
     """Maps in one frame. All arrays are read-only by convention.
 
     Attributes:
         frame: local ENU frame of everything here.
-        maps: the maps without their observations, which take most of the memory and which no answer needs;
-            `point_map` and `image_map` index into it.
-        points: (p, 3) float64, metres in `frame`.
-        point_map: (p,) int32.
-        point_row: (p,) int64, row in the map's MapPoints.
-        point_covariance: (p, 3, 3) float64, square metres in `frame`, relative to the map's gauge.
-        view_direction: (p, 3) float64, mean unit vector from the point to the cameras that saw it.
-        view_spread_cos: (p,) float64, cosine of the angle between that mean and the outermost view.
-        view_distance: (p, 2) float64, smallest and largest distance of those cameras, metres.
-        descriptors: (p, 128) uint8, mean RootSIFT of the track, length 512.
-        see_image, see_point: (s,) int32, "image sees point", sorted by image.
-        image_start: (i + 1,) int64, slices of see_* per image.
-        image_map: (i,) int32.
-        image_center: (i, 3) float64, camera centres in `frame`.
-        image_scene: (i, 3) float64, median of the points that the image sees.
-        image_reach: (i,) float64, median distance of those points from the camera, metres.
+        maps: the maps without points and observations, which take most of the memory and which no answer
+            needs; `point_map` and `image_map` index into it.
+        point_map: (p,) int32, ascending.
+        covariance: (p, 6) float32, upper triangles (MapPoints.covariance), square metres in `frame`, relative
+            to the map's gauge.
+        codes: of the descriptors.
+        image_map: (i,) int32, ascending.
         covisible: (i, i) sparse, numbers of shared points; between maps, of neighbouring places.
+        points, point_row, view_direction, view_spread_cos, view_distance, descriptors, image_start,
+        see_point, image_center, image_scene, image_reach: those of the maps' segments (`Segment`), one after
+            the other, in `frame`, with the area's rows of points in `see_point`.
         extractor_fingerprint: of all descriptors.
         modes: (m,) joint errors of each map, None of those that keep none.
         searched: (m,) which maps take part in a search; the others are there as if they were not.
@@ -60,13 +54,13 @@ class Area:
     maps: tuple[FeatureMap, ...]
     points: FloatArray
     point_map: NDArray[np.int32]
-    point_row: NDArray[np.int64]
-    point_covariance: FloatArray
-    view_direction: FloatArray
-    view_spread_cos: FloatArray
-    view_distance: FloatArray
+    point_row: NDArray[np.int32]
+    covariance: NDArray[np.float32]
+    view_direction: NDArray[np.float32]
+    view_spread_cos: NDArray[np.float32]
+    view_distance: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
-    see_image: NDArray[np.int32]
+    codes: DescriptorCodes
     see_point: NDArray[np.int32]
     image_start: NDArray[np.int64]
     image_map: NDArray[np.int32]
@@ -90,12 +84,45 @@ class Area:
         """(i,) which images are of the maps that are searched."""
         return np.asarray(self.searched[self.image_map], dtype=np.bool_)
 
+    def point_covariance(self, rows: NDArray[np.integer]) -> FloatArray:
+        """(k, 3, 3) of points (k,), square metres in `frame`, relative to the map's gauge."""
+        return full_covariances(self.covariance[rows])
+
     def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:
         """Rows of the points that any of these images sees, ascending, without repetition."""
-        seen = np.zeros(len(self.points), dtype=np.bool_)
-        for i in images:
-            seen[self.see_point[self.image_start[i] : self.image_start[i + 1]]] = True
-        return np.flatnonzero(seen).astype(np.int32)
+        seen = self.see_point[self.sights_of_images(images)]
+        if not len(seen):
+            return np.zeros(0, np.int32)
+        first = int(seen.min())  # points of a map, and maps of a neighbourhood, lie together
+        marked = np.zeros(int(seen.max()) - first + 1, dtype=np.bool_)
+        marked[seen - first] = True
+        return (np.flatnonzero(marked) + first).astype(np.int32)
+
+    def sights_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Rows of `see_point` of these images, image by image."""
+        start, count = self.image_start[images], np.diff(self.image_start)[images]
+        before = np.cumsum(count) - count
+        return np.repeat(start - before, count) + np.arange(int(count.sum()))
+
+    def images_that_see(self, rows: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Which images see some points, in pairs: rows of images, ascending, and positions in `rows`.
+
+        Args:
+            rows: (k,) of points, ascending, without repetition.
+        """
+        pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
+        for number in np.unique(self.point_map[rows]):
+            first, last = np.searchsorted(self.image_map, [number, number + 1])
+            start, end = self.image_start[first], self.image_start[last]
+            seen = self.see_point[start:end]
+            position = np.minimum(np.searchsorted(rows, seen), len(rows) - 1)
+            hit = np.flatnonzero(rows[position] == seen)
+            image = np.searchsorted(self.image_start[first : last + 1], start + hit, side="right") - 1 + first
+            pairs.append((image, position[hit]))
+        return (
+            np.concatenate([image for image, _ in pairs] or [np.zeros(0, np.intp)]),
+            np.concatenate([position for _, position in pairs] or [np.zeros(0, np.intp)]),
+        )
 
     def camera_for_key(self, camera_key: str) -> Camera | None:
         """Intrinsics that the maps have for this EXIF key; of the one that took most images if several.
@@ -128,6 +155,17 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
         InvalidValueError: no maps.
         IncompatibleExtractorError: the maps' descriptors come from different extractors.
     """
+    return join_segments([m.outline() for m in maps], [segment_of(m) for m in maps], frame)
+
+
+def join_segments(
+    maps: Sequence[FeatureMap], segments: Sequence[Segment], frame: LocalFrame | None = None
+) -> Area:
+    """The area of maps, of which only the outlines are needed, whose segments are there.
+
+    Raises:
+        InvalidValueError, IncompatibleExtractorError: as `build_area`.
+    """
     if not maps:
         raise InvalidValueError("build_area: expected at least one map, found none")
     fingerprints = sorted({m.extractor_fingerprint for m in maps})
@@ -136,28 +174,38 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
             f"build_area: maps of one area must share an extractor, found {fingerprints}; "
             "ingest the photos of one of them again"
         )
-    frame = frame or max(maps, key=lambda m: len(m.points)).frame
-    parts = [_lay_out(feature_map, frame) for feature_map in maps]
-    points, images = ([len(part[name]) for part in parts] for name in ("points", "image_center"))
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    see_image, see_point = (
-        np.concatenate(
-            [part[name] + offset for part, offset in zip(parts, np.cumsum([0, *counts]), strict=False)]
-        ).astype(np.int32)
-        for name, counts in (("see_image", images), ("see_point", points))
-    )
-    joined |= {"see_image": see_image, "see_point": see_point}
-    image_map = _repeat(images)
+    frame = frame or maps[int(np.argmax([len(segment) for segment in segments]))].frame
+    area_from_maps = [frame.enu_from(m.frame) for m in maps]
+    parts = list(zip(area_from_maps, segments, strict=True))
+    points = np.array([len(segment) for segment in segments])
+    images = np.array([len(segment.image_center) for segment in segments])
+    sights = np.array([len(segment.see_point) for segment in segments])
+    scene = np.concatenate([move.act(s.image_scene) for move, s in parts])
+    reach = np.concatenate([s.image_reach for s in segments])
+    image_map = np.repeat(np.arange(len(maps), dtype=np.int32), images)
     return Area(
         frame=frame,
-        maps=tuple(replace(m, observations=m.observations.none()) for m in maps),
-        **joined,
-        point_map=_repeat(points),
-        image_start=np.searchsorted(see_image, np.arange(len(image_map) + 1)).astype(np.int64),
-        image_map=image_map,
-        covisible=_covisibility(
-            see_image, see_point, image_map, joined["image_scene"], joined["image_reach"]
+        maps=tuple(maps),
+        points=np.concatenate([move.act(s.points) for move, s in parts]),
+        point_map=np.repeat(np.arange(len(maps), dtype=np.int32), points),
+        point_row=np.concatenate([s.point_row for s in segments]),
+        covariance=np.concatenate(
+            [moved_covariances(s.covariance, Sim3.from_rigid3(move)) for move, s in parts]
         ),
+        view_direction=np.concatenate(
+            [s.view_direction @ move.rotation.T.astype(np.float32) for move, s in parts]
+        ),
+        view_spread_cos=np.concatenate([s.view_spread_cos for s in segments]),
+        view_distance=np.concatenate([s.view_distance for s in segments]),
+        descriptors=np.concatenate([s.descriptors for s in segments]),
+        codes=DescriptorCodes.joined([DescriptorCodes(lists=s.lists, codes=s.codes) for s in segments]),
+        image_start=_joined_starts([s.image_start for s in segments], sights),
+        see_point=_raised([s.see_point for s in segments], points),
+        image_map=image_map,
+        image_center=np.concatenate([move.act(s.image_center) for move, s in parts]),
+        image_scene=scene,
+        image_reach=reach,
+        covisible=_covisibility(segments, images, image_map, scene, reach),
         extractor_fingerprint=fingerprints[0],
         modes=tuple(_modes(feature_map) for feature_map in maps),
         searched=np.ones(len(maps), dtype=np.bool_),
@@ -173,68 +221,22 @@ def _modes(feature_map: FeatureMap) -> ErrorModes | None:
         return None
 
 
-def _lay_out(feature_map: FeatureMap, frame: LocalFrame) -> dict[str, NDArray[Any]]:
-    """One map's arrays by their names in Area, counted from zero."""
-    area_from_map = frame.enu_from(feature_map.frame)
-    observations = feature_map.observations
-    keep = np.flatnonzero(observations.has_descriptor)
-    rows, see_point = np.unique(observations.point_index[keep], return_inverse=True)
-    points = feature_map.points_local(frame)[rows]
-    see_image = feature_map.image_rows(observations.image_id[keep])
-    centers = np.array([area_from_map.act(i.cam_from_local.center) for i in feature_map.images]).reshape(
-        -1, 3
-    )
-    cones = view_cones(points, centers, see_point, see_image)
-    distance = np.linalg.norm(centers[see_image] - points[see_point], axis=1)
-    near, far = np.full(len(rows), np.inf), np.zeros(len(rows))
-    np.minimum.at(near, see_point, distance)
-    np.maximum.at(far, see_point, distance)
-    order = np.lexsort((see_point, see_image))
-    see_image, see_point = see_image[order], see_point[order]
-    start = np.searchsorted(see_image, np.arange(len(centers) + 1))
-    scene, reach = centers.copy(), np.zeros(len(centers))
-    for i in range(len(centers)):
-        seen = points[see_point[start[i] : start[i + 1]]]
-        if len(seen):
-            scene[i] = np.median(seen, axis=0)
-            reach[i] = np.median(np.linalg.norm(seen - centers[i], axis=1))
-    turn = area_from_map.rotation
-    return {
-        "points": points,
-        "point_row": rows,
-        "point_covariance": turn @ full_covariances(feature_map.points.covariance[rows]) @ turn.T,
-        "view_direction": cones.direction,
-        "view_spread_cos": cones.spread_cos,
-        "view_distance": np.stack([near, far], axis=1),
-        "descriptors": _mean_descriptors(observations.descriptors[keep][order], see_point, len(rows)),
-        "see_image": see_image.astype(np.int32),
-        "see_point": see_point.astype(np.int32),
-        "image_center": centers,
-        "image_scene": scene,
-        "image_reach": reach,
-    }
+def _raised(parts: Sequence[NDArray[np.int32]], counts: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Row numbers of all parts, one after the other, each counted from the rows of those before it."""
+    before = np.cumsum(counts) - counts
+    return np.concatenate([part + np.int32(first) for part, first in zip(parts, before, strict=True)])
 
 
-def _mean_descriptors(
-    descriptors: NDArray[np.uint8], point: NDArray[np.intp], count: int
-) -> NDArray[np.uint8]:
-    """Mean descriptor of each track, brought back to length 512 and 8 bits."""
-    total = _sum_by(point, descriptors.astype(np.float32), count)
-    norm = np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
-    return np.asarray(np.clip(np.rint(total * (512.0 / norm)), 0, 255), dtype=np.uint8)
-
-
-def _sum_by(group: NDArray[np.intp], values: NDArray[np.floating], count: int) -> FloatArray:
-    """Sums (count, k) of rows of values (n, k) by group number (n,)."""
-    matrix = sparse.csr_array(
-        (np.ones(len(group)), (group, np.arange(len(group)))), shape=(count, len(group))
-    )
-    return np.asarray(matrix @ values, dtype=np.float64).reshape(count, values.shape[1])
+def _joined_starts(parts: Sequence[NDArray[np.int64]], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Starts of slices of all parts, and the end of the last, from those of each part and its length."""
+    before = np.cumsum(counts) - counts
+    starts = [part[:-1] + first for part, first in zip(parts, before, strict=True)]
+    return np.concatenate([*starts, [counts.sum()]])
 
 
 def _covisibility(
-    see_image: NDArray[np.int32],
-    see_point: NDArray[np.int32],
+    segments: Sequence[Segment],
+    images: NDArray[np.int64],
     image_map: NDArray[np.int32],
     image_scene: FloatArray,
     image_reach: FloatArray,
@@ -245,13 +247,13 @@ def _covisibility(
     half of the smaller reach of each other are taken to overlap.
     """
     count = len(image_map)
-    sees = sparse.csr_array(
-        (np.ones(len(see_image), dtype=np.int32), (see_image, see_point)),
-        shape=(count, int(see_point.max()) + 1 if len(see_point) else 1),
+    starts = _joined_starts(
+        [s.shared_start for s in segments], np.array([len(s.shared_image) for s in segments])
     )
-    sees.data[:] = 1  # a point that an image sees twice is one point
-    shared = sparse.csr_array(sees @ sees.T)
-    if len(np.unique(image_map)) < 2:
+    columns = _raised([s.shared_image for s in segments], images)
+    values = np.concatenate([s.shared_count for s in segments])
+    shared = sparse.csr_array((values, columns, starts), shape=(count, count))
+    if len(segments) < 2:
         return shared
     from scipy.spatial import cKDTree
 
@@ -264,7 +266,3 @@ def _covisibility(
         (np.full(2 * len(a), 30, dtype=np.int32), (np.r_[a, b], np.r_[b, a])), shape=(count, count)
     )
     return sparse.csr_array(shared + links.tocsr())
-
-
-def _repeat(counts: list[int]) -> NDArray[np.int32]:
-    return np.repeat(np.arange(len(counts), dtype=np.int32), counts)

@@ -1,13 +1,16 @@
-"""FAISS over the descriptors of an area, built in memory when the area is loaded.
+"""FAISS over the descriptors of areas: inverted lists of short codes, which choose the neighbours.
 
-8-bit RootSIFT goes in exactly (QT_8bit_direct, 128 bytes a descriptor), into inverted lists whose centres
-were trained once and come with featuredb: an area costs no training, and one that grows keeps its lists.
+Which of them is nearest, and how near, the descriptors themselves say (`squared_distances`). The centres of
+lists and codes were trained once and come with featuredb: an index costs no training, and a map's part of it
+is worked out once and kept with the map.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from io import BytesIO
-from typing import Any
+from typing import Any, Self
 
 import faiss
 import numpy as np
@@ -15,14 +18,54 @@ from numpy.typing import NDArray
 
 from featuredb.features.features import DESCRIPTOR_SIZE
 
-# Where an exhaustive search of 3,000 query features takes as long as one of the lists (45 ms of one core).
-_EXHAUSTIVE_LIMIT = 4_000
+CODE_PARTS, CODE_BYTES = 32, 16  # 4 bits a part
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
-_CENTERS = "list_centers.npz"  # tools/train_vocabulary.py made it
+_LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
+_CHUNK = 50_000  # descriptors at a time: bounds the float32 copies
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DescriptorCodes:
+    """What an index keeps of descriptors.
+
+    Attributes:
+        lists: (n,) int16, the inverted list of each.
+        codes: (n, 16) uint8, product code.
+    """
+
+    lists: NDArray[np.int16]
+    codes: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.lists)
+
+    def take(self, rows: NDArray[np.integer]) -> "DescriptorCodes":
+        return DescriptorCodes(lists=self.lists[rows], codes=self.codes[rows])
+
+    @classmethod
+    def of(cls, descriptors: NDArray[np.uint8]) -> Self:
+        """Codes of descriptors (n, 128)."""
+        lists = np.empty(len(descriptors), np.int16)
+        codes = np.empty((len(descriptors), CODE_BYTES), np.uint8)
+        index = _empty_index()  # which its quantizer dies with
+        for start in range(0, len(descriptors), _CHUNK):
+            end = start + _CHUNK
+            part = np.ascontiguousarray(descriptors[start:end], dtype=np.float32)
+            lists[start:end] = _list_centers().search(part, 1)[1][:, 0]
+            codes[start:end] = index.pq.compute_codes(part)
+        return cls(lists=lists, codes=codes)
+
+    @classmethod
+    def joined(cls, parts: Sequence["DescriptorCodes"]) -> Self:
+        """Of all, one after the other."""
+        return cls(
+            lists=np.concatenate([part.lists for part in parts] or [np.zeros(0, np.int16)]),
+            codes=np.concatenate([part.codes for part in parts] or [np.zeros((0, CODE_BYTES), np.uint8)]),
+        )
 
 
 class DescriptorIndex:
-    """Nearest descriptors of an area. Searching is thread-safe; the object never changes."""
+    """Neighbours among descriptors. Searching is thread-safe; the object never changes."""
 
     def __init__(self, index: Any, memory: NDArray[np.uint8] | None = None) -> None:
         """`memory`: where the index has its arrays, if it does not own them."""
@@ -35,66 +78,67 @@ class DescriptorIndex:
     def __len__(self) -> int:
         return int(self._index.ntotal)
 
-    def search(
-        self, descriptors: NDArray[np.uint8], k: int, among: NDArray[np.bool_] | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """The k nearest rows of each descriptor.
+    @classmethod
+    def of(cls, codes: DescriptorCodes) -> Self:
+        index = _empty_index()
+        order = np.argsort(codes.lists, kind="stable")
+        rows, sorted_codes = order.astype(np.int64), np.ascontiguousarray(codes.codes[order])
+        ends = np.searchsorted(codes.lists[order], np.arange(index.nlist + 1))
+        for number in np.flatnonzero(np.diff(ends)):
+            start, end = ends[number : number + 2]
+            index.invlists.add_entries(
+                int(number),
+                int(end - start),
+                faiss.swig_ptr(rows[start:end]),
+                faiss.swig_ptr(sorted_codes[start:end]),
+            )
+        index.ntotal = len(codes)
+        packed = faiss.IndexIVFPQFastScan(index)
+        packed.nprobe = _PROBES
+        return cls(packed)
 
-        Args:
-            descriptors: (n, 128) uint8.
-            among: (rows,) which rows may be found; None: all.
-
-        Returns:
-            Squared distances (n, k) float32, ascending, and rows (n, k) int64, -1 where there are fewer.
-        """
+    def search(self, descriptors: NDArray[np.uint8], k: int) -> NDArray[np.int64]:
+        """Rows (n, k) of near ones to each descriptor (n, 128), about nearest first; -1: there are fewer."""
         if len(self) == 0 or len(descriptors) == 0:
-            shape = (len(descriptors), k)
-            return np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int64)
-        parameters: Any = None
-        if among is not None:
-            lists = isinstance(self._index, faiss.IndexIVF)
-            parameters = faiss.SearchParametersIVF() if lists else faiss.SearchParameters()
-            bits = np.packbits(among, bitorder="little")
-            select: Any = faiss.IDSelectorBitmap  # its stub is that of C++
-            selector = select(bits)
-            parameters.sel = selector
-            if lists:
-                parameters.nprobe = self._index.nprobe
-        distance, row = self._index.search(descriptors.astype(np.float32), k, params=parameters)
-        return distance, row
+            return np.full((len(descriptors), k), -1, np.int64)
+        _, row = self._index.search(np.ascontiguousarray(descriptors, dtype=np.float32), k)
+        return np.asarray(row, dtype=np.int64)
 
 
-def build_index(descriptors: NDArray[np.uint8]) -> DescriptorIndex:
-    """Index of descriptors (n, 128) uint8: exhaustive when small, else inverted lists of exact codes."""
-    count = len(descriptors)
-    if count <= _EXHAUSTIVE_LIMIT:
-        index: Any = faiss.IndexFlatL2(DESCRIPTOR_SIZE)
-    else:
-        centers = _list_centers()
-        index = faiss.IndexIVFScalarQuantizer(
-            centers,  # kept alive by the Python object of the index
-            DESCRIPTOR_SIZE,
-            centers.ntotal,
-            faiss.ScalarQuantizer.QT_8bit_direct,
-            faiss.METRIC_L2,
-            False,  # codes, not residuals: exact
-        )
-        index.is_trained = True  # nor do direct codes need any
-        index.nprobe = _PROBES
-    for start in range(0, count, 100_000):
-        index.add(descriptors[start : start + 100_000].astype(np.float32))
-    return DescriptorIndex(index)
+def squared_distances(
+    query: NDArray[np.uint8], base: NDArray[np.uint8], rows: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Exact squared distances (n, k) of descriptors (n, 128) from rows (n, k) of others; infinity for -1."""
+    difference = base[np.maximum(rows, 0)].astype(np.float32)
+    difference -= query[:, None, :]
+    squared = np.einsum("ijk,ijk->ij", difference, difference)
+    squared[rows < 0] = np.inf
+    return np.asarray(squared, dtype=np.float32)
+
+
+def _empty_index() -> Any:
+    """Inverted lists of product codes, not of residuals, so that a code is the same in every list."""
+    centers = _list_centers()
+    index = faiss.IndexIVFPQ(centers, DESCRIPTOR_SIZE, centers.ntotal, CODE_PARTS, 4, faiss.METRIC_L2)
+    index.by_residual = False
+    faiss.copy_array_to_vector(_shipped(_CODES).ravel(), index.pq.centroids)
+    index.is_trained = True
+    return index
 
 
 @cache
 def _list_centers() -> Any:
-    """The index of the lists' centres (2048, 128), which all areas share."""
-    data = resources.files("featuredb.index").joinpath("data", _CENTERS).read_bytes()
-    with np.load(BytesIO(data), allow_pickle=False) as archive:
-        centers = archive["centers"].astype(np.float32)
+    """The index of the lists' centres (2048, 128), which all indexes share."""
     index = faiss.IndexFlatL2(DESCRIPTOR_SIZE)
-    index.add(centers)
+    index.add(_shipped(_LISTS))
     return index
+
+
+@cache
+def _shipped(name: str) -> NDArray[np.float32]:
+    data = resources.files("featuredb.index").joinpath("data", name).read_bytes()
+    with np.load(BytesIO(data), allow_pickle=False) as archive:
+        return np.asarray(archive["centers"], dtype=np.float32)
 
 
 def _in_memory(memory: NDArray[np.uint8]) -> DescriptorIndex:

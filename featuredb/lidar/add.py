@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from featuredb.atomic import user_cache
 from featuredb.errors import ConflictError, GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
 from featuredb.geo.crs.scan import ScanCrs, scan_crs
@@ -104,8 +105,7 @@ def work_folder(database: Database, work: Path | None, name: str, points: int) -
 def _default_parent(database: Database) -> Path:
     if "://" not in database.url:
         return Path(database.url) / "_work"
-    cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(cache) / "featuredb" / "lidar"
+    return user_cache() / "lidar"
 
 
 def _lock(path: Path) -> int:

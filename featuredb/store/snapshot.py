@@ -2,13 +2,14 @@
 
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
+from numpy.typing import NDArray
 
 from featuredb.errors import MapNotFoundError, UnplacedMapError
 from featuredb.geometry.arrays import FloatArray
@@ -18,10 +19,18 @@ from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, UnplacedStatus
 from featuredb.store.changes import RETIRED
 from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_place, of_columns
-from featuredb.store.delta import Table
+from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
-from featuredb.store.tables import BOUNDS, CHILD_TABLES, IMAGES, UTM_COORDINATES
+from featuredb.store.tables import (
+    BOUNDS,
+    CHILD_TABLES,
+    IMAGES,
+    OBSERVATIONS,
+    POINTS,
+    SPECS,
+    UTM_COORDINATES,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,16 +187,11 @@ class Snapshot:
         with read_errors("cannot read where the photos were taken"):
             found = self._children[IMAGES].dataset().to_table(["write_id", *UTM_COORDINATES])
         utm = np.column_stack([found[name].to_numpy() for name in UTM_COORDINATES])
-        encoded = found["write_id"].combine_chunks().dictionary_encode()
-        group = encoded.indices.to_numpy()
-        order = np.argsort(group, kind="stable")
-        ends = np.searchsorted(group[order], np.arange(len(encoded.dictionary) + 1))
-        at = dict(zip(encoded.dictionary.to_pylist(), itertools.pairwise(ends), strict=True))
+        grouped = _grouped(found["write_id"])
         medians = {}
         for map_id, row in self._rows.items():
-            if has_place(row) and row["write_id"] in at:
-                start, end = at[row["write_id"]]
-                middle = np.median(utm[order[start:end]], axis=0)
+            if has_place(row) and row["write_id"] in grouped:
+                middle = np.median(utm[grouped[row["write_id"]]], axis=0)
                 medians[map_id] = frame_of(row).enu_from_utm(middle, row["epsg"])
         return medians
 
@@ -241,6 +245,28 @@ class Snapshot:
         assert isinstance(loaded, FeatureMap)
         return loaded
 
+    def load_outlines(self, map_ids: Collection[str]) -> dict[str, FeatureMap]:
+        """Maps with a place, by id, without their points and observations (`FeatureMap.outline`).
+
+        Raises:
+            MapNotFoundError, UnplacedMapError, StoreError: as `load_map`.
+        """
+        rows = [self._row(self.get(map_id).map_id) for map_id in map_ids]
+        if not rows:
+            return {}
+        own: Condition = ("write_id", "in", [row["write_id"] for row in rows])
+        found = self._read(IMAGES, own, "the maps'")
+        table = pa.Table.from_batches(found) if found else SPECS[IMAGES].schema.empty_table()
+        grouped = _grouped(table["write_id"])
+        maps = {}
+        for row in rows:
+            images = table.take(grouped.get(row["write_id"], np.zeros(0, np.int64))).to_batches()
+            bare = {**row, "points": 0, "observations": 0}
+            outline = decode_map(bare, {IMAGES: images, POINTS: (), OBSERVATIONS: ()})
+            assert isinstance(outline, FeatureMap)
+            maps[row["map_id"]] = outline
+        return maps
+
     def load_unplaced(self, map_id: str) -> UnplacedMap:
         """The map without a place exactly as it was committed; only its status may differ.
 
@@ -261,7 +287,9 @@ class Snapshot:
             StoreError: rows are missing or unreadable.
         """
         row = self._row(map_id)
-        return decode_map(row, {name: self._batches(name, row) for name in CHILD_TABLES})
+        own: Condition = ("write_id", "=", row["write_id"])
+        whose = f"map {map_id}: its"
+        return decode_map(row, {name: self._read(name, own, whose) for name in CHILD_TABLES})
 
     def dataset(self, table: str, *, include_retired: bool = True) -> ds.Dataset:
         """The child rows that this snapshot sees, as an Arrow dataset that reads when asked."""
@@ -281,20 +309,30 @@ class Snapshot:
             )
         return self._rows[map_id]
 
-    def _batches(self, table: str, row: Row) -> list[pa.RecordBatch]:
-        """The map's rows of one child table, from the few files that can hold them."""
-        with read_errors(f"map {row['map_id']}: cannot read its {table}"):
+    def _read(self, table: str, where: Condition, whose: str) -> list[pa.RecordBatch]:
+        """Rows of one child table, from the few files that can hold them."""
+        child = self._children[table]
+        with read_errors(f"cannot read {whose} {table}"):
             try:
-                return self._read(table, row["write_id"])
+                found = child.dataset([where]).to_table(use_threads=False)
             except FileNotFoundError:
                 # Compacted and vacuumed since this snapshot was taken: the same rows, in newer files.
-                self._children[table].refresh()
-                return self._read(table, row["write_id"])
-
-    def _read(self, table: str, write_id: str) -> list[pa.RecordBatch]:
-        dataset = self._children[table].dataset([("write_id", "=", write_id)])
-        batches: list[pa.RecordBatch] = dataset.to_table(use_threads=False).to_batches()
+                child.refresh()
+                found = child.dataset([where]).to_table(use_threads=False)
+        batches: list[pa.RecordBatch] = found.to_batches()
         return batches
+
+
+def _grouped(column: pa.ChunkedArray) -> dict[str, NDArray[np.int64]]:
+    """Rows of each of the values of a column of text."""
+    encoded = column.combine_chunks().dictionary_encode()
+    group = encoded.indices.to_numpy()
+    order = np.argsort(group, kind="stable")
+    ends = np.searchsorted(group[order], np.arange(len(encoded.dictionary) + 1))
+    return {
+        value: order[start:end]
+        for value, (start, end) in zip(encoded.dictionary.to_pylist(), itertools.pairwise(ends), strict=True)
+    }
 
 
 def _without_place(row: Row) -> UnplacedMapError:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.atomic import atomic_folder
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
@@ -30,7 +31,7 @@ from ingest.sfm.mapper import (
     reconstruct,
 )
 from ingest.sfm.pairs import Pair
-from ingest.workspace import Workspace, atomic_folder
+from ingest.workspace import Workspace
 
 _LOG = logging.getLogger(__name__)
 # What numbers can do to a block, in COLMAP or here. A full disk is another thing: it ends the run.

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from featuredb.atomic import atomic_file
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
 from ingest.plot_parts import plan_png
 from ingest.register.control.report import control_html
 from ingest.report.films import films_html
 from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, report_json
-from ingest.workspace import atomic_file, write_json
+from ingest.workspace import write_json
 
 REPORT_JSON = "report.json"
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from featuredb.atomic import atomic_folder
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import SUPPORTED_MODELS, Camera
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
@@ -25,7 +26,6 @@ from ingest.sfm.view_graph_focals import (
     registered_with_usual_lens,
     start_from,
 )
-from ingest.workspace import atomic_folder
 
 logger = logging.getLogger(__name__)
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from featuredb.atomic import atomic_file
 from featuredb.errors import VideoError
 from featuredb.features.exif.angles import DJI_GIMBAL
 from featuredb.features.exif.read import UNNAMED_MAKE, shot_model, unnamed_model
@@ -36,7 +37,7 @@ from ingest.video.positions import (
     lateness,
     places_at,
 )
-from ingest.workspace import atomic_file, write_json
+from ingest.workspace import write_json
 
 _DONE = "film.json"
 # Raised when a film gives other stills: with the constants of `motion`, `burnt_in`, `clocks`, `lag`, `match`.

@@ -108,10 +108,8 @@ def map_covariance(area: Area, center: FloatArray, rows: NDArray[np.int64]) -> F
     Args:
         center: (3,) camera centre in the area's frame. rows: of the area's points that gave the pose.
     """
-    wanted = np.zeros(len(area.points), dtype=np.bool_)
-    wanted[rows] = True
-    shared = np.bincount(area.see_image[wanted[area.see_point]], minlength=len(area.image_map))
-    best = int(np.argmax(shared))
+    images, _ = area.images_that_see(np.unique(rows))
+    best = int(np.argmax(np.bincount(images, minlength=1)))
     feature_map = area.maps[int(area.image_map[best])]
     first = int(np.searchsorted(area.image_map, area.image_map[best]))
     image = feature_map.images[best - first]
@@ -171,7 +169,7 @@ def _inliers(area: Area, order: list[int], pixels: FloatArray, point_rows: NDArr
     utm = np.empty((len(point_rows), 3))
     for i in order:
         mine = area.point_map[point_rows] == i
-        utm[mine] = area.maps[i].points.utm[area.point_row[point_rows[mine]]]
+        utm[mine] = area.frame.utm_from_enu(area.points[point_rows[mine]], area.maps[i].epsg)
     return Inliers(pixels=pixels, points_utm=utm, map_rows=place[area.point_map[point_rows]])
 
 
@@ -221,11 +219,8 @@ def _moved_points(
     """Points (n,) of the area and their displacements (n, 3, r), as the images that see them move."""
     feature_map = area.maps[main]
     first = int(np.searchsorted(area.image_map, main))
-    wanted = np.full(len(area.points), -1, dtype=np.int64)
     points = np.unique(rows)
-    wanted[points] = np.arange(len(points))
-    seen = wanted[area.see_point] >= 0
-    images, of = area.see_image[seen], wanted[area.see_point[seen]]
+    images, of = area.images_that_see(points)
     place = {int(image_id): k for k, image_id in enumerate(modes.image_id)}
     turn = area.frame.enu_from(feature_map.frame)
     normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, modes.poses.shape[2]))

@@ -1,7 +1,7 @@
 """Which part of the maps a photo may show: voting for images, then clusters of images that see the same."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,7 +10,7 @@ from featuredb.errors import IncompatibleExtractorError
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.area import Area, build_area
-from featuredb.index.descriptor_index import DescriptorIndex, build_index
+from featuredb.index.descriptor_index import DescriptorCodes, DescriptorIndex, squared_distances
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from reloc.localise.options import CandidateOptions
 
@@ -20,20 +20,38 @@ _FAR_BELOW_M = 100_000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class IndexedArea:
-    """An area and the index over its descriptors."""
+    """An area and an index over its descriptors, and maybe those of other areas.
+
+    Attributes:
+        first: row of the index where the area's points begin.
+    """
 
     area: Area
     index: DescriptorIndex
+    first: int = 0
 
     @classmethod
     def of(cls, maps: Sequence[FeatureMap]) -> "IndexedArea":
         """Maps of one extractor and height datum, laid out in one frame and ready to be asked."""
         area = build_area(maps)
-        return cls(area=area, index=build_index(area.descriptors))
+        return cls(area=area, index=DescriptorIndex.of(area.codes))
 
     def only(self, map_ids: Collection[str]) -> "IndexedArea":
         """The same area and index, of which only these maps are searched."""
-        return IndexedArea(area=self.area.only(map_ids), index=self.index)
+        return replace(self, area=self.area.only(map_ids))
+
+
+def indexed_together(areas: Sequence[Area]) -> list[IndexedArea]:
+    """The areas with one index for all of each extractor: a photo is looked for in all of them at once."""
+    indexed: dict[int, IndexedArea] = {}
+    for fingerprint in {area.extractor_fingerprint for area in areas}:
+        mine = [k for k, area in enumerate(areas) if area.extractor_fingerprint == fingerprint]
+        index = DescriptorIndex.of(DescriptorCodes.joined([areas[k].codes for k in mine]))
+        first = 0
+        for k in mine:
+            indexed[k] = IndexedArea(area=areas[k], index=index, first=first)
+            first += len(areas[k].points)
+    return [indexed[k] for k in range(len(areas))]
 
 
 def usable_areas(areas: Sequence[IndexedArea], fingerprint: str) -> list[IndexedArea]:
@@ -81,31 +99,49 @@ def find_clusters(
     Args:
         beyond: images that may see what a camera within this prior sees are left out: they were tried.
     """
-    reach = [(indexed, images_in_reach(indexed.area, prior, options)) for indexed in areas]
-    if beyond is not None:
-        reach = [(a, allowed & ~images_in_reach(a.area, beyond, options)) for a, allowed in reach]
-    reach = [(indexed, allowed) for indexed, allowed in reach if allowed.any()]
-    images = [np.flatnonzero(allowed) for _, allowed in reach]
-    points = [indexed.area.points_of_images(rows) for (indexed, _), rows in zip(reach, images, strict=True)]
-    small = [len(rows) <= options.single_cluster_points for rows in points]
+    reach: list[_Reach] = []
+    for indexed in areas:
+        allowed = images_in_reach(indexed.area, prior, options)
+        if beyond is not None:
+            allowed &= ~images_in_reach(indexed.area, beyond, options)
+        if allowed.any():
+            reach.append(_Reach.of(indexed, allowed))
+    small = [len(r.points) <= options.single_cluster_points for r in reach]
     if all(small) and len(reach) <= options.max_clusters:
-        return [
-            Cluster(area=indexed.area, images=images[i], points=points[i], score=np.inf)
-            for i, (indexed, _) in enumerate(reach)
-        ]
-    votes = _vote([indexed for indexed, _ in reach], features, options)
-    searched = sum(int(np.count_nonzero(a.area.searched[a.area.point_map])) for a, _ in reach)
-    share = sum(float(v.sum()) for v in votes) / max(searched, 1)
+        return [Cluster(area=r.area, images=r.images, points=r.points, score=np.inf) for r in reach]
+    votes = _vote(reach, features, options)
+    share = sum(float(v.sum()) for v in votes) / max(sum(len(r.points) for r in reach), 1)
     found: list[Cluster] = []
-    for i, (indexed, allowed) in enumerate(reach):
+    for i, r in enumerate(reach):
         if small[i]:
-            score = float(_above_chance(votes[i][points[i]].sum(), share * len(points[i])))
-            found.append(Cluster(area=indexed.area, images=images[i], points=points[i], score=score))
+            score = float(_above_chance(votes[i].sum(), share * len(r.points)))
+            found.append(Cluster(area=r.area, images=r.images, points=r.points, score=score))
         else:
-            scores = np.where(allowed, _image_scores(indexed.area, votes[i], share), -np.inf)
-            found.extend(_grow_clusters(indexed.area, scores, options))
+            found.extend(_grow_clusters(r.area, _image_scores(r, votes[i], share), options))
     found.sort(key=lambda cluster: -cluster.score)
     return found[: options.shortlist]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Reach:
+    """The part of an area that is searched: rows (i,) of its images, and (p,) of the points that they see."""
+
+    indexed: IndexedArea
+    images: NDArray[np.intp]
+    points: NDArray[np.int32]
+
+    @property
+    def area(self) -> Area:
+        return self.indexed.area
+
+    @classmethod
+    def of(cls, indexed: IndexedArea, allowed: NDArray[np.bool_]) -> "_Reach":
+        images = np.flatnonzero(allowed)
+        if len(images) == len(allowed):
+            points = np.arange(len(indexed.area.points), dtype=np.int32)
+        else:
+            points = indexed.area.points_of_images(images)
+        return cls(indexed=indexed, images=images, points=points)
 
 
 def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOptions) -> NDArray[np.bool_]:
@@ -122,8 +158,8 @@ def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOption
     return np.asarray(area.searched_images() & (np.minimum(to_camera, to_scene) <= margin), dtype=np.bool_)
 
 
-def _vote(areas: Sequence[IndexedArea], features: Features, options: CandidateOptions) -> list[FloatArray]:
-    """For each area the votes (p,) of its points: a feature votes for its nearest point of all areas.
+def _vote(reach: Sequence[_Reach], features: Features, options: CandidateOptions) -> list[FloatArray]:
+    """For each area the votes (p,) of all its points: a feature votes for its nearest point in reach.
 
     By as much as that point is nearer than the `vote_background`-th, in squares: what looks like everything
     else says nothing (McCann and Lowe, Local Naive Bayes Nearest Neighbor, 2012). Points as near as the
@@ -131,44 +167,82 @@ def _vote(areas: Sequence[IndexedArea], features: Features, options: CandidateOp
     average.
     """
     asked = features.descriptors[: options.vote_features]
-    found = [
-        indexed.index.search(
-            asked,
-            options.vote_background,
-            None if indexed.area.searched.all() else indexed.area.searched[indexed.area.point_map],
-        )
-        for indexed in areas
-    ]
-    rows = np.concatenate([r for _, r in found], axis=1)
-    squared = np.concatenate([d for d, _ in found], axis=1).astype(np.float64)
-    squared[rows < 0] = np.inf
+    part, rows, squared = _nearest(reach, asked, options.vote_background)
     ranked = np.sort(squared, axis=1)[:, : options.vote_background]
     background = np.max(ranked, axis=1, where=np.isfinite(ranked), initial=1.0)[:, None]
     weight = np.maximum(1.0 - squared / background, 0.0)
     weight[squared > (1.0 + options.vote_tie) ** 2 * ranked[:, :1]] = 0.0
     weight /= max(float(weight[weight > 0.0].mean()) if (weight > 0.0).any() else 0.0, 1e-9)
     votes: list[FloatArray] = []
-    for indexed, part in zip(areas, np.split(np.arange(rows.shape[1]), len(areas)), strict=True):
-        given = weight[:, part] > 0.0
-        chosen, weights = rows[:, part][given], weight[:, part][given]
-        counted = np.bincount(chosen, weights=weights, minlength=len(indexed.area.points))
-        votes.append(counted.astype(np.float64))
+    for i, r in enumerate(reach):
+        given = (weight > 0.0) & (part == i)
+        counted = np.zeros(len(r.area.points))
+        np.add.at(counted, rows[given], weight[given])
+        votes.append(counted)
     return votes
 
 
-def _image_scores(area: Area, votes_of_point: FloatArray, share: float) -> FloatArray:
-    """(i,) votes of each image above what chance gives it, in standard deviations.
+def _nearest(
+    reach: Sequence[_Reach], asked: NDArray[np.uint8], k: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Of descriptors (n, 128) the k nearest points in reach, or more.
+
+    Areas that share an index and are in reach as a whole are searched by it. Of others, the points in reach
+    get an index now: what lies elsewhere costs nothing.
+
+    Returns:
+        For each (n, m) where in `reach` it is, the row of the point in its area, and the squared distance;
+        infinity where there are fewer.
+    """
+    groups: dict[int, list[int]] = {}
+    for i, r in enumerate(reach):
+        groups.setdefault(id(r.indexed.index), []).append(i)
+    parts, rows, squared = [], [], []
+    for group in groups.values():
+        index = reach[group[0]].indexed.index
+        whole = sum(len(reach[i].points) for i in group) == len(index)
+        if whole:
+            first = np.array([reach[i].indexed.first for i in group])
+        else:
+            codes = [reach[i].area.codes.take(reach[i].points) for i in group]
+            index = DescriptorIndex.of(DescriptorCodes.joined(codes))
+            first = np.cumsum([0, *(len(part) for part in codes[:-1])])
+        found = index.search(asked, k)
+        order = np.argsort(first)
+        place = order[np.maximum(np.searchsorted(first[order], found, side="right") - 1, 0)]
+        row = np.full(found.shape, -1, np.int64)
+        distance = np.full(found.shape, np.inf)
+        for j, i in enumerate(group):
+            mine = (place == j) & (found >= 0)
+            if not mine.any():
+                continue
+            own = found[mine] - first[j]
+            row[mine] = own if whole else reach[i].points[own]
+            local = np.where(mine, row, -1)
+            exact = squared_distances(asked, reach[i].area.descriptors, local)
+            distance[mine] = exact[mine]
+        parts.append(np.array(group)[place])
+        rows.append(row)
+        squared.append(distance)
+    return np.concatenate(parts, axis=1), np.concatenate(rows, axis=1), np.concatenate(squared, axis=1)
+
+
+def _image_scores(reach: _Reach, votes_of_point: FloatArray, share: float) -> FloatArray:
+    """(i,) votes of each of the area's images above what chance gives it, in standard deviations.
+
+    Those out of reach have minus infinity.
 
     Args:
-        share: votes per point over all areas. An image that sees many points gets many votes by chance:
-            p points get p times this, with about that variance.
+        share: votes per point over all that is in reach. An image that sees many points gets many votes by
+            chance: p points get p times this, with about that variance.
     """
-    votes = np.add.reduceat(
-        np.append(votes_of_point[area.see_point], 0.0), np.minimum(area.image_start[:-1], len(area.see_point))
-    )
-    seen = np.diff(area.image_start)
-    votes[seen == 0] = 0.0
-    return np.asarray(_above_chance(votes, share * seen), dtype=np.float64)
+    area, images = reach.area, reach.images
+    votes = votes_of_point[area.see_point[area.sights_of_images(images)]]
+    seen = np.diff(area.image_start)[images]
+    total = np.bincount(np.repeat(np.arange(len(images)), seen), weights=votes, minlength=len(images))
+    scores = np.full(len(area.image_map), -np.inf)
+    scores[images] = _above_chance(total, share * seen)
+    return scores
 
 
 def _above_chance(votes: ArrayLike, expected: ArrayLike) -> FloatArray:

@@ -197,7 +197,7 @@ def _decide(
         return refuse(refusal[0], refusal[1], best.evidence.inliers, rival)
     pixels, points = pairs(features, best.area, best.matches)
     rows = best.matches.point[best.rows]
-    inliers = (pixels[best.rows], points[best.rows], best.area.point_covariance[rows])
+    inliers = (pixels[best.rows], points[best.rows], best.area.point_covariance(rows))
     uncertainty = pose_uncertainty(*inliers, best.pose, options.pose)
     told = request.camera if request.camera_is_exact else None
     lent = None

@@ -81,7 +81,7 @@ class _MapNeighbours:
         row = self._row[:count]
         distance = np.sqrt(np.maximum(self._squared[:count], 0.0))
         position = area.points[points[np.maximum(row, 0)]]
-        same_m = options.same_place * area.view_distance[points[np.maximum(row[:, 0], 0)]].mean(axis=1)
+        same_m = options.same_place * area.view_distance[points[np.maximum(row[:, 0], 0)]]
         second_is_same = np.linalg.norm(position[:, 1] - position[:, 0], axis=1) < same_m
         rival = np.where(second_is_same, distance[:, 2], distance[:, 1])
         good = np.flatnonzero((row[:, 0] >= 0) & (distance[:, 0] < options.ratio * rival))

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from featuredb.errors import IncompatibleExtractorError, MapNotFoundError
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.index import descriptor_index
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from reloc.localise.candidates import IndexedArea
@@ -80,8 +79,8 @@ def test_a_database_serves_its_active_maps_only(
 
     database.commit_map(far)
     second = Localiser.open(database, previous=first)
-    kept = {id(a) for a in first.areas}
-    assert sum(id(a) in kept for a in second.areas) == 2
+    kept = {id(a.area) for a in first.areas}
+    assert sum(id(a.area) in kept for a in second.areas) == 2
     assert len(second.areas) == 3
     assert second.localise(photo, KNOWN).reason == "AMBIGUOUS"
     assert first.localise(photo, KNOWN).reason is None  # a snapshot stays as it was
@@ -105,7 +104,6 @@ def test_naming_maps_of_an_area_builds_nothing_and_leaves_the_others_out(
     by_gps = replace(loose, placement=replace(loose.placement, method="gps"))
     for feature_map in (field_map, replace(beside, camera_keys=("its own",)), by_gps):
         database.commit_map(feature_map)
-    monkeypatch.setattr(descriptor_index, "_EXHAUSTIVE_LIMIT", 1000)
     options = LocaliseOptions(candidates=CandidateOptions(single_cluster_points=1))
     localiser = Localiser.open(database, options)
     (both,) = localiser.areas
@@ -116,7 +114,7 @@ def test_naming_maps_of_an_area_builds_nothing_and_leaves_the_others_out(
         raise AssertionError("something was built for a query")
 
     monkeypatch.setattr("reloc.localise.candidates.build_area", built)
-    monkeypatch.setattr("reloc.localise.candidates.build_index", built)
+    monkeypatch.setattr("reloc.localiser.segment_of", built)
     for named, east_m in (("field", 0.0), ("beside", 100.0), ("loose", 9000.0)):
         pose = localiser.localise(photo, replace(KNOWN, map_ids=(named,))).pose
         assert pose is not None

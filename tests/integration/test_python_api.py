@@ -80,18 +80,21 @@ def test_colours_are_red_first(url: Path, pixels: NDArray[np.uint8]) -> None:
 
 
 def test_the_index_is_kept_until_the_database_changes(
-    url: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
+    url: Path, photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    built: list[int] = []
-    build = reloc.localise.candidates.build_index
-    monkeypatch.setattr(reloc.localise.candidates, "build_index", lambda d: built.append(len(d)) or build(d))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    built: list[str] = []
+    build = reloc.localiser.segment_of
+    monkeypatch.setattr(reloc.localiser, "segment_of", lambda m: built.append(m.map_id) or build(m))
     db = featuredb.open(url)
     for _ in range(3):
         assert db.localise(photo).localised
-    assert len(built) == 1
+    assert built == ["field"]
     db.store.commit_map(moved(field.planar_map(5), "elsewhere", 9000.0))
     assert db.localise(photo).localised
-    assert len(built) == 2, "the new map alone"
+    assert built == ["field", "elsewhere"]
+    assert featuredb.open(url).localise(photo).localised
+    assert built == ["field", "elsewhere"], "a new start lays out nothing"
     db.store.retire("elsewhere", "a test")
     assert {m.map_id for m in db.maps} == {"field"}
 

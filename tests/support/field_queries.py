@@ -7,9 +7,8 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap
-from reloc.localise.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.localise.result import LocaliseRequest, LocaliseResult
 from tests.support.planar_map import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, view
 
@@ -19,7 +18,7 @@ POSE = view(5.0, -6.0, 40.0, 8.0, 33.0)
 
 def indexed(*maps: FeatureMap) -> IndexedArea:
     made = build_area(maps)
-    return IndexedArea(area=made, index=build_index(made.descriptors))
+    return indexed_together([made])[0]
 
 
 def moved(feature_map: FeatureMap, map_id: str, east_m: float, sigma_m: float = 0.01) -> FeatureMap:

@@ -10,8 +10,7 @@ import numpy as np
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
-from reloc.localise.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.wire.query import CameraRequest
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
 from tests.support.service import ScriptedLocaliser
@@ -31,7 +30,7 @@ def pose_at(frame: int) -> Rigid3:
 def field_area() -> IndexedArea:
     """The field's map, indexed."""
     area = build_area([planar_map(FIELD, fingerprint=ExtractorOptions().fingerprint)])
-    return IndexedArea(area=area, index=build_index(area.descriptors))
+    return indexed_together([area])[0]
 
 
 @cache

@@ -13,9 +13,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
-from reloc.localise.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea, indexed_together
 
 EPSG = 32632
 EASTING, NORTHING, HEIGHT = 456_800.0, 5_429_300.0, 120.0
@@ -132,7 +131,7 @@ def scene_map(
 def indexed(*maps: FeatureMap) -> IndexedArea:
     """The maps as one indexed area."""
     area = build_area(maps)
-    return IndexedArea(area=area, index=build_index(area.descriptors))
+    return indexed_together([area])[0]
 
 
 def query_features(

@@ -45,7 +45,7 @@ def test_points_views_and_reach_against_loops() -> None:
         mean /= np.linalg.norm(mean)
         np.testing.assert_allclose(area.view_direction[row], mean, atol=1e-6)
         assert area.view_spread_cos[row] == pytest.approx((toward / distance[:, None] @ mean).min(), abs=1e-6)
-        np.testing.assert_allclose(area.view_distance[row], [distance.min(), distance.max()], atol=1e-5)
+        assert area.view_distance[row] == pytest.approx((distance.min() + distance.max()) / 2, abs=1e-5)
         total = seen.descriptors[seen.point_index == index].astype(float).sum(axis=0)
         expected = np.clip(512 * total / np.linalg.norm(total), 0, 255)
         assert np.abs(area.descriptors[row] - expected).max() <= 0.51
@@ -104,12 +104,27 @@ def test_two_maps_of_two_frames_and_zones_lie_in_one_frame() -> None:
     turn = away_from_here.rotation.T
     ee, en, eu, nn, nu, uu = COVARIANCE
     full = np.array([[ee, en, eu], [en, nn, nu], [eu, nu, uu]])
-    np.testing.assert_allclose(area.point_covariance[first][0], full, atol=1e-9)
-    np.testing.assert_allclose(area.point_covariance[second][0], turn @ full @ turn.T, atol=1e-8)
+    np.testing.assert_allclose(area.point_covariance(np.flatnonzero(first))[0], full, atol=1e-9)
+    np.testing.assert_allclose(
+        area.point_covariance(np.flatnonzero(second))[0], turn @ full @ turn.T, atol=1e-8
+    )
     assert np.abs(turn - np.eye(3)).max() > 2e-3  # it has something to turn
     # Images of different maps that look at one place count as sharing.
     assert area.covisible[0, 4] > 0
     assert build_area([one, two]).frame == max((one, two), key=lambda m: len(m.points)).frame
+
+
+def test_which_images_see_points_of_several_maps() -> None:
+    maps = [a_map(0, map_id="a"), a_map(1, map_id="b", east_m=200.0), a_map(2, map_id="c", east_m=400.0)]
+    area = build_area(maps)
+    rows = np.sort(np.random.default_rng(3).choice(len(area.points), 40, replace=False))
+    images, position = area.images_that_see(rows)
+    pairs = set(zip(images.tolist(), position.tolist(), strict=True))
+    for image in range(len(area.image_map)):
+        sees = area.see_point[area.image_start[image] : area.image_start[image + 1]]
+        assert {p for i, p in pairs if i == image} == set(np.flatnonzero(np.isin(rows, sees)).tolist())
+    assert len(pairs) == len(images)
+    assert [len(part) for part in area.images_that_see(rows[:0])] == [0, 0]
 
 
 def test_maps_that_look_elsewhere_do_not_share() -> None:

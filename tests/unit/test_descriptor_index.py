@@ -1,11 +1,12 @@
 """Descriptor search against NumPy, in float64, by exhaustion."""
 
+import pickle
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from featuredb.index import descriptor_index
-from featuredb.index.descriptor_index import build_index
+from featuredb.index.descriptor_index import DescriptorCodes, DescriptorIndex, squared_distances
 from featuredb.index.nearest import nearest
 from tests.support.scenes import noisy, random_descriptors
 
@@ -23,65 +24,61 @@ def clustered(count: int, seed: int = 0) -> NDArray[np.uint8]:
     return noisy(rng, kinds[rng.integers(0, len(kinds), count)], 12.0)
 
 
-def assert_exact(
-    distance: NDArray[np.float32], row: NDArray[np.int64], query: NDArray[np.uint8], base: NDArray[np.uint8]
-) -> None:
-    truth = brute_force(query, base)
-    np.testing.assert_array_equal(distance, np.sort(truth, axis=1)[:, : distance.shape[1]])
-    np.testing.assert_array_equal(np.take_along_axis(truth, row, axis=1), distance)
+def found(query: NDArray[np.uint8], base: NDArray[np.uint8], k: int) -> NDArray[np.int64]:
+    return DescriptorIndex.of(DescriptorCodes.of(base)).search(query, k)
 
 
-def test_small_areas_are_searched_exactly() -> None:
+def test_nearest_is_exact() -> None:
     base = clustered(700)
     query = noisy(np.random.default_rng(1), base[::7], 6.0)
-    assert_exact(*build_index(base).search(query, 4), query, base)
-    assert_exact(*nearest(query, base, 4), query, base)
-
-
-@pytest.mark.parametrize("limit", [1, 100_000])
-def test_only_the_rows_that_may_be_found_are(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(descriptor_index, "_EXHAUSTIVE_LIMIT", limit)
-    base = clustered(700)
-    among = np.arange(700) % 3 == 1
-    query = base[among][:50]
-    distance, row = build_index(base).search(query, 4, among)
-    assert (distance[:, 0] == 0.0).all()
-    assert among[row[row >= 0]].all()
+    distance, row = nearest(query, base, 4)
+    truth = brute_force(query, base)
+    np.testing.assert_array_equal(distance, np.sort(truth, axis=1)[:, :4])
+    np.testing.assert_array_equal(np.take_along_axis(truth, row, axis=1), distance)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_missing_neighbours_are_padded(count: int) -> None:
     base, query = clustered(count + 1)[:count], clustered(5, seed=3)
-    for distance, row in (nearest(query, base, 3), build_index(base).search(query, 3)):
-        assert distance.shape == row.shape == (5, 3)
-        assert (row[:, count:] == -1).all()
-        assert (row[:, :count] >= 0).all()
-        assert (distance[:, count:] > 1e30).all()
+    distance, row = nearest(query, base, 3)
+    assert distance.shape == row.shape == (5, 3)
+    assert (row[:, count:] == -1).all()
+    assert (row[:, :count] >= 0).all()
+    assert (distance[:, count:] > 1e30).all()
     distance, row = nearest(query[:0], base, 3)
     assert distance.shape == row.shape == (0, 3)
+    row = found(query, base, 3)
+    assert row.shape == (5, 3)
+    assert (row[:, count:] == -1).all()
+    assert found(query[:0], base, 3).shape == (0, 3)
+    distance = squared_distances(query, np.zeros((1, 128), np.uint8), np.full((5, 2), -1))
+    assert np.isinf(distance).all()
 
 
-@pytest.fixture(scope="module")
-def large() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def test_the_neighbours_are_found_among_the_first_ten() -> None:
     base = clustered(6000)
-    return base, noisy(np.random.default_rng(5), base[::20], 5.0)
-
-
-@pytest.fixture(autouse=True)
-def low_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Inverted lists from 1,000 descriptors on, so that the tests stay small."""
-    monkeypatch.setattr(descriptor_index, "_EXHAUSTIVE_LIMIT", 1000)
-
-
-def test_inverted_lists_find_the_neighbours_with_exact_distances(
-    large: tuple[NDArray[np.uint8], NDArray[np.uint8]],
-) -> None:
-    base, query = large
-    index = build_index(base)
-    assert hasattr(index._index, "nprobe")  # it is the other kind of index
-    assert len(index) == len(base)
-    distance, row = index.search(query, 2)
+    query = noisy(np.random.default_rng(5), base[::20], 5.0)
+    row = found(query, base, 10)
     truth = brute_force(query, base)
-    np.testing.assert_array_equal(distance, np.take_along_axis(truth, row, axis=1))
-    recall = np.mean(row[:, 0] == np.argmin(truth, axis=1))
+    recall = np.mean((row == np.argmin(truth, axis=1)[:, None]).any(axis=1))
     assert recall >= 0.95
+    exact = squared_distances(query, base, row)
+    np.testing.assert_array_equal(exact, np.take_along_axis(truth, np.maximum(row, 0), axis=1))
+
+
+def test_codes_of_parts_are_those_of_the_whole() -> None:
+    base = clustered(900)
+    parts = [DescriptorCodes.of(base[:500]), DescriptorCodes.of(base[500:])]
+    joined, whole = DescriptorCodes.joined(parts), DescriptorCodes.of(base)
+    np.testing.assert_array_equal(joined.lists, whole.lists)
+    np.testing.assert_array_equal(joined.codes, whole.codes)
+    some = np.array([3, 700, 5])
+    np.testing.assert_array_equal(whole.take(some).codes, DescriptorCodes.of(base[some]).codes)
+
+
+def test_an_index_is_the_same_after_it_was_pickled() -> None:
+    base = clustered(3000)
+    index = DescriptorIndex.of(DescriptorCodes.of(base))
+    again = pickle.loads(pickle.dumps(index))
+    np.testing.assert_array_equal(again.search(base[:50], 5), index.search(base[:50], 5))
+    assert len(again) == len(index) == 3000

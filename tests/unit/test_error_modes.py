@@ -115,7 +115,7 @@ def _triangulated(
 ) -> FloatArray:
     """Where a point comes to lie whose pixels are those of the true poses and lens."""
     start = area.points[row]
-    images = area.see_image[area.see_point == row]
+    images = area.images_that_see(np.array([row]))[0]
     xy = [_LENS.project(poses[i].act(start[None]))[0] for i in images]
 
     def residual(x: FloatArray) -> FloatArray:

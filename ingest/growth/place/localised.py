@@ -144,7 +144,7 @@ def _densified(features: Features, outcome: Localised) -> LocalisedPhoto:
         feature, point = feature[better.inliers], point[better.inliers]
         pixels, points = pixels[better.inliers], points[better.inliers]
         if len(feature) >= outcome.best.evidence.inliers:
-            pose, spread = better, area.point_covariance[point]
+            pose, spread = better, area.point_covariance(point)
             uncertainty = pose_uncertainty(pixels, points, spread, better, QUERY.pose)
     of_map = area.point_map[point]
     counts = np.bincount(of_map, minlength=len(area.maps))
@@ -160,9 +160,9 @@ def _densified(features: Features, outcome: Localised) -> LocalisedPhoto:
         pixels=pixels,
         map_ids=tuple(area.maps[i].map_id for i in order),
         map_of=place[of_map],
-        point_of=area.point_row[point],
+        point_of=area.point_row[point].astype(np.int64),
         points=points,
-        point_covariance=area.point_covariance[point],
+        point_covariance=area.point_covariance(point),
         result=outcome.result,
     )
 

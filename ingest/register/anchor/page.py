@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.atomic import atomic_file
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
@@ -27,7 +28,7 @@ from ingest.register.anchor.pictures import (
 )
 from ingest.register.anchor.report import FRAME_HEADER, AnchorReport, frame_rows, report_json
 from ingest.register.anchor.together.register import TOGETHER
-from ingest.workspace import atomic_file, write_json
+from ingest.workspace import write_json
 
 REPORT_JSON, REPORT_HTML = "anchor.json", "anchor.html"
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from featuredb.atomic import atomic_file
 from featuredb.cli.common import format_table
 from ingest.html_parts import note, page, picture, table
 from ingest.plot_parts import PlanView, plan_png
 from ingest.register.control.placement import GcpPlacement
-from ingest.workspace import atomic_file, write_json
+from ingest.workspace import write_json
 
 _HEADER = ("control point", "marks", "east m", "north m", "up m", "horizontal m", "without it m", "")
 

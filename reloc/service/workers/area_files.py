@@ -14,7 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import IO, Any
 
 from featuredb.errors import StoreError
-from reloc.localise.candidates import IndexedArea
+from featuredb.index.area import Area
+from featuredb.index.descriptor_index import DescriptorIndex
 from reloc.localiser import Localiser, OnDemand
 
 _ALIGNMENT = 64
@@ -109,7 +110,7 @@ class _Pickler(pickle.Pickler):
         self._key_of = key_of
 
     def persistent_id(self, obj: object) -> int | None:
-        return self._key_of(obj) if isinstance(obj, IndexedArea | OnDemand) else None
+        return self._key_of(obj) if isinstance(obj, Area | DescriptorIndex | OnDemand) else None
 
 
 class _Unpickler(pickle.Unpickler):

@@ -1,0 +1,297 @@
+"""What a large database costs: its start, a small commit, a query; beside a small one of the same maps.
+
+    python -m tools.scale_benchmark DB:FOLDER [DB:FOLDER ...] --work FOLDER [--points N] [--json FILE]
+
+Each DB holds one map of the photos in FOLDER. Some of its photos are taken out of the map and asked for.
+Copies of the maps are laid out as one city until they have N described points. A copy has its map's shape at
+another place, and its descriptors with their cells in another order: real ones, which are neither the map's
+nor another copy's. Photos are asked for by their features in a copy's order, with a prior
+of 30 m and without one; their true places are where the whole map has them, moved with the copy.
+
+Each database is measured in a process of its own: start to the first answer, a commit of a map of 100 points
+until it answers, queries, memory.
+"""
+
+import gc
+import multiprocessing
+import os
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.features.decode import decode_gray
+from featuredb.features.extractor import extract
+from featuredb.features.features import Features
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import utm_epsg
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.index.descriptor_index import use_threads
+from featuredb.maps.feature_map import FeatureMap, GeoPrior
+from featuredb.maps.subset import only_images, only_points
+from featuredb.store import Database
+from reloc.localise.localise import localise_features
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import LocaliseRequest
+from reloc.localiser import Localiser
+from tools.figures import study_parser, write_figures
+
+_HELD_OUT = 4  # photos of each map
+_ASKED = 40  # queries of a database
+_GAP_M = 50.0
+_PRIOR_M = 30.0
+_RIGHT_M = 1.0
+_COMMITTED = 100  # points
+_AT_ONCE = 16  # maps of a commit
+_SMALL = 10_000  # points
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Source:
+    """A map to copy; photos that are not in it: features, lenses, and centres (3,) in its frame, metres."""
+
+    feature_map: FeatureMap
+    photos: list[Features]
+    cameras: list[Camera]
+    places: list[FloatArray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Query:
+    """Features, a lens, a prior, and the true place: latitude, longitude, height."""
+
+    features: Features
+    camera: Camera
+    prior: GeoPrior
+    place: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """Of one database: seconds, milliseconds of a query (median), shares of queries, bytes a point."""
+
+    points: int
+    first_start_s: float
+    start_s: float
+    commit_s: float
+    with_prior_ms: float
+    without_ms: float
+    answered_with_prior: float
+    answered_without: float
+    wrong: int
+    resident_bytes: float
+    peak_bytes: float
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = study_parser(__doc__, "--work")
+    parser.add_argument("sources", nargs="+", metavar="DB:FOLDER")
+    parser.add_argument("--points", type=int, default=1_000_000)
+    args = parser.parse_args(argv)
+    args.work.mkdir(parents=True, exist_ok=True)
+    sources = [source_of(*text.rsplit(":", 1)) for text in args.sources]
+    small, large = args.work / "small", args.work / f"large-{args.points}"
+    ask = {}
+    for path, points in ((small, _SMALL), (large, args.points)):
+        ask[path] = city(path, sources, points)
+    context = multiprocessing.get_context("spawn")
+    measured = {}
+    for path, queries in ask.items():
+        with ProcessPoolExecutor(1, mp_context=context) as pool:
+            first_start_s = pool.submit(first_start, path, queries[0]).result()
+        with ProcessPoolExecutor(1, mp_context=context) as pool:
+            measured[path] = pool.submit(measure, path, queries, first_start_s).result()
+    figures: dict[str, Any] = {
+        f"{size}_{name}": value
+        for size, path in (("small", small), ("large", large))
+        for name, value in asdict(measured[path]).items()
+    }
+    for name in ("first_start_s", "start_s", "commit_s", "with_prior_ms", "without_ms"):
+        figures[f"times_{name.rsplit('_', 1)[0]}"] = figures[f"large_{name}"] / figures[f"small_{name}"]
+    write_figures(args.json, figures)
+    return 0
+
+
+def source_of(database: str, folder: str) -> Source:
+    """The largest placed map of a database without some of its photos, which are spread over it."""
+    snapshot = Database.open(database).snapshot()
+    whole = snapshot.load_map(max(snapshot.maps(), key=lambda m: m.images).map_id)
+    images = sorted(whole.images, key=lambda image: image.name)
+    at = np.linspace(0, len(images) - 1, _HELD_OUT + 2).round().astype(int)[1:-1]
+    asked = [images[i] for i in at]
+    rest = only_images(whole, {i.image_id for i in whole.images} - {i.image_id for i in asked})
+    rest = replace(rest, images=tuple(replace(image, gps=None) for image in rest.images))
+    options = LocaliseOptions()
+    photos = [extract(decode_gray(Path(folder) / image.name), options.extractor) for image in asked]
+    places = [image.cam_from_local.center for image in asked]
+    cameras = [whole.cameras[image.camera_id] for image in asked]
+    return Source(feature_map=rest, photos=photos, cameras=cameras, places=places)
+
+
+def city(path: Path, sources: Sequence[Source], points: int) -> list[Query]:
+    """A database of at least so many described points, and what to ask it."""
+    for folder in (path, Path(f"{path}-cache")):
+        shutil.rmtree(folder, ignore_errors=True)
+    database = Database.create(str(path))
+    total, copies = 0, 0
+    queries: list[Query] = []
+    waiting: list[FeatureMap] = []
+    side = max(1, round(np.sqrt(points / 20_000)))
+    pitch = _GAP_M + max(float(np.ptp(s.feature_map.points.utm[:, :2], axis=0).max()) for s in sources)
+    while total < points:
+        source = sources[copies % len(sources)]
+        order = _order(copies)
+        column, row = copies % side, copies // side
+        frame = LocalFrame(
+            latitude_deg=45.0 + row * pitch / 111_000.0,
+            longitude_deg=8.0 + column * pitch / 78_000.0,
+            height_m=source.feature_map.frame.height_m,
+        )
+        seen = source.feature_map.observations
+        described = len(np.unique(seen.point_index[seen.has_descriptor]))
+        placed = _copy(source.feature_map, frame, order, f"copy-{copies}")
+        waiting.append(placed)
+        total += described
+        if len(waiting) == _AT_ONCE or total >= points:
+            database.commit_maps(waiting)
+            waiting.clear()
+        for photo, camera, place in zip(source.photos, source.cameras, source.places, strict=True):
+            geodetic = frame.geodetic_from_enu(place)
+            prior = GeoPrior(
+                latitude_deg=float(geodetic[0]),
+                longitude_deg=float(geodetic[1]),
+                height_m=None,
+                sigma_horizontal_m=_PRIOR_M,
+                sigma_vertical_m=_PRIOR_M,
+            )
+            features = replace(photo, descriptors=photo.descriptors[:, order])
+            queries.append(Query(features=features, camera=camera, prior=prior, place=geodetic))
+        copies += 1
+    every = max(1, len(queries) // _ASKED)
+    return queries[::every][:_ASKED]
+
+
+def _order(copy: int) -> NDArray[np.int64]:
+    """(128,) another order of a descriptor's 4 x 4 cells; the first is its own.
+
+    Corners, edges and inner cells change places among themselves: they have different weights in SIFT.
+    """
+    rng = np.random.default_rng(copy)
+    cells = np.arange(16)
+    row, column = np.divmod(cells, 4)
+    inner = ((row % 3) > 0).astype(np.int64) + ((column % 3) > 0)
+    if copy:
+        for kind in range(3):
+            alike = np.flatnonzero(inner == kind)
+            cells[alike] = rng.permutation(alike)
+    return (cells[:, None] * 8 + np.arange(8)).ravel()
+
+
+def _copy(source: FeatureMap, frame: LocalFrame, order: NDArray[np.int64], map_id: str) -> FeatureMap:
+    epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
+    local, seen = source.points_local(), source.observations
+    return replace(
+        source,
+        map_id=map_id,
+        name=map_id,
+        frame=frame,
+        epsg=epsg,
+        points=replace(source.points, utm=frame.utm_from_enu(local, epsg)),
+        observations=replace(seen, descriptors=seen.descriptors[:, order]),
+    )
+
+
+def first_start(path: Path, query: Query) -> float:
+    """Seconds to the first answer where nothing has been laid out yet; in a new process."""
+    _own_cache(path)
+    began = time.perf_counter()
+    ask(Localiser.open(Database.open(str(path))), query, prior=True)
+    return time.perf_counter() - began
+
+
+def _own_cache(path: Path) -> None:
+    use_threads(1)
+    os.environ["XDG_CACHE_HOME"] = f"{path}-cache"
+
+
+def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measured:
+    """In a process that has done nothing before."""
+    _own_cache(path)
+    before = _resident()
+    began = time.perf_counter()
+    database = Database.open(str(path))
+    localiser = Localiser.open(database)
+    ask(localiser, queries[0], prior=True)
+    start_s = time.perf_counter() - began
+    points = sum(len(a.area.points) for a in localiser.areas)
+    gc.collect()
+    resident = (_resident() - before) / points
+    peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before) / points
+    times: dict[bool, list[float]] = {True: [], False: []}
+    answered = {True: 0, False: 0}
+    wrong = 0
+    for query in queries:
+        for prior in (True, False):
+            began = time.perf_counter()
+            error = ask(localiser, query, prior=prior)
+            times[prior].append(time.perf_counter() - began)
+            answered[prior] += error is not None and error < _RIGHT_M
+            wrong += error is not None and error >= _RIGHT_M
+    commit_s = _commit(database, localiser, queries[0])
+    return Measured(
+        points=points,
+        first_start_s=first_start_s,
+        start_s=start_s,
+        commit_s=commit_s,
+        with_prior_ms=1e3 * median(times[True]),
+        without_ms=1e3 * median(times[False]),
+        answered_with_prior=answered[True] / len(queries),
+        answered_without=answered[False] / len(queries),
+        wrong=wrong,
+        resident_bytes=resident,
+        peak_bytes=peak,
+    )
+
+
+def _commit(database: Database, localiser: Localiser, query: Query) -> float:
+    """Seconds from a commit of a small map until a query is answered from a database that has it."""
+    snapshot = database.snapshot()
+    like = snapshot.load_map(snapshot.maps()[0].map_id)
+    few = np.zeros(len(like.points), dtype=np.bool_)
+    few[:_COMMITTED] = True
+    small = replace(only_points(like, few), map_id="committed", name="committed")
+    began = time.perf_counter()
+    database.commit_map(small)
+    opened = Localiser.open(database, previous=localiser)
+    ask(opened, query, prior=True)
+    return time.perf_counter() - began
+
+
+def ask(localiser: Localiser, query: Query, *, prior: bool) -> float | None:
+    """Metres from the true place; None where it is not answered."""
+    request = LocaliseRequest(camera=query.camera, prior=query.prior if prior else None)
+    found = localise_features(query.features, request, localiser.areas_of(None), localiser.options)
+    pose = found.result.pose
+    if pose is None:
+        return None
+    offset = pose.frame.enu_from_geodetic(query.place) - pose.cam_from_local.center
+    return float(np.linalg.norm(offset))
+
+
+def _resident() -> int:
+    text = Path("/proc/self/status").read_text(encoding="ascii")
+    return 1024 * next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmRSS"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
