@@ -105,6 +105,7 @@ def _unreadable(message: str) -> Any:
 
 
 _OwnArea = tuple[UnplacedMap, IndexedArea]
+_State = tuple[FeatureMap, Segment]  # the outline of a map, and what is laid out of it
 
 
 class Localiser:
@@ -133,6 +134,7 @@ class Localiser:
         # Of the snapshot, not of an area: an area that is taken over may hang on maps that have changed.
         self._lineages = lineages
         self._unplaced, self._provisional = unplaced, provisional
+        self._states: dict[str, _State] = {}
 
     @property
     def areas(self) -> tuple[IndexedArea, ...]:
@@ -171,13 +173,14 @@ class Localiser:
         known = previous._loaded if previous else {}
         loaded: dict[tuple[str, ...], Area] = {}
         trial = instead or {}
+        states = dict(previous._states) if previous else {}
         for group in _group(active):
             key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
             tried = any(m.map_id in trial for m in group)
             if key in known and not tried:
                 loaded[key] = known[key].area
             else:
-                loaded[key] = _load(database.url, snapshot, group, trial)
+                loaded[key] = _load(database.url, snapshot, group, states, trial)
         had = {d.write_id: d for d in previous._unplaced.values()} if previous else {}
         unplaced = {
             m.map_id: had.get(m.write_id) or OnDemand(m.write_id, partial(_own_area, snapshot, m.map_id))
@@ -192,7 +195,13 @@ class Localiser:
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
         served = dict(zip(loaded, indexed_together(list(loaded.values())), strict=True))
-        return cls(served, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
+        made = cls(served, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
+        made._states = {m.write_id: states[m.write_id] for m in active if m.write_id in states}
+        return made
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without what only the next one needs."""
+        return {**self.__dict__, "_states": {}}
 
     def areas_of(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
         """All areas, or those of the named maps, of which only these are searched.
@@ -274,26 +283,41 @@ def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
 
 
 def _load(
-    url: str, snapshot: Snapshot, group: Sequence[MapSummary], instead: Mapping[str, FeatureMap]
+    url: str,
+    snapshot: Snapshot,
+    group: Sequence[MapSummary],
+    states: dict[str, _State],
+    instead: Mapping[str, FeatureMap],
 ) -> Area:
-    """The area of some maps; what was laid out before is not again."""
+    """The area of some maps; what was laid out before is not again.
+
+    Args:
+        states: by write id; what is read now is added.
+    """
     files = SegmentFiles()
-    outlines = snapshot.load_outlines([m.map_id for m in group if m.map_id not in instead])
-    outlines |= {map_id: feature_map.outline() for map_id, feature_map in instead.items()}
-
-    def segment(summary: MapSummary) -> Segment:
-        if summary.map_id in instead:
-            return segment_of(instead[summary.map_id])
-        return files.get(url, summary.write_id, lambda: segment_of(snapshot.load_map(summary.map_id)))
-
-    segments = [segment(summary) for summary in group]
-    area = join_segments([outlines[m.map_id] for m in group], segments)
-    _LOG.info("area of %d maps: %d points, %d images", len(group), len(area.points), len(area.image_map))
+    new = [m for m in group if m.map_id not in instead and m.write_id not in states]
+    outlines = snapshot.load_outlines([m.map_id for m in new])
+    for m in new:
+        segment = files.get(url, m.write_id, partial(_laid_out, snapshot, m.map_id))
+        states[m.write_id] = outlines[m.map_id], segment
+    chosen = [
+        (instead[m.map_id].outline(), segment_of(instead[m.map_id]))
+        if m.map_id in instead
+        else states[m.write_id]
+        for m in group
+    ]
+    area = join_segments([outline for outline, _ in chosen], [segment for _, segment in chosen])
+    points, images = len(area.points), len(area.image_map)
+    _LOG.info("area of %d maps: %d points, %d images", len(group), points, images)
     return area
 
 
+def _laid_out(snapshot: Snapshot, map_id: str) -> Segment:
+    return segment_of(snapshot.load_map(map_id))
+
+
 def _load_alone(url: str, snapshot: Snapshot, summary: MapSummary) -> IndexedArea:
-    return indexed_together([_load(url, snapshot, [summary], {})])[0]
+    return indexed_together([_load(url, snapshot, [summary], {}, {})])[0]
 
 
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:

@@ -18,12 +18,12 @@ from featuredb.features.exif.read import is_of_film
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.sim3 import Sim3
 from featuredb.index.descriptor_index import DescriptorCodes
 from featuredb.index.segment import Segment, segment_of
+from featuredb.index.stacked import Stacked
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.move import full_covariances, moved_covariances
+from featuredb.maps.move import full_covariances
 
 _LOG = logging.getLogger(__name__)
 
@@ -36,15 +36,15 @@ class Area:
         frame: local ENU frame of everything here.
         maps: the maps without points and observations, which take most of the memory and which no answer
             needs; `point_map` and `image_map` index into it.
+        segments: (m,) of the maps, whose arrays stay where they are, in mapped files for example.
+        turns: (m, 3, 3) rotations from the maps' frames to `frame`.
         point_map: (p,) int32, ascending.
-        covariance: (p, 6) float32, upper triangles (MapPoints.covariance), square metres in `frame`, relative
-            to the map's gauge.
-        codes: of the descriptors.
         image_map: (i,) int32, ascending.
         covisible: (i, i) sparse, numbers of shared points; between maps, of neighbouring places.
-        points, point_row, view_direction, view_spread_cos, view_distance, descriptors, image_start,
-        see_point, image_center, image_scene, image_reach: those of the maps' segments (`Segment`), one after
-            the other, in `frame`, with the area's rows of points in `see_point`.
+        points, image_start, see_point, image_center, image_scene, image_reach: those of the segments, one
+            after the other, in `frame`, with the area's rows of points in `see_point`.
+        point_row, covariance, own_direction, view_spread_cos, view_distance, descriptors, lists, code: those
+            of the segments, row by row; covariances and directions in the maps' own frames.
         extractor_fingerprint: of all descriptors.
         modes: (m,) joint errors of each map, None of those that keep none.
         searched: (m,) which maps take part in a search; the others are there as if they were not.
@@ -52,15 +52,18 @@ class Area:
 
     frame: LocalFrame
     maps: tuple[FeatureMap, ...]
+    segments: tuple[Segment, ...]
+    turns: FloatArray
     points: FloatArray
     point_map: NDArray[np.int32]
-    point_row: NDArray[np.int32]
-    covariance: NDArray[np.float32]
-    view_direction: NDArray[np.float32]
-    view_spread_cos: NDArray[np.float32]
-    view_distance: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
-    codes: DescriptorCodes
+    point_row: Stacked[np.int32]
+    covariance: Stacked[np.float32]
+    own_direction: Stacked[np.float32]
+    view_spread_cos: Stacked[np.float32]
+    view_distance: Stacked[np.float32]
+    descriptors: Stacked[np.uint8]
+    lists: Stacked[np.int16]
+    code: Stacked[np.uint8]
     see_point: NDArray[np.int32]
     image_start: NDArray[np.int64]
     image_map: NDArray[np.int32]
@@ -86,7 +89,20 @@ class Area:
 
     def point_covariance(self, rows: NDArray[np.integer]) -> FloatArray:
         """(k, 3, 3) of points (k,), square metres in `frame`, relative to the map's gauge."""
-        return full_covariances(self.covariance[rows])
+        turn = self.turns[self.point_map[rows]]
+        own = full_covariances(self.covariance[rows])
+        return np.asarray(turn @ own @ np.swapaxes(turn, 1, 2), dtype=np.float64)
+
+    def view_direction(self, rows: NDArray[np.integer]) -> FloatArray:
+        """(k, 3) mean unit vectors, in `frame`, from points (k,) to the cameras that saw them."""
+        turn = self.turns[self.point_map[rows]]
+        return np.asarray(np.einsum("kij,kj->ki", turn, self.own_direction[rows]), dtype=np.float64)
+
+    def codes(self, rows: NDArray[np.integer] | None = None) -> DescriptorCodes:
+        """Of the descriptors of these points (k,), or of all."""
+        if rows is None:
+            return DescriptorCodes(lists=self.lists.whole(), codes=self.code.whole())
+        return DescriptorCodes(lists=self.lists[rows], codes=self.code[rows])
 
     def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:
         """Rows of the points that any of these images sees, ascending, without repetition."""
@@ -186,19 +202,18 @@ def join_segments(
     return Area(
         frame=frame,
         maps=tuple(maps),
+        segments=tuple(segments),
+        turns=np.array([move.rotation for move in area_from_maps]),
         points=np.concatenate([move.act(s.points) for move, s in parts]),
         point_map=np.repeat(np.arange(len(maps), dtype=np.int32), points),
-        point_row=np.concatenate([s.point_row for s in segments]),
-        covariance=np.concatenate(
-            [moved_covariances(s.covariance, Sim3.from_rigid3(move)) for move, s in parts]
-        ),
-        view_direction=np.concatenate(
-            [s.view_direction @ move.rotation.T.astype(np.float32) for move, s in parts]
-        ),
-        view_spread_cos=np.concatenate([s.view_spread_cos for s in segments]),
-        view_distance=np.concatenate([s.view_distance for s in segments]),
-        descriptors=np.concatenate([s.descriptors for s in segments]),
-        codes=DescriptorCodes.joined([DescriptorCodes(lists=s.lists, codes=s.codes) for s in segments]),
+        point_row=Stacked(segments, "point_row"),
+        covariance=Stacked(segments, "covariance"),
+        own_direction=Stacked(segments, "view_direction"),
+        view_spread_cos=Stacked(segments, "view_spread_cos"),
+        view_distance=Stacked(segments, "view_distance"),
+        descriptors=Stacked(segments, "descriptors"),
+        lists=Stacked(segments, "lists"),
+        code=Stacked(segments, "codes"),
         image_start=_joined_starts([s.image_start for s in segments], sights),
         see_point=_raised([s.see_point for s in segments], points),
         image_map=image_map,

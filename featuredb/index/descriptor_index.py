@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.index.stacked import Stacked
 
 CODE_PARTS, CODE_BYTES = 32, 16  # 4 bits a part
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
@@ -38,9 +39,6 @@ class DescriptorCodes:
 
     def __len__(self) -> int:
         return len(self.lists)
-
-    def take(self, rows: NDArray[np.integer]) -> "DescriptorCodes":
-        return DescriptorCodes(lists=self.lists[rows], codes=self.codes[rows])
 
     @classmethod
     def of(cls, descriptors: NDArray[np.uint8]) -> Self:
@@ -106,7 +104,7 @@ class DescriptorIndex:
 
 
 def squared_distances(
-    query: NDArray[np.uint8], base: NDArray[np.uint8], rows: NDArray[np.int64]
+    query: NDArray[np.uint8], base: NDArray[np.uint8] | Stacked[np.uint8], rows: NDArray[np.int64]
 ) -> NDArray[np.float32]:
     """Exact squared distances (n, k) of descriptors (n, 128) from rows (n, k) of others; infinity for -1."""
     difference = base[np.maximum(rows, 0)].astype(np.float32)

@@ -16,7 +16,7 @@ from featuredb.index.descriptor_index import DescriptorCodes
 from featuredb.maps.feature_map import FeatureMap
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class Segment:
     """Arrays of p points and i images, by convention read-only; lengths in metres, in the map's local frame.
 

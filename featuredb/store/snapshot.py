@@ -257,6 +257,7 @@ class Snapshot:
         own: Condition = ("write_id", "in", [row["write_id"] for row in rows])
         found = self._read(IMAGES, own, "the maps'")
         table = pa.Table.from_batches(found) if found else SPECS[IMAGES].schema.empty_table()
+        table = table.combine_chunks()
         grouped = _grouped(table["write_id"])
         maps = {}
         for row in rows:

@@ -34,7 +34,7 @@ class IndexedArea:
     def of(cls, maps: Sequence[FeatureMap]) -> "IndexedArea":
         """Maps of one extractor and height datum, laid out in one frame and ready to be asked."""
         area = build_area(maps)
-        return cls(area=area, index=DescriptorIndex.of(area.codes))
+        return cls(area=area, index=DescriptorIndex.of(area.codes()))
 
     def only(self, map_ids: Collection[str]) -> "IndexedArea":
         """The same area and index, of which only these maps are searched."""
@@ -46,7 +46,7 @@ def indexed_together(areas: Sequence[Area]) -> list[IndexedArea]:
     indexed: dict[int, IndexedArea] = {}
     for fingerprint in {area.extractor_fingerprint for area in areas}:
         mine = [k for k, area in enumerate(areas) if area.extractor_fingerprint == fingerprint]
-        index = DescriptorIndex.of(DescriptorCodes.joined([areas[k].codes for k in mine]))
+        index = DescriptorIndex.of(DescriptorCodes.joined([areas[k].codes() for k in mine]))
         first = 0
         for k in mine:
             indexed[k] = IndexedArea(area=areas[k], index=index, first=first)
@@ -204,7 +204,7 @@ def _nearest(
         if whole:
             first = np.array([reach[i].indexed.first for i in group])
         else:
-            codes = [reach[i].area.codes.take(reach[i].points) for i in group]
+            codes = [reach[i].area.codes(reach[i].points) for i in group]
             index = DescriptorIndex.of(DescriptorCodes.joined(codes))
             first = np.cumsum([0, *(len(part) for part in codes[:-1])])
         found = index.search(asked, k)
@@ -218,9 +218,8 @@ def _nearest(
                 continue
             own = found[mine] - first[j]
             row[mine] = own if whole else reach[i].points[own]
-            local = np.where(mine, row, -1)
-            exact = squared_distances(asked, reach[i].area.descriptors, local)
-            distance[mine] = exact[mine]
+            own = np.where(mine, row, -1)
+            distance[mine] = squared_distances(asked, reach[i].area.descriptors, own)[mine]
         parts.append(np.array(group)[place])
         rows.append(row)
         squared.append(distance)

@@ -33,22 +33,26 @@ def test_points_views_and_reach_against_loops() -> None:
     area = build_area([feature_map])
     local = feature_map.frame.enu_from_utm(feature_map.points.utm, EPSG)
     seen = feature_map.observations
-    np.testing.assert_array_equal(area.point_row, np.unique(seen.point_index))
-    np.testing.assert_allclose(area.points, local[area.point_row], atol=1e-6)
+    point_row = area.point_row.whole()
+    np.testing.assert_array_equal(point_row, np.unique(seen.point_index))
+    np.testing.assert_allclose(area.points, local[point_row], atol=1e-6)
     centers = np.array([i.cam_from_local.center for i in feature_map.images])
     np.testing.assert_allclose(area.image_center, centers, atol=1e-9)
-    for row, index in enumerate(area.point_row):
+    directions = area.view_direction(np.arange(len(point_row)))
+    for row, index in enumerate(point_row):
         viewers = seen.image_id[seen.point_index == index]
         toward = centers[viewers] - local[index]
         distance = np.linalg.norm(toward, axis=1)
         mean = (toward / distance[:, None]).sum(axis=0)
         mean /= np.linalg.norm(mean)
-        np.testing.assert_allclose(area.view_direction[row], mean, atol=1e-6)
-        assert area.view_spread_cos[row] == pytest.approx((toward / distance[:, None] @ mean).min(), abs=1e-6)
-        assert area.view_distance[row] == pytest.approx((distance.min() + distance.max()) / 2, abs=1e-5)
+        np.testing.assert_allclose(directions[row], mean, atol=1e-6)
+        assert area.view_spread_cos.whole()[row] == pytest.approx((toward @ mean / distance).min(), abs=1e-6)
+        assert area.view_distance.whole()[row] == pytest.approx(
+            (distance.min() + distance.max()) / 2, abs=1e-5
+        )
         total = seen.descriptors[seen.point_index == index].astype(float).sum(axis=0)
         expected = np.clip(512 * total / np.linalg.norm(total), 0, 255)
-        assert np.abs(area.descriptors[row] - expected).max() <= 0.51
+        assert np.abs(area.descriptors[np.array(row)] - expected).max() <= 0.51
     for image in range(len(centers)):
         own = local[seen.point_index[seen.image_id == image]]
         np.testing.assert_allclose(area.image_scene[image], np.median(own, axis=0), atol=1e-6)
@@ -97,8 +101,9 @@ def test_two_maps_of_two_frames_and_zones_lie_in_one_frame() -> None:
     first, second = (area.point_map == i for i in (0, 1))
     assert first.sum() == second.sum() > 30
     np.testing.assert_allclose(area.points[first], area.points[second], atol=2e-4)
-    np.testing.assert_allclose(area.points[first], points[area.point_row[first]], atol=2e-4)
-    np.testing.assert_allclose(area.view_direction[first], area.view_direction[second], atol=1e-5)
+    np.testing.assert_allclose(area.points[first], points[area.point_row[np.flatnonzero(first)]], atol=2e-4)
+    here_seen, there_seen = (area.view_direction(np.flatnonzero(part)) for part in (first, second))
+    np.testing.assert_allclose(here_seen, there_seen, atol=1e-5)
     np.testing.assert_allclose(area.image_center[:4], area.image_center[4:], atol=1e-6)
     # Covariances turn with the axes: the east-north one of the far map is not that of this frame's axes.
     turn = away_from_here.rotation.T
@@ -142,7 +147,7 @@ def test_no_maps_and_mixed_extractors_are_refused() -> None:
 def test_a_map_without_descriptors_gives_an_empty_area() -> None:
     area = build_area([random_map(0, observations=0)])
     assert area.points.shape == (0, 3)
-    assert area.descriptors.shape == (0, 128)
+    assert area.descriptors.whole().shape == (0, 128)
     assert area.covisible.nnz == 0
     assert (area.image_reach == 0).all()
 

@@ -72,8 +72,6 @@ def test_codes_of_parts_are_those_of_the_whole() -> None:
     joined, whole = DescriptorCodes.joined(parts), DescriptorCodes.of(base)
     np.testing.assert_array_equal(joined.lists, whole.lists)
     np.testing.assert_array_equal(joined.codes, whole.codes)
-    some = np.array([3, 700, 5])
-    np.testing.assert_array_equal(whole.take(some).codes, DescriptorCodes.of(base[some]).codes)
 
 
 def test_an_index_is_the_same_after_it_was_pickled() -> None:

@@ -184,8 +184,8 @@ def test_visible_points_against_a_loop() -> None:
         for row in rows:
             toward = pose.center - area.points[row]
             toward /= np.linalg.norm(toward)
-            off_deg = np.degrees(np.arccos(np.clip(toward @ area.view_direction[row], -1, 1)))
-            cone_deg = np.degrees(np.arccos(np.clip(area.view_spread_cos[row], -1, 1))) + 30.0
+            off_deg = np.degrees(np.arccos(np.clip(toward @ area.view_direction(np.array([row]))[0], -1, 1)))
+            cone_deg = np.degrees(np.arccos(np.clip(area.view_spread_cos[np.array(row)], -1, 1))) + 30.0
             assert (row in found) == bool(inside[row] and off_deg <= cone_deg)
     # The two cameras of the map look from the east: from the west nothing is known, nor from below.
     assert len(visible_points(area, rows, CAMERA, ring(6)[0])) > 100

@@ -16,6 +16,7 @@ from typing import IO, Any
 from featuredb.errors import StoreError
 from featuredb.index.area import Area
 from featuredb.index.descriptor_index import DescriptorIndex
+from featuredb.index.segment import Segment
 from reloc.localiser import Localiser, OnDemand
 
 _ALIGNMENT = 64
@@ -44,7 +45,8 @@ class AreaFiles:
 
     def __init__(self) -> None:
         self._keys = itertools.count()
-        self._written: weakref.WeakKeyDictionary[object, AreaFile] = weakref.WeakKeyDictionary()
+        # With the files of what is within, before its own.
+        self._written: weakref.WeakKeyDictionary[object, LocaliserFiles] = weakref.WeakKeyDictionary()
 
     def of(self, localiser: Localiser) -> LocaliserFiles:
         """The files of a localiser.
@@ -52,27 +54,27 @@ class AreaFiles:
         Raises:
             StoreError: the folder of temporary files has no room for them.
         """
-        parts: list[AreaFile] = []
-
-        def key_of(part: object) -> int:
-            if part not in self._written:
-                self._written[part] = self._file(part, lambda _: None)
-            parts.append(self._written[part])
-            return parts[-1].key
-
         try:
-            whole = self._file(localiser, key_of)
+            return self._files(localiser)
         except OSError as error:
             raise StoreError(
                 f"cannot write the maps into {tempfile.gettempdir()} for the worker processes: {error}. They "
                 "need as much room as in memory; free it, or set TMPDIR to another folder"
             ) from error
-        return (*parts, whole)
 
-    def _file(self, value: object, key_of: Callable[[object], int | None]) -> AreaFile:
+    def _files(self, value: object) -> LocaliserFiles:
+        """The files of all that is within a value and has one of its own, each once, and its own file."""
+        within: dict[int, AreaFile] = {}
+
+        def key_of(part: object) -> int:
+            if part not in self._written:
+                self._written[part] = self._files(part)
+            within.update({file.key: file for file in self._written[part]})
+            return self._written[part][-1].key
+
         made = AreaFile(next(self._keys))
         _write(value, made.file, key_of)
-        return made
+        return (*within.values(), made)
 
 
 class MappedAreas:
@@ -95,7 +97,8 @@ class MappedAreas:
                 if key == keys[-1]:
                     localiser = _read(descriptor, found)
                 else:
-                    found[key] = self._parts.get(key) or _read(descriptor, {})
+                    known = self._parts.get(key)
+                    found[key] = _read(descriptor, found) if known is None else known
             finally:
                 os.close(descriptor)
         self._parts = found
@@ -104,13 +107,19 @@ class MappedAreas:
 
 class _Pickler(pickle.Pickler):
     def __init__(
-        self, file: IO[bytes], buffers: list[pickle.PickleBuffer], key_of: Callable[[object], int | None]
+        self,
+        file: IO[bytes],
+        buffers: list[pickle.PickleBuffer],
+        whole: object,
+        key_of: Callable[[object], int],
     ) -> None:
         super().__init__(file, protocol=5, buffer_callback=buffers.append)
-        self._key_of = key_of
+        self._whole, self._key_of = whole, key_of
 
     def persistent_id(self, obj: object) -> int | None:
-        return self._key_of(obj) if isinstance(obj, Area | DescriptorIndex | OnDemand) else None
+        if obj is self._whole or not isinstance(obj, Area | Segment | DescriptorIndex | OnDemand):
+            return None
+        return self._key_of(obj)
 
 
 class _Unpickler(pickle.Unpickler):
@@ -122,14 +131,14 @@ class _Unpickler(pickle.Unpickler):
         return self._parts[pid]
 
 
-def _write(value: object, file: IO[bytes], key_of: Callable[[object], int | None]) -> None:
+def _write(value: object, file: IO[bytes], key_of: Callable[[object], int]) -> None:
     """Arrays as they are, then the rest pickled, then where each of them lies.
 
     Args:
-        key_of: of an area within that is a file of its own; None: it is none, and written along.
+        key_of: of what is within and is a file of its own, an area for example.
     """
     stream, buffers = io.BytesIO(), list[pickle.PickleBuffer]()
-    _Pickler(stream, buffers, key_of).dump(value)
+    _Pickler(stream, buffers, value, key_of).dump(value)
     places = []
     for content in (*(buffer.raw() for buffer in buffers), stream.getbuffer()):
         file.write(bytes(-file.tell() % _ALIGNMENT))
