@@ -105,7 +105,7 @@ def _unreadable(message: str) -> Any:
 
 
 _OwnArea = tuple[UnplacedMap, IndexedArea]
-_State = tuple[FeatureMap, Segment]  # the outline of a map, and what is laid out of it
+_State = tuple[FeatureMap, Segment]  # a bare map, and what is laid out of it
 
 
 class Localiser:
@@ -296,17 +296,16 @@ def _load(
     """
     files = SegmentFiles()
     new = [m for m in group if m.map_id not in instead and m.write_id not in states]
-    outlines = snapshot.load_outlines([m.map_id for m in new])
     for m in new:
         segment = files.get(url, m.write_id, partial(_laid_out, snapshot, m.map_id))
-        states[m.write_id] = outlines[m.map_id], segment
+        states[m.write_id] = snapshot.load_bare(m.map_id), segment
     chosen = [
-        (instead[m.map_id].outline(), segment_of(instead[m.map_id]))
+        (instead[m.map_id].bare(), segment_of(instead[m.map_id]))
         if m.map_id in instead
         else states[m.write_id]
         for m in group
     ]
-    area = join_segments([outline for outline, _ in chosen], [segment for _, segment in chosen])
+    area = join_segments([bare for bare, _ in chosen], [segment for _, segment in chosen])
     points, images = len(area.points), len(area.image_map)
     _LOG.info("area of %d maps: %d points, %d images", len(group), points, images)
     return area

@@ -15,7 +15,6 @@ until it answers, queries, memory.
 import gc
 import multiprocessing
 import os
-import resource
 import shutil
 import sys
 import time
@@ -78,7 +77,7 @@ class Query:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """Of one database: seconds, milliseconds of a query (median), shares of queries, bytes a point."""
+    """Of one database: seconds, milliseconds of a query (median), shares of queries, bytes after them."""
 
     points: int
     first_start_s: float
@@ -89,8 +88,7 @@ class Measured:
     answered_with_prior: float
     answered_without: float
     wrong: int
-    resident_bytes: float
-    peak_bytes: float
+    resident_bytes: int
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -118,6 +116,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     }
     for name in ("first_start_s", "start_s", "commit_s", "with_prior_ms", "without_ms"):
         figures[f"times_{name.rsplit('_', 1)[0]}"] = figures[f"large_{name}"] / figures[f"small_{name}"]
+    more = measured[large].points - measured[small].points
+    more_bytes = measured[large].resident_bytes - measured[small].resident_bytes
+    figures["resident_bytes_a_point"] = more_bytes / more
     write_figures(args.json, figures)
     return 0
 
@@ -227,16 +228,12 @@ def _own_cache(path: Path) -> None:
 def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measured:
     """In a process that has done nothing before."""
     _own_cache(path)
-    before = _resident()
     began = time.perf_counter()
     database = Database.open(str(path))
     localiser = Localiser.open(database)
     ask(localiser, queries[0], prior=True)
     start_s = time.perf_counter() - began
     points = sum(len(a.area.points) for a in localiser.areas)
-    gc.collect()
-    resident = (_resident() - before) / points
-    peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before) / points
     times: dict[bool, list[float]] = {True: [], False: []}
     answered = {True: 0, False: 0}
     wrong = 0
@@ -247,6 +244,8 @@ def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measu
             times[prior].append(time.perf_counter() - began)
             answered[prior] += error is not None and error < _RIGHT_M
             wrong += error is not None and error >= _RIGHT_M
+    gc.collect()
+    resident = _resident()
     commit_s = _commit(database, localiser, queries[0])
     return Measured(
         points=points,
@@ -259,7 +258,6 @@ def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measu
         answered_without=answered[False] / len(queries),
         wrong=wrong,
         resident_bytes=resident,
-        peak_bytes=peak,
     )
 
 

@@ -5,9 +5,8 @@ An area is derived from maps and can be rebuilt at any time; what takes long of 
 
 import logging
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from featuredb.features.exif.read import is_of_film
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.descriptor_index import DescriptorCodes
 from featuredb.index.segment import Segment, segment_of
 from featuredb.index.stacked import Stacked
@@ -28,14 +28,24 @@ from featuredb.maps.move import full_covariances
 _LOG = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AreaImage:
+    """What answers need of a map's image; as in MapImage, in the map's local frame."""
+
+    image_id: int
+    camera_id: int
+    cam_from_local: Rigid3
+    covariance: FloatArray | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class Area:
     """Maps in one frame. All arrays are read-only by convention.
 
     Attributes:
         frame: local ENU frame of everything here.
-        maps: the maps without points and observations, which take most of the memory and which no answer
-            needs; `point_map` and `image_map` index into it.
+        maps: the maps without images, points and observations, which the
+            segments have (`FeatureMap.bare`); `point_map` and `image_map` index into it.
         segments: (m,) of the maps, whose arrays stay where they are, in mapped files for example.
         turns: (m, 3, 3) rotations from the maps' frames to `frame`.
         point_map: (p,) int32, ascending.
@@ -45,6 +55,7 @@ class Area:
             after the other, in `frame`, with the area's rows of points in `see_point`.
         point_row, covariance, own_direction, view_spread_cos, view_distance, descriptors, lists, code: those
             of the segments, row by row; covariances and directions in the maps' own frames.
+        lenses: by camera key the maps' cameras that have it: row of the map, camera, images that it took.
         extractor_fingerprint: of all descriptors.
         modes: (m,) joint errors of each map, None of those that keep none.
         searched: (m,) which maps take part in a search; the others are there as if they were not.
@@ -71,6 +82,7 @@ class Area:
     image_scene: FloatArray
     image_reach: FloatArray
     covisible: sparse.csr_array
+    lenses: Mapping[str, Sequence[tuple[int, Camera, int]]]
     extractor_fingerprint: str
     modes: tuple[ErrorModes | None, ...]
     searched: NDArray[np.bool_]
@@ -140,6 +152,19 @@ class Area:
             np.concatenate([position for _, position in pairs] or [np.zeros(0, np.intp)]),
         )
 
+    def image(self, row: int) -> "AreaImage":
+        """One of the images, as its map has it."""
+        number = int(self.image_map[row])
+        segment = self.segments[number]
+        own = row - int(np.searchsorted(self.image_map, number))
+        pose, covariance = segment.image_pose[own], segment.image_covariance[own]
+        return AreaImage(
+            image_id=int(segment.image_id[own]),
+            camera_id=int(segment.image_camera[own]),
+            cam_from_local=Rigid3(rotation=pose[:, :3], translation=pose[:, 3]),
+            covariance=None if np.isnan(covariance).any() else covariance,
+        )
+
     def camera_for_key(self, camera_key: str) -> Camera | None:
         """Intrinsics that the maps have for this EXIF key; of the one that took most images if several.
 
@@ -147,20 +172,17 @@ class Area:
         first: it was only taken where the images asked for it.
         """
         taken: Counter[Camera] = Counter()
-        for feature_map in compress(self.maps, self.searched):
-            images = Counter(image.camera_id for image in feature_map.images)
-            for c, key in enumerate(feature_map.camera_keys[: len(feature_map.cameras)]):
-                if key and key == camera_key:
-                    taken[feature_map.cameras[c]] += images[c]
+        for row, camera, images in self.lenses.get(camera_key, ()):
+            if self.searched[row]:
+                taken[camera] += images
         return max(taken, key=lambda camera: (len(camera.params), taken[camera]), default=None)
 
     def cameras_of_film(self, film: str) -> list[Camera]:
         """Intrinsics that the maps have of a film's shots, each once; `film`: `film_lens.unnamed_model`."""
         found: dict[Camera, None] = {}
-        for feature_map in compress(self.maps, self.searched):
-            for camera, key in zip(feature_map.cameras, feature_map.camera_keys, strict=False):
-                if is_of_film(key, film):
-                    found[camera] = None
+        for key, lenses in self.lenses.items():
+            if is_of_film(key, film):
+                found |= {camera: None for row, camera, _ in lenses if self.searched[row]}
         return list(found)
 
 
@@ -171,13 +193,13 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
         InvalidValueError: no maps.
         IncompatibleExtractorError: the maps' descriptors come from different extractors.
     """
-    return join_segments([m.outline() for m in maps], [segment_of(m) for m in maps], frame)
+    return join_segments([m.bare() for m in maps], [segment_of(m) for m in maps], frame)
 
 
 def join_segments(
     maps: Sequence[FeatureMap], segments: Sequence[Segment], frame: LocalFrame | None = None
 ) -> Area:
-    """The area of maps, of which only the outlines are needed, whose segments are there.
+    """The area of bare maps (`FeatureMap.bare`) and their segments.
 
     Raises:
         InvalidValueError, IncompatibleExtractorError: as `build_area`.
@@ -221,10 +243,23 @@ def join_segments(
         image_scene=scene,
         image_reach=reach,
         covisible=_covisibility(segments, images, image_map, scene, reach),
+        lenses=_lenses(maps, segments),
         extractor_fingerprint=fingerprints[0],
         modes=tuple(_modes(feature_map) for feature_map in maps),
         searched=np.ones(len(maps), dtype=np.bool_),
     )
+
+
+def _lenses(
+    maps: Sequence[FeatureMap], segments: Sequence[Segment]
+) -> dict[str, list[tuple[int, Camera, int]]]:
+    lenses: dict[str, list[tuple[int, Camera, int]]] = {}
+    for row, (feature_map, segment) in enumerate(zip(maps, segments, strict=True)):
+        taken = np.bincount(segment.image_camera, minlength=len(feature_map.cameras))
+        for camera, key, images in zip(feature_map.cameras, feature_map.camera_keys, taken, strict=False):
+            if key:
+                lenses.setdefault(key, []).append((row, camera, int(images)))
+    return lenses
 
 
 def _modes(feature_map: FeatureMap) -> ErrorModes | None:

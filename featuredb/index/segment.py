@@ -29,6 +29,9 @@ class Segment:
         view_distance: (p,) float32, between the nearest and the farthest of those cameras, in the middle.
         descriptors: (p, 128) uint8, mean RootSIFT of the track, length 512.
         lists, codes: (p,) int16 and (p, 16) uint8, of the descriptors (DescriptorCodes).
+        image_id, image_camera: (i,) int32, as in MapImage.
+        image_pose: (i, 3, 4) float64, rotation and translation of MapImage.cam_from_local.
+        image_covariance: (i, 6, 6) float64, MapImage.covariance; NaN where there is none.
         image_start: (i + 1,) int64, slices of see_point for each image.
         see_point: (s,) int32, points that the image sees, ascending.
         image_center: (i, 3) float64, camera centres.
@@ -47,6 +50,10 @@ class Segment:
     descriptors: NDArray[np.uint8]
     lists: NDArray[np.int16]
     codes: NDArray[np.uint8]
+    image_id: NDArray[np.int32]
+    image_camera: NDArray[np.int32]
+    image_pose: FloatArray
+    image_covariance: FloatArray
     image_start: NDArray[np.int64]
     see_point: NDArray[np.int32]
     image_center: FloatArray
@@ -67,7 +74,9 @@ def segment_of(feature_map: FeatureMap) -> Segment:
     rows, see_point = np.unique(observations.point_index[keep], return_inverse=True)
     points = feature_map.points_local()[rows]
     see_image = feature_map.image_rows(observations.image_id[keep])
-    centers = np.array([i.cam_from_local.center for i in feature_map.images]).reshape(-1, 3)
+    images = feature_map.images
+    poses = [image.cam_from_local for image in images]
+    centers = np.array([pose.center for pose in poses]).reshape(-1, 3)
     cones = view_cones(points, centers, see_point, see_image)
     distance = np.linalg.norm(centers[see_image] - points[see_point], axis=1)
     near, far = np.full(len(rows), np.inf), np.zeros(len(rows))
@@ -95,6 +104,12 @@ def segment_of(feature_map: FeatureMap) -> Segment:
         descriptors=descriptors,
         lists=codes.lists,
         codes=codes.codes,
+        image_id=np.array([image.image_id for image in images], dtype=np.int32),
+        image_camera=np.array([image.camera_id for image in images], dtype=np.int32),
+        image_pose=np.array([np.column_stack([p.rotation, p.translation]) for p in poses]).reshape(-1, 3, 4),
+        image_covariance=np.array(
+            [np.full((6, 6), np.nan) if image.covariance is None else image.covariance for image in images]
+        ).reshape(-1, 6, 6),
         image_start=start.astype(np.int64),
         see_point=see_point.astype(np.int32),
         image_center=centers,

@@ -314,10 +314,10 @@ class FeatureMap(MapParts):
         """Points (n, 3) in metres in the given local frame (default: the map's own)."""
         return (frame or self.frame).enu_from_utm(self.points.utm, self.epsg)
 
-    def outline(self) -> "FeatureMap":
-        """The map without its points and observations, which take most of the memory."""
+    def bare(self) -> "FeatureMap":
+        """The map without its images, points and observations: what is left is small."""
         none = self.points.take(np.zeros(0, np.int64))
-        return replace(self, points=none, observations=self.observations.none())
+        return replace(self, images=(), points=none, observations=self.observations.none())
 
     def with_status(self, status: MapStatus) -> "FeatureMap":
         return replace(self, status=status)

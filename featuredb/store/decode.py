@@ -104,7 +104,7 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
             **{name: row[name] for name in AS_IN_MAP},
             "cameras": tuple(Camera(**{**c, "params": tuple(c["params"])}) for c in row["cameras"]),
             "camera_keys": tuple(row["camera_keys"]),
-            "images": _decode_images(children[IMAGES], row["images"]),
+            "images": decode_images(children[IMAGES], row["images"]),
             "observations": _decode_observations(children[OBSERVATIONS], row["observations"]),
             "parents": tuple(row["parents"]),
             "provenance": json.loads(row["provenance"]),
@@ -172,7 +172,12 @@ def placement_of(row: Row) -> Placement:
     )
 
 
-def _decode_images(batches: Iterable[pa.RecordBatch], count: int) -> tuple[MapImage, ...]:
+def decode_images(batches: Iterable[pa.RecordBatch], count: int) -> tuple[MapImage, ...]:
+    """Images of the rows of a map, which has so many.
+
+    Raises:
+        StoreError: rows are missing or double.
+    """
     rows = sorted((row for batch in batches for row in batch.to_pylist()), key=lambda r: r["image_index"])
     if [row["image_index"] for row in rows] != list(range(count)):
         raise StoreError(f"images: expected rows 0 to {count - 1}, found {len(rows)} rows")

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from featuredb.errors import MapNotFoundError, UnplacedMapError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
+from featuredb.maps.feature_map import FeatureMap, MapImage, MapMethod, MapStatus
 from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
 from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, UnplacedStatus
 from featuredb.store.changes import RETIRED
-from featuredb.store.decode import decode_map, decode_no_place, frame_of, has_place, of_columns
+from featuredb.store.decode import decode_images, decode_map, decode_no_place, frame_of, has_place, of_columns
 from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
@@ -26,8 +26,6 @@ from featuredb.store.tables import (
     BOUNDS,
     CHILD_TABLES,
     IMAGES,
-    OBSERVATIONS,
-    POINTS,
     SPECS,
     UTM_COORDINATES,
 )
@@ -245,28 +243,37 @@ class Snapshot:
         assert isinstance(loaded, FeatureMap)
         return loaded
 
-    def load_outlines(self, map_ids: Collection[str]) -> dict[str, FeatureMap]:
-        """Maps with a place, by id, without their points and observations (`FeatureMap.outline`).
+    def load_bare(self, map_id: str) -> FeatureMap:
+        """The map with a place, without its images, points and observations (`FeatureMap.bare`).
 
         Raises:
             MapNotFoundError, UnplacedMapError, StoreError: as `load_map`.
         """
-        rows = [self._row(self.get(map_id).map_id) for map_id in map_ids]
-        if not rows:
-            return {}
+        row = self._row(self.get(map_id).map_id)
+        bare = {**row, "images": 0, "points": 0, "observations": 0}
+        loaded = decode_map(bare, dict.fromkeys(CHILD_TABLES, ()))
+        assert isinstance(loaded, FeatureMap)
+        return loaded
+
+    def images_of(self, map_ids: Collection[str]) -> dict[str, tuple[MapImage, ...]]:
+        """Images of maps, by map, in their order.
+
+        Raises:
+            MapNotFoundError: the snapshot has no such map.
+            StoreError: rows are missing or unreadable.
+        """
+        rows = [self._row(map_id) for map_id in map_ids]
         own: Condition = ("write_id", "in", [row["write_id"] for row in rows])
-        found = self._read(IMAGES, own, "the maps'")
-        table = pa.Table.from_batches(found) if found else SPECS[IMAGES].schema.empty_table()
-        table = table.combine_chunks()
+        found = self._read(IMAGES, own, "the maps'") if rows else []
+        table = pa.Table.from_batches(found, SPECS[IMAGES].schema).combine_chunks()
         grouped = _grouped(table["write_id"])
-        maps = {}
-        for row in rows:
-            images = table.take(grouped.get(row["write_id"], np.zeros(0, np.int64))).to_batches()
-            bare = {**row, "points": 0, "observations": 0}
-            outline = decode_map(bare, {IMAGES: images, POINTS: (), OBSERVATIONS: ()})
-            assert isinstance(outline, FeatureMap)
-            maps[row["map_id"]] = outline
-        return maps
+        none = np.zeros(0, np.int64)
+        return {
+            row["map_id"]: decode_images(
+                table.take(grouped.get(row["write_id"], none)).to_batches(), row["images"]
+            )
+            for row in rows
+        }
 
     def load_unplaced(self, map_id: str) -> UnplacedMap:
         """The map without a place exactly as it was committed; only its status may differ.

@@ -110,12 +110,10 @@ def map_covariance(area: Area, center: FloatArray, rows: NDArray[np.int64]) -> F
     """
     images, _ = area.images_that_see(np.unique(rows))
     best = int(np.argmax(np.bincount(images, minlength=1)))
-    feature_map = area.maps[int(area.image_map[best])]
-    first = int(np.searchsorted(area.image_map, area.image_map[best]))
-    image = feature_map.images[best - first]
+    image = area.image(best)
     if image.covariance is None:
         return np.zeros((6, 6))
-    turn = area.frame.enu_from(feature_map.frame).rotation @ image.cam_from_local.rotation.T
+    turn = area.turns[area.image_map[best]] @ image.cam_from_local.rotation.T
     arm = np.eye(6)
     arm[3:, :3] = -skew(center - area.image_center[best])
     by_pose = arm @ np.kron(np.eye(2), -turn)
@@ -218,14 +216,13 @@ def _moved_points(
 ) -> tuple[NDArray[np.int64], FloatArray] | None:
     """Points (n,) of the area and their displacements (n, 3, r), as the images that see them move."""
     feature_map = area.maps[main]
-    first = int(np.searchsorted(area.image_map, main))
     points = np.unique(rows)
     images, of = area.images_that_see(points)
     place = {int(image_id): k for k, image_id in enumerate(modes.image_id)}
     turn = area.frame.enu_from(feature_map.frame)
     normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, modes.poses.shape[2]))
     for image in np.unique(images):
-        photo = feature_map.images[image - first]
+        photo = area.image(int(image))
         if photo.image_id not in place:
             return None
         sees = of[images == image]

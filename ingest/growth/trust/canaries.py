@@ -189,8 +189,10 @@ def own_canaries(
         if len(m.points):
             low, high = np.percentile(m.points_local()[:, :2], (2, 98), axis=0)
             boxes.append((m.frame, low - NEAR_M, high + NEAR_M))
+    snapshot = database.snapshot(before.snapshot)
     for indexed in before.areas:
-        images = [(m, image) for m in indexed.area.maps for image in m.images]
+        own = snapshot.images_of([m.map_id for m in indexed.area.maps])
+        images = [(m, image) for m in indexed.area.maps for image in own[m.map_id]]
         for (feature_map, image), described in zip(images, np.diff(indexed.area.image_start), strict=True):
             if described < LEAST_FEATURES:
                 continue
@@ -203,7 +205,6 @@ def own_canaries(
             (near if around else far).append((key, feature_map.map_id, image))
     chosen = sorted(near, key=lambda e: e[0])[:_OWN_NEAR]
     chosen += sorted(far, key=lambda e: e[0])[: _OWN_NEAR // 2]
-    snapshot = database.snapshot(before.snapshot)
     whole = {map_id: snapshot.load_map(map_id) for map_id in sorted({map_id for _, map_id, _ in chosen})}
     return [(whole[map_id], image) for _, map_id, image in chosen]
 

@@ -1,0 +1,42 @@
+"""Stacked rows against one array of all of them."""
+
+import pickle
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.index.stacked import Stacked
+
+
+@dataclass
+class Owner:
+    values: NDArray[np.float32]
+
+
+def test_rows_are_those_of_one_array() -> None:
+    rng = np.random.default_rng(0)
+    owners = [Owner(rng.random((count, 3)).astype(np.float32)) for count in (5, 0, 7, 1)]
+    whole = np.concatenate([owner.values for owner in owners])
+    stacked = Stacked[np.float32](owners, "values")
+    assert len(stacked) == 13
+    np.testing.assert_array_equal(stacked.whole(), whole)
+    for rows in (
+        np.array([12, 0, 5, 5, 4]),
+        rng.integers(0, 13, (4, 2)),
+        np.array([6, 7]),
+        np.array(12),
+        np.zeros(0, np.int64),
+        np.zeros((0, 2), np.int64),
+    ):
+        taken = stacked[rows]
+        assert taken.dtype == np.float32
+        np.testing.assert_array_equal(taken, whole[rows])
+    again = pickle.loads(pickle.dumps(stacked))
+    np.testing.assert_array_equal(again.whole(), whole)
+
+
+def test_rows_of_nothing() -> None:
+    none = Stacked[np.float32]([Owner(np.zeros((0, 3), np.float32))], "values")
+    assert len(none) == 0
+    assert none[np.zeros(0, np.int64)].shape == (0, 3)
