@@ -56,8 +56,8 @@ _SMALL = 10_000  # points
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Source:
-    """A map to copy; photos that are not in it: features, lenses, and centres (3,) in its frame, metres."""
+class CopiedMap:
+    """A map; photos that are not in it: features, lenses, and centres (3,) in its frame, metres."""
 
     feature_map: FeatureMap
     photos: list[Features]
@@ -123,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def source_of(database: str, folder: str) -> Source:
+def source_of(database: str, folder: str) -> CopiedMap:
     """The largest placed map of a database without some of its photos, which are spread over it."""
     snapshot = Database.open(database).snapshot()
     whole = snapshot.load_map(max(snapshot.maps(), key=lambda m: m.images).map_id)
@@ -136,10 +136,10 @@ def source_of(database: str, folder: str) -> Source:
     photos = [extract(decode_gray(Path(folder) / image.name), options.extractor) for image in asked]
     places = [image.cam_from_local.center for image in asked]
     cameras = [whole.cameras[image.camera_id] for image in asked]
-    return Source(feature_map=rest, photos=photos, cameras=cameras, places=places)
+    return CopiedMap(feature_map=rest, photos=photos, cameras=cameras, places=places)
 
 
-def city(path: Path, sources: Sequence[Source], points: int) -> list[Query]:
+def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
     """A database of at least so many described points, and what to ask it."""
     for folder in (path, Path(f"{path}-cache")):
         shutil.rmtree(folder, ignore_errors=True)

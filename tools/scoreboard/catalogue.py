@@ -42,6 +42,26 @@ SPEED: tuple[Row, ...] = (
         minutes=15,
     ),
     _row(
+        name="scale-1m",
+        claim="a million points, the maps of `brighton` and `seneca` over and over, beside one each: start "
+        "to the first answer, commit of 100 points until a query is answered, queries with a prior of 30 m "
+        "and without",
+        commands=f"{_MADE}featuredb.cli ingest photos {{work}}/seneca {{data}}/seneca/images --quiet\n"
+        f"tools.scale_benchmark {{work}}/db:{BRIGHTON} {{work}}/seneca:{{data}}/seneca/images "
+        f"--work {{work}}/scale {OUT}",
+        figures=same(
+            "large_points large_first_start_s large_start_s large_commit_s large_with_prior_ms large_without_ms"
+        ),
+        text="{times_start:.1f} times the start, {times_commit:.1f} times the commit, {times_with_prior:.2f} and "
+        "{times_without:.2f} times a query with a prior and without; {large_answered_without:.0%} answered "
+        "without, {large_wrong:.0f} wrong; {resident_bytes_a_point:.0f} bytes a point; the very first start "
+        "{large_first_start_s:.0f} s",
+        limits="times_start <= 3, times_commit <= 3, times_with_prior <= 1.2, times_without <= 3, "
+        "0.97 <= large_answered_with_prior, 0.97 <= large_answered_without, large_wrong <= 0, "
+        "resident_bytes_a_point <= 250",
+        minutes=15,
+    ),
+    _row(
         name="bridge-latency",
         claim="`live --json | bridge` on a film that shows a photo of `brighton`: from a reply as any "
         "subscriber gets it to the bridge's message, decoded (pymavlink from UDP, rosbags from Zenoh), pose "
