@@ -30,6 +30,7 @@ from featuredb.maps.lineage import MapLineage
 from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database, MapSummary, Snapshot
+from featuredb.store.tables import BOUNDS
 from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.localise.localise import localise
 from reloc.localise.options import LocaliseOptions
@@ -328,24 +329,14 @@ def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:
     """
     if not maps:
         return []
-    frame: LocalFrame | None = None
-    centers, radii = [], []
-    for summary in maps:
-        box = summary.box
-        assert box is not None
-        corners = np.array(
-            [
-                [box.min_easting, box.min_northing, box.min_height],
-                [box.max_easting, box.max_northing, box.max_height],
-            ]
-        )
-        middle = corners.mean(axis=0)
-        frame = frame or LocalFrame.from_utm(
-            float(middle[0]), float(middle[1]), float(middle[2]), summary.epsg
-        )
-        centers.append(frame.enu_from_utm(middle, summary.epsg))
-        radii.append(0.5 * float(np.linalg.norm(corners[1] - corners[0])))
-    place, radius = np.array(centers), np.array(radii)
+    boxes = np.array([[getattr(m.box, name) for name in BOUNDS] for m in maps]).reshape(-1, 2, 3)
+    middle, radius = boxes.mean(axis=1), 0.5 * np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1)
+    zone = np.array([m.epsg for m in maps])
+    east, north, up = middle[0].tolist()
+    frame = LocalFrame.from_utm(east, north, up, maps[0].epsg)
+    place = np.empty_like(middle)
+    for epsg in np.unique(zone):
+        place[zone == epsg] = frame.enu_from_utm(middle[zone == epsg], int(epsg))
     # Of two maps that are near each other, the larger one finds the other within twice its own radius.
     found = cKDTree(place).query_ball_point(place, 2.0 * radius + _AREA_GAP_M)
     rows = np.repeat(np.arange(len(maps)), [len(others) for others in found])

@@ -307,12 +307,12 @@ def _covisibility(
         return shared
     from scipy.spatial import cKDTree
 
-    pairs = cKDTree(image_scene).query_pairs(0.5 * float(image_reach.max()), output_type="ndarray")
-    a, b = pairs[:, 0], pairs[:, 1]
+    # Each looks as far as its own reach: one that sees for kilometres does not make all of them look so far.
+    found = cKDTree(image_scene).query_ball_point(image_scene, 0.5 * image_reach, return_sorted=False)
+    a = np.repeat(np.arange(count), [len(others) for others in found])
+    b = np.concatenate(found).astype(np.int64)
     gap = np.linalg.norm(image_scene[a] - image_scene[b], axis=1)
     near = (image_map[a] != image_map[b]) & (gap < 0.5 * np.minimum(image_reach[a], image_reach[b]))
     a, b = a[near], b[near]
-    links = sparse.coo_array(
-        (np.full(2 * len(a), 30, dtype=np.int32), (np.r_[a, b], np.r_[b, a])), shape=(count, count)
-    )
+    links = sparse.coo_array((np.full(len(a), 30, dtype=np.int32), (a, b)), shape=(count, count))
     return sparse.csr_array(shared + links.tocsr())

@@ -50,12 +50,13 @@ SPEED: tuple[Row, ...] = (
         f"tools.scale_benchmark {{work}}/db:{BRIGHTON} {{work}}/seneca:{{data}}/seneca/images "
         f"--work {{work}}/scale {OUT}",
         figures=same(
-            "large_points large_first_start_s large_start_s large_commit_s large_with_prior_ms large_without_ms"
+            "large_points large_first_start_s large_start_s large_commit_s large_with_prior_ms "
+            "large_without_ms"
         ),
-        text="{times_start:.1f} times the start, {times_commit:.1f} times the commit, {times_with_prior:.2f} and "
-        "{times_without:.2f} times a query with a prior and without; {large_answered_without:.0%} answered "
-        "without, {large_wrong:.0f} wrong; {resident_bytes_a_point:.0f} bytes a point; the very first start "
-        "{large_first_start_s:.0f} s",
+        text="{times_start:.1f} times the start, {times_commit:.1f} times the commit, {times_with_prior:.2f} "
+        "and {times_without:.2f} times a query with a prior and without; {large_answered_without:.0%} "
+        "answered without, {large_wrong:.0f} wrong; {resident_bytes_a_point:.0f} bytes a point; the very "
+        "first start {large_first_start_s:.0f} s",
         limits="times_start <= 3, times_commit <= 3, times_with_prior <= 1.2, times_without <= 3, "
         "0.97 <= large_answered_with_prior, 0.97 <= large_answered_without, large_wrong <= 0, "
         "resident_bytes_a_point <= 250",
