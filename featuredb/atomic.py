@@ -11,7 +11,11 @@ TEMPORARY = ".tmp-"  # names of files that are being written begin so
 
 
 def user_cache() -> Path:
-    """The user's folder for what can be made again."""
+    """The user's folder for what can be made again.
+
+    Raises:
+        RuntimeError: the user has no home, and `XDG_CACHE_HOME` names no folder.
+    """
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "featuredb"
 
 

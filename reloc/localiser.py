@@ -175,13 +175,14 @@ class Localiser:
         loaded: dict[tuple[str, ...], Area] = {}
         trial = instead or {}
         states = dict(previous._states) if previous else {}
+        files = SegmentFiles(database.url)
         for group in _group(active):
             key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
             tried = any(m.map_id in trial for m in group)
             if key in known and not tried:
                 loaded[key] = known[key].area
             else:
-                loaded[key] = _load(database.url, snapshot, group, states, trial)
+                loaded[key] = _load(files, snapshot, group, states, trial)
         had = {d.write_id: d for d in previous._unplaced.values()} if previous else {}
         unplaced = {
             m.map_id: had.get(m.write_id) or OnDemand(m.write_id, partial(_own_area, snapshot, m.map_id))
@@ -195,7 +196,9 @@ class Localiser:
             for m in snapshot.maps()
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
-        served = dict(zip(loaded, indexed_together(list(loaded.values())), strict=True))
+        files.prune()
+        before = previous.areas if previous else ()
+        served = dict(zip(loaded, indexed_together(list(loaded.values()), before), strict=True))
         made = cls(served, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
         made._states = {m.write_id: states[m.write_id] for m in active if m.write_id in states}
         return made
@@ -284,7 +287,7 @@ def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
 
 
 def _load(
-    url: str,
+    files: SegmentFiles,
     snapshot: Snapshot,
     group: Sequence[MapSummary],
     states: dict[str, _State],
@@ -295,10 +298,9 @@ def _load(
     Args:
         states: by write id; what is read now is added.
     """
-    files = SegmentFiles()
     new = [m for m in group if m.map_id not in instead and m.write_id not in states]
     for m in new:
-        segment = files.get(url, m.write_id, partial(_laid_out, snapshot, m.map_id))
+        segment = files.get(m.write_id, partial(_laid_out, snapshot, m.map_id))
         states[m.write_id] = snapshot.load_bare(m.map_id), segment
     chosen = [
         (instead[m.map_id].bare(), segment_of(instead[m.map_id]))
@@ -317,7 +319,10 @@ def _laid_out(snapshot: Snapshot, map_id: str) -> Segment:
 
 
 def _load_alone(url: str, snapshot: Snapshot, summary: MapSummary) -> IndexedArea:
-    return indexed_together([_load(url, snapshot, [summary], {}, {})])[0]
+    files = SegmentFiles(url)
+    area = _load(files, snapshot, [summary], {}, {})
+    files.prune()
+    return indexed_together([area])[0]
 
 
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:

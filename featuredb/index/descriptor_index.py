@@ -5,6 +5,7 @@ lists and codes were trained once and come with featuredb: an index costs no tra
 is worked out once and kept with the map.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -22,6 +23,7 @@ from featuredb.index.stacked import Stacked
 CODE_PARTS, CODE_BYTES = 32, 16  # 4 bits a part
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
 _LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
+LISTS = 2048
 _CHUNK = 50_000  # descriptors at a time: bounds the float32 copies
 
 
@@ -65,13 +67,12 @@ class DescriptorCodes:
 class DescriptorIndex:
     """Neighbours among descriptors. Searching is thread-safe; the object never changes."""
 
-    def __init__(self, index: Any, memory: NDArray[np.uint8] | None = None) -> None:
-        """`memory`: where the index has its arrays, if it does not own them."""
-        self._index, self._memory = index, memory
+    def __init__(self, index: Any) -> None:
+        self._index = index
 
     def __reduce__(self) -> tuple[object, ...]:
-        """As bytes, which are not copied where they are read."""
-        return _in_memory, (faiss.serialize_index(self._index),)
+        """As bytes, which are copied where they are read: 25 a descriptor."""
+        return _of_bytes, (faiss.serialize_index(self._index),)
 
     def __len__(self) -> int:
         return int(self._index.ntotal)
@@ -104,14 +105,19 @@ class DescriptorIndex:
 
 
 def squared_distances(
-    query: NDArray[np.uint8], base: NDArray[np.uint8] | Stacked[np.uint8], rows: NDArray[np.int64]
+    query: NDArray[np.uint8],
+    query_rows: NDArray[np.int64],
+    base: NDArray[np.uint8] | Stacked[np.uint8],
+    base_rows: NDArray[np.int64],
 ) -> NDArray[np.float32]:
-    """Exact squared distances (n, k) of descriptors (n, 128) from rows (n, k) of others; infinity for -1."""
-    difference = base[np.maximum(rows, 0)].astype(np.float32)
-    difference -= query[:, None, :]
-    squared = np.einsum("ijk,ijk->ij", difference, difference)
-    squared[rows < 0] = np.inf
-    return np.asarray(squared, dtype=np.float32)
+    """Exact squared distances (m,) of pairs of descriptors, a row of `query` and one of `base` each."""
+    squared = np.empty(len(base_rows), np.float32)
+    for start in range(0, len(base_rows), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        difference = base[base_rows[part]].astype(np.float32)
+        difference -= query[query_rows[part]]
+        squared[part] = np.einsum("ij,ij->i", difference, difference)
+    return squared
 
 
 def _empty_index() -> Any:
@@ -139,10 +145,17 @@ def _shipped(name: str) -> NDArray[np.float32]:
         return np.asarray(archive["centers"], dtype=np.float32)
 
 
-def _in_memory(memory: NDArray[np.uint8]) -> DescriptorIndex:
-    library: Any = faiss  # its stubs lack these
-    reader = library.ZeroCopyIOReader(library.swig_ptr(memory), memory.nbytes)
-    return DescriptorIndex(faiss.read_index(reader), memory)
+def _of_bytes(data: NDArray[np.uint8]) -> DescriptorIndex:
+    return DescriptorIndex(faiss.deserialize_index(data))
+
+
+@cache
+def trained_digest() -> str:
+    """Names what codes hang on: the centres of lists and of codes."""
+    digest = hashlib.sha256()
+    for name in (_LISTS, _CODES):
+        digest.update(_shipped(name).tobytes())
+    return digest.hexdigest()
 
 
 def use_threads(count: int) -> None:

@@ -5,11 +5,11 @@ nobody asks for takes no memory.
 """
 
 import hashlib
-import json
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import fields
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,85 +18,146 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from featuredb.atomic import atomic_file, user_cache
+from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.index.descriptor_index import CODE_BYTES, LISTS, trained_digest
 from featuredb.index.segment import Segment
 
 _LOG = logging.getLogger(__name__)
-_LAYOUT = "1"  # of what a segment is made of, and how: another one makes all anew
+_LAYOUT = "1"  # raised where the same arrays come to mean something else
 _SUFFIX = ".arrow"
-_NAMES = tuple(field.name for field in fields(Segment))
+# Of each array of a segment, the type and the shape of a row.
+_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "points": ("<f8", (3,)),
+    "point_row": ("<i4", ()),
+    "covariance": ("<f4", (6,)),
+    "view_direction": ("<f4", (3,)),
+    "view_spread_cos": ("<f4", ()),
+    "view_distance": ("<f4", ()),
+    "descriptors": ("|u1", (DESCRIPTOR_SIZE,)),
+    "lists": ("<i2", ()),
+    "codes": ("|u1", (CODE_BYTES,)),
+    "image_id": ("<i4", ()),
+    "image_camera": ("<i4", ()),
+    "image_pose": ("<f8", (3, 4)),
+    "image_covariance": ("<f8", (6, 6)),
+    "image_start": ("<i8", ()),
+    "see_point": ("<i4", ()),
+    "image_center": ("<f8", (3,)),
+    "image_scene": ("<f8", (3,)),
+    "image_reach": ("<f8", ()),
+    "shared_start": ("<i8", ()),
+    "shared_image": ("<i4", ()),
+    "shared_count": ("<i4", ()),
+}
+_OF_POINTS = (*list(_ARRAYS)[1:7], "lists", "codes")
+_OF_IMAGES = ("image_camera", "image_pose", "image_covariance", "image_center", "image_scene", "image_reach")
 _MOST_BYTES = 20 * 2**30
 
 
 class SegmentFiles:
-    """A folder of segments, bounded; those that were not used for longest go first.
+    """The segments of one database in a folder that all databases share.
 
-    A file that cannot be read is as one that is not there; where none can be written, nothing is kept.
+    The folder is bounded: `prune` removes what was not used for longest, but nothing that this object has
+    used; what does not fit beside that is not kept. A file that cannot be read is as one that is not there.
     """
 
-    def __init__(self, folder: Path | None = None, most_bytes: int = _MOST_BYTES) -> None:
-        """`folder`: default `segments` in the user's cache."""
-        self._folder = user_cache() / "segments" if folder is None else folder
-        self._most_bytes = most_bytes
-
-    def get(self, database: str, write_id: str, make: Callable[[], Segment]) -> Segment:
-        """The segment of a map's state, kept or made now.
-
+    def __init__(self, database: str, folder: Path | None = None, most_bytes: int = _MOST_BYTES) -> None:
+        """
         Args:
             database: its address: what one database calls a state says nothing of another's.
+            folder: default `segments` in the user's cache.
         """
-        name = hashlib.sha256(f"{_LAYOUT} {database} {write_id}".encode()).hexdigest()
+        self._database, self._most_bytes = database, most_bytes
+        self._folder = _default_folder() if folder is None else folder
+        self._used: dict[Path, int] = {}
+        self._told = self._written = False
+
+    def get(self, write_id: str, make: Callable[[], Segment]) -> Segment:
+        """The segment of a map's state, kept or made now."""
+        if self._folder is None:
+            return make()
+        key = f"{_layout()} {self._database} {write_id}"
+        name = hashlib.sha256(key.encode()).hexdigest()
         path = self._folder / name[:2] / f"{name}{_SUFFIX}"
         kept = _read(path)
-        if kept is not None:
-            return kept
-        made = make()
-        try:
-            with atomic_file(path) as temporary:
-                _write(temporary, made)
-            self._prune(path)
-        except OSError as error:
-            _LOG.info("cannot keep what is laid out for searching in %s: %s", self._folder, error)
-        return made
+        if kept is None:
+            kept = make()
+            self._keep(path, kept)
+        else:
+            with suppress(OSError):
+                os.utime(path)
+                self._used[path] = path.stat().st_size
+        return kept
 
-    def _prune(self, newest: Path) -> None:
-        """Remove files until what is left fits; the newest stays."""
-        found = [(path.stat(), path) for path in self._folder.glob(f"*/*{_SUFFIX}")]
+    def _keep(self, path: Path, segment: Segment) -> None:
+        size = sum(getattr(segment, name).nbytes for name in _ARRAYS)
+        try:
+            if sum(self._used.values()) + size > self._most_bytes:
+                raise OSError(f"{self._most_bytes / 2**30:.0f} GiB are full of what is used now")
+            with atomic_file(path) as temporary:
+                _write(temporary, segment)
+            self._used[path] = size
+            self._written = True
+        except OSError as error:
+            if not self._told:
+                _LOG.warning(
+                    "what is laid out for searching is not kept in %s, and made anew at each start: %s",
+                    self._folder,
+                    error,
+                )
+            self._told = True
+
+    def prune(self) -> None:
+        """Remove files until what is left fits; those used or written here stay."""
+        if self._folder is None or not self._written:
+            return
+        found = []
+        for path in self._folder.glob(f"*/*{_SUFFIX}"):
+            with suppress(OSError):  # another process prunes, too
+                found.append((path.stat(), path))
         total = sum(stat.st_size for stat, _ in found)
         for stat, path in sorted(found, key=lambda one: one[0].st_mtime):
             if total <= self._most_bytes:
                 return
-            if path != newest:
-                path.unlink(missing_ok=True)
+            if path not in self._used:
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
                 total -= stat.st_size
 
 
+def _default_folder() -> Path | None:
+    try:
+        return user_cache() / "segments"
+    except RuntimeError as error:
+        _LOG.warning("what is laid out for searching is made anew at each start: %s", error)
+        return None
+
+
+@cache
+def _layout() -> str:
+    """Names what segments are made of, and with what; another one makes all anew."""
+    return " ".join((_LAYOUT, trained_digest(), *_ARRAYS))
+
+
 def _write(path: Path, segment: Segment) -> None:
-    arrays = {name: np.ascontiguousarray(getattr(segment, name)) for name in _NAMES}
-    kinds = {name: [array.dtype.str, array.shape] for name, array in arrays.items()}
-    schema = pa.schema(
-        [pa.field(name, pa.large_binary()) for name in _NAMES], metadata={"arrays": json.dumps(kinds)}
-    )
-    columns = [
-        pa.Array.from_buffers(
-            pa.large_binary(),
-            1,
-            [None, pa.py_buffer(np.array([0, array.nbytes], np.int64)), pa.py_buffer(array)],
-        )
-        for array in arrays.values()
-    ]
+    schema = pa.schema([pa.field(name, pa.large_binary()) for name in _ARRAYS])
+    columns = []
+    for name, (dtype, _) in _ARRAYS.items():
+        array = np.ascontiguousarray(getattr(segment, name), dtype)
+        offsets = pa.py_buffer(np.array([0, array.nbytes], np.int64))
+        columns.append(pa.Array.from_buffers(pa.large_binary(), 1, [None, offsets, pa.py_buffer(array)]))
     with pa.OSFile(str(path), "wb") as file, pa.ipc.new_file(file, schema) as writer:
         writer.write_batch(pa.record_batch(columns, schema=schema))
 
 
 def _read(path: Path) -> Segment | None:
-    """The segment of a file, marked as used now; None where there is none, or it is broken."""
+    """The segment of a file; None where there is none that may be read, or it is broken."""
     try:
-        os.utime(path)
         with pa.ipc.open_file(pa.memory_map(str(path))) as reader:
             batch = reader.get_batch(0)
-            kinds = json.loads(reader.schema.metadata[b"arrays"])
-        segment = Segment(**{name: _array(batch.column(name), *kinds[name]) for name in _NAMES})
-    except FileNotFoundError:
+        segment = Segment(**{name: _array(batch.column(name), *kind) for name, kind in _ARRAYS.items()})
+        _check(segment)
+    except (FileNotFoundError, PermissionError, NotADirectoryError):
         return None
     except (OSError, pa.ArrowException, ValueError, KeyError, TypeError, IndexError) as error:
         _LOG.warning("%s is broken and made anew: %s", path, error)
@@ -104,7 +165,32 @@ def _read(path: Path) -> Segment | None:
     return segment
 
 
-def _array(column: pa.Array, dtype: str, shape: list[int]) -> NDArray[Any]:
-    data = column.buffers()[2]
-    flat = np.frombuffer(data, dtype=np.dtype(dtype)) if data is not None else np.empty(0, np.dtype(dtype))
-    return flat[: int(np.prod(shape))].reshape(shape)
+def _array(column: pa.Array, dtype: str, tail: tuple[int, ...]) -> NDArray[Any]:
+    _, offsets, data = column.buffers()  # as they lie in the file; Arrow's scalars are copies
+    size = int(np.frombuffer(offsets, np.int64)[1])
+    count = size // np.dtype(dtype).itemsize
+    flat: NDArray[Any] = np.frombuffer(data, dtype, count) if count else np.empty(0, dtype)
+    return flat.reshape(-1, *tail)
+
+
+def _check(segment: Segment) -> None:
+    """Raises ValueError where arrays do not fit together, or name a row that is not there."""
+    points, images = len(segment.points), len(segment.image_id)
+    counts = dict.fromkeys(_OF_POINTS, points) | dict.fromkeys(_OF_IMAGES, images)
+    counts |= {
+        "image_start": images + 1,
+        "shared_start": images + 1,
+        "shared_count": len(segment.shared_image),
+    }
+    for name, count in counts.items():
+        if len(getattr(segment, name)) != count:
+            raise ValueError(f"{name}: expected {count} rows, found {len(getattr(segment, name))}")
+    for starts, rows, most in (
+        (segment.image_start, segment.see_point, points),
+        (segment.shared_start, segment.shared_image, images),
+        (np.array([0, points]), segment.lists, LISTS),
+    ):
+        if starts[0] != 0 or starts[-1] != len(rows) or (np.diff(starts) < 0).any():
+            raise ValueError("slices do not cover their rows")
+        if len(rows) and not 0 <= rows.min() <= rows.max() < most:
+            raise ValueError(f"expected rows from 0 to {most - 1}, found {rows.min()} to {rows.max()}")

@@ -182,8 +182,10 @@ class Snapshot:
         Raises:
             StoreError: photos' rows are unreadable.
         """
-        with read_errors("cannot read where the photos were taken"):
-            found = self._children[IMAGES].dataset().to_table(["write_id", *UTM_COORDINATES])
+        own: Condition = ("write_id", "in", [r["write_id"] for r in self._rows.values() if has_place(r)])
+        columns = ["write_id", *UTM_COORDINATES]
+        batches = self._read(IMAGES, own, "where they were taken:", columns)
+        found = pa.Table.from_batches(batches, pa.schema([SPECS[IMAGES].schema.field(c) for c in columns]))
         utm = np.column_stack([found[name].to_numpy() for name in UTM_COORDINATES])
         grouped = _grouped(found["write_id"])
         medians = {}
@@ -317,16 +319,18 @@ class Snapshot:
             )
         return self._rows[map_id]
 
-    def _read(self, table: str, where: Condition, whose: str) -> list[pa.RecordBatch]:
+    def _read(
+        self, table: str, where: Condition, whose: str, columns: list[str] | None = None
+    ) -> list[pa.RecordBatch]:
         """Rows of one child table, from the few files that can hold them."""
         child = self._children[table]
         with read_errors(f"cannot read {whose} {table}"):
             try:
-                found = child.dataset([where]).to_table(use_threads=False)
+                found = child.dataset([where]).to_table(columns, use_threads=False)
             except FileNotFoundError:
                 # Compacted and vacuumed since this snapshot was taken: the same rows, in newer files.
                 child.refresh()
-                found = child.dataset([where]).to_table(use_threads=False)
+                found = child.dataset([where]).to_table(columns, use_threads=False)
         batches: list[pa.RecordBatch] = found.to_batches()
         return batches
 

@@ -14,6 +14,11 @@ from featuredb.index.descriptor_index import DescriptorCodes, DescriptorIndex, s
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from reloc.localise.options import CandidateOptions
 
+# Neighbours that codes propose for each that is wanted; the descriptors choose. Of a million points ten codes
+# hold the nearest point of 62 % of features, forty of 71 %, exact codes in the same lists of 76 %.
+_PROPOSED = 4
+# Where at least this share of an index is in reach, it is searched as it is.
+_MOST = 0.5
 # A place this far under the frame's horizon is more than 1,100 km away.
 _FAR_BELOW_M = 100_000.0
 
@@ -41,11 +46,19 @@ class IndexedArea:
         return replace(self, area=self.area.only(map_ids))
 
 
-def indexed_together(areas: Sequence[Area]) -> list[IndexedArea]:
-    """The areas with one index for all of each extractor: a photo is looked for in all of them at once."""
+def indexed_together(areas: Sequence[Area], previous: Sequence[IndexedArea] = ()) -> list[IndexedArea]:
+    """The areas with one index for all of each extractor: a photo is looked for in all of them at once.
+
+    Args:
+        previous: taken over where all areas of an extractor are the same.
+    """
     indexed: dict[int, IndexedArea] = {}
     for fingerprint in {area.extractor_fingerprint for area in areas}:
         mine = [k for k, area in enumerate(areas) if area.extractor_fingerprint == fingerprint]
+        had = [one for one in previous if one.area.extractor_fingerprint == fingerprint]
+        if [id(one.area) for one in had] == [id(areas[k]) for k in mine]:
+            indexed |= dict(zip(mine, had, strict=True))
+            continue
         index = DescriptorIndex.of(DescriptorCodes.joined([areas[k].codes() for k in mine]))
         first = 0
         for k in mine:
@@ -134,6 +147,13 @@ class _Reach:
     def area(self) -> Area:
         return self.indexed.area
 
+    def has(self, points: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(k,) which of the area's points (k,) are in reach."""
+        if len(self.points) == len(self.area.points):
+            return np.ones(len(points), dtype=np.bool_)
+        place = np.minimum(np.searchsorted(self.points, points), max(len(self.points) - 1, 0))
+        return np.asarray(self.points[place] == points, dtype=np.bool_)
+
     @classmethod
     def of(cls, indexed: IndexedArea, allowed: NDArray[np.bool_]) -> "_Reach":
         images = np.flatnonzero(allowed)
@@ -185,9 +205,9 @@ def _vote(reach: Sequence[_Reach], features: Features, options: CandidateOptions
 def _nearest(
     reach: Sequence[_Reach], asked: NDArray[np.uint8], k: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Of descriptors (n, 128) the k nearest points in reach, or more.
+    """Of descriptors (n, 128) the k nearest points in reach of each index, best first.
 
-    Areas that share an index and are in reach as a whole are searched by it. Of others, the points in reach
+    Areas of which most is in reach are searched by the index that they share. Of others, the points in reach
     get an index now: what lies elsewhere costs nothing.
 
     Returns:
@@ -196,34 +216,53 @@ def _nearest(
     """
     groups: dict[int, list[int]] = {}
     for i, r in enumerate(reach):
-        groups.setdefault(id(r.indexed.index), []).append(i)
-    parts, rows, squared = [], [], []
-    for group in groups.values():
-        index = reach[group[0]].indexed.index
-        whole = sum(len(reach[i].points) for i in group) == len(index)
-        if whole:
-            first = np.array([reach[i].indexed.first for i in group])
-        else:
-            codes = [reach[i].area.codes(reach[i].points) for i in group]
-            index = DescriptorIndex.of(DescriptorCodes.joined(codes))
-            first = np.cumsum([0, *(len(part) for part in codes[:-1])])
-        found = index.search(asked, k)
-        order = np.argsort(first)
-        place = order[np.maximum(np.searchsorted(first[order], found, side="right") - 1, 0)]
-        row = np.full(found.shape, -1, np.int64)
-        distance = np.full(found.shape, np.inf)
-        for j, i in enumerate(group):
-            mine = (place == j) & (found >= 0)
-            if not mine.any():
-                continue
-            own = found[mine] - first[j]
-            row[mine] = own if whole else reach[i].points[own]
-            own = np.where(mine, row, -1)
-            distance[mine] = squared_distances(asked, reach[i].area.descriptors, own)[mine]
-        parts.append(np.array(group)[place])
-        rows.append(row)
-        squared.append(distance)
-    return np.concatenate(parts, axis=1), np.concatenate(rows, axis=1), np.concatenate(squared, axis=1)
+        if len(r.points):
+            groups.setdefault(id(r.indexed.index), []).append(i)
+    if not groups:
+        none = np.zeros((len(asked), 0), np.int64)
+        return none, none, none.astype(np.float64)
+    found = [_nearest_of(reach, np.array(group), asked, k) for group in groups.values()]
+    part, row, squared = (np.concatenate([one[of] for one in found], axis=1) for of in range(3))
+    return part, row, squared
+
+
+def _nearest_of(
+    reach: Sequence[_Reach], group: NDArray[np.int64], asked: NDArray[np.uint8], k: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """As `_nearest`, for the areas (g,) that share an index and have points in reach."""
+    index = reach[group[0]].indexed.index
+    in_reach = sum(len(reach[i].points) for i in group)
+    shared = in_reach >= _MOST * len(index)
+    if shared:
+        first = np.array([reach[i].indexed.first for i in group])
+    else:
+        codes = [reach[i].area.codes(reach[i].points) for i in group]
+        index = DescriptorIndex.of(DescriptorCodes.joined(codes))
+        first = np.cumsum([0, *(len(part) for part in codes[:-1])])
+    proposed = index.search(asked, _PROPOSED * k)
+    order = np.argsort(first)
+    place = order[np.maximum(np.searchsorted(first[order], proposed, side="right") - 1, 0)]
+    row, squared = np.full(proposed.shape, -1, np.int64), np.full(proposed.shape, np.inf)
+    asker, rank = np.nonzero(proposed >= 0)
+    by_area = np.argsort(place[asker, rank], kind="stable")
+    asker, rank = asker[by_area], rank[by_area]
+    ends = np.searchsorted(place[asker, rank], np.arange(len(group) + 1))
+    for j in np.flatnonzero(np.diff(ends)):
+        r = reach[group[j]]
+        own = slice(ends[j], ends[j + 1])
+        points = proposed[asker[own], rank[own]] - first[j]
+        if not shared:
+            points = r.points[points].astype(np.int64)
+        distance = squared_distances(asked, asker[own], r.area.descriptors, points).astype(np.float64)
+        if shared:
+            distance[~r.has(points)] = np.inf
+        row[asker[own], rank[own]], squared[asker[own], rank[own]] = points, distance
+    best = np.argsort(squared, axis=1, kind="stable")[:, :k]
+    return (
+        group[np.take_along_axis(place, best, axis=1)],
+        np.take_along_axis(row, best, axis=1),
+        np.take_along_axis(squared, best, axis=1),
+    )
 
 
 def _image_scores(reach: _Reach, votes_of_point: FloatArray, share: float) -> FloatArray:

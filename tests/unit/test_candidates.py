@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from featuredb.features.features import Features
+from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
-from reloc.localise.candidates import IndexedArea, find_clusters, images_in_reach
+from reloc.localise.candidates import (
+    IndexedArea,
+    _nearest,
+    _Reach,
+    find_clusters,
+    images_in_reach,
+    indexed_together,
+)
 from reloc.localise.matching import ClusterMatcher
 from reloc.localise.options import CandidateOptions, LocaliseOptions
 from reloc.localise.search import most_matched
@@ -16,6 +24,7 @@ from tests.support.scenes import (
     box_points,
     indexed,
     looking_at,
+    noisy,
     pixels_inside,
     query_features,
     random_descriptors,
@@ -185,3 +194,66 @@ def test_of_many_places_those_that_match_best_are_tried() -> None:
     assert len(chosen) == 2
     assert (area.area.image_map[chosen[0].cluster.images] == 4).all()
     assert most_matched(tries[:2], options) == tries[:2]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_nearest_points_in_reach_against_all_of_them(seed: int) -> None:
+    """Several areas of several maps and two extractors, some without points, as wholes and in parts."""
+    rng = np.random.default_rng(seed)
+    asked = random_descriptors(rng, 40)
+    areas, east_m = [], 0.0
+    for k in range(int(rng.integers(2, 6))):
+        maps = []
+        for m in range(int(rng.integers(1, 4))):
+            count = int(rng.choice([0, 30, 200]))
+            east_m += 300.0
+            own = random_descriptors(rng, count)
+            shown = min(count, 10)
+            own[:shown] = noisy(rng, asked[rng.integers(0, len(asked), shown)], 3.0)
+            maps.append(
+                scene_map(
+                    points=box_points(rng, count),
+                    descriptors=own,
+                    poses=ring(4),
+                    east_m=east_m,
+                    map_id=f"{k}-{m}",
+                    fingerprint=f"extractor-{k % 2}",
+                )
+            )
+        areas.append(build_area(maps))
+    reach = []
+    for one in indexed_together(areas):
+        count = len(one.area.points)
+        some = np.sort(rng.choice(count, int(rng.integers(0, count + 1)), replace=False))
+        points = np.arange(count) if rng.random() < 0.5 else some
+        reach.append(_Reach(indexed=one, images=np.arange(1), points=points.astype(np.int32)))
+    part, row, squared = _nearest(reach, asked, 5)
+    found, true_nearest = [], []
+    for i in range(len(asked)):
+        there = np.isfinite(squared[i])
+        pairs = list(zip(part[i][there].tolist(), row[i][there].tolist(), strict=True))
+        assert len(set(pairs)) == len(pairs)
+        true: dict[tuple[int, int], float] = {}
+        for p, r in enumerate(reach):
+            base = r.area.descriptors[r.points].astype(np.float64)
+            distance = ((base - asked[i].astype(np.float64)) ** 2).sum(axis=1)
+            true |= {(p, int(at)): float(d) for at, d in zip(r.points, distance, strict=True)}
+        assert [true[pair] for pair in pairs] == squared[i][there].tolist()
+        if true:
+            true_nearest.append(min(true.values()))
+            found.append(min((true[pair] for pair in pairs), default=np.inf))
+    close = np.array(true_nearest) < 120.0**2  # that of the feature itself
+    if close.any():
+        assert np.mean(np.array(found)[close] == np.array(true_nearest)[close]) > 0.9
+
+
+def test_an_index_is_kept_where_its_areas_are_the_same() -> None:
+    areas = [build_area([place(k, 3000.0 * k)]) for k in range(3)]
+    first = indexed_together(areas)
+    counts = [len(area.points) for area in areas]
+    assert [one.first for one in first] == [0, counts[0], counts[0] + counts[1]]
+    again = indexed_together(areas, first)
+    assert all(one is other for one, other in zip(first, again, strict=True))
+    fewer = indexed_together(areas[:2], first)
+    assert fewer[0].index is not first[0].index
+    assert len(fewer[0].index) == counts[0] + counts[1]

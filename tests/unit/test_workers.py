@@ -1,6 +1,7 @@
 """The server's workers where something fails around them."""
 
 import errno
+import os
 import pickle
 import resource
 import tempfile
@@ -13,12 +14,15 @@ import pytest
 from featuredb.errors import ImageError, StoreError
 from featuredb.features import decode
 from featuredb.features.decode import DecodeLimits
-from reloc.localiser import OnDemand
+from featuredb.store import Database
+from reloc.localiser import Localiser, OnDemand
 from reloc.service.handler import answer_query
 from reloc.service.workers import answering, process
 from reloc.service.workers.answering import WorkerLimits
-from reloc.service.workers.area_files import AreaFiles
+from reloc.service.workers.area_files import AreaFiles, MappedAreas
 from reloc.service.workers.process import WorkerEndedError, WorkerProcess
+from tests.support.field_queries import moved
+from tests.support.maps import random_map
 
 LIMITS = WorkerLimits(threads=1, memory_bytes=1 << 30, processor_s=5.0)
 ANSWERER = answer_query
@@ -59,6 +63,39 @@ def test_a_map_that_cannot_be_read_is_told_to_who_names_it():
     copy = pickle.loads(pickle.dumps(OnDemand("w1", broken)))
     with pytest.raises(StoreError, match="its points are gone"):
         copy.get()
+
+
+def test_what_did_not_change_over_reloads_keeps_its_file_and_its_mapping(tmp_path):
+    """A worker gets a localiser's files, three times, and answers from the same arrays."""
+    database = Database.create(tmp_path / "db")
+    database.commit_map(random_map(0, map_id="a", extent_m=50.0))
+    database.commit_map(moved(random_map(1, map_id="b", extent_m=50.0), "b", 100.0))
+    writer, reader = AreaFiles(), MappedAreas()
+    localiser, mapped, keys = None, [], []
+    for change in (None, "c", None):
+        if change is not None:
+            database.commit_map(moved(random_map(2, extent_m=50.0), change, 5_000.0))
+        localiser = Localiser.open(database, previous=localiser)
+        files = writer.of(localiser)
+        keys.append([file.key for file in files])
+        waiting = iter(files)
+        mapped.append(reader.localiser(keys[-1], lambda it=waiting: os.dup(next(it).file.fileno())))
+        for own, theirs in zip(localiser.areas, mapped[-1].areas, strict=True):
+            assert (own.first, len(own.index)) == (theirs.first, len(theirs.index))
+            assert [m.map_id for m in own.area.maps] == [m.map_id for m in theirs.area.maps]
+            for name in ("points", "see_point", "image_center"):
+                np.testing.assert_array_equal(getattr(own.area, name), getattr(theirs.area, name))
+            for name in ("descriptors", "lists", "point_row"):
+                np.testing.assert_array_equal(
+                    getattr(own.area, name).whole(), getattr(theirs.area, name).whole()
+                )
+    first, second, third = mapped
+    assert second.areas[0].area is first.areas[0].area
+    assert len(second.areas) == 2
+    assert third.areas[1].area is second.areas[1].area
+    assert third.areas[0].index is second.areas[0].index
+    assert set(keys[0][:-2]) < set(keys[1])  # all but its index and itself
+    assert set(keys[2]) - set(keys[1]) == {keys[2][-1]}  # itself
 
 
 def test_a_full_disk_is_named(monkeypatch):

@@ -35,7 +35,7 @@ _JOIN_S = 5.0  # for one that has ended or is killed
 def prepare_workers() -> None:
     """Let the process begin from which workers are forked: its imports take seconds.
 
-    It and this one may have as many open files as the system allows: each area is one.
+    It and this one may have as many open files as the system allows: each map and area is one.
     """
     from multiprocessing.forkserver import ensure_running
 
