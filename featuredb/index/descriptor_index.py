@@ -24,7 +24,7 @@ CODE_PARTS, CODE_BYTES = 32, 16  # 4 bits a part
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
 _LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
 LISTS = 2048
-_CHUNK = 50_000  # descriptors at a time: bounds the float32 copies
+_CHUNK = 4_096  # descriptors at a time: bounds the float32 copies
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,7 +51,7 @@ class DescriptorCodes:
         for start in range(0, len(descriptors), _CHUNK):
             end = start + _CHUNK
             part = np.ascontiguousarray(descriptors[start:end], dtype=np.float32)
-            lists[start:end] = _list_centers().search(part, 1)[1][:, 0]
+            lists[start:end] = _nearest_list(part)
             codes[start:end] = index.pq.compute_codes(part)
         return cls(lists=lists, codes=codes)
 
@@ -128,6 +128,12 @@ def _empty_index() -> Any:
     faiss.copy_array_to_vector(_shipped(_CODES).ravel(), index.pq.centroids)
     index.is_trained = True
     return index
+
+
+def _nearest_list(descriptors: NDArray[np.float32]) -> NDArray[np.intp]:
+    """The list (n,) of each descriptor (n, 128); NumPy's product takes a third of FAISS's search."""
+    centers = _shipped(_LISTS)
+    return np.asarray(((centers**2).sum(axis=1) - 2.0 * (descriptors @ centers.T)).argmin(axis=1))
 
 
 @cache
