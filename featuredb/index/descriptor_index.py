@@ -24,7 +24,7 @@ CODE_PARTS, CODE_BYTES = 32, 16  # 4 bits a part
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
 _LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
 LISTS = 2048
-_CHUNK = 4_096  # descriptors at a time: bounds the float32 copies
+_CHUNK = 2_048  # descriptors at a time: bounds the float32 copies
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,7 +133,9 @@ def _empty_index() -> Any:
 def _nearest_list(descriptors: NDArray[np.float32]) -> NDArray[np.intp]:
     """The list (n,) of each descriptor (n, 128); NumPy's product takes a third of FAISS's search."""
     centers = _shipped(_LISTS)
-    return np.asarray(((centers**2).sum(axis=1) - 2.0 * (descriptors @ centers.T)).argmin(axis=1))
+    squared = descriptors @ (-2.0 * centers.T)
+    squared += (centers**2).sum(axis=1)
+    return squared.argmin(axis=1)
 
 
 @cache
