@@ -135,7 +135,7 @@ def _nearest_list(descriptors: NDArray[np.float32]) -> NDArray[np.intp]:
     centers = _shipped(_LISTS)
     squared = descriptors @ (-2.0 * centers.T)
     squared += (centers**2).sum(axis=1)
-    return squared.argmin(axis=1)
+    return np.asarray(squared.argmin(axis=1))
 
 
 @cache
