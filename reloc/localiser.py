@@ -150,6 +150,7 @@ class Localiser:
         as_of: int | datetime | None = None,
         *,
         previous: "Localiser | None" = None,
+        served: Callable[[MapSummary], bool] = lambda summary: True,
         also: Collection[str] = (),
         instead: Mapping[str, FeatureMap] | None = None,
     ) -> "Localiser":
@@ -160,6 +161,7 @@ class Localiser:
         Args:
             as_of: snapshot number or time; None: the newest.
             previous: areas that have not changed since are taken over from it.
+            served: of the maps with a place, which are there at all.
             also: quarantined maps that take part as if they were active: a trial before they are.
             instead: states of maps, by id, that take part in the place of those in the database: a trial
                 before they are committed.
@@ -169,7 +171,8 @@ class Localiser:
         """
         options = options or LocaliseOptions()
         snapshot = database.snapshot(as_of)
-        taken = [m for m in snapshot.maps() if m.status == "active" or m.map_id in also]
+        placed = [m for m in snapshot.maps() if served(m)]
+        taken = [m for m in placed if m.status == "active" or m.map_id in also]
         active = [m for m in taken if m.descriptors and m.box]
         known = previous._loaded if previous else {}
         loaded: dict[tuple[str, ...], Area] = {}
@@ -193,13 +196,13 @@ class Localiser:
         provisional = {
             m.map_id: held.get(m.write_id)
             or OnDemand(m.write_id, partial(_load_alone, database.url, snapshot, m))
-            for m in snapshot.maps()
+            for m in placed
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
         files.prune()
         before = previous.areas if previous else ()
-        served = dict(zip(loaded, indexed_together(list(loaded.values()), before), strict=True))
-        made = cls(served, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
+        indexed = dict(zip(loaded, indexed_together(list(loaded.values()), before), strict=True))
+        made = cls(indexed, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
         made._states = {m.write_id: states[m.write_id] for m in active if m.write_id in states}
         return made
 

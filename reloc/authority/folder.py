@@ -72,7 +72,7 @@ def access_control(server: str, clients: Iterable[str]) -> Section:
 def _rules_of_all() -> list[Section]:
     """What all clients may: ask a server about itself, find it, hear its events."""
     about = [_KEYS.of("status"), _KEYS.of("maps")]
-    offered = [*about, _KEYS.localise("*"), _KEYS.track("*", "*")]
+    offered = [*about, _KEYS.localise("*"), _KEYS.localise("*", "*"), _KEYS.track("*", "*")]
     tokens, events = [_KEYS.server_token("*"), _KEYS.tile_token("*", "*")], [_KEYS.of("events")]
     return [
         _rule("ask", [_IN], ["query"], about),
@@ -87,7 +87,7 @@ def _rules_of_all() -> list[Section]:
 
 def _own(client: str) -> list[Section]:
     """Photos to localise, and live sessions, under the client's own name."""
-    asked = [_KEYS.localise(client), _KEYS.track(client, "*")]
+    asked = [_KEYS.localise(client), _KEYS.localise(client, "*"), _KEYS.track(client, "*")]
     poses = [_KEYS.track(client, "*", leaf) for leaf in ("poses", "events")]
     frames, token = [_KEYS.track(client, "*", "frames")], [_KEYS.track(client, "*", "client")]
     return [

@@ -46,6 +46,12 @@ def register(subparsers: Any) -> None:
         help="start even where machines that nobody has authenticated can reach the server",
     )
     serve.add_argument("--name", default="", help="database name on the wire; default: the folder's name")
+    serve.add_argument(
+        "--bbox",
+        type=_bbox,
+        metavar="W,S,E,N",
+        help="answer only from maps that touch this box (degrees); other servers have the rest",
+    )
     serve.add_argument("--workers", type=int, help="queries localised at a time; default 2")
     serve.add_argument("--max-queue", type=int, help="queries that may wait; default 32")
     serve.add_argument(
@@ -80,6 +86,17 @@ def register(subparsers: Any) -> None:
     )
 
 
+def _bbox(text: str) -> tuple[float, float, float, float]:
+    expected = f"expected west,south,east,north in degrees, found {text!r}"
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(expected) from None
+    if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
+        raise argparse.ArgumentTypeError(expected)
+    return west, south, east, north
+
+
 def _serve(args: argparse.Namespace) -> int:
     from reloc.service.logs import fields, log_to
 
@@ -105,6 +122,7 @@ def _serve(args: argparse.Namespace) -> int:
         config_path=args.config,
         insecure=args.insecure,
         name=args.name,
+        bbox=args.bbox,
         metrics_port=args.metrics_port,
         contributions=args.contributions == "on",
         live=LiveOptions(**given("max_sessions", "idle_timeout_s")),

@@ -1,11 +1,11 @@
 """Ask a relocalisation server over Zenoh. Needs nothing but eclipse-zenoh and the image's bytes."""
 
 import json
-import queue
 import random
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -13,8 +13,10 @@ import zenoh
 from pydantic import BaseModel, ValidationError
 
 from featuredb.errors import InvalidValueError, ServiceError
+from reloc.client.events import EventStream
+from reloc.client.fleet import ANY, Fleet, best_supported
 from reloc.client.live import LiveTrack
-from reloc.client.replies import NO_SERVER, TIMEOUT, first_reply
+from reloc.client.replies import NO_SERVER, TIMEOUT, first_reply, read_message
 from reloc.wire.endpoints import DEFAULT_ENDPOINT
 from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, Keys
 from reloc.wire.query import (
@@ -27,7 +29,7 @@ from reloc.wire.query import (
     encode,
     explain,
 )
-from reloc.wire.server import Event, MapsReply, StatusReply
+from reloc.wire.server import MapsReply, StatusReply
 
 _Message = TypeVar("_Message", bound=BaseModel)
 
@@ -37,6 +39,9 @@ _DEADLINE_MARGIN_S = 0.2
 _FIRST_WAIT_S = 0.25  # before a busy server is asked again, as long as a query takes; then twice that
 _LEAST_LEFT_S = 0.1  # with less, a busy server is not asked again
 _ASK_AGAIN_S = 0.05  # while no server is there yet
+# What every server would say of the request.
+_OF_THE_REQUEST = (ErrorCode.BAD_IMAGE, ErrorCode.TOO_LARGE, ErrorCode.UNSUPPORTED)
+_STATUS_S = 1.0  # for all servers to say who they are
 
 
 class Client:
@@ -72,6 +77,7 @@ class Client:
         self._config_path = config_path
         self._connect_timeout_s = connect_timeout_s
         self._open_session: zenoh.Session | None = None
+        self._fleet = Fleet(self.statuses)
         self.name = ANONYMOUS
 
     def __enter__(self) -> Self:
@@ -168,25 +174,80 @@ class Client:
         Raises:
             ServiceError: see the class.
         """
-        key = self._keys.localise(self.name)
-        end, wait_s = time.perf_counter() + timeout_s, _FIRST_WAIT_S
+        end = time.perf_counter() + timeout_s
+        first, *others = self._fleet.parts(request.prior)
+        if not others:
+            return self._ask_part(first, data, request, end)
+        # It is given once.
+        again = request.model_copy(update={"contribute": False, "credit": None, "licence": None})
+        with ThreadPoolExecutor(len(others)) as pool:
+            asked = [pool.submit(self._ask_part, part, data, again, end) for part in others]
+            outcomes = [_outcome(lambda: self._ask_part(first, data, request, end))]
+            outcomes += [_outcome(one.result) for one in asked]
+        replies = [outcome for outcome in outcomes if isinstance(outcome, LocaliseReply)]
+        errors = [outcome for outcome in outcomes if isinstance(outcome, ServiceError)]
+        for error in errors:
+            if error.code in _OF_THE_REQUEST:
+                raise error
+        # Who is asked for maps that another server has says that it has no such maps.
+        missing = [error for error in errors if error.code != ErrorCode.BAD_REQUEST]
+        if not replies or (missing and all(reply.status == "not_localised" for reply in replies)):
+            raise (missing or errors)[0]
+        best = best_supported(replies)
+        given = outcomes[0].contribution if isinstance(outcomes[0], LocaliseReply) else None
+        unheard = f"; {len(missing)} of {len(outcomes)} servers did not answer" if missing else ""
+        return best.model_copy(update={"contribution": given, "detail": best.detail + unheard})
+
+    def _ask_part(self, part: str, data: bytes, request: LocaliseWireRequest, end: float) -> LocaliseReply:
+        """The answer of one of the servers of a part; where one is lost or busy, of another."""
+        wait_s, said = _FIRST_WAIT_S, None
+        lost: set[str] = set()
         while True:
-            left_s = max(end - time.perf_counter(), 1e-3)
-            options = request.options.model_copy(update={"deadline_ms": _deadline_ms(left_s)})
-            asked = encode(request.model_copy(update={"options": options}))
-            try:
-                return self._ask(key, LocaliseReply, left_s, payload=data, attachment=asked)
-            except ServiceError as error:
-                # So that those who were refused do not return at once.
-                pause_s = wait_s * random.uniform(0.5, 1.5)
-                if error.code != ErrorCode.BUSY or time.perf_counter() + pause_s + _LEAST_LEFT_S >= end:
-                    raise
+            refusal: ServiceError | None = None
+            servers = [s for s in self._fleet.servers(part) if s not in lost]
+            for server_id in servers or [ANY]:
+                left_s = max(end - time.perf_counter(), 1e-3)
+                options = request.options.model_copy(update={"deadline_ms": _deadline_ms(left_s)})
+                asked = encode(request.model_copy(update={"options": options}))
+                key = self._keys.localise(self.name, server_id)
+                try:
+                    return self._ask(key, LocaliseReply, left_s, payload=data, attachment=asked)
+                except ServiceError as error:
+                    if error.code in (NO_SERVER, ErrorCode.SHUTTING_DOWN) and server_id != ANY:
+                        self._fleet.lose(server_id)
+                        lost.add(server_id)
+                        said = error
+                    elif error.code != ErrorCode.BUSY:
+                        raise said if said is not None and error.code == NO_SERVER else error from None
+                    refusal = error
+            assert refusal is not None
+            # So that those who were refused do not return at once; who lost all servers looks for others.
+            pause_s = wait_s * random.uniform(0.5, 1.5) if refusal.code == ErrorCode.BUSY else 0.0
+            if time.perf_counter() + pause_s + _LEAST_LEFT_S >= end:
+                raise refusal
             time.sleep(pause_s)
             wait_s *= 2
 
     def status(self, timeout_s: float = _TIMEOUT_S) -> StatusReply:
         """Counts, latencies, snapshot and limits of the server."""
         return self._ask(self._keys.of("status"), StatusReply, timeout_s)
+
+    def statuses(self, timeout_s: float = _STATUS_S) -> list[StatusReply]:
+        """`status` of each server of the database that answers within the time."""
+        replies = self._session().get(
+            self._keys.of("status"),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            source_info=zenoh.SourceInfo(self._session().id, 0),
+        )
+        found = {}
+        for reply in replies:
+            with suppress(ServiceError):  # what is no status is nobody's
+                if reply.ok is not None:
+                    status = read_message(reply.ok.payload.to_bytes(), StatusReply)
+                    found[status.server_id] = status
+        return list(found.values())
 
     def maps(self, timeout_s: float = _TIMEOUT_S) -> MapsReply:
         """The maps that the server answers from."""
@@ -214,7 +275,7 @@ class Client:
         return LiveTrack(self._session(), self._keys, self.name, camera, prior, timeout_s)
 
     @contextmanager
-    def watch_events(self) -> Iterator["EventStream"]:
+    def watch_events(self) -> Iterator[EventStream]:
         """Within the block, what the server publishes: maps that come and go, reloads, its end."""
         stream = EventStream()
         with self._session().declare_subscriber(self._keys.of("events"), stream.receive):
@@ -291,6 +352,13 @@ def client_config(endpoint: str, timeout_s: float) -> zenoh.Config:
     return config
 
 
+def _outcome(ask: Callable[[], LocaliseReply]) -> LocaliseReply | ServiceError:
+    try:
+        return ask()
+    except ServiceError as error:
+        return error
+
+
 def _deadline_ms(left_s: float) -> float:
     """What the server is told of the time that is left."""
     return 1e3 * max(left_s - _DEADLINE_MARGIN_S, 0.5 * left_s)
@@ -300,27 +368,6 @@ def _name_in(config: zenoh.Config) -> str:
     """What a configuration calls its client."""
     metadata = json.loads(config.get_json("metadata"))
     return str(metadata.get(CLIENT_SETTING, ANONYMOUS)) if isinstance(metadata, dict) else ANONYMOUS
-
-
-class EventStream:
-    """Events in the order in which they arrived."""
-
-    def __init__(self) -> None:
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-
-    def receive(self, sample: zenoh.Sample) -> None:
-        """Take one publication; what is no event is left out."""
-        try:
-            self._events.put(Event.model_validate_json(sample.payload.to_bytes()))
-        except ValidationError:
-            return
-
-    def next(self, timeout_s: float | None = None) -> Event | None:
-        """The next event; None when none came within the time."""
-        try:
-            return self._events.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
 
 
 def _wait_for_database(session: zenoh.Session, database: str | None, where: str, timeout_s: float) -> str:

@@ -24,6 +24,7 @@ class ServeOptions:
         config_path: a Zenoh configuration (JSON5), in which `listen` and `connect` replace what it has.
         insecure: start also where whoever reaches the server could answer in its place.
         name: the database's name on the wire; "" takes the name of the database's folder.
+        bbox: west, south, east and north in degrees: only maps that touch it are served; None: all.
         metrics_port: of this machine, where Prometheus finds the server's figures; 0 takes a free one, None:
             there is no such page.
         workers: queries localised at a time, each in a process of its own; two fill the reference machine's
@@ -53,6 +54,7 @@ class ServeOptions:
     config_path: Path | None = None
     insecure: bool = False
     name: str = ""
+    bbox: tuple[float, float, float, float] | None = None
     metrics_port: int | None = None
     workers: int = 2
     threads_per_worker: int = field(default_factory=lambda: os.cpu_count() or 1)

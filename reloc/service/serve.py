@@ -71,7 +71,7 @@ def start_server(database: Database, options: ServeOptions | None = None) -> Ser
     inbox = None
     if options.contributions:
         inbox = Inbox(partial(contribute, database), partial(count_candidates, database), options.inbox)
-    return Server.start(DatabaseSource(database), options, name, inbox)
+    return Server.start(DatabaseSource(database, options.bbox), options, name, inbox)
 
 
 def serve(

@@ -30,7 +30,7 @@ from reloc.service.source import AreaWatcher, DatabaseSource, ServedArea
 from reloc.service.tally import Tally
 from reloc.service.workers.pool import WorkerPool
 from reloc.service.workers.process import prepare_workers
-from reloc.wire.keys import Keys, client_of
+from reloc.wire.keys import Keys, client_of, is_addressed
 from reloc.wire.query import MESSAGE_HEADROOM, WIRE_VERSION, ErrorCode, RequestError, encode
 from reloc.wire.server import (
     Event,
@@ -166,6 +166,7 @@ class Server:
         # `complete`: of several servers of one database the nearest answers, not all of them.
         for key, callback in (
             (self._keys.localise("*"), self._on_localise),
+            (self._keys.localise("*", self.server_id), self._on_localise),
             (self._keys.of("status"), self._on_status),
             (self._keys.of("maps"), self._on_maps),
         ):
@@ -234,6 +235,9 @@ class Server:
             ),
             contributions=None if self._inbox is None else self._inbox.status(),
             live=self._live.status(),
+            part="" if options.bbox is None else ",".join(f"{side:g}" for side in options.bbox),
+            bounds=area.bounds,
+            addressable=True,
         )
 
     def _queries(self) -> QueryCounts:
@@ -252,7 +256,7 @@ class Server:
         client = client_of(str(query.key_expr))
         item = PendingQuery(
             query,
-            self._keys.localise(client),
+            self._keys.localise(client, self.server_id if is_addressed(str(query.key_expr)) else ""),
             self._options.deadline_s,
             self._tally,
             identity=client if self._authenticates else None,

@@ -35,6 +35,19 @@ class ServedArea:
         return self.localiser.snapshot
 
     @property
+    def bounds(self) -> BoundingBox | None:
+        """Around all maps; None without any."""
+        boxes = [info.bounds for info in self.maps if info.bounds is not None]
+        if not boxes:
+            return None
+        return BoundingBox(
+            west=min(box.west for box in boxes),
+            south=min(box.south for box in boxes),
+            east=max(box.east for box in boxes),
+            north=max(box.north for box in boxes),
+        )
+
+    @property
     def tiles(self) -> tuple[str, ...]:
         """Tiles that the maps touch, sorted."""
         return tuple(sorted({tile for info in self.maps for tile in info.tiles}))
@@ -43,8 +56,9 @@ class ServedArea:
 class DatabaseSource:
     """Loads areas of a database; the server polls `version` and loads when it has changed."""
 
-    def __init__(self, database: Database) -> None:
-        self._database = database
+    def __init__(self, database: Database, bbox: tuple[float, float, float, float] | None = None) -> None:
+        """`bbox`: west, south, east and north in degrees; only maps that touch it are loaded."""
+        self._database, self._bbox = database, bbox
         self._previous: Localiser | None = None
 
     def version(self) -> int:
@@ -57,11 +71,19 @@ class DatabaseSource:
         Raises:
             FeatureDbError: the store cannot be read, or maps do not fit together.
         """
-        localiser = Localiser.open(self._database, previous=self._previous)
+        localiser = Localiser.open(self._database, previous=self._previous, served=self._serves)
         self._previous = localiser
         snapshot = self._database.snapshot(localiser.snapshot)
-        active = [summary for summary in snapshot.maps() if summary.status == "active"]
+        active = [m for m in snapshot.maps() if m.status == "active" and self._serves(m)]
         return ServedArea(localiser=localiser, maps=tuple(map_info(summary) for summary in active))
+
+    def _serves(self, summary: MapSummary) -> bool:
+        if self._bbox is None:
+            return True
+        bounds, (west, south, east, north) = _bounds(summary), self._bbox
+        if bounds is None:
+            return False
+        return bounds.west <= east and bounds.east >= west and bounds.south <= north and bounds.north >= south
 
 
 def map_info(summary: MapSummary) -> MapInfo:

@@ -25,9 +25,9 @@ class Keys:
         """Key of what the server says of itself: status, maps, events."""
         return f"{KEY_ROOT}/{self.database}/{leaf}"
 
-    def localise(self, client: str) -> str:
-        """Key under which a client asks where a photo was taken."""
-        return self.of(f"localise/{client}")
+    def localise(self, client: str, server_id: str = "") -> str:
+        """Key under which a client asks where a photo was taken: any server, or this one."""
+        return self.of(f"localise/{client}" + (f"/{server_id}" if server_id else ""))
 
     def track(self, client: str, session: str, leaf: str = "") -> str:
         """Key of a client's live session, or of a leaf of it: frames, poses, events, client."""
@@ -44,8 +44,13 @@ class Keys:
 
 def client_of(key: str) -> str:
     """The client that a query to `Keys.localise` names; ANONYMOUS where that is a wildcard."""
-    last = key.rpartition("/")[2]
-    return last if is_name(last) else ANONYMOUS
+    name = (*key.split("/"), "", "", "", "")[3]
+    return name if is_name(name) else ANONYMOUS
+
+
+def is_addressed(key: str) -> bool:
+    """Whether a query to `Keys.localise` names a server."""
+    return key.count("/") == 4
 
 
 def is_name(text: str) -> bool:

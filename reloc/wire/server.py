@@ -57,8 +57,22 @@ class ContributionStatus(Answer):
     error: str | None
 
 
+class BoundingBox(Answer):
+    """WGS84 degrees."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+
+
 class StatusReply(Answer):
-    """Answer of `.../status`."""
+    """Answer of `.../status`.
+
+    `part`: which part of the database it answers from, as `serve --bbox` has it; "" all of it. Servers of one
+    part can stand in for each other. `bounds`: around the maps that it answers from, null without any.
+    `addressable`: it can be asked by `localise/<client>/<server id>`.
+    """
 
     database: str
     server_id: str
@@ -74,15 +88,9 @@ class StatusReply(Answer):
     limits: Limits
     contributions: ContributionStatus | None = None
     live: LiveStatus | None = None
-
-
-class BoundingBox(Answer):
-    """WGS84 degrees."""
-
-    west: float
-    south: float
-    east: float
-    north: float
+    part: str = ""
+    bounds: BoundingBox | None = None
+    addressable: bool = False
 
 
 class MapInfo(Answer):
