@@ -29,6 +29,8 @@ class Stacked(Generic[_Scalar]):
     def __getitem__(self, rows: NDArray[np.integer]) -> NDArray[_Scalar]:
         """Rows, in any shape: (..., *shape of a row)."""
         flat = np.ravel(rows)
+        if len(flat) and not 0 <= flat.min() <= flat.max() < len(self):
+            raise IndexError(f"expected rows from 0 to {len(self) - 1}, found {flat.min()} to {flat.max()}")
         part = np.searchsorted(self._starts, flat, side="right") - 1
         first = int(part[0]) if len(part) else 0
         if not (part != first).any():

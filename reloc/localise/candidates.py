@@ -243,20 +243,22 @@ def _nearest_of(
     order = np.argsort(first)
     place = order[np.maximum(np.searchsorted(first[order], proposed, side="right") - 1, 0)]
     row, squared = np.full(proposed.shape, -1, np.int64), np.full(proposed.shape, np.inf)
-    asker, rank = np.nonzero(proposed >= 0)
+    # A shared index has areas, too, of which nothing is in reach: their rows are none of the one before.
+    length = np.array([len(reach[i].area.points if shared else reach[i].points) for i in group])
+    own = proposed - first[place]
+    asker, rank = np.nonzero((proposed >= 0) & (own >= 0) & (own < length[place]))
     by_area = np.argsort(place[asker, rank], kind="stable")
     asker, rank = asker[by_area], rank[by_area]
     ends = np.searchsorted(place[asker, rank], np.arange(len(group) + 1))
     for j in np.flatnonzero(np.diff(ends)):
         r = reach[group[j]]
-        own = slice(ends[j], ends[j + 1])
-        points = proposed[asker[own], rank[own]] - first[j]
-        if not shared:
-            points = r.points[points].astype(np.int64)
-        distance = squared_distances(asked, asker[own], r.area.descriptors, points).astype(np.float64)
+        mine = slice(ends[j], ends[j + 1])
+        at = asker[mine], rank[mine]
+        points = own[at] if shared else r.points[own[at]].astype(np.int64)
+        distance = squared_distances(asked, asker[mine], r.area.descriptors, points).astype(np.float64)
         if shared:
             distance[~r.has(points)] = np.inf
-        row[asker[own], rank[own]], squared[asker[own], rank[own]] = points, distance
+        row[at], squared[at] = points, distance
     best = np.argsort(squared, axis=1, kind="stable")[:, :k]
     return (
         group[np.take_along_axis(place, best, axis=1)],

@@ -4,6 +4,7 @@ import pickle
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from featuredb.index.stacked import Stacked
@@ -32,6 +33,9 @@ def test_rows_are_those_of_one_array() -> None:
         taken = stacked[rows]
         assert taken.dtype == np.float32
         np.testing.assert_array_equal(taken, whole[rows])
+    for beyond in (np.array([0, 13]), np.array([-1, 3])):
+        with pytest.raises(IndexError, match="expected rows from 0 to 12"):
+            stacked[beyond]
     again = pickle.loads(pickle.dumps(stacked))
     np.testing.assert_array_equal(again.whole(), whole)
 

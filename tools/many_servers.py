@@ -1,0 +1,155 @@
+"""What several servers of one database behind a router carry, and what becomes of queries when one is killed.
+
+    python -m tools.many_servers [--json FILE]
+
+Each server is a process whose only worker takes 100 ms for a photo and does nothing else. Clients ask without
+pause: one server, two, four; then two of which one is killed (SIGKILL) in the middle.
+"""
+
+import io
+import multiprocessing
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from multiprocessing.synchronize import Event
+from typing import Any
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+from PIL import Image
+
+from featuredb.errors import ServiceError
+from reloc.client import Client
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import LocaliseRequest, LocaliseResult
+from reloc.service.options import ServeOptions
+from reloc.service.server import Server
+from reloc.service.session import bind_free_port
+from reloc.service.source import ServedArea
+from tools.figures import study_parser, write_figures
+
+_TAKES_S = 0.1
+_ASKING = 12  # threads of clients
+_SECONDS = 8.0
+_DATABASE = "town"
+
+
+class _Slow:
+    """A localiser that takes its time and finds nothing."""
+
+    options, snapshot, areas = LocaliseOptions(), 1, ()
+
+    def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
+        time.sleep(_TAKES_S)
+        return LocaliseResult(
+            reason="NO_COVERAGE",
+            detail="",
+            pose=None,
+            confidence=0.0,
+            features=0,
+            matches=0,
+            inliers=0,
+            runner_up=None,
+            snapshot=self.snapshot,
+            timings_ms={},
+        )
+
+
+class _Source:
+    def version(self) -> int:
+        return _Slow.snapshot
+
+    def load(self) -> ServedArea:
+        return ServedArea(localiser=_Slow(), maps=())  # type: ignore[arg-type]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = study_parser(__doc__).parse_args(argv)
+    rates = {}
+    for count in (1, 2, 4):
+        with servers(count) as (router, _):
+            asked = ask(router, _SECONDS)
+            rates[count] = asked["answered"] / _SECONDS
+    with servers(2) as (router, processes):
+        killed = ask(router, _SECONDS, lambda: processes[0].kill())
+    figures: dict[str, Any] = {
+        "one_per_s": rates[1],
+        "two_times": rates[2] / rates[1],
+        "four_times": rates[4] / rates[1],
+        "killed_answered": killed["answered"],
+        "killed_lost": killed["lost"],
+    }
+    write_figures(args.json, figures)
+    return 0
+
+
+@contextmanager
+def servers(count: int) -> Iterator[tuple[str, list[Any]]]:
+    """A router's endpoint, and so many server processes that are connected to it."""
+    context = multiprocessing.get_context("spawn")
+    endpoint = bind_free_port("tcp/127.0.0.1:0")
+    config = zenoh.Config.from_json5(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}}}')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    stop = context.Event()
+    with ExitStack() as stack:
+        stack.enter_context(zenoh.open(config))
+        processes = [context.Process(target=_serve, args=(endpoint, stop)) for _ in range(count)]
+        for process in processes:
+            process.start()
+        try:
+            _wait_for(endpoint, count)
+            yield endpoint, processes
+        finally:
+            stop.set()
+            for process in processes:
+                process.join()
+
+
+def _serve(router: str, stop: Event) -> None:
+    options = ServeOptions(listen=("tcp/127.0.0.1:0",), connect=(router,), workers=1, contributions=False)
+    with Server.start(_Source(), options, _DATABASE):  # type: ignore[arg-type]
+        stop.wait()
+
+
+def _wait_for(router: str, count: int) -> None:
+    with Client(router, _DATABASE, connect_timeout_s=60.0) as client:
+        while len(client.statuses()) < count:
+            time.sleep(0.1)
+
+
+def ask(router: str, seconds: float, in_the_middle: Callable[[], None] | None = None) -> dict[str, int]:
+    """Queries that were answered, and that were not, of clients that ask without pause for so long."""
+    picture = io.BytesIO()
+    Image.fromarray(np.zeros((64, 64), np.uint8)).save(picture, "png")
+    asked = {"answered": 0, "lost": 0}
+    lock = threading.Lock()
+    with Client(router, _DATABASE) as client, ThreadPoolExecutor(_ASKING) as pool:
+        end = time.monotonic() + seconds
+
+        def ask_on() -> None:
+            while time.monotonic() < end:
+                try:
+                    client.localise(picture.getvalue())
+                    outcome = "answered"
+                except ServiceError:
+                    outcome = "lost"
+                with lock:
+                    asked[outcome] += 1
+
+        asking = [pool.submit(ask_on) for _ in range(_ASKING)]
+        if in_the_middle is not None:
+            time.sleep(0.5 * seconds)
+            in_the_middle()
+        for one in asking:
+            one.result()
+    return asked
+
+
+if __name__ == "__main__":
+    from tools import many_servers  # workers look for its classes there, and not in a program
+
+    sys.exit(many_servers.main())
