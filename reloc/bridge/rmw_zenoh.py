@@ -17,7 +17,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from reloc.bridge.robot_pose import RobotPose
 from reloc.bridge.ros2 import TOPICS, messages
-from reloc.client.client import client_config
+from reloc.client.connection import client_config
 
 _NODE, _NODE_ID = "featuredb", 0
 # Of each topic's type, by its description (REP 2016), from Iron on; what has another hash is another type.

@@ -50,7 +50,7 @@ def register(subparsers: Any) -> None:
         "--bbox",
         type=_bbox,
         metavar="W,S,E,N",
-        help="answer only from maps that touch this box (degrees); other servers have the rest",
+        help="answer only from maps that touch this box in degrees, --bbox=W,S,E,N; others have the rest",
     )
     serve.add_argument("--workers", type=int, help="queries localised at a time; default 2")
     serve.add_argument("--max-queue", type=int, help="queries that may wait; default 32")

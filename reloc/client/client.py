@@ -1,6 +1,5 @@
 """Ask a relocalisation server over Zenoh. Needs nothing but eclipse-zenoh and the image's bytes."""
 
-import json
 import random
 import time
 from collections.abc import Callable, Iterator
@@ -13,12 +12,13 @@ import zenoh
 from pydantic import BaseModel, ValidationError
 
 from featuredb.errors import InvalidValueError, ServiceError
+from reloc.client.connection import client_config, name_in, wait_for_database
 from reloc.client.events import EventStream
-from reloc.client.fleet import ANY, Fleet, best_supported
+from reloc.client.fleet import ANY, WHOLE, Fleet, best_supported
 from reloc.client.live import LiveTrack
 from reloc.client.replies import NO_SERVER, TIMEOUT, first_reply, read_message
 from reloc.wire.endpoints import DEFAULT_ENDPOINT
-from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, Keys
+from reloc.wire.keys import ANONYMOUS, Keys
 from reloc.wire.query import (
     CameraRequest,
     ErrorCode,
@@ -37,10 +37,8 @@ _TIMEOUT_S = 10.0  # Zenoh's own default
 # The server's deadline is this much earlier than the client's timeout, so that its word arrives in time.
 _DEADLINE_MARGIN_S = 0.2
 _FIRST_WAIT_S = 0.25  # before a busy server is asked again, as long as a query takes; then twice that
+_LEAST_S = 0.002  # of which the server is told half; messages take no less than a millisecond
 _LEAST_LEFT_S = 0.1  # with less, a busy server is not asked again
-_ASK_AGAIN_S = 0.05  # while no server is there yet
-# What every server would say of the request.
-_OF_THE_REQUEST = (ErrorCode.BAD_IMAGE, ErrorCode.TOO_LARGE, ErrorCode.UNSUPPORTED)
 _STATUS_S = 1.0  # for all servers to say who they are
 
 
@@ -95,7 +93,7 @@ class Client:
         """
         session = self._connected_session()
         try:
-            self._database = _wait_for_database(session, self._database, self._where, self._connect_timeout_s)
+            self._database = wait_for_database(session, self._database, self._where, self._connect_timeout_s)
         except ServiceError:
             session.close()
             raise
@@ -175,7 +173,8 @@ class Client:
             ServiceError: see the class.
         """
         end = time.perf_counter() + timeout_s
-        first, *others = self._fleet.parts(request.prior)
+        prior = None if request.options.maps else request.prior  # maps are named wherever they lie
+        first, *others = self._fleet.parts(prior, _status_s(timeout_s))
         if not others:
             return self._ask_part(first, data, request, end)
         # It is given once.
@@ -187,16 +186,11 @@ class Client:
         replies = [outcome for outcome in outcomes if isinstance(outcome, LocaliseReply)]
         errors = [outcome for outcome in outcomes if isinstance(outcome, ServiceError)]
         for error in errors:
-            if error.code in _OF_THE_REQUEST:
+            # Maps that are another server's are none of this one. What a silent part shows, nobody knows.
+            if not (replies and error.code == ErrorCode.BAD_REQUEST and "options.maps" in error.message):
                 raise error
-        # Who is asked for maps that another server has says that it has no such maps.
-        missing = [error for error in errors if error.code != ErrorCode.BAD_REQUEST]
-        if not replies or (missing and all(reply.status == "not_localised" for reply in replies)):
-            raise (missing or errors)[0]
-        best = best_supported(replies)
         given = outcomes[0].contribution if isinstance(outcomes[0], LocaliseReply) else None
-        unheard = f"; {len(missing)} of {len(outcomes)} servers did not answer" if missing else ""
-        return best.model_copy(update={"contribution": given, "detail": best.detail + unheard})
+        return best_supported(replies).model_copy(update={"contribution": given})
 
     def _ask_part(self, part: str, data: bytes, request: LocaliseWireRequest, end: float) -> LocaliseReply:
         """The answer of one of the servers of a part; where one is lost or busy, of another."""
@@ -204,15 +198,24 @@ class Client:
         lost: set[str] = set()
         while True:
             refusal: ServiceError | None = None
-            servers = [s for s in self._fleet.servers(part) if s not in lost]
+            left_s = end - time.perf_counter()
+            servers = [s for s in self._fleet.servers(part, _status_s(left_s)) if s not in lost]
+            if not servers and part != WHOLE:
+                gone = f"no server of the part {part} of database {self._database!r} answers at {self._where}"
+                raise said or ServiceError(NO_SERVER, gone)
             for server_id in servers or [ANY]:
-                left_s = max(end - time.perf_counter(), 1e-3)
+                left_s = end - time.perf_counter()
+                if left_s < _LEAST_S:
+                    raise refusal or ServiceError(TIMEOUT, "no server answered in time")
                 options = request.options.model_copy(update={"deadline_ms": _deadline_ms(left_s)})
                 asked = encode(request.model_copy(update={"options": options}))
                 key = self._keys.localise(self.name, server_id)
                 try:
                     return self._ask(key, LocaliseReply, left_s, payload=data, attachment=asked)
                 except ServiceError as error:
+                    if error.code == TIMEOUT:
+                        self._fleet.lose(server_id)
+                        raise
                     if error.code in (NO_SERVER, ErrorCode.SHUTTING_DOWN) and server_id != ANY:
                         self._fleet.lose(server_id)
                         lost.add(server_id)
@@ -234,24 +237,35 @@ class Client:
 
     def statuses(self, timeout_s: float = _STATUS_S) -> list[StatusReply]:
         """`status` of each server of the database that answers within the time."""
+        found = self._ask_all(self._keys.of("status"), StatusReply, timeout_s)
+        return list({status.server_id: status for status in found}.values())
+
+    def maps(self, timeout_s: float = _TIMEOUT_S) -> MapsReply:
+        """The maps that the server answers from; those of all parts where servers have parts."""
+        if self._fleet.parts(None, _status_s(timeout_s)) == [WHOLE]:
+            return self._ask(self._keys.of("maps"), MapsReply, timeout_s)
+        found = self._ask_all(self._keys.of("maps"), MapsReply, timeout_s)
+        if not found:
+            raise ServiceError(NO_SERVER, f"no server of database {self._database!r} answers any more")
+        maps = {info.map_id: info for reply in found for info in reply.maps}
+        newest = max(found, key=lambda reply: reply.snapshot)
+        return newest.model_copy(update={"maps": tuple(maps.values())})
+
+    def _ask_all(self, key: str, model: type[_Message], timeout_s: float) -> list[_Message]:
+        """What all servers that answer within the time say."""
         replies = self._session().get(
-            self._keys.of("status"),
+            key,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
             source_info=zenoh.SourceInfo(self._session().id, 0),
         )
-        found = {}
+        found = []
         for reply in replies:
-            with suppress(ServiceError):  # what is no status is nobody's
+            with suppress(ServiceError):  # what is no such message is nobody's
                 if reply.ok is not None:
-                    status = read_message(reply.ok.payload.to_bytes(), StatusReply)
-                    found[status.server_id] = status
-        return list(found.values())
-
-    def maps(self, timeout_s: float = _TIMEOUT_S) -> MapsReply:
-        """The maps that the server answers from."""
-        return self._ask(self._keys.of("maps"), MapsReply, timeout_s)
+                    found.append(read_message(reply.ok.payload.to_bytes(), model))
+        return found
 
     def track(
         self,
@@ -300,7 +314,7 @@ class Client:
         try:
             if self._config_path is not None:
                 config = zenoh.Config.from_file(str(self._config_path))
-                self.name = _name_in(config)
+                self.name = name_in(config)
             else:
                 config = client_config(self._connect, self._connect_timeout_s)
             return zenoh.open(config)
@@ -341,15 +355,9 @@ class Client:
         )
 
 
-def client_config(endpoint: str, timeout_s: float) -> zenoh.Config:
-    """The Zenoh configuration of a client of this endpoint alone; raises ZError where it is none."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    config.insert_json5("connect/timeout_ms", json.dumps(int(timeout_s * 1e3)))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("transport/shared_memory/enabled", "false")
-    return config
+def _status_s(left_s: float) -> float:
+    """How long servers may take to say who they are, of the time that is left for an answer."""
+    return min(_STATUS_S, max(0.3 * left_s, _LEAST_S))
 
 
 def _outcome(ask: Callable[[], LocaliseReply]) -> LocaliseReply | ServiceError:
@@ -362,35 +370,3 @@ def _outcome(ask: Callable[[], LocaliseReply]) -> LocaliseReply | ServiceError:
 def _deadline_ms(left_s: float) -> float:
     """What the server is told of the time that is left."""
     return 1e3 * max(left_s - _DEADLINE_MARGIN_S, 0.5 * left_s)
-
-
-def _name_in(config: zenoh.Config) -> str:
-    """What a configuration calls its client."""
-    metadata = json.loads(config.get_json("metadata"))
-    return str(metadata.get(CLIENT_SETTING, ANONYMOUS)) if isinstance(metadata, dict) else ANONYMOUS
-
-
-def _wait_for_database(session: zenoh.Session, database: str | None, where: str, timeout_s: float) -> str:
-    """The database's name, once the liveliness token of one of its servers is there.
-
-    Asks again and again instead of subscribing: a Zenoh 1.10 session that had a liveliness subscriber and
-    gave it up gets incomplete answers to later liveliness queries now and then.
-    """
-    pattern = Keys(database=database or "*").server_token("*")
-    end = time.perf_counter() + timeout_s
-    while True:
-        left_s = max(0.1, end - time.perf_counter())
-        replies = session.liveliness().get(pattern, timeout=left_s)
-        found = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None}
-        if found or time.perf_counter() >= end:
-            break
-        time.sleep(_ASK_AGAIN_S)
-    if not found:
-        named = "" if database is None else f" of database {database!r}"
-        raise ServiceError(
-            NO_SERVER,
-            f"no server{named} answers at {where} within {timeout_s:g} s, or none that lets this client in",
-        )
-    if len(found) > 1:
-        raise ServiceError(NO_SERVER, f"{where} serves {', '.join(sorted(found))}; name the database to ask")
-    return found.pop()

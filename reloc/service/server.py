@@ -163,15 +163,18 @@ class Server:
             undo.pop_all()
 
     def _listen(self) -> None:
-        # `complete`: of several servers of one database the nearest answers, not all of them.
+        # `complete`: of several servers of one database the nearest answers, not all of them. One that has a
+        # part of it answers who asks it by its id, and has no live sessions: others may have the place.
+        whole = self._options.bbox is None
         for key, callback in (
-            (self._keys.localise("*"), self._on_localise),
+            *([(self._keys.localise("*"), self._on_localise)] if whole else []),
             (self._keys.localise("*", self.server_id), self._on_localise),
             (self._keys.of("status"), self._on_status),
             (self._keys.of("maps"), self._on_maps),
         ):
             self._queryables.append(self._session.declare_queryable(key, callback, complete=True))
-        self._live.start()
+        if whole:
+            self._live.start()
         self._advertise(self._area)  # after the queryables: who sees the token can ask at once
         self._watcher.start()
         self._log("serving", snapshot=self._area.snapshot, maps=len(self._area.maps), listen=self.endpoints)
@@ -235,7 +238,7 @@ class Server:
             ),
             contributions=None if self._inbox is None else self._inbox.status(),
             live=self._live.status(),
-            part="" if options.bbox is None else ",".join(f"{side:g}" for side in options.bbox),
+            part="" if options.bbox is None else ",".join(map(repr, options.bbox)),
             bounds=area.bounds,
             addressable=True,
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from scipy.spatial.transform import Rotation
 
 from featuredb.errors import ServiceError
 from featuredb.geometry.camera import Camera
@@ -17,6 +18,7 @@ from reloc.client import Client, PriorRequest
 from reloc.client import fleet as fleet_module
 from reloc.localise.acceptance import AcceptanceOptions
 from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import LocaliseResult
 from reloc.service.contributions.inbox import Inbox, InboxOptions
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
@@ -66,17 +68,29 @@ def member(
         yield server
 
 
-def with_inliers(count: int, east_m: float = 0.0) -> Callable[..., object]:
-    """Answers with so many inliers, so far from the usual place."""
+def with_inliers(
+    count: int, east_m: float = 0.0, up_m: float = 0.0, turn_deg: float = 0.0
+) -> Callable[..., LocaliseResult]:
+    """Answers with so many inliers, so far from the usual place, turned about the vertical."""
 
     def answer(gray, request):
         height, width = gray.shape
         found = localised(1, Camera.from_focal(width, height, 200.0))
         pose = found.pose
-        geopose = replace(pose.geopose, longitude_deg=pose.geopose.longitude_deg + east_m / 73_000.0)
-        return replace(found, inliers=count, pose=replace(pose, geopose=geopose))
+        at = replace(
+            pose.geopose,
+            longitude_deg=pose.geopose.longitude_deg + east_m / 73_000.0,
+            height_m=pose.geopose.height_m + up_m,
+            quaternion_xyzw=_turned(pose.geopose.quaternion_xyzw, turn_deg),
+        )
+        return replace(found, inliers=count, pose=replace(pose, geopose=at))
 
     return answer
+
+
+def _turned(xyzw: tuple[float, ...], degrees: float) -> tuple[float, ...]:
+    turn = Rotation.from_euler("z", degrees, degrees=True) * Rotation.from_quat(xyzw)
+    return tuple(turn.as_quat(canonical=True).tolist())
 
 
 def test_replicas_share_the_queries(router: str) -> None:
@@ -95,7 +109,7 @@ def test_a_prior_says_which_part_is_asked(router: str) -> None:
     west, east = ScriptedLocaliser(1, with_inliers(50)), ScriptedLocaliser(1, with_inliers(90))
     with member(router, west, WEST), member(router, east, EAST), Client(router) as client:
         parts = {status.part for status in client.statuses()}
-        assert parts == {"8,49,8.5,49.5", "8.5,49,9,49.5"}
+        assert parts == {"8.0,49.0,8.5,49.5", "8.5,49.0,9.0,49.5"}
         for _ in range(3):
             assert client.localise(photo(), IN_WEST).inliers == 50
         assert client.localise(photo(), IN_EAST).inliers == 90
@@ -116,9 +130,59 @@ def test_without_a_prior_the_best_supported_answer_counts(router: str) -> None:
         assert (reply.status, reply.reason, reply.position) == ("not_localised", "AMBIGUOUS", None)
         west._answer = with_inliers(60, 500.0)
         assert client.localise(photo()).inliers == 90, "both have the same place"
+        for other in (with_inliers(60, 500.0, up_m=20.0), with_inliers(60, 500.0, turn_deg=170.0)):
+            west._answer = other
+            assert client.localise(photo()).reason == "AMBIGUOUS"
+        # What the other refused, one server would have taken for a rival, too.
+        west._answer = lambda *_: replace(not_localised(1), inliers=60)
+        assert client.localise(photo()).reason == "AMBIGUOUS"
         west._answer = east._answer = lambda *_: not_localised(1)
         assert client.localise(photo()).reason == "TOO_FEW_INLIERS"
-    assert (len(west.requests), len(east.requests)) == (5, 5)
+    assert (len(west.requests), len(east.requests)) == (8, 8)
+
+
+def test_a_part_that_is_gone_is_missed(router: str) -> None:
+    """Nobody else's answer stands for it, with a prior there or without one."""
+    west, east = ScriptedLocaliser(1, with_inliers(20)), ScriptedLocaliser(1, with_inliers(90, 500.0))
+    with member(router, east, EAST), Client(router) as client:
+        with member(router, west, WEST):
+            assert client.localise(photo()).inliers == 90
+        for prior in (None, IN_WEST):
+            with pytest.raises(ServiceError, match="no server of"):
+                client.localise(photo(), prior)
+        client._fleet._state.until = 0.0  # the list is made anew
+        for prior in (None, IN_WEST):
+            with pytest.raises(ServiceError, match=r"no server of the part 8\.0,49\.0"):
+                client.localise(photo(), prior)
+        assert client.localise(photo(), IN_EAST).inliers == 90
+
+
+def test_maps_are_those_of_all_parts_and_named_ones_are_asked_for_everywhere(router: str) -> None:
+    west, east = ScriptedLocaliser(1, with_inliers(20)), ScriptedLocaliser(1, with_inliers(90))
+    with member(router, west, WEST), member(router, east, EAST), Client(router) as client:
+        assert len(client.maps().maps) == 1  # both have map-a
+        client.localise(photo(), IN_WEST, maps=("map-a",))
+    assert (len(west.requests), len(east.requests)) == (1, 1)
+
+
+def test_replicas_of_several_parts_take_turns_each(router: str) -> None:
+    localisers = [ScriptedLocaliser(1, with_inliers(20 if k < 2 else 90)) for k in range(4)]
+    with ExitStack() as stack:
+        for k, localiser in enumerate(localisers):
+            stack.enter_context(member(router, localiser, WEST if k < 2 else EAST))
+        client = stack.enter_context(Client(router))
+        for _ in range(6):
+            client.localise(photo())
+    assert [len(one.requests) for one in localisers] == [3, 3, 3, 3]
+
+
+def test_a_status_that_hangs_leaves_time_for_the_answer(router: str) -> None:
+    held: list[zenoh.Query] = []
+    with member(router, ScriptedLocaliser(1)), Client(router) as client:
+        hanging = client._session().declare_queryable("featuredb/town/status", held.append, complete=True)
+        assert client.localise(photo(), timeout_s=5.0).status == "localised"
+        hanging.undeclare()
+        held.clear()
 
 
 def test_a_server_that_has_all_makes_parts_needless(router: str) -> None:
@@ -213,12 +277,12 @@ def test_servers_that_cannot_be_addressed_are_asked_by_the_common_key(router: st
     with member(router, localiser), Client(router) as client:
         own = client.statuses
         older = [status.model_copy(update={"addressable": False}) for status in own()]
-        client._fleet = fleet_module.Fleet(lambda: older)
+        client._fleet = fleet_module.Fleet(lambda _: older)
         assert client.localise(photo()).status == "localised"
-        client._fleet = fleet_module.Fleet(list)
+        client._fleet = fleet_module.Fleet(lambda _: [])
         assert client.localise(photo()).status == "localised"
         gone = [status.model_copy(update={"server_id": "gone"}) for status in own()]
-        client._fleet = fleet_module.Fleet(lambda: gone)
+        client._fleet = fleet_module.Fleet(lambda _: gone)
         assert client.localise(photo()).status == "localised", "by the common key"
     assert len(localiser.requests) == 3
 
