@@ -277,9 +277,11 @@ def _image_scores(reach: _Reach, votes_of_point: FloatArray, share: float) -> Fl
             chance: p points get p times this, with about that variance.
     """
     area, images = reach.area, reach.images
-    votes = votes_of_point[area.see_point[area.sights_of_images(images)]]
+    whole = len(images) == len(area.image_map)
+    votes = votes_of_point[area.see_point if whole else area.see_point[area.sights_of_images(images)]]
     seen = np.diff(area.image_start)[images]
-    total = np.bincount(np.repeat(np.arange(len(images)), seen), weights=votes, minlength=len(images))
+    ends = np.concatenate([[0.0], np.cumsum(votes)])[np.concatenate([[0], np.cumsum(seen)])]
+    total = np.diff(ends)
     scores = np.full(len(area.image_map), -np.inf)
     scores[images] = _above_chance(total, share * seen)
     return scores
