@@ -10,7 +10,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 
 from featuredb.store import Database
@@ -18,7 +17,7 @@ from featuredb.store.candidates.photos import mark_used
 from featuredb.store.candidates.states import OPERATOR
 from ingest.colmap.bridge import Model
 from ingest.growth.asked_before import recall, remember
-from ingest.growth.graph.map_graph import allowed_m, grow_within_budget, placed_maps
+from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.graph.replacing import Replacement, replace_descendants
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate, grown_entry, refused_entry
 from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, split
@@ -179,9 +178,7 @@ class _Run:
         outside = NewPhotos(
             given=self.new, rows=self._open_rows(), localised=self.localised, heard=self.heard
         )
-        maps, budget_m = placed_maps(self.database.snapshot()), self.options.drift_budget_m
-        allowed = partial(allowed_m, maps=maps, budget_m=budget_m)
-        outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside, allowed)
+        outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside)
         for outcome in outcomes:
             self.promotions[outcome.map_id] = outcome
             entry = self.entries.get(outcome.map_id)

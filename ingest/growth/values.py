@@ -28,7 +28,6 @@ FeaturesOf = Callable[[int], PhotoFeatures]
 """Features of the photo of a row; called when they are needed, so that not all are in memory."""
 
 DRIFT_BUDGET_M = 0.5  # what a survey's points are usually wanted for
-OF_THE_PLACE = 1.0 / 3.0  # of the 95 % radius of a map's place: in squares a tenth, of the radius a twentieth
 # Of a reconstruction, of a map without a place, of those by which two maps overlap, and of those that see a
 # point that is asked for what is there: two leave it along a ray.
 LEAST_PHOTOS = 3
@@ -152,8 +151,7 @@ class GrowthOptions:
 
     Attributes:
         drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken;
-            its photos wait for an anchor. More is allowed beside maps whose own place is wider
-            (`OF_THE_PLACE`).
+            its photos wait for an anchor.
         trusted: identities that the operator vouches for: their photos need nobody else, as his own.
         threads: photos that are localised at a time.
     """

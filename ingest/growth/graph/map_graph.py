@@ -6,7 +6,7 @@ its digest of place differs, and the edge has to be measured again.
 
 import hashlib
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,6 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.move import covariance_in_frame, in_frame
-from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.store import Snapshot
 from featuredb.store.changes import is_imported
 from featuredb.store.decode import frame_of, placement_of
@@ -29,7 +28,6 @@ from ingest.growth.map_places import drift_m, growth_of, inflated, map_drift_m, 
 from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.values import (
     LEAST_PHOTOS,
-    OF_THE_PLACE,
     Edge,
     FeaturesOf,
     LocalisedPhoto,
@@ -54,7 +52,6 @@ class PlacedMap:
     Attributes:
         place: digest of where it lies.
         corners: (8, 3) of its points' box in its own frame, metres; empty for a map without points.
-        middle: (3,) of its cameras, in its own frame, metres.
         edges: overlaps that were measured when it was placed.
     """
 
@@ -68,7 +65,6 @@ class PlacedMap:
     placement: Placement
     place: str
     corners: FloatArray
-    middle: FloatArray
     edges: tuple[Edge, ...]
 
     @property
@@ -89,15 +85,10 @@ class PlacedMap:
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
     """Maps with a place, by id, but retired ones and imports that nobody vouches for: edges may be forged."""
     placed = {m.map_id for m in snapshot.maps() if not is_imported(m.status, m.status_reason)}
-    middles = snapshot.camera_middles()
-    return {
-        row["map_id"]: _placed(row, middles.get(row["map_id"], np.zeros(3)))
-        for row in snapshot.rows()
-        if row["map_id"] in placed
-    }
+    return {row["map_id"]: _placed(row) for row in snapshot.rows() if row["map_id"] in placed}
 
 
-def _placed(row: Row, middle: FloatArray) -> PlacedMap:
+def _placed(row: Row) -> PlacedMap:
     frame, placement = frame_of(row), placement_of(row)
     return PlacedMap(
         map_id=row["map_id"],
@@ -110,7 +101,6 @@ def _placed(row: Row, middle: FloatArray) -> PlacedMap:
         placement=placement,
         place=place_key(frame, placement),
         corners=_corners(row, frame),
-        middle=middle,
         edges=tuple(Edge.from_json(edge) for edge in growth_of(placement.evidence).get("edges", ())),
     )
 
@@ -220,8 +210,6 @@ def grow_within_budget(
         reconstruction and not the others of the run, nor the next run.
     """
     part, everything = model, tuple(model.rows.tolist())
-    holding = {localised[r].map_ids[0] for r in everything if r in localised}
-    budget_m = allowed_m(holding, maps, budget_m)
     beyond: dict[int, tuple[str, str]] = {}
     refused = Refused(reason="", message="")
     for _ in range(_TRIES):
@@ -247,26 +235,6 @@ def grow_within_budget(
         beyond |= {r: grown.left_out.get(r, (gate.reason, gate.message)) for r in gone}
         part = left
     return refused
-
-
-def allowed_m(holding: Iterable[str], maps: Mapping[str, PlacedMap], budget_m: float) -> float:
-    """The budget of a map, metres: more where it adds hardly to what its anchors' own places leave open.
-
-    Args:
-        holding: maps that hold it, whose anchors are its own.
-    """
-    anchors: list[PlacedMap] = []
-    seen, left = set(), [m for m in holding if m in maps]
-    while left:
-        map_id = left.pop()
-        if map_id in seen:
-            continue
-        seen.add(map_id)
-        if maps[map_id].is_anchor:
-            anchors.append(maps[map_id])
-        left += [m for m in maps[map_id].parents if m in maps]
-    bounds = [PlaceBounds.of(one.placement.covariance, one.middle).horizontal_m for one in anchors]
-    return max(budget_m, OF_THE_PLACE * min(bounds, default=0.0))
 
 
 def with_drift(

@@ -19,7 +19,6 @@ from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import (
     OWN,
     PlacedMap,
-    allowed_m,
     holds,
     place_key,
     placed_maps,
@@ -199,7 +198,6 @@ def _moved(
     places |= {m: place_key(there.frame, there.placement) for m, there in moved.items()}
     contradicting = {(edge.a, edge.b) for edge in solution.left_out}
     new, reports = [], []
-    now = {**maps, **{m: replace(maps[m], placement=there.placement) for m, there in moved.items()}}
     for map_id, feature_map in moved.items():
         before = maps[map_id]
         edges = [
@@ -207,10 +205,9 @@ def _moved(
             for e in (*(e for e in before.edges if holds(maps, e)), *new_edges.get(map_id, ()))
             if (map_id, e.map_id) not in contradicting and e.map_id in corrections
         ]
-        allowed = allowed_m({*before.parents, *(e.map_id for e in edges)}, now, budget_m)
-        finished, drift = _with_evidence(feature_map, before, edges, solution, frame, allowed)
+        finished, drift = _with_evidence(feature_map, before, edges, solution, frame, budget_m)
         # Active maps stay so; those that were quarantined for their parent's sake are active again.
-        again = PARENT_MOVED in before.status_reason and drift <= allowed
+        again = PARENT_MOVED in before.status_reason and drift <= budget_m
         active = before.status == "active" or again
         new.append(replace(finished, status="active" if active else "quarantined"))
         drifted = growth_of(before.placement.evidence).get("drift_m")

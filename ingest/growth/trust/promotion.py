@@ -62,7 +62,6 @@ def promote_confirmed(
     options: GrowthOptions,
     work: Path,
     new: NewPhotos | None = None,
-    allowed_m: Callable[[Sequence[str]], float] | None = None,
 ) -> list[Promotion]:
     """Try every quarantined map that growth has made; those that have drifted beyond the budget stay.
 
@@ -70,7 +69,6 @@ def promote_confirmed(
         localiser: of the active maps of the newest snapshot.
         work: work folder, where it is kept what was found out: without anything new nothing is asked again.
         new: photos that may corroborate a map, beside the images of other maps.
-        allowed_m: how far a map with these parents may have drifted; None: the budget.
 
     Raises:
         StoreError
@@ -85,8 +83,7 @@ def promote_confirmed(
         if summary.status != "quarantined" or summary.method != "map":
             continue
         known = recall(work, "maps", summary.map_id, asked)
-        budget_m = options.drift_budget_m if allowed_m is None else allowed_m(summary.parents)
-        stays = _held_back(summary, snapshot, budget_m)
+        stays = _held_back(summary, snapshot, options.drift_budget_m)
         stays = stays or (Promotion(**known) if known else None)
         if stays is None:
             open_maps.append(summary)
