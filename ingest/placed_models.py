@@ -23,7 +23,7 @@ from ingest.register.block import block_of_model, model_of_block
 from ingest.register.control.maps import Survey, place_by_survey, vertical_of
 from ingest.register.control.marks import control_frame
 from ingest.register.control.placement import GcpPlacement
-from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.register.gps import GpsPlacement, place_by_gps
 from ingest.register.tagged_elsewhere import TaggedElsewhere, tagged_elsewhere
 from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.held_lens import impossible
@@ -112,7 +112,7 @@ def place_models(
 
 
 def placed_by_gps(
-    model: Model, chosen: Sequence[Photo], options: GpsOptions
+    model: Model, chosen: Sequence[Photo]
 ) -> tuple[LocalFrame | None, tuple[int, ...], GpsPlacement]:
     """A model by the GPS of its photos: the frame, photos with GPS by place in the model, the placement."""
     frame = local_frame_of(chosen)  # its own: models may lie in different towns
@@ -123,13 +123,13 @@ def placed_by_gps(
     angles, orientations = [photo.angles for photo in chosen], [photo.orientation for photo in chosen]
     held = held_of(model.cam_from_sfm, angles, camera_of, orientations)
     centers, told_by = model.centers()[with_gps], camera_of[with_gps]
-    placed = place_by_gps(centers, positions[with_gps], sigmas[with_gps], options, times_s, held, told_by)
+    placed = place_by_gps(centers, positions[with_gps], sigmas[with_gps], times_s, held, told_by)
     return frame, tuple(with_gps.tolist()), placed
 
 
 def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[TaggedElsewhere]:
     """Groups of photos whose GPS contradicts a placement that is accepted."""
-    _, with_gps, placed = placed_by_gps(model, [photos[r] for r in model.rows], options.gps)
+    _, with_gps, placed = placed_by_gps(model, [photos[r] for r in model.rows])
     return tagged_elsewhere(model, with_gps, placed) if placed.reason is None else []
 
 
@@ -142,7 +142,7 @@ def _by_gps(
         photos: all usable ones.
     """
     chosen = tuple(photos[r] for r in model.rows)
-    frame, with_gps, placed = placed_by_gps(model, chosen, options.gps)
+    frame, with_gps, placed = placed_by_gps(model, chosen)
     component = Component(
         model=model,
         photos=chosen,

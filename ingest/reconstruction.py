@@ -23,7 +23,6 @@ from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapOptions
 from ingest.photos.duplicates import copies_of
 from ingest.photos.photo import CameraSharing, Photo, gps_priors, local_frame_of, photo_cameras
-from ingest.register.gps import GpsOptions
 from ingest.sfm.extract import FeatureFiles, extract_photos, features_key, read_keypoints
 from ingest.sfm.mapper import SfmOptions, SfmView
 from ingest.sfm.matching import Matched, PhotoView, match_pairs
@@ -53,7 +52,6 @@ class MapMakingOptions:
     matching: MatchOptions = field(default_factory=MatchOptions)
     clusters: ClusterOptions = field(default_factory=ClusterOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
-    gps: GpsOptions = field(default_factory=GpsOptions)
     maps: MapOptions = field(default_factory=MapOptions)
     cameras: CameraSharing = "shared"
     min_tie: int = 30

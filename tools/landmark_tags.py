@@ -27,7 +27,7 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.store import Database
 from ingest.own_frame import held_of
 from ingest.photos.photo import Photo, whose_cameras
-from ingest.register.gps import GpsOptions, place_by_gps
+from ingest.register.gps import place_by_gps
 from tools.commands import featuredb
 from tools.figures import laid_on, study_parser, write_figures
 from tools.made_maps import all_maps, copied, make, photo_names, position_table
@@ -138,9 +138,7 @@ def drawn(landmark: Landmark, draws: int, seed: int) -> dict[str, float]:
                 tags[on] = landmark.middle + rng.normal(0.0, 15.0, (int(on.sum()), 3))
                 sigmas = np.tile([_STATED_M, _STATED_M, np.inf if draw % 2 else _STATED_M], (count, 1))
                 held = held_of(landmark.poses, (), landmark.camera_of)
-                placed = place_by_gps(
-                    landmark.xyz[rows], tags, sigmas, GpsOptions(), None, held, landmark.camera_of[rows]
-                )
+                placed = place_by_gps(landmark.xyz[rows], tags, sigmas, None, held, landmark.camera_of[rows])
                 if placed.reason is None:
                     assert placed.local_from_sfm is not None
                     assert placed.covariance is not None

@@ -47,7 +47,6 @@ from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, 
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
 from ingest.placed_models import placed_by_gps
-from ingest.register.gps import GpsOptions
 from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.mapper import SfmOptions, mapping_settings
 from reloc.localise.candidates import IndexedArea
@@ -257,7 +256,7 @@ def _map_of(scene: LensDraw, poses: Sequence[Rigid3], frame: LocalFrame, sigma_m
     if model is None:
         return None
     chosen = [photos[row] for row in model.rows]
-    own, _, placed = placed_by_gps(model, chosen, GpsOptions())
+    own, _, placed = placed_by_gps(model, chosen)
     if placed.local_from_sfm is None or placed.covariance is None or placed.reason or own is None:
         return None
     placement = Placement(

@@ -28,7 +28,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.own_frame import held_of
-from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.register.gps import GpsPlacement, place_by_gps
 from tools.figures import study_parser, write_figures
 from tools.made_maps import all_maps, make
 
@@ -58,7 +58,7 @@ class Flight:
             for pose in self.cam_from_local[: len(positions)]
         ]
         times_s = self.times_s[: len(positions)]
-        return place_by_gps(centers, positions, sigmas, GpsOptions(), times_s, held_of(held, angles))
+        return place_by_gps(centers, positions, sigmas, times_s, held_of(held, angles))
 
 
 def _bias(flight: Flight, rng: np.random.Generator) -> FloatArray:

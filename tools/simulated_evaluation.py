@@ -31,7 +31,7 @@ from featuredb.simworld.scoring import PoseError, pose_difference, summarise
 from featuredb.simworld.world import World
 from featuredb.store import Database
 from ingest.demo import ingest_world, make_world
-from ingest.register.gps import GpsOptions, place_by_gps
+from ingest.register.gps import place_by_gps
 from reloc.localise.answer import placement_covariance
 from reloc.localise.result import LocalisedPose
 from reloc.localiser import Localiser
@@ -134,7 +134,7 @@ def inside_over_placements(
     measured = [measured_covariance(area, feature_map, pose) for pose, _ in answers]
     inside, placed = [], 0
     for _ in range(draws):
-        again = place_by_gps(centers_sfm, survey_positions(true_centers, rng), sigmas, GpsOptions())
+        again = place_by_gps(centers_sfm, survey_positions(true_centers, rng), sigmas)
         if again.reason is not None or again.local_from_sfm is None or again.covariance is None:
             continue
         placed += 1

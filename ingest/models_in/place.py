@@ -19,7 +19,6 @@ from ingest.colmap.bridge import Model
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photos.photo import Photo
 from ingest.placed_models import placed_by_gps
-from ingest.register.gps import GpsOptions
 
 Axes = Literal["enu", "utm", "ecef"]
 # A model in UTM is not a similarity of the place: heights are unscaled, the plane by up to 0.04 %. What the
@@ -166,7 +165,7 @@ def place_at_reference(model: Model, reference: LocalFrame, sigma_m: tuple[float
 
 def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place | NoPlace:
     """By the GPS of the photos, with the gates of an ordinary ingest; or why they refuse it."""
-    frame, _, placed = placed_by_gps(model, photos, GpsOptions())
+    frame, _, placed = placed_by_gps(model, photos)
     if (
         placed.reason is not None
         or placed.local_from_sfm is None

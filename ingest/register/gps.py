@@ -14,7 +14,7 @@ tests, each by a rate of error:
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -34,32 +34,14 @@ GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
 _LEAST_PHOTOS = 3  # fix a similarity
 _MANY_SHARE = 0.1  # of what they state, of many people's positions: pins on one map, which may be off
+# Shares of receivers that are noisier than what is refused: in general, and where chance explains the fit.
+_WRONG, _NO_PLACE = 0.001, 0.05
+_ANSWERS = 0.001  # chance below which a map may answer
+# Standard deviations of scale and turn beyond which covariances say nothing, as they are linear.
+_MAX_SCALE_SIGMA, _MAX_TURN_DEG = 0.3, 25.0
+_ANSWERS_TURN_DEG = 10.0  # standard deviation of the turn beyond which a map may not answer
+_MAX_SAMPLES = 500  # of three positions; fewer photos are tried exhaustively
 _PLAIN_M = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GpsOptions:
-    """How the similarity is estimated and what may answer.
-
-    Attributes:
-        wrong: share of receivers that are noisier than what is refused.
-        no_place: the same, where chance explains the fit as often.
-        answers: chance below which a map may answer.
-        max_scale_sigma, max_turn_deg: standard deviations beyond which covariances say nothing, as they are
-            linear.
-        answers_turn_deg: standard deviation of the turn beyond which a map may not answer.
-        max_ransac_samples: of three positions; fewer photos are tried exhaustively.
-        seed: of the samples.
-    """
-
-    wrong: float = 0.001
-    no_place: float = 0.05
-    answers: float = 0.001
-    max_scale_sigma: float = 0.3
-    max_turn_deg: float = 25.0
-    answers_turn_deg: float = 10.0
-    max_ransac_samples: int = 500
-    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,7 +78,6 @@ def place_by_gps(
     centers_sfm: FloatArray,
     positions_local: FloatArray,
     sigmas_m: FloatArray,
-    options: GpsOptions,
     times_s: FloatArray | None = None,
     held: Held | None = None,
     camera_of: NDArray[np.int64] | None = None,
@@ -113,11 +94,11 @@ def place_by_gps(
         camera_of: (n,) whose and which camera took the photo; None: one took all.
     """
     count = len(centers_sfm)
-    figures: dict[str, Any] = {"photos_with_gps": count, "options": asdict(options)}
+    figures: dict[str, Any] = {"photos_with_gps": count}
     if count < _LEAST_PHOTOS:
         message = f"{count} registered photos have GPS, at least {_LEAST_PHOTOS} are needed"
         return _refused("TOO_FEW", message, count, figures)
-    start = _start(centers_sfm, positions_local, sigmas_m, options)
+    start = _start(centers_sfm, positions_local, sigmas_m)
     if start is None:
         return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
     many = receivers(camera_of, count) > 1.0
@@ -125,13 +106,13 @@ def place_by_gps(
     if held is not None and (fit.local_from_sfm.rotation @ held.down)[2] > 0:  # a line, the wrong side up
         turned = _turned_over(fit.local_from_sfm, centers_sfm)
         over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, held, many)
-        if over.log_chance <= fit.log_chance + np.log(1.0 / options.wrong):  # else pictures are upside down
+        if over.log_chance <= fit.log_chance + np.log(1.0 / _WRONG):  # else pictures are upside down
             fit = over
     if held is not None:
         figures["angles"] = _angles(fit, held)
     inner = fit.used.all(axis=1)
     by = receivers(None if camera_of is None else camera_of[inner], int(inner.sum()))
-    return _judged(fit, centers_sfm, positions_local, sigmas_m, by, figures, options)
+    return _judged(fit, centers_sfm, positions_local, sigmas_m, by, figures)
 
 
 def _angles(fit: NoisyFit, held: Held) -> dict[str, Any]:
@@ -154,7 +135,6 @@ def _judged(
     sigmas: FloatArray,
     by: float,
     figures: dict[str, Any],
-    options: GpsOptions,
 ) -> GpsPlacement:
     """Covariance, figures and tests of an estimated similarity.
 
@@ -176,7 +156,7 @@ def _judged(
     usual = np.maximum(stated, _PLAIN_M)[known.any(axis=0)] * NOISE_SHARE
     above = float(np.log(rms / usual).max())  # standard deviations of a receiver's noise
     # Where positions are noisier than usual, those along another way would be, too: fewer of them count.
-    unusual = above > -ndtri(options.no_place)
+    unusual = above > -ndtri(_NO_PLACE)
     chance = fit.log_chance_of_path if unusual else fit.log_chance
     inliers = np.asarray(fit.used.all(axis=1))
     turn_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])))
@@ -209,7 +189,7 @@ def _judged(
             figures=figures,
         )
 
-    refused = -ndtri(options.wrong if chance <= np.log(options.no_place) else options.no_place)
+    refused = -ndtri(_WRONG if chance <= np.log(_NO_PLACE) else _NO_PLACE)
     if above > refused or inliers.sum() < _LEAST_PHOTOS:
         height = f" and {rms[2]:.0f} m in height" if len(rms) == 3 else ""
         return outcome(
@@ -218,32 +198,32 @@ def _judged(
             f"agree, noisy by {rms[0]:.0f} m horizontally{height}; positions of other photos would fit as "
             f"well in {np.exp(chance):.1g} of cases",
         )
-    if turn_deg > options.max_turn_deg:
+    if turn_deg > _MAX_TURN_DEG:
         return outcome(
             "DEGENERATE_LINE",
             f"the photos lie along a line: their GPS tells the orientation to {turn_deg:.0f} degrees, "
-            f"{options.max_turn_deg:.0f} are needed; add photos beside the line or the camera's angles, or "
+            f"{_MAX_TURN_DEG:.0f} are needed; add photos beside the line or the camera's angles, or "
             "place it by control points (--gcp) or a scan",
         )
-    if figures["scale_sigma"] > options.max_scale_sigma:
+    if figures["scale_sigma"] > _MAX_SCALE_SIGMA:
         return outcome(
             "SCALE",
-            f"the scale is known to {figures['scale_sigma']:.1%} only, {options.max_scale_sigma:.0%} is "
+            f"the scale is known to {figures['scale_sigma']:.1%} only, {_MAX_SCALE_SIGMA:.0%} is "
             "needed: the photos are too close together for their GPS",
         )
-    if chance > np.log(options.answers):
+    if chance > np.log(_ANSWERS):
         return outcome(
             None,
             "placed by GPS",
             f"positions that have nothing to do with these photos would fit as well in {np.exp(chance):.1%} "
-            f"of cases (limit {options.answers:.1%}): too few are left to check the place by",
+            f"of cases (limit {_ANSWERS:.1%}): too few are left to check the place by",
         )
-    if checked_deg > options.answers_turn_deg:
+    if checked_deg > _ANSWERS_TURN_DEG:
         return outcome(
             None,
             "placed by GPS",
             f"the photos lie along a line: their GPS tells the turn about it to {checked_deg:.0f} degrees, "
-            f"{options.answers_turn_deg:.0f} are needed, and no camera angles do",
+            f"{_ANSWERS_TURN_DEG:.0f} are needed, and no camera angles do",
         )
     return outcome(None, _words("placed by GPS", figures))
 
@@ -279,16 +259,14 @@ def _turned_over(sim: Sim3, centers: FloatArray) -> Sim3:
     return Sim3(scale=1.0, rotation=turn, translation=middle - turn @ middle) @ sim
 
 
-def _start(
-    centers: FloatArray, positions: FloatArray, sigmas: FloatArray, options: GpsOptions
-) -> Sim3 | None:
+def _start(centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> Sim3 | None:
     """The similarity of three photos, or of all, that fits most of them at whatever noise they have."""
     whole = np.isfinite(sigmas).all(axis=1)
     if not whole.any():  # heights that nobody knows: one height for all
         positions, whole = np.where(np.isfinite(sigmas), positions, 0.0), np.ones(len(sigmas), dtype=np.bool_)
     rows = np.flatnonzero(whole)
     best: tuple[float, Sim3] | None = None
-    for sample in [rows, *(rows[s] for s in _samples(len(rows), options))]:
+    for sample in [rows, *(rows[s] for s in _samples(len(rows)))]:
         sim = similarity_closed_form(centers[sample], positions[sample])
         if sim is None:
             continue
@@ -300,11 +278,11 @@ def _start(
     return best[1] if best is not None else None
 
 
-def _samples(count: int, options: GpsOptions) -> list[NDArray[np.int64]]:
-    if count * (count - 1) * (count - 2) // 6 <= options.max_ransac_samples:
+def _samples(count: int) -> list[NDArray[np.int64]]:
+    if count * (count - 1) * (count - 2) // 6 <= _MAX_SAMPLES:
         return [np.array(c) for c in itertools.combinations(range(count), 3)]
-    generator = np.random.default_rng(options.seed)
-    return [generator.choice(count, 3, replace=False) for _ in range(options.max_ransac_samples)]
+    generator = np.random.default_rng(0)
+    return [generator.choice(count, 3, replace=False) for _ in range(_MAX_SAMPLES)]
 
 
 def _refused(reason: GpsReason, message: str, count: int, figures: dict[str, Any]) -> GpsPlacement:

@@ -5,9 +5,8 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.register.gps import GpsPlacement, place_by_gps
 
-OPTIONS = GpsOptions()
 TRUE = Sim3(scale=8.5, rotation=so3_exp([0.3, -0.2, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
 
 
@@ -19,7 +18,5 @@ def flight(count: int, seed: int = 0) -> FloatArray:
     )
 
 
-def place(
-    positions: FloatArray, noise: FloatArray, sigmas: FloatArray, options: GpsOptions = OPTIONS
-) -> GpsPlacement:
-    return place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas, options)
+def place(positions: FloatArray, noise: FloatArray, sigmas: FloatArray) -> GpsPlacement:
+    return place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas)

@@ -10,7 +10,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation
 from ingest.own_frame import held_of
 from ingest.register.gps import place_by_gps
-from tests.support.gps_flights import OPTIONS, TRUE, flight
+from tests.support.gps_flights import TRUE, flight
 
 
 def _crowd(count: int) -> tuple[FloatArray, list[Rigid3]]:
@@ -31,7 +31,7 @@ def test_photos_of_many_people_who_look_one_way_tell_the_vertical_and_those_of_o
     sigmas = np.tile([4.0, 4.0, np.inf], (40, 1))
     tagged = local + np.random.default_rng(9).normal(0, 5.0, local.shape)
     by_many, by_one = (
-        place_by_gps(TRUE.inverse().act(local), tagged, sigmas, OPTIONS, held=held_of(held, (), camera_of))
+        place_by_gps(TRUE.inverse().act(local), tagged, sigmas, held=held_of(held, (), camera_of))
         for camera_of in (np.arange(40), np.zeros(40, dtype=np.int64))
     )
     assert (by_many.reason, by_many.provisional) == (None, "")
@@ -48,7 +48,7 @@ def test_positions_by_many_receivers_share_no_bias() -> None:
     tagged = positions + np.random.default_rng(6).normal(0, 2.0, positions.shape)
     sigmas = np.full((40, 3), 20.0)
     by_many, by_one = (
-        place_by_gps(TRUE.inverse().act(positions), tagged, sigmas, OPTIONS, camera_of=camera_of)
+        place_by_gps(TRUE.inverse().act(positions), tagged, sigmas, camera_of=camera_of)
         for camera_of in (np.arange(40), None)
     )
     assert by_many.figures["bias_sigma_m"][0] < 4.0
@@ -68,7 +68,7 @@ def test_drones_that_share_a_block_are_as_uncertain_as_one(drones: int) -> None:
         told = positions + bias[camera_of] + rng.normal(0, 0.5, positions.shape)
         sigmas, times = np.tile([4.0, 4.0, 10.0], (len(positions), 1)), 4.0 * np.arange(len(positions))
         placed = place_by_gps(
-            TRUE.inverse().act(positions), told, sigmas, OPTIONS, times + 600.0 * camera_of, None, camera_of
+            TRUE.inverse().act(positions), told, sigmas, times + 600.0 * camera_of, None, camera_of
         )
         if placed.reason is None:
             placements += 1
@@ -90,7 +90,6 @@ def test_people_who_stand_at_two_places_leave_nothing_to_check_by() -> None:
         TRUE.inverse().act(local),
         tagged,
         sigmas,
-        OPTIONS,
         None,
         held_of(held, (), np.arange(40)),
         np.arange(40),

@@ -16,7 +16,7 @@ from ingest.own_frame import held_of
 from ingest.positions.held import Held
 from ingest.register.gps import GpsPlacement, place_by_gps
 from ingest.report.page import FIGURES, figure_rows
-from tests.support.gps_flights import OPTIONS, TRUE, flight, place
+from tests.support.gps_flights import TRUE, flight, place
 
 
 def test_exact_positions_give_the_exact_similarity() -> None:
@@ -146,9 +146,7 @@ def test_a_line_of_photos_that_are_held_level_has_a_place(seed: int) -> None:
         local = roll @ np.stack([across, np.cross(view, across), view])
         held.append(Rigid3(rotation=nearest_rotation(local @ TRUE.rotation), translation=np.zeros(3)))
     noise, sigmas = rng.normal(0, 0.5, (12, 3)), np.tile([4.0, 4.0, 10.0], (12, 1))
-    placed = place_by_gps(
-        TRUE.inverse().act(positions), positions + noise, sigmas, OPTIONS, held=held_of(held)
-    )
+    placed = place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas, held=held_of(held))
     assert placed.reason is None
     assert "no camera angles" in placed.provisional  # nothing has measured that they are level
     assert placed.local_from_sfm is not None
@@ -171,7 +169,7 @@ def test_pictures_that_are_stored_upside_down_do_not_turn_a_flight_over() -> Non
     assert level is not None
     level = replace(level, down=-level.down)
     noise, sigmas = rng.normal(0, 1.0, (20, 3)), np.tile([4.0, 4.0, 10.0], (20, 1))
-    placed = place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas, OPTIONS, held=level)
+    placed = place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas, held=level)
     assert placed.reason is None
     assert placed.local_from_sfm is not None
     assert np.degrees(np.abs((TRUE @ placed.local_from_sfm.inverse()).log()[1:4]).max()) < 5.0
@@ -214,7 +212,7 @@ def _strip(count: int = 12) -> FloatArray:
 def _placed_by(positions: FloatArray, held: Held | None) -> GpsPlacement:
     noise = np.random.default_rng(3).normal(0, 0.5, positions.shape)
     sigmas = np.tile([4.0, 4.0, 10.0], (len(positions), 1))
-    return place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas, OPTIONS, held=held)
+    return place_by_gps(TRUE.inverse().act(positions), positions + noise, sigmas, held=held)
 
 
 def _turn_deg(placed: GpsPlacement) -> float:
@@ -231,7 +229,7 @@ def test_a_strip_with_the_cameras_angles_answers(yaw_deg: float) -> None:
     assert placed.figures["turn_sigma_deg"] < 3.0
     assert _turn_deg(placed) < 3.0
     figures = placed.figures.keys() | placed.figures["angles"].keys()
-    assert figures - FIGURES.keys() == {"options", "angles"}  # the report explains each
+    assert figures - FIGURES.keys() == {"angles"}  # the report explains each
 
 
 def test_a_strip_whose_photos_look_across_waits_without_angles() -> None:
@@ -296,7 +294,7 @@ def test_positions_that_are_late_say_by_how_much() -> None:
     speed = np.gradient(positions, times, axis=0)
     late = positions - 2.0 * speed + rng.normal(0, 0.3, positions.shape)
     sigmas = np.tile([4.0, 4.0, 10.0], (len(plan), 1))
-    placed = place_by_gps(TRUE.inverse().act(positions), late, sigmas, OPTIONS, times)
+    placed = place_by_gps(TRUE.inverse().act(positions), late, sigmas, times)
     assert placed.reason is None
     assert placed.figures["lag_s"] == pytest.approx(2.0, abs=0.3)
 
@@ -337,5 +335,5 @@ def test_positions_along_another_way_are_no_place() -> None:
     turn = np.linspace(0.0, 2.0 * np.pi, 24)[:18]
     orbit = np.column_stack([40 * np.cos(turn), 30 * np.sin(turn), 25 + 5 * np.sin(3 * turn)])
     sigmas = np.tile([4.0, 4.0, 10.0], (18, 1))
-    placed = place_by_gps(TRUE.inverse().act(strips), orbit, sigmas, OPTIONS, 4.0 * np.arange(18.0))
+    placed = place_by_gps(TRUE.inverse().act(strips), orbit, sigmas, 4.0 * np.arange(18.0))
     assert placed.reason == "RESIDUALS"

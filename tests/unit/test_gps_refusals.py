@@ -9,11 +9,11 @@ from scipy.stats import chi2
 
 from ingest.placed_models import placement_evidence
 from ingest.register.gps import place_by_gps
-from tests.support.gps_flights import OPTIONS, TRUE, flight, place
+from tests.support.gps_flights import TRUE, flight, place
 
 
 def test_positions_at_one_place_are_refused() -> None:
-    placed = place_by_gps(flight(6), np.zeros((6, 3)), np.ones((6, 3)), OPTIONS)
+    placed = place_by_gps(flight(6), np.zeros((6, 3)), np.ones((6, 3)))
     assert placed.reason == "DEGENERATE_LINE"
 
 
@@ -25,7 +25,6 @@ def test_positions_of_other_photos_are_refused(seed: int) -> None:
         TRUE.inverse().act(positions),
         positions[rng.permutation(25)],
         np.tile([4.0, 4.0, 10.0], (25, 1)),
-        OPTIONS,
     )
     assert placed.reason == "RESIDUALS"
     assert "other photos" in placed.message
@@ -37,7 +36,7 @@ def test_positions_drawn_by_chance_let_no_map_answer() -> None:
         count = int(rng.integers(3, 9))
         drawn = np.column_stack([rng.uniform(-500, 500, (count, 2)), rng.uniform(0, 100, count)])
         placed = place_by_gps(
-            TRUE.inverse().act(flight(count, seed)), drawn, np.tile([4.0, 4.0, 10.0], (count, 1)), OPTIONS
+            TRUE.inverse().act(flight(count, seed)), drawn, np.tile([4.0, 4.0, 10.0], (count, 1))
         )
         assert placed.reason is not None or placed.provisional
 
@@ -63,7 +62,7 @@ def test_positions_without_heights_place_a_map() -> None:
     noisy = positions + rng.normal(0, 1, (20, 3))
     noisy[:, 2] = 0.0
     sigmas = np.tile([2.0, 2.0, np.inf], (20, 1))
-    placed = place_by_gps(TRUE.inverse().act(positions), noisy, sigmas, OPTIONS)
+    placed = place_by_gps(TRUE.inverse().act(positions), noisy, sigmas)
     assert placed.reason is None
     assert placed.local_from_sfm is not None
     assert placed.covariance is not None
@@ -117,7 +116,7 @@ def test_a_refusal_without_heights_names_none() -> None:
     positions = flight(25)
     sigmas = np.tile([4.0, 4.0, np.inf], (25, 1))
     centers = TRUE.inverse().act(positions)
-    placed = place_by_gps(centers, positions[rng.permutation(25)] * [9.0, 9.0, 0.0], sigmas, OPTIONS)
+    placed = place_by_gps(centers, positions[rng.permutation(25)] * [9.0, 9.0, 0.0], sigmas)
     assert placed.reason == "RESIDUALS"
     assert "in height" not in placed.message
     assert placed.figures["rms_vertical_m"] is None

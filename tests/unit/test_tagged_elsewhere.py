@@ -8,7 +8,7 @@ import pytest
 
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.bridge import Model
-from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.register.gps import GpsPlacement, place_by_gps
 from ingest.register.tagged_elsewhere import tagged_elsewhere
 from tests.support.posed_models import model_of
 
@@ -39,7 +39,7 @@ def placed(
         positions[k, :2] += offset
     with_gps = [k for k in range(len(model.rows)) if k not in set(without)]
     sigmas = np.full((len(with_gps), 3), _SIGMA_M)
-    return with_gps, place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas, GpsOptions())
+    return with_gps, place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas)
 
 
 def found(model: Model, with_gps: list[int], placement: GpsPlacement) -> list[tuple[int, ...]]:
@@ -86,6 +86,6 @@ def test_a_receiver_that_lost_its_correction_for_a_while() -> None:
     model = walk()
     positions = model.centers() + np.random.default_rng(4).normal(0.0, 0.02, (20, 3))
     positions[8:12, :2] += (1.2, 1.6)
-    placement = place_by_gps(model.centers(), positions, np.full((20, 3), 0.03), GpsOptions())
+    placement = place_by_gps(model.centers(), positions, np.full((20, 3), 0.03))
     assert (~placement.inliers).sum() == 4
     assert found(model, list(range(20)), placement) == []
