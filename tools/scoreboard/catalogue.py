@@ -64,8 +64,8 @@ SPEED: tuple[Row, ...] = (
     ),
     _row(
         name="many-servers",
-        claim="servers of one database behind a router, each of whose workers takes 100 ms for a photo: queries a "
-        "second of two and four, in those of one; and queries that are lost when one of two is killed",
+        claim="servers of one database behind a router, each of whose workers takes 100 ms for a photo: "
+        "queries a second of two and four, in those of one; and queries lost when one of two is killed",
         commands=f"tools.many_servers {OUT}",
         figures=same("one_per_s killed_answered"),
         text="{two_times:.2f} and {four_times:.2f} times the queries of one; {killed_lost:.0f} of "
