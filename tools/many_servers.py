@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from multiprocessing.synchronize import Event
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -94,25 +94,26 @@ def servers(count: int) -> Iterator[tuple[str, list[Any]]]:
     endpoint = bind_free_port("tcp/127.0.0.1:0")
     config = zenoh.Config.from_json5(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}}}')
     config.insert_json5("scouting/multicast/enabled", "false")
-    stop = context.Event()
+    pipes = [context.Pipe() for _ in range(count)]  # an event would wait for a killed one
     with ExitStack() as stack:
         stack.enter_context(zenoh.open(config))
-        processes = [context.Process(target=_serve, args=(endpoint, stop)) for _ in range(count)]
+        processes = [context.Process(target=_serve, args=(endpoint, theirs)) for _, theirs in pipes]
         for process in processes:
             process.start()
         try:
             _wait_for(endpoint, count)
             yield endpoint, processes
         finally:
-            stop.set()
-            for process in processes:
+            for process, (ours, theirs) in zip(processes, pipes, strict=True):
+                theirs.close()
+                ours.close()
                 process.join()
 
 
-def _serve(router: str, stop: Event) -> None:
+def _serve(router: str, until_closed: Connection) -> None:
     options = ServeOptions(listen=("tcp/127.0.0.1:0",), connect=(router,), workers=1, contributions=False)
     with Server.start(_Source(), options, _DATABASE):  # type: ignore[arg-type]
-        stop.wait()
+        until_closed.poll(None)
 
 
 def _wait_for(router: str, count: int) -> None:
