@@ -6,17 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from featuredb.atomic import atomic_file, atomic_folder
 from featuredb.errors import IngestError
-from ingest.workspace import (
-    atomic_file,
-    atomic_folder,
-    default_root,
-    read_arrays,
-    read_json,
-    remove_leftovers,
-    write_arrays,
-    write_json,
-)
+from ingest.workspace import default_root, read_arrays, read_json, remove_leftovers, write_arrays, write_json
 
 
 def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
