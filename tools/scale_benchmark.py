@@ -89,6 +89,7 @@ class Measured:
     answered_without: float
     wrong: int
     resident_bytes: int
+    anonymous_bytes: int
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -117,8 +118,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in ("first_start_s", "start_s", "commit_s", "with_prior_ms", "without_ms"):
         figures[f"times_{name.rsplit('_', 1)[0]}"] = figures[f"large_{name}"] / figures[f"small_{name}"]
     more = measured[large].points - measured[small].points
-    more_bytes = measured[large].resident_bytes - measured[small].resident_bytes
-    figures["resident_bytes_a_point"] = more_bytes / more
+    for kind in ("resident_bytes", "anonymous_bytes"):
+        more_bytes = figures[f"large_{kind}"] - figures[f"small_{kind}"]
+        figures[f"{kind}_a_point"] = more_bytes / more
     write_figures(args.json, figures)
     return 0
 
@@ -245,7 +247,7 @@ def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measu
             answered[prior] += error is not None and error < _RIGHT_M
             wrong += error is not None and error >= _RIGHT_M
     gc.collect()
-    resident = _resident()
+    resident, anonymous = _memory("VmRSS"), _memory("RssAnon")
     commit_s = _commit(database, localiser, queries[0])
     return Measured(
         points=points,
@@ -258,6 +260,7 @@ def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measu
         answered_without=answered[False] / len(queries),
         wrong=wrong,
         resident_bytes=resident,
+        anonymous_bytes=anonymous,
     )
 
 
@@ -286,9 +289,10 @@ def ask(localiser: Localiser, query: Query, *, prior: bool) -> float | None:
     return float(np.linalg.norm(offset))
 
 
-def _resident() -> int:
+def _memory(kind: str) -> int:
+    """Bytes of this process; RssAnon leaves out files that are mapped, which the system may drop."""
     text = Path("/proc/self/status").read_text(encoding="ascii")
-    return 1024 * next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmRSS"))
+    return 1024 * next(int(line.split()[1]) for line in text.splitlines() if line.startswith(kind))
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ SPEED: tuple[Row, ...] = (
         f"--work {{work}}/scale {OUT}",
         figures=same(
             "large_points large_first_start_s large_start_s large_commit_s large_with_prior_ms "
-            "large_without_ms"
+            "large_without_ms anonymous_bytes_a_point"
         ),
         text="{times_start:.1f} times the start, {times_commit:.1f} times the commit, {times_with_prior:.2f} "
         "and {times_without:.2f} times a query with a prior and without; {large_answered_without:.0%} "
