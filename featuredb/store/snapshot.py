@@ -175,7 +175,7 @@ class Snapshot:
         }
 
     def camera_middles(self) -> dict[str, FloatArray]:
-        """Medians (3,) of the camera centres of the placed maps that have any, in their local frames, metres.
+        """Medians (3,), by UTM's axes, of the placed maps' camera centres, in their local frames, metres.
 
         Not of the points: a few far ones move the middle of those by hundreds of metres.
 

@@ -7,9 +7,11 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from featuredb.cli.main import COMMAND_GROUP, build_parser, main, needed_for
@@ -206,3 +208,24 @@ def test_what_a_command_does_not_need_is_not_loaded() -> None:
 
 def broken_register(subparsers: object) -> None:
     raise StoreError("no good")
+
+
+def test_a_few_far_points_do_not_widen_the_radius_of_a_place(tmp_path: Path) -> None:
+    """It is asked where the cameras are: of two maps that differ in one point 5 km away it is the same."""
+    near = random_map(0, map_id="near")
+    tilted = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 0.01, 0.01, 0.01])  # a turn about the vertical
+    near = replace(near, placement=replace(near.placement, covariance=tilted))
+    utm = near.points.utm.copy()
+    utm[0] += [5000.0, 0.0, 0.0]
+    far = replace(near, map_id="far", points=replace(near.points, utm=utm))
+    database = Database.create(tmp_path / "db")
+    database.commit_maps([near, far])
+    snapshot = database.snapshot()
+    bounds = snapshot.place_bounds()
+    assert bounds["far"].horizontal_m == pytest.approx(bounds["near"].horizontal_m)
+    centers = np.array([image.cam_from_local.center for image in near.images])
+    middle = np.median(near.frame.utm_from_enu(centers, near.epsg), axis=0)
+    expected = near.frame.enu_from_utm(middle, near.epsg)
+    np.testing.assert_allclose(snapshot.camera_middles()["far"], expected, atol=1e-6)
+    images = snapshot.images_of(["far", "near"])
+    assert [image.name for image in images["far"]] == [image.name for image in far.images]
