@@ -1,24 +1,18 @@
-"""RootSIFT as 8-bit integers: the one extractor of ingest and queries.
-
-The half pixel between OpenCV (centre of the top-left pixel at (0, 0)) and this project's convention
-(at (0.5, 0.5), COLMAP's) is added here and nowhere else.
-"""
+"""RootSIFT as 8-bit integers: the one extractor of ingest and queries."""
 
 import hashlib
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.features import Features
+from featuredb.features.scale_space import LAYERS, SIGMA, ScaleSpace
 from featuredb.features.shrink import shrunk
 
 # Raise when a change to this module makes descriptors that older maps cannot be compared with.
 _DESCRIPTOR_VERSION = "rootsift8-opencv-1"
-OCTAVE_LAYERS, SIGMA = 3, 1.6
 # 24 x 18 cells: a cell of a 4:3 photo is about square, and 4,000 features are about nine a cell, so that
 # a textured corner cannot take all the places while a cell still has a choice.
 _COLUMNS, _ROWS = 24, 18
@@ -34,7 +28,6 @@ class ExtractorOptions:
         max_features: the strongest, spatially spread, are kept. For maps many: on `brighton` 12,000 instead
             of 6,000 double the observations and halve what poses move by between subsets of the photos.
         oversample: the spread selection chooses among this many times as many of the strongest keypoints.
-            All of them are described, since that shares the scale pyramid with their detection.
         contrast_threshold: SIFT's; half of OpenCV's 0.04, so that asphalt and lawn still give keypoints.
         edge_threshold: SIFT's (Lowe's 10).
         upright: angles are set to zero, for image pairs whose rotation is known; more distinctive.
@@ -67,7 +60,7 @@ class ExtractorOptions:
         Size and number of features are not part of it: they change how many keypoints there are,
         not what a descriptor means.
         """
-        text = f"{_DESCRIPTOR_VERSION};upright={self.upright};layers={OCTAVE_LAYERS};sigma={SIGMA}"
+        text = f"{_DESCRIPTOR_VERSION};upright={self.upright};layers={LAYERS};sigma={SIGMA}"
         return (
             f"{_DESCRIPTOR_VERSION}{'-upright' if self.upright else ''}-"
             + (hashlib.sha256(text.encode()).hexdigest()[:12])
@@ -93,22 +86,30 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
     if min(height, width) < 32:
         raise ImageError(f"extract: expected at least 32x32 pixels, found {width}x{height}")
     small = shrunk(gray, options.max_side_px)
-    sift = create_sift(
-        # OpenCV keeps the strongest; describing them in the same pass shares the scale pyramid.
-        nfeatures=0 if options.upright else int(options.oversample * options.max_features),
-        contrastThreshold=options.contrast_threshold,
-        edgeThreshold=options.edge_threshold,
+    space = ScaleSpace(small)
+    points = space.keypoints(options.contrast_threshold, options.edge_threshold)
+    points = points.take(np.arange(min(len(points), int(options.oversample * options.max_features))))
+    points = points.take(
+        spread_strongest(points.xy, points.response, small.shape[1], small.shape[0], options.max_features)
     )
     if options.upright:
-        keypoints, raw = sift.compute(small, _upright(sift.detect(small, None)))
+        angle = np.zeros(len(points), np.float32)
     else:
-        keypoints, raw = sift.detectAndCompute(small, None)
-    if not keypoints:
-        return _features([], np.zeros((0, 128), np.uint8), gray.shape, small.shape, options)
-    xy = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float32)
-    response = np.array([k.response for k in keypoints], dtype=np.float32)
-    rows = spread_strongest(xy, response, small.shape[1], small.shape[0], options.max_features)
-    return _features([keypoints[i] for i in rows], rootsift_8bit(raw[rows]), gray.shape, small.shape, options)
+        angles, counts = space.orientations(points)
+        rows = np.repeat(np.arange(len(points)), counts)[: options.max_features]
+        angle = angles[rows, np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]]
+        points = points.take(rows)
+    ratio = np.array([width / small.shape[1], height / small.shape[0]])
+    return Features(
+        xy=(points.xy * ratio).astype(np.float32),
+        scale=points.diameter * np.float32(ratio.mean()),
+        angle=angle,
+        response=points.response,
+        descriptors=rootsift_8bit(space.descriptors(points, angle)),
+        width=width,
+        height=height,
+        fingerprint=options.fingerprint,
+    )
 
 
 def rootsift_8bit(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -118,43 +119,6 @@ def rootsift_8bit(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
     """
     total = np.maximum(sift.sum(axis=1, keepdims=True), np.float32(1e-9))
     return np.asarray(np.clip(np.rint(512.0 * np.sqrt(sift / total)), 0, 255), dtype=np.uint8)
-
-
-def create_sift(**options: Any) -> Any:
-    """OpenCV's SIFT with this extractor's scale space, and more options by OpenCV's names."""
-    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
-    return create(nOctaveLayers=OCTAVE_LAYERS, sigma=SIGMA, enable_precise_upscale=True, **options)
-
-
-def _upright(keypoints: "list[cv2.KeyPoint]") -> "list[cv2.KeyPoint]":
-    """One keypoint per place and scale, with angle zero (a place may have several orientations)."""
-    seen: dict[tuple[float, float, float], cv2.KeyPoint] = {}
-    for keypoint in keypoints:
-        keypoint.angle = 0.0
-        seen.setdefault((*keypoint.pt, keypoint.size), keypoint)
-    return list(seen.values())
-
-
-def _features(
-    keypoints: "list[cv2.KeyPoint]",
-    descriptors: NDArray[np.uint8],
-    shape: tuple[int, ...],
-    small_shape: tuple[int, ...],
-    options: ExtractorOptions,
-) -> Features:
-    """Back to full-size pixels, with the half pixel."""
-    ratio = np.array([shape[1] / small_shape[1], shape[0] / small_shape[0]])
-    xy = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
-    return Features(
-        xy=((xy + 0.5) * ratio).astype(np.float32),
-        scale=np.array([k.size for k in keypoints], dtype=np.float32) * np.float32(ratio.mean()),
-        angle=np.array([k.angle for k in keypoints], dtype=np.float32) % np.float32(360.0),
-        response=np.array([k.response for k in keypoints], dtype=np.float32),
-        descriptors=descriptors,
-        width=shape[1],
-        height=shape[0],
-        fingerprint=options.fingerprint,
-    )
 
 
 def spread_strongest(

@@ -1,4 +1,4 @@
-"""FAISS over the descriptors of areas: inverted lists of short codes, which choose the neighbours.
+"""FAISS over the descriptors of areas: short codes choose neighbours, in inverted lists where there are many.
 
 Which of them is nearest, and how near, the descriptors themselves say (`squared_distances`). The centres of
 lists and codes were trained once and come with featuredb: an index costs no training, and a map's part of it
@@ -21,6 +21,8 @@ from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.index.stacked import Stacked
 
 CODE_PARTS, CODE_BYTES = 32, 16  # 4 bits a part
+# So many are compared one by one in the time that the lists of a descriptor take to be found.
+_FEW = 25_000
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
 _LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
 LISTS = 2048
@@ -79,6 +81,12 @@ class DescriptorIndex:
 
     @classmethod
     def of(cls, codes: DescriptorCodes) -> Self:
+        if len(codes) <= _FEW:
+            flat = faiss.IndexPQ(DESCRIPTOR_SIZE, CODE_PARTS, 4, faiss.METRIC_L2)
+            faiss.copy_array_to_vector(_shipped(_CODES).ravel(), flat.pq.centroids)
+            faiss.copy_array_to_vector(codes.codes.ravel(), flat.codes)
+            flat.is_trained, flat.ntotal = True, len(codes)
+            return cls(faiss.IndexPQFastScan(flat))  # type: ignore[arg-type]  # its stubs have one form of several
         index = _empty_index()
         order = np.argsort(codes.lists, kind="stable")
         rows, sorted_codes = order.astype(np.int64), np.ascontiguousarray(codes.codes[order])
@@ -100,7 +108,12 @@ class DescriptorIndex:
         """Rows (n, k) of near ones to each descriptor (n, 128), about nearest first; -1: there are fewer."""
         if len(self) == 0 or len(descriptors) == 0:
             return np.full((len(descriptors), k), -1, np.int64)
-        _, row = self._index.search(np.ascontiguousarray(descriptors, dtype=np.float32), k)
+        asked = np.ascontiguousarray(descriptors, dtype=np.float32)
+        if len(self) <= _FEW:
+            _, row = self._index.search(asked, k)
+        else:
+            lists = np.argpartition(_from_lists(asked), _PROBES, axis=1)[:, :_PROBES].astype(np.int64)
+            _, row = self._index.search_preassigned(asked, k, lists, np.zeros(lists.shape, np.float32))
         return np.asarray(row, dtype=np.int64)
 
 
@@ -133,7 +146,7 @@ def _empty_index() -> Any:
 def _from_lists(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Squared distances (n, lists) of descriptors (n, 128) from the lists' centres, less their own length.
 
-    On one thread NumPy's product takes a third of FAISS's search; for queries, on two, FAISS is quicker.
+    FAISS's search among the centres takes twice as long.
     """
     centers = _shipped(_LISTS)
     squared = descriptors @ (-2.0 * centers.T)

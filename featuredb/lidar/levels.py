@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.compiled import compiled_module
 from featuredb.geometry.arrays import FloatArray
-from featuredb.render.compiled import compiled_module
 
 # The coarsest level has a point every 4 m: some 16,000 in a tile of flat land, small enough to load for
 # kilometres.

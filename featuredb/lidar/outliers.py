@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from featuredb.compiled import compiled_module
 from featuredb.geometry.arrays import FloatArray
-from featuredb.render.compiled import compiled_module
 
 _QUERY_ROWS = 100_000  # neighbours of this many points at a time: 15 MB
 _SORTED_CELLS = 8.0  # cells per reach when points are sorted: about as many as there are neighbours

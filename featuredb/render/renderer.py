@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.compiled import compiled_module, mapped, over_rows, thread_count
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import CloudNodes, PointCloud
-from featuredb.render.compiled import compiled_module, mapped, over_rows, thread_count
 from featuredb.render.rendering import Rendering
 from featuredb.render.splats import FINEST_PX, NEAR_M, BlockPlanes, Splats, draw_splats, project_points
 
@@ -53,9 +53,6 @@ def render(
     """What the camera sees of the cloud, in colour, intensity, depth and by index.
 
     The same picture whatever the number of threads; safe to call from several threads at once.
-
-    Raises:
-        MissingExtraError: numba is not installed.
     """
     options = options or RenderOptions()
     threads = thread_count(options.threads)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from featuredb.render.compiled import compiled_module
+from featuredb.compiled import compiled_module
 
 _CODE_BITS = 21  # per axis in a 63-bit code
 _PROBE_POINTS = 16.0  # points per probing cell: enough that its spacing is known to an eighth or so

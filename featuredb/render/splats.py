@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.compiled import compiled_module, mapped
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
-from featuredb.render.compiled import compiled_module, mapped
 
 NEAR_M = 0.3  # nothing closer is drawn: a camera does not stand in a wall
 # Points closer together than this in the picture are left to coarser levels: two to three points a pixel at

@@ -11,7 +11,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.view_cones import ViewCones, in_view
 from featuredb.index.area import Area
-from featuredb.index.nearest import nearest
+from featuredb.index.descriptor_index import DescriptorIndex, squared_distances
 from reloc.localise.candidates import Cluster
 from reloc.localise.options import PointMatchOptions
 
@@ -19,6 +19,9 @@ from reloc.localise.options import PointMatchOptions
 # and from descents: up to the first a point is missed where it is not found, up to the
 # second a match may be one. More is a scene seen from behind, or from under the ground.
 EXPECTED_DEG, POSSIBLE_DEG = 30.0, 60.0
+# Points that codes propose for a feature. Of 6,400 points twenty codes hold the nearest of 98 % of features,
+# and of all that pass the ratio test.
+_PROPOSED = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,14 +71,14 @@ class _MapNeighbours:
 
     def __init__(self, features: Features, area: Area, points: NDArray[np.int64]) -> None:
         self._features, self._points = features, points
-        self._descriptors = area.descriptors[points]
+        self._index = DescriptorIndex.of(area.codes(points))
         self._squared, self._row = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64)
 
     def matches(self, xy: NDArray[np.float32], area: Area, options: PointMatchOptions) -> Matches:
         count, points = len(xy), self._points
         if count > len(self._row):
             more = self._features.descriptors[len(self._row) : count]
-            squared, row = nearest(more, self._descriptors, 3)
+            squared, row = self._nearest(area, more)
             self._squared = np.concatenate([self._squared, squared])
             self._row = np.concatenate([self._row, row])
         row = self._row[:count]
@@ -86,6 +89,18 @@ class _MapNeighbours:
         rival = np.where(second_is_same, distance[:, 2], distance[:, 1])
         good = np.flatnonzero((row[:, 0] >= 0) & (distance[:, 0] < options.ratio * rival))
         return _one_to_one(xy, good, points[row[good, 0]], distance[good, 0])
+
+    def _nearest(self, area: Area, asked: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Squared distances, rows (n, 3) of the nearest points to descriptors (n, 128); infinity, -1: fewer.
+
+        Codes propose them, descriptors decide.
+        """
+        row = self._index.search(asked, _PROPOSED)
+        squared = np.full(row.shape, np.inf, np.float32)
+        at = np.nonzero(row >= 0)
+        squared[at] = squared_distances(asked, at[0], area.descriptors, self._points[row[at]])
+        best = np.argsort(squared, axis=1, kind="stable")[:, :3]
+        return np.take_along_axis(squared, best, axis=1), np.take_along_axis(row, best, axis=1)
 
 
 def guided_matches(

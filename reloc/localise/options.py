@@ -27,14 +27,14 @@ class CandidateOptions:
         prior_reach: ... plus so many times the distance from which they look at their scene.
     """
 
-    vote_features: int = 3000
+    vote_features: int = 1000
     vote_background: int = 10
     vote_tie: float = 0.02
     max_cluster_images: int = 12
     shortlist: int = 10
     shortlist_features: int = 200
     max_clusters: int = 3
-    single_cluster_points: int = 6000
+    single_cluster_points: int = 20_000
     prior_sigmas: float = 3.0
     prior_reach: float = 2.0
 

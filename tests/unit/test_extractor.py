@@ -64,26 +64,66 @@ def test_rootsift_is_the_float_formula() -> None:
     np.testing.assert_array_equal(rootsift_8bit(np.zeros((1, 128), np.float32)), 0)
 
 
-def test_descriptors_are_those_of_opencv_at_the_same_keypoints() -> None:
-    """An independent pass: OpenCV's raw SIFT of the shrunk image, RootSIFT in float64."""
-    gray = texture(300, 220)
-    found = extract(gray, ExtractorOptions(max_features=200))
-    sift = cv2.SIFT_create(0, 3, 0.02, 10.0, 1.6, enable_precise_upscale=True)
+def test_keypoints_and_descriptors_are_opencvs() -> None:
+    """All but a few of OpenCV's keypoints, and descriptors that are nearer to it than any other is by far."""
+    gray = texture(500, 400)
+    options = ExtractorOptions(max_features=100_000)
+    found = extract(gray, options)
+    sift = cv2.SIFT_create(
+        0, 3, options.contrast_threshold, options.edge_threshold, 1.6, enable_precise_upscale=True
+    )
     keypoints, raw = sift.detectAndCompute(gray, None)
-    by_key = {(*k.pt, k.size, k.angle): d for k, d in zip(keypoints, raw, strict=True)}
-    for i in range(0, len(found), 17):
-        x, y = found.xy[i] - np.float32(0.5)
-        key = min(
-            by_key,
-            key=lambda k: (
-                abs(k[0] - x) + abs(k[1] - y) + abs(k[2] - found.scale[i]) + abs(k[3] - found.angle[i])
-            ),
-        )
-        expected = np.minimum(512 * np.sqrt(by_key[key].astype(np.float64) / by_key[key].sum()), 255)
-        assert np.abs(found.descriptors[i] - expected).max() <= 0.51
+    theirs = np.array([(k.pt[0] + 0.5, k.pt[1] + 0.5, k.size, k.angle) for k in keypoints])
+    apart = theirs[:, None, :] - np.column_stack([found.xy, found.scale, found.angle])
+    turned = np.abs((apart[..., 3] + 180.0) % 360.0 - 180.0)
+    same = np.linalg.norm(apart[..., :2], axis=2) < 0.1 * theirs[:, 2:3]
+    same &= (np.abs(apart[..., 2]) < 0.1 * theirs[:, 2:3]) & (turned < 10.0)
+    rows = same.argmax(axis=1)[same.any(axis=1)]
+    assert len(theirs) > 500
+    assert 0.97 * len(theirs) < len(found) < 1.03 * len(theirs)
+    assert len(rows) > 0.8 * len(theirs)  # OpenCV doubles the image with other weights
+    expected = rootsift_8bit(raw[same.any(axis=1)]).astype(np.float64)
+    distance = np.linalg.norm(found.descriptors[rows] - expected, axis=1)
+    assert np.median(distance) < 45.0
+    assert np.percentile(distance, 99) < 110.0
+    other = np.linalg.norm(found.descriptors[rows] - np.roll(expected, 1, axis=0), axis=1)
+    assert np.median(other) > 250.0
     lengths = np.linalg.norm(found.descriptors.astype(float), axis=1)
-    assert len(found) == 200
     assert np.abs(lengths - 512).max() < 12  # clipping at 255 and rounding
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_turned_image_has_the_same_fine_features_turned(quarters: int) -> None:
+    gray = texture(300, 220, seed=2)
+    found, turned = extract(gray), extract(np.ascontiguousarray(np.rot90(gray, -quarters)))
+    xy, size = found.xy.astype(np.float64), np.array([300.0, 220.0])
+    for _ in range(quarters):
+        xy, size = np.column_stack([size[1] - xy[:, 1], xy[:, 0]]), size[::-1]
+    apart = np.linalg.norm(xy[:, None] - turned.xy, axis=2)
+    turn = (turned.angle - found.angle[:, None] - 90.0 * quarters + 180.0) % 360.0 - 180.0
+    same = (apart < 0.01) & (np.abs(turn) < 0.1) & (np.abs(turned.scale - found.scale[:, None]) < 0.01)
+    first = found.scale < 3.5  # of the others pixels are left out: others in the turned image
+    assert first.sum() > 300
+    assert same[first].any(axis=1).mean() > 0.99
+    rows = np.flatnonzero(first & same.any(axis=1))
+    difference = found.descriptors[rows].astype(float) - turned.descriptors[same[rows].argmax(axis=1)]
+    assert np.median(np.linalg.norm(difference, axis=1)) < 20.0
+
+
+def test_features_of_a_window_are_those_of_the_whole() -> None:
+    """Even sizes and offsets keep the pixels of all octaves but the coarsest where they are."""
+    gray = texture(420, 360, seed=4)
+    window = np.ascontiguousarray(gray[64:296, 96:352])
+    whole, part = extract(gray), extract(window)
+    inside = (np.abs(part.xy - [128.0, 116.0]) < [60.0, 50.0]).all(axis=1) & (part.scale < 6.0)
+    assert inside.sum() > 50
+    for row in np.flatnonzero(inside):
+        at = np.linalg.norm(whole.xy - part.xy[row] - [96.0, 64.0], axis=1)
+        at += np.abs(whole.angle - part.angle[row])
+        assert at.min() < 0.01
+        np.testing.assert_allclose(
+            part.descriptors[row].astype(int), whole.descriptors[at.argmin()].astype(int), atol=3
+        )
 
 
 def test_the_fingerprint_names_the_space_of_descriptors() -> None:

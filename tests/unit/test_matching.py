@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import reloc.localise.matching as matching_module
 from featuredb.features.features import Features
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.descriptor_index import DescriptorIndex
 from reloc.localise.candidates import Cluster, IndexedArea
 from reloc.localise.matching import (
     EXPECTED_DEG,
@@ -126,13 +126,13 @@ def test_more_features_are_matched_as_if_they_had_come_at_once(monkeypatch: pyte
     features, _ = photo()
     cluster = whole(indexed(first, second))
     asked: list[int] = []
-    honest = matching_module.nearest
+    honest = DescriptorIndex.search
 
-    def counted(query: np.ndarray, base: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    def counted(index: DescriptorIndex, query: np.ndarray, k: int) -> np.ndarray:
         asked.append(len(query))
-        return honest(query, base, k)
+        return honest(index, query, k)
 
-    monkeypatch.setattr(matching_module, "nearest", counted)
+    monkeypatch.setattr(DescriptorIndex, "search", counted)
     matcher = ClusterMatcher(features, cluster, OPTIONS)
     for count in (20, 90, 50, len(features), len(features) + 10):
         at_once = match_cluster(features.take(np.arange(min(count, len(features)))), cluster, OPTIONS)

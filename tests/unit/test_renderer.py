@@ -1,19 +1,17 @@
 """The renderer of point clouds against ray casting, closed forms and pycolmap's lenses."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError, MissingExtraError
+from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rays import pixel_rays
 from featuredb.render import renderer, shading, splats
 from featuredb.render.cloud import PointCloud
-from featuredb.render.compiled import compiled_module
 from featuredb.render.loops.draw_loops import project
 from featuredb.render.renderer import RenderOptions, render, visible_nodes
 from featuredb.render.shading import shaded_relief
@@ -300,13 +298,6 @@ def test_a_picture_smaller_than_the_distance_of_points_has_no_relief(monkeypatch
     picture = shaded_relief(rendering)
     assert picture.shape == (10, 16)
     assert not picture.any()
-
-
-def test_without_numba_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "featuredb.render.loops.level_loops", raising=False)
-    monkeypatch.setitem(sys.modules, "numba", None)
-    with pytest.raises(MissingExtraError, match=r"featuredb\[lidar\]"):
-        compiled_module("featuredb.render.loops.level_loops")
 
 
 def test_a_cloud_without_spacings_is_drawn_by_its_nodes() -> None:

@@ -27,6 +27,20 @@ SPEED: tuple[Row, ...] = (
         minutes=2,
     ),
     _row(
+        name="sift",
+        form="quick",
+        claim="our SIFT beside OpenCV's, the same photos on one thread: processor time, and inliers of "
+        "neighbouring photos of `brighton`, `seneca`, `lewis`, `copr` and `reichstag` with ours, and across",
+        commands="tools.sift_against_opencv "
+        + " ".join(f"{{data}}/{name}/images" for name in ("brighton", "seneca", "lewis", "copr", "reichstag"))
+        + f" {OUT}",
+        figures=same("photos ours_ms opencv_inliers"),
+        text="{time_ratio:.2f} times OpenCV's time; {inliers_ratio:.3f} times its {opencv_inliers:.0f} "
+        "inliers, across {across_ratio:.3f} times; {photos} photos",
+        limits="time_ratio <= 0.7, 0.98 <= inliers_ratio, 0.95 <= across_ratio",
+        minutes=4,
+    ),
+    _row(
         name="ingest-time",
         claim="ingest of `brighton` and `seneca` against COLMAP's own pipeline, processor time of one run",
         commands=f"tools.ingest_benchmark {BRIGHTON} {{data}}/seneca/images {OUT}",

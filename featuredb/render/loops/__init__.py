@@ -1,1 +1,1 @@
-"""Compiled loops of the renderer; import them through `featuredb.render.compiled.compiled_module`."""
+"""Compiled loops of the renderer; import them through `featuredb.compiled.compiled_module`."""

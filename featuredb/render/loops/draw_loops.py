@@ -11,7 +11,7 @@ with atomic additions that threads fight over.
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.render.compiled import compiled
+from featuredb.compiled import compiled
 
 Bytes = NDArray[np.uint8]
 Float32 = NDArray[np.float32]

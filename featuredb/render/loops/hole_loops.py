@@ -8,7 +8,7 @@ be closed; those few are then closed one by one.
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.render.compiled import compiled
+from featuredb.compiled import compiled
 from featuredb.render.loops.draw_loops import lies_on
 
 Float32 = NDArray[np.float32]

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.render.compiled import compiled
+from featuredb.compiled import compiled
 
 Int64 = NDArray[np.int64]
 

@@ -8,7 +8,7 @@ works on rows `first` to `end` of the picture, so that threads can share it.
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.render.compiled import compiled
+from featuredb.compiled import compiled
 from featuredb.render.loops.draw_loops import NOTHING, lies_on, slot_of
 
 Float32 = NDArray[np.float32]

@@ -7,7 +7,7 @@ blocks `first` to `end`, so that threads can share it.
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.render.compiled import compiled
+from featuredb.compiled import compiled
 from featuredb.render.loops.draw_loops import NOTHING, slot_of
 
 Float32 = NDArray[np.float32]

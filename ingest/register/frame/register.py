@@ -58,7 +58,6 @@ def register_frame(
 
     Raises:
         ImageError: the image is not 8-bit, or not of the camera's size.
-        MissingExtraError: numba is not installed.
     """
     options = options or FrameOptions()
     clock = StageClock()

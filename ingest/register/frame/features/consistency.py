@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import gammainc
 
+from featuredb.compiled import compiled_module
 from featuredb.geometry.arrays import FloatArray
-from featuredb.render.compiled import compiled_module
 
 # Matches around each one that are asked. At 3 % true ones, 180 hold five; with 120 a third of these is lost,
 # and time grows with the square.
@@ -48,9 +48,6 @@ def consistent_matches(
         photo: (m, 2) pixels. reference: (m, 2) where the matched scan points appear in one common view;
             rows that are not finite are supported by nothing.
         side_px: longer side of the photo. area_px: over which false matches are spread in the reference.
-
-    Raises:
-        MissingExtraError: numba is not installed.
     """
     m = len(photo)
     finite = np.isfinite(reference).all(axis=1)

@@ -1,10 +1,10 @@
-"""Compiled loop of the local consistency; import it through `featuredb.render.compiled.compiled_module`."""
+"""Compiled loop of the local consistency; import it through `featuredb.compiled.compiled_module`."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.compiled import compiled
 from featuredb.geometry.arrays import FloatArray
-from featuredb.render.compiled import compiled
 
 
 @compiled

@@ -8,7 +8,6 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from featuredb.errors import InvalidValueError
-from featuredb.extras import require
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -59,15 +58,14 @@ def compiled(function: F) -> F:
     import numba
 
     # IEEE division instead of a test per division; NaN keeps its meaning, so no fastmath.
-    decorated: F = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+    options = {"nogil": True, "error_model": "numpy"}
+    try:
+        decorated: F = numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # there is no folder that may be written to: it is compiled in each process
+        decorated = numba.njit(**options)(function)
     return decorated
 
 
 def compiled_module(name: str) -> ModuleType:
-    """Import a module of compiled loops.
-
-    Raises:
-        MissingExtraError: numba is not installed.
-    """
-    require("lidar", "Drawing point clouds", "numba")
+    """Import a module of compiled loops, which takes half a second: where it is needed, and not before."""
     return importlib.import_module(name)

@@ -1,0 +1,116 @@
+"""Our SIFT beside OpenCV's: time, and matches of neighbouring photos with ours, with OpenCV's, and across.
+
+    python -m tools.sift_against_opencv FOLDER... [--side PX] [--features N] [--json FILE]
+
+Of each folder's photos, by name, every eighth and the one after it. Both extractors have the same thresholds
+and number of features, and choose them alike; matches are mutual and pass a ratio test of 0.85; inliers are
+those of a fundamental matrix to one pixel of the shrunk photos. Times are of one thread, without decoding.
+"""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.features.decode import decode_gray
+from featuredb.features.extractor import ExtractorOptions, extract, rootsift_8bit, spread_strongest
+from featuredb.features.scale_space import LAYERS, SIGMA
+from featuredb.features.shrink import shrunk
+from featuredb.index.nearest import nearest
+from tools.figures import study_parser, write_figures
+
+_EVERY, _RATIO, _TOLERANCE_PX = 8, 0.85, 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Described:
+    """Places (n, 2) in pixels of the shrunk photo, descriptors (n, 128), and seconds that they took."""
+
+    xy: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    seconds: float
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = study_parser(__doc__)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
+    parser.add_argument("--side", type=int, default=1000, metavar="PX", help="longer side; default: 1000")
+    parser.add_argument("--features", type=int, default=3000, metavar="N", help="default: 3000")
+    args = parser.parse_args(argv)
+    options = ExtractorOptions(max_side_px=args.side, max_features=args.features, oversample=1.25)
+    cv2.setNumThreads(1)
+    counts = {"ours": 0, "opencv": 0, "across": 0}
+    ours_s, opencv_s = [], []
+    for folder in args.folders:
+        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".jpg", ".jpeg"))
+        for first, second in zip(paths[::_EVERY], paths[1::_EVERY], strict=False):
+            photos = [shrunk(decode_gray(path.read_bytes()), args.side) for path in (first, second)]
+            ours = [by_us(photo, options) for photo in photos]
+            theirs = [by_opencv(photo, options) for photo in photos]
+            counts["ours"] += inliers(ours[0], ours[1])
+            counts["opencv"] += inliers(theirs[0], theirs[1])
+            counts["across"] += inliers(ours[0], theirs[1])
+            ours_s += [one.seconds for one in ours]
+            opencv_s += [one.seconds for one in theirs]
+    ratios = [mine / other for mine, other in zip(ours_s, opencv_s, strict=True)]
+    figures = {
+        "photos": len(ratios),
+        "time_ratio": median(ratios),
+        "ours_ms": 1e3 * median(ours_s),
+        "opencv_inliers": counts["opencv"],
+        "inliers_ratio": counts["ours"] / counts["opencv"],
+        "across_ratio": counts["across"] / counts["opencv"],
+    }
+    write_figures(args.json, figures)
+    return 0
+
+
+def by_us(photo: NDArray[np.uint8], options: ExtractorOptions) -> Described:
+    start = time.thread_time()
+    found = extract(photo, options)
+    return Described(xy=found.xy, descriptors=found.descriptors, seconds=time.thread_time() - start)
+
+
+def by_opencv(photo: NDArray[np.uint8], options: ExtractorOptions) -> Described:
+    start = time.thread_time()
+    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
+    sift = create(
+        int(options.oversample * options.max_features),
+        LAYERS,
+        options.contrast_threshold,
+        options.edge_threshold,
+        SIGMA,
+        enable_precise_upscale=True,
+    )
+    keypoints, raw = sift.detectAndCompute(photo, None)
+    xy = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float32)
+    response = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
+    rows = spread_strongest(xy, response, photo.shape[1], photo.shape[0], options.max_features)
+    descriptors = rootsift_8bit(raw[rows])
+    return Described(
+        xy=xy[rows] + np.float32(0.5), descriptors=descriptors, seconds=time.thread_time() - start
+    )
+
+
+def inliers(first: Described, second: Described) -> int:
+    """Matches of two photos that agree with one fundamental matrix."""
+    squared, row = nearest(first.descriptors, second.descriptors, 2)
+    _, back = nearest(second.descriptors, first.descriptors, 1)
+    good = np.sqrt(squared[:, 0]) < _RATIO * np.sqrt(squared[:, 1])
+    good &= back[row[:, 0], 0] == np.arange(len(row))
+    places = [first.xy[good].astype(np.float64), second.xy[row[good, 0]].astype(np.float64)]
+    if len(places[0]) < 8:
+        return 0
+    _, mask = cv2.findFundamentalMat(*places, cv2.USAC_MAGSAC, _TOLERANCE_PX, 0.999, 5000)
+    return 0 if mask is None else int(mask.sum())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
