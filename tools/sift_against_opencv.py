@@ -30,7 +30,7 @@ _EVERY, _RATIO, _TOLERANCE_PX = 8, 0.85, 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Described:
+class TimedFeatures:
     """Places (n, 2) in pixels of the shrunk photo, descriptors (n, 128), and seconds that they took."""
 
     xy: NDArray[np.float32]
@@ -72,13 +72,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def by_us(photo: NDArray[np.uint8], options: ExtractorOptions) -> Described:
+def by_us(photo: NDArray[np.uint8], options: ExtractorOptions) -> TimedFeatures:
     start = time.thread_time()
     found = extract(photo, options)
-    return Described(xy=found.xy, descriptors=found.descriptors, seconds=time.thread_time() - start)
+    return TimedFeatures(xy=found.xy, descriptors=found.descriptors, seconds=time.thread_time() - start)
 
 
-def by_opencv(photo: NDArray[np.uint8], options: ExtractorOptions) -> Described:
+def by_opencv(photo: NDArray[np.uint8], options: ExtractorOptions) -> TimedFeatures:
     start = time.thread_time()
     create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
     sift = create(
@@ -94,12 +94,12 @@ def by_opencv(photo: NDArray[np.uint8], options: ExtractorOptions) -> Described:
     response = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
     rows = spread_strongest(xy, response, photo.shape[1], photo.shape[0], options.max_features)
     descriptors = rootsift_8bit(raw[rows])
-    return Described(
+    return TimedFeatures(
         xy=xy[rows] + np.float32(0.5), descriptors=descriptors, seconds=time.thread_time() - start
     )
 
 
-def inliers(first: Described, second: Described) -> int:
+def inliers(first: TimedFeatures, second: TimedFeatures) -> int:
     """Matches of two photos that agree with one fundamental matrix."""
     squared, row = nearest(first.descriptors, second.descriptors, 2)
     _, back = nearest(second.descriptors, first.descriptors, 1)

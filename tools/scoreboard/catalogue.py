@@ -28,7 +28,6 @@ SPEED: tuple[Row, ...] = (
     ),
     _row(
         name="sift",
-        form="quick",
         claim="our SIFT beside OpenCV's, the same photos on one thread: processor time, and inliers of "
         "neighbouring photos of `brighton`, `seneca`, `lewis`, `copr` and `reichstag` with ours, and across",
         commands="tools.sift_against_opencv "
