@@ -3,9 +3,9 @@
 Ours is 2.4 to 2.9 times as fast as OpenCV's, and its matches are as many (docs/decisions/0015-own-sift.md).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
+from itertools import pairwise
 from types import ModuleType
 from typing import Any, Self
 
@@ -13,14 +13,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.compiled import compiled_module
+from featuredb.compiled import compiled_module, mapped
 from featuredb.geometry.arrays import FloatArray
 
 LAYERS, SIGMA = 3, 1.6
 X, Y, SCALE, OCTAVE, LAYER, RESPONSE = range(6)  # of a keypoint's row
 _CAMERA_BLUR = 0.5  # of any photo, in its pixels
 _LEAST_PX = 12  # a side of an octave: less has no extrema
+_BAND_ROWS = 200  # for a thread at least
+_AT_ONCE = 500  # keypoints for a thread
+_MOST_THREADS = 4
 _MOST_ORIENTATIONS = 18  # of a keypoint: each second direction can be a peak
+
+_Part = tuple[NDArray[np.float32], NDArray[np.intp]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,10 +88,14 @@ class ScaleSpacePoints:
 
 
 class ScaleSpace:
-    """Octaves of an image (h, w) uint8, the first of which is twice its size."""
+    """Octaves of an image (h, w) uint8, the first of which is twice its size.
+
+    On as many threads as OpenCV may use in this process, up to four; results are the same for any number.
+    """
 
     def __init__(self, gray: NDArray[np.uint8]) -> None:
         self._gray = gray
+        self._threads = min(max(cv2.getNumThreads(), 1), _MOST_THREADS)
 
     @cached_property
     def octaves(self) -> list[NDArray[np.float32]]:
@@ -97,27 +106,27 @@ class ScaleSpace:
         while not octaves or min(first.shape) >= _LEAST_PX:
             octave = np.empty((LAYERS + 3, *first.shape), np.float32)
             octave[0] = first
-            for layer in range(1, LAYERS + 3):
-                before = SIGMA * 2.0 ** ((layer - 1) / LAYERS)
-                kernel = _kernel(before * float(np.sqrt(4.0 ** (1 / LAYERS) - 1.0)))
-                cv2.sepFilter2D(octave[layer - 1], cv2.CV_32F, kernel, kernel, dst=octave[layer])
+            mapped(partial(_blur, octave), self._bands(len(first)), self._threads)
             octaves.append(octave)
             first = octave[LAYERS, ::2, ::2]
         return octaves
 
     def keypoints(self, contrast_threshold: float, edge_threshold: float) -> ScaleSpacePoints:
         """All extrema of at least this contrast that are no edges (OpenCV's thresholds), strongest first."""
-        found = [
-            _loops().extrema(octave, number, contrast_threshold, edge_threshold)
-            for number, octave in enumerate(self.octaves)
-        ]
-        rows = np.concatenate(found)
+
+        def found(where: tuple[int, tuple[int, int]]) -> NDArray[np.float32]:
+            number, rows = where
+            extrema: NDArray[np.float32] = _loops().extrema(
+                self.octaves[number], number, *rows, contrast_threshold, edge_threshold
+            )
+            return extrema
+
+        bands = [(n, rows) for n, one in enumerate(self.octaves) for rows in self._bands(one.shape[1])]
+        rows = np.concatenate(mapped(found, bands, self._threads))
         rows = rows[np.argsort(-rows[:, RESPONSE], kind="stable")]
         # Neighbouring pixels may be refined to one place.
-        first = np.concatenate(
-            [np.ones(min(len(rows), 1), np.bool_), (np.diff(rows, axis=0) != 0).any(axis=1)]
-        )
-        return ScaleSpacePoints(rows=rows[first])
+        new = (np.diff(rows, axis=0) != 0).any(axis=1)
+        return ScaleSpacePoints(rows=rows[np.append(np.ones(min(len(rows), 1), np.bool_), new)])
 
     def orientations(self, points: ScaleSpacePoints) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Angles (n, 18), degrees in [0, 360) clockwise from the x axis, of each the strongest first, and
@@ -125,24 +134,55 @@ class ScaleSpace:
         """
         angles = np.zeros((len(points), _MOST_ORIENTATIONS), np.float32)
         counts = np.zeros(len(points), np.int64)
-        for octave, mine in self._by_octave(points):
+
+        def turn(part: _Part) -> None:
+            octave, mine = part
             own = np.zeros((len(mine), _MOST_ORIENTATIONS), np.float32)
             counts[mine] = _loops().orientations(octave, points.rows[mine], own)
             angles[mine] = own
+
+        mapped(turn, self._parts(points), self._threads)
         return angles, counts
 
     def descriptors(self, points: ScaleSpacePoints, angle: NDArray[np.float32]) -> NDArray[np.float32]:
         """SIFT (n, 128) of keypoints turned by angles (n,), of any length."""
         found = np.zeros((len(points), 128), np.float32)
-        for octave, mine in self._by_octave(points):
+
+        def describe(part: _Part) -> None:
+            octave, mine = part
             found[mine] = _loops().descriptors(octave, points.rows[mine], angle[mine], *_samples())
+
+        mapped(describe, self._parts(points), self._threads)
         return found
 
-    def _by_octave(self, points: ScaleSpacePoints) -> Iterator[tuple[NDArray[np.float32], NDArray[np.intp]]]:
+    def _bands(self, height: int) -> list[tuple[int, int]]:
+        """Rows from and to, for a thread each."""
+        count = 1 if height < _BAND_ROWS * self._threads else self._threads
+        ends = np.linspace(0, height, count + 1).astype(int).tolist()
+        return list(pairwise(ends))
+
+    def _parts(self, points: ScaleSpacePoints) -> "list[_Part]":
+        """Octaves, and rows of keypoints in each, some at a time."""
+        parts = []
         for number, octave in enumerate(self.octaves):
             mine = np.flatnonzero(points.rows[:, OCTAVE] == number)
-            if len(mine):
-                yield octave, mine
+            parts += [(octave, mine[k : k + _AT_ONCE]) for k in range(0, len(mine), _AT_ONCE)]
+        return parts
+
+
+def _blur(octave: NDArray[np.float32], rows: tuple[int, int]) -> None:
+    """Fill rows of the layers after the first. A blur is wrong by half its kernel where the image is cut."""
+    first, end = rows
+    kernels = [
+        _kernel(SIGMA * 2.0 ** (layer / LAYERS) * float(np.sqrt(4.0 ** (1 / LAYERS) - 1.0)))
+        for layer in range(LAYERS + 2)
+    ]
+    beside = sum(len(kernel) // 2 for kernel in kernels)
+    start = max(first - beside, 0)
+    image = octave[0, start : end + beside]
+    for layer, kernel in enumerate(kernels, start=1):
+        image = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel), dtype=np.float32)
+        octave[layer, first:end] = image[first - start : end - start]
 
 
 def _loops() -> ModuleType:

@@ -45,11 +45,13 @@ def doubled(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 @compiled
-def extrema(octave: NDArray[np.float32], number: int, contrast: float, edge: float) -> NDArray[np.float32]:
-    """Keypoints (n, 6) of an octave: extrema of its differences in place and scale.
+def extrema(
+    octave: NDArray[np.float32], number: int, first: int, end: int, contrast: float, edge: float
+) -> NDArray[np.float32]:
+    """Keypoints (n, 6) of an octave's rows from first to end: extrema of its differences in place and scale.
 
     Args:
-        number: of the octave, which the rows name.
+        number: of the octave, which the keypoints name.
         contrast, edge: OpenCV's thresholds; of responses in grey levels from 0 to 1.
     """
     _, height, width = octave.shape
@@ -60,9 +62,10 @@ def extrema(octave: NDArray[np.float32], number: int, contrast: float, edge: flo
     mask = np.zeros((width + 7) // 8 * 8, np.uint8)
     words = mask.view(np.uint64)
     limit = np.float32(0.5 * contrast / LAYERS * 255.0)
-    for y in range(_BORDER - 1, height - _BORDER + 1):
+    first, end = max(first, _BORDER), min(end, height - _BORDER)
+    for y in range(first - 1, end + 1):
         _difference(octave, y, rows)
-        if y <= _BORDER:
+        if y <= first:
             continue
         above, here, below = (y - 2) % 3, (y - 1) % 3, y % 3
         for layer in range(1, LAYERS + 1):

@@ -126,6 +126,22 @@ def test_features_of_a_window_are_those_of_the_whole() -> None:
         )
 
 
+@pytest.mark.parametrize("shape", [(900, 700), (70, 700)])
+def test_any_number_of_threads_gives_the_same(shape: tuple[int, int]) -> None:
+    gray = texture(shape[1], shape[0], seed=6)
+    before, found = cv2.getNumThreads(), []
+    try:
+        for threads in (1, 2, 3):
+            cv2.setNumThreads(threads)
+            found.append(extract(gray, ExtractorOptions(max_features=2000)))
+    finally:
+        cv2.setNumThreads(before)
+    assert len(found[0]) > 100
+    for other in found[1:]:
+        for name in ("xy", "scale", "angle", "response", "descriptors"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name))
+
+
 def test_the_fingerprint_names_the_space_of_descriptors() -> None:
     plain = ExtractorOptions()
     assert ExtractorOptions(upright=True).fingerprint != plain.fingerprint
