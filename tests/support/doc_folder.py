@@ -59,14 +59,14 @@ _WALK = WorldOptions(
 _FILM = FilmOptions(
     world=_TOWN,
     path=PathOptions(
-        duration_s=4.0,
+        duration_s=3.0,
         half_extent_m=(22.0, 18.0),
         heights_m=(58.0, 62.0),
         speed_m_s=20.0,
         down_deg=(80.0, 88.0),
         river=False,
     ),
-    frames=32,
+    frames=24,
     rate_hz=8.0,
     width=480,
     height=270,
