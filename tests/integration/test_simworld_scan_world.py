@@ -45,8 +45,8 @@ WORLD = WorldOptions(
     negatives_per_kind=0,
     workers=1,
 )
-SCAN = AirborneScanOptions(density_per_m2=1.0, margin_m=5.0)
-ORTHO = OrthoOptions(pixel_m=0.5, margin_m=5.0)
+SCAN = AirborneScanOptions(density_per_m2=0.5, margin_m=5.0)
+ORTHO = OrthoOptions(pixel_m=1.0, margin_m=5.0)
 
 
 @pytest.fixture(scope="module")

@@ -10,21 +10,17 @@ from scipy.stats import chi2
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.camera.shot import look_pose
-from ingest.register.anchor.ground import place
 from ingest.register.anchor.ground.parts import halves, weakest_cut
 from ingest.register.anchor.ground.place import place_on_outlines
 from ingest.register.anchor.ground.street_plan import looks_level
 from tests.support.scanned_map import plain_cloud
-from tests.support.street_map import OWN_FROM_LOCAL, joined_wrongly, street_map, street_scan
+from tests.support.street_map import OWN_FROM_LOCAL, few_sizes, joined_wrongly, street_map, street_scan
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_sizes() -> Iterator[None]:
-    """Sizes around that of the street, at which its fronts are 5 to 50 m away."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(place, "_NEAREST_M", 5.0)
-        patch.setattr(place, "_FURTHEST_M", 50.0)
-        patch.setattr(place, "_COARSE", 250)
+        few_sizes(patch)
         yield
 
 
