@@ -140,13 +140,13 @@ def test_the_scan_mends_the_lens(wrong_lens: ScannedMap, frames: tuple[int, ...]
     assert after["surface_median_m"] < adjustment.figures["before"]["surface_median_m"]
 
 
-def test_the_adjusted_map_keeps_what_is_not_geometry(wrong_lens: ScannedMap) -> None:
-    structure, adjustment = _adjusted(wrong_lens, (4,))
-    before = wrong_lens.feature_map
-    after = placed_map(before, structure, wrong_lens.cloud, adjustment)
+def test_the_adjusted_map_keeps_what_is_not_geometry(world: ScannedMap) -> None:
+    structure, adjustment = _adjusted(world, (4,))
+    before = world.feature_map
+    after = placed_map(before, structure, world.cloud, adjustment)
     assert after.map_id == before.map_id
     assert after.frame == before.frame
-    assert after.height_datum == wrong_lens.cloud.height_datum
+    assert after.height_datum == world.cloud.height_datum
     assert after.placement.method == "lidar"
     assert after.placement.evidence["replaces"] == "gps"
     assert after.generation == 0

@@ -112,7 +112,7 @@ def test_auto_places_the_map_on_the_scan(
     assert new.map_id == old.map_id
     np.testing.assert_array_equal(new.observations.descriptors, old.observations.descriptors)
     evidence = new.placement.evidence["anchor"]
-    assert evidence["before"]["median_m"] > 5.0 > 0.1 > evidence["after"]["median_m"]
+    assert evidence["before"]["median_m"] > 5.0 > 0.15 > evidence["after"]["median_m"]
     assert len(evidence["frames"]) >= 2
     sigmas = np.sqrt(np.diag(new.placement.covariance))
     assert 0 < sigmas[4:].max() < 0.5

@@ -13,15 +13,16 @@ from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from tests.support.las_files import write_scan
 from tests.support.scanned_map import FRAME
-from tests.support.street_map import JOIN, OWN_FROM_LOCAL, joined_wrongly, street_map, street_scan
+from tests.support.street_map import JOIN, OWN_FROM_LOCAL, few_sizes, joined_wrongly, street_map, street_scan
 
 _EPSG = 32632
 
 
 def test_a_part_is_placed_where_look_alikes_have_joined_two(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Sixteen photos of the street, and as many of it by people who were held for standing in another one."""
+    few_sizes(monkeypatch)
     joined = joined_wrongly(street_map(mirrored=False))
     (tmp_path / "photos").mkdir()
     photo = cv2.imencode(".png", np.zeros((60, 80, 3), np.uint8))[1].tobytes()

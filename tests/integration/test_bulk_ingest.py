@@ -32,7 +32,7 @@ _OPTIONS = IngestOptions(
     workers=1,
     gps_sigma_m=(0.02, 0.02),
     making=MapMakingOptions(
-        extractor=ExtractorOptions(max_features=800),
+        extractor=ExtractorOptions(max_features=600),
         # As small as hills of twenty photos allow: several blocks, joined by their seams.
         clusters=ClusterOptions(max_block_photos=8, least_seam_photos=4),
     ),

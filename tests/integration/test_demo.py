@@ -31,12 +31,12 @@ def run_in(folder: Path) -> None:
 def test_the_demo_holds_on_a_small_town(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It exits with 0 only if most drone photos are answered and nothing is answered wrongly."""
     small = WorldOptions(
-        town_size_m=(260.0, 230.0),
-        flight=FlightOptions(lines=3, per_line=3, oblique=0, width=640),
+        town_size_m=(200.0, 180.0),
+        flight=FlightOptions(lines=3, per_line=3, oblique=0, width=512),
         queries=3,
-        query_width=640,
+        query_width=512,
         street=1,
-        street_width=640,
+        street_width=512,
         negatives_per_kind=1,
         workers=1,
     )

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from _pytest.mark import ParameterSet
+from IPython.core.inputtransformer2 import TransformerManager
 from IPython.core.interactiveshell import InteractiveShell
 from traitlets.config import Config
 
@@ -61,13 +63,23 @@ PYTHON_NOT_RUN = {
 }
 # The page that makes the database; the others begin with what it leaves.
 _FIRST = "docs/quickstart.md"
+# What these show, others run part by part: placing by a scan docs/anchoring.md and test_anchor, by control
+# points docs/control-points.md, a film's track docs/video.md, the names in Python docs/python.md and
+# test_python_api. Whole they are run with the studies.
+_AT_NIGHT = {"docs/tutorials/photogrammetrist.md", "film-and-scan"}
 _LANGUAGES = {"sh", "python", "sql", "json", "text"}
 
-_NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+_NOTEBOOK_FOLDER = ROOT / "docs" / "notebooks"
+_NOTEBOOKS = sorted(_NOTEBOOK_FOLDER.glob("*.ipynb"))
 _TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in pages()}
 _BLOCKS = [block for page, text in _TEXTS.items() for block in blocks(page, text)]
 _COMMANDS = [command for block in _BLOCKS if block.language == "sh" for command in commands(block)]
 _PROSE = [command for page, text in _TEXTS.items() for command in prose(page, text)]
+
+
+def at_their_time(names: list[str]) -> list[ParameterSet]:
+    """Parameters of a test, of which some are run with the studies."""
+    return [pytest.param(n, id=n, marks=[pytest.mark.evaluation] * (n in _AT_NIGHT)) for n in names]
 
 
 def why_not_run(command: Command) -> str | None:
@@ -143,18 +155,18 @@ def test_the_commands_of_the_first_page_run(after_first: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in _TEXTS if page != _FIRST and what_runs(page)])
+@pytest.mark.parametrize("page", at_their_time([p for p in _TEXTS if p != _FIRST and what_runs(p)]))
 def test_the_commands_of_a_page_run(after_first: Path, tmp_path: Path, page: str) -> None:
     run_page(page, Path(shutil.copytree(after_first, tmp_path / "here")))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("notebook", _NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("notebook", at_their_time([path.stem for path in _NOTEBOOKS]))
 def test_a_notebook_runs(
-    after_first: Path, tmp_path: Path, notebook: Path, monkeypatch: pytest.MonkeyPatch
+    after_first: Path, tmp_path: Path, notebook: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In IPython in this process: a kernel of its own would import everything and register frames again."""
-    stored = nbformat.read(notebook, as_version=4)
+    stored = nbformat.read(_NOTEBOOK_FOLDER / f"{notebook}.ipynb", as_version=4)
     nbformat.validate(stored)
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     with inside(Path(shutil.copytree(after_first, tmp_path / "here"))), ipython(tmp_path) as shell:
@@ -169,6 +181,17 @@ def test_a_notebook_is_stored_without_what_it_gave(notebook: Path) -> None:
     cells = [c for c in json.loads(notebook.read_text("utf-8"))["cells"] if c["cell_type"] == "code"]
     assert cells
     assert [c["outputs"] for c in cells if c["outputs"] or c["execution_count"] is not None] == []
+
+
+@pytest.mark.parametrize("notebook", _NOTEBOOKS, ids=lambda path: path.stem)
+def test_cells_of_a_notebook_are_read(notebook: Path) -> None:
+    """As Python and as commands, whose words in braces are of the notebook's."""
+    cells = [c.source for c in nbformat.read(notebook, as_version=4).cells if c.cell_type == "code"]
+    for number, cell in enumerate(cells):
+        compile(TransformerManager().transform_cell(cell), f"{notebook.name}:{number}", "exec")
+        for line in cell.splitlines():
+            if line.startswith("!"):
+                check_usage(Command(notebook.name, number, line[1:]))
 
 
 @pytest.mark.parametrize("command", [*_COMMANDS, *_PROSE], ids=str)

@@ -25,6 +25,7 @@ from ingest.growing import grow_candidates, watch_and_grow
 from ingest.growth.growth_report import GrowthReport
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
+from tests.support.few_canaries import few_canaries as few_canaries
 from tests.support.grown_maps import ask, copied, described, states
 from tests.support.hill_scan import write_hill_scan
 from tests.support.hill_walk import (

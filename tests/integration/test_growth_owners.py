@@ -19,6 +19,7 @@ from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
+from tests.support.few_canaries import few_canaries as few_canaries
 from tests.support.scene_strip import FRAME, note_contributed, put_on_record, strip_map
 
 _OLD = Path(__file__).parent.parent / "data" / "claimed_owners.db"

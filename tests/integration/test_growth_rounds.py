@@ -8,6 +8,7 @@ from featuredb.store import Database
 from ingest.growth import run
 from ingest.growth.trust.promotion import Promotion
 from ingest.growth.values import no_photos
+from tests.support.few_canaries import few_canaries as few_canaries
 from tests.support.growth_box import existing
 
 

@@ -18,6 +18,7 @@ from ingest.growth.growth_report import GrowthReport
 from ingest.growth.place.component import AT_SEVERAL_PLACES
 from ingest.growth.run import grow
 from ingest.growth.values import GrowthPhotos, Refused
+from tests.support.few_canaries import few_canaries as few_canaries
 from tests.support.growth_box import DESCRIPTORS, FRAME, KEY, POINTS, existing, prior, walk
 from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import looking_at

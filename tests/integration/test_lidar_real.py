@@ -25,7 +25,7 @@ FILES = {
 }
 OFTEN = (
     "lidar/autzen_trim.laz",
-    "brighton/model.laz",
+    "lidar/Topography.laz",
     "lidar/lone-star.copc.laz",
 )  # feet; metres; COPC, no CRS
 

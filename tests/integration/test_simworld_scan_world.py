@@ -36,7 +36,7 @@ from featuredb.simworld.town.town import make_town
 from featuredb.simworld.world import WorldOptions, town_of
 
 WORLD = WorldOptions(
-    seed=6,
+    seed=3,  # of `town`, too: what walls look like is painted once for each seed
     town_size_m=(155.0, 150.0),
     flight=FlightOptions(lines=1, per_line=1, oblique=0, width=160),
     queries=1,
@@ -45,8 +45,8 @@ WORLD = WorldOptions(
     negatives_per_kind=0,
     workers=1,
 )
-SCAN = AirborneScanOptions(density_per_m2=1.0, margin_m=5.0)
-ORTHO = OrthoOptions(pixel_m=0.5, margin_m=5.0)
+SCAN = AirborneScanOptions(density_per_m2=0.5, margin_m=5.0)
+ORTHO = OrthoOptions(pixel_m=1.0, margin_m=5.0)
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +209,7 @@ def test_the_command_writes_scan_and_ortho(
 ) -> None:
     parser = argparse.ArgumentParser()
     command.register(parser.add_subparsers())
-    args = parser.parse_args(["simworld", str(tmp_path / "w"), "--lidar", "--workers", "1"])
+    args = parser.parse_args(["simworld", str(tmp_path / "w"), "--lidar", "--workers", "1", "--seed", "3"])
     monkeypatch.setattr(WorldOptions, "short", classmethod(lambda cls, seed: replace(WORLD, seed=seed)))
     monkeypatch.setattr(
         scan_world,

@@ -6,7 +6,7 @@ from tests.support.store_machine import StoreMachine, run
 
 
 def test_some_steps() -> None:
-    run(StoreMachine, 6, 12)
+    run(StoreMachine, 4, 12)
     assert StoreMachine.kills > 0
 
 

@@ -7,8 +7,9 @@ import pytest
 from featuredb.features.extractor import ExtractorOptions
 from ingest import pipeline
 from ingest.cli import video
-from ingest.register.anchor import frames
+from ingest.register.anchor import frames, placing
 from ingest.register.anchor.anchor_map import AnchorOptions
+from ingest.register.anchor.together import register as together
 from tests.support.remembered import remembered
 
 FEATURES = 1500  # of a photo
@@ -27,3 +28,7 @@ def shorten(patch: pytest.MonkeyPatch, work: Path) -> None:
     patch.setattr(video, "_FEATURES", FEATURES)
     patch.setitem(AnchorOptions.__init__.__kwdefaults__, "frames", 2)
     patch.setattr(frames, "register_frame", remembered(frames.register_frame))
+    patch.setattr(frames, "fit_vouched_for", remembered(frames.fit_vouched_for))
+    for name in ("evidence_of", "fitted_together", "fit_vouched_for"):
+        patch.setattr(together, name, remembered(getattr(together, name)))
+    patch.setattr(placing, "adjust_to_scan", remembered(placing.adjust_to_scan))

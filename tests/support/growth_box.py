@@ -23,7 +23,7 @@ from tests.support.scenes import (
 FRAME = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
 KEY = "scene|camera"
 RNG = np.random.default_rng(7)
-WORLD = box_points(RNG, 900)  # 50 x 50 m, 12 m high
+WORLD = box_points(RNG, 600)  # 50 x 50 m, 12 m high
 EAST = WORLD + np.array([38.0, 0.0, 0.0])  # beyond the map's points
 POINTS = np.concatenate([WORLD, EAST])
 DESCRIPTORS = random_descriptors(RNG, len(POINTS))

@@ -19,7 +19,7 @@ def write_hill_scan(
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     texture_seed: int = 1,
     half_side_m: float = 45.0,
-    spacing_m: float = 0.2,
+    spacing_m: float = 0.3,
     laser: bool = False,
 ) -> Path:
     """Write a scan with points about `spacing_m` apart, under another light than the photos.
@@ -37,7 +37,7 @@ def write_hill_scan(
     v = ((_SIDE_M / 2 - north) / _TEXEL_M - 0.5).astype(np.float32)
     # A point of a scan has the mean of its footprint.
     blurred = cv2.GaussianBlur(field_texture(texture_seed), (0, 0), 0.4 * spacing_m / _TEXEL_M)
-    grey = cv2.remap(blurred, u.reshape(-1, 500), v.reshape(-1, 500), cv2.INTER_LINEAR)
+    grey = cv2.remap(blurred, u.reshape(len(steps), -1), v.reshape(len(steps), -1), cv2.INTER_LINEAR)
     other_light = 255.0 * (grey.ravel() / 255.0) ** 1.3 * 0.85
     height = hill_height(east, north) + rng.normal(0, 0.02, len(east))
     utm = FRAME.utm_from_enu(np.column_stack([east, north, height]) + offset_m, EPSG)

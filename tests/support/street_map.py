@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
@@ -10,6 +11,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import GeoPrior, MapObservations
 from featuredb.maps.unplaced_map import OwnFrame, OwnPoints, UnplacedMap
 from featuredb.simworld.camera.shot import look_pose
+from ingest.register.anchor.ground import place
 from tests.support.maps import random_unplaced_map
 from tests.support.scanned_map import FRAME
 
@@ -32,6 +34,13 @@ OWN_FROM_LOCAL = Sim3(
 
 def _ground(xy: FloatArray) -> FloatArray:
     return np.asarray(0.02 * xy[:, 0] - 0.01 * xy[:, 1])
+
+
+def few_sizes(patch: pytest.MonkeyPatch) -> None:
+    """The street is sought at sizes at which its fronts are 5 to 50 m away, by fewer of its points."""
+    patch.setattr(place, "_NEAREST_M", 5.0)
+    patch.setattr(place, "_FURTHEST_M", 50.0)
+    patch.setattr(place, "_COARSE", 250)
 
 
 def street_scan() -> FloatArray:

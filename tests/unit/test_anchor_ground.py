@@ -1,5 +1,6 @@
 """Street maps on a scan's outlines: a made street is found within its covariance, its mirror image is not."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,14 @@ from ingest.register.anchor.ground.parts import halves, weakest_cut
 from ingest.register.anchor.ground.place import place_on_outlines
 from ingest.register.anchor.ground.street_plan import looks_level
 from tests.support.scanned_map import plain_cloud
-from tests.support.street_map import OWN_FROM_LOCAL, joined_wrongly, street_map, street_scan
+from tests.support.street_map import OWN_FROM_LOCAL, few_sizes, joined_wrongly, street_map, street_scan
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_sizes() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        few_sizes(patch)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -61,9 +61,10 @@ def _of_photos(town: FloatImage, side: int = 130, at: FloatArray = _AT) -> Ortho
 
 
 @pytest.fixture(autouse=True)
-def _few_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(from_ortho, "_LEAST_SHARE", 0.25)
-    monkeypatch.setattr(from_ortho, "_SIZE_STEP", 0.09)
+def _few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(from_ortho, "_LEAST_SHARE", 0.28)
+    monkeypatch.setattr(from_ortho, "_SIZE_STEP", 0.1)
+    monkeypatch.setattr(from_ortho, "_TURN_STEP", np.radians(8.0))
     monkeypatch.setattr(from_ortho, "_AGAIN", 8)
 
 

@@ -85,7 +85,7 @@ def squares(problem: Problem, truth: Block, found: Marginals, photo: int = 5) ->
 def test_covariances_are_of_the_noise_whatever_the_priors_count() -> None:
     """Priors count fifty times; errors are as wide as the covariances say, not as the normal matrix does."""
     right, by_weights = [], []
-    for seed in range(40):
+    for seed in range(20):
         truth = drawn(seed)
         problem = solved(truth, seed, dilution=50.0)
         found, weighted = problem.honest_marginals()
