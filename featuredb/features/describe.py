@@ -27,6 +27,9 @@ def describe_at(
         gray: (h, w) uint8.
         xy: (n, 2) full-size pixels, centre of the top-left pixel (0.5, 0.5). scale: (n,) diameters in pixels.
         angle: (n,) degrees clockwise from the x axis.
+
+    Raises:
+        ImageError: a place or diameter is no finite number, or a diameter is not above zero.
     """
     if not len(xy):
         return np.zeros((0, 128), np.uint8)

@@ -112,6 +112,12 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
     )
 
 
+def warm_up() -> None:
+    """Load the extractor's compiled loops, or compile them, now: processes that are forked then have them."""
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)
+    extract(noise, ExtractorOptions(contrast_threshold=0.0))
+
+
 def rootsift_8bit(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
     """RootSIFT (Arandjelovic and Zisserman 2012) of SIFT descriptors (n, 128), as 8-bit integers.
 

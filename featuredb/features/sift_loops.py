@@ -5,9 +5,9 @@ SIFT, and two differences. Keypoints are chosen before they are described. And a
 `SAMPLES` a side in the keypoint's own turned frame, whose weights are the same for all, about its place to a
 fraction of a pixel; OpenCV sums over all pixels of the window around the next pixel.
 
-An octave is (6, h, w) float32, images each blurred by a third of an octave more than the one before. A
-keypoint is a row (6,) float32: x, y and scale (the blur's sigma) in the octave's pixels, where the centre of
-the top-left pixel is (0, 0); octave; layer; response.
+An octave is (layers + 3, h, w) float32, images each blurred by a part of an octave more than the one before.
+A keypoint is a row (6,) float32: x, y and scale (the blur's sigma) in the octave's pixels, where the centre
+of the top-left pixel is (0, 0); octave; layer, which is the octave's image; response.
 """
 
 import math
@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.compiled import compiled
-from featuredb.features.scale_space import LAYER, LAYERS, OCTAVE, RESPONSE, SCALE, SIGMA, X, Y
 
+# Numba keeps what it has compiled until this file changes: what the loops are made with is said here.
+X, Y, SCALE, OCTAVE, LAYER, RESPONSE = range(6)
 DIRECTIONS = 36  # bins of an orientation's histogram
 _BORDER = 5  # pixels in which no extremum is looked for
 _STEPS = 5  # of an extremum's refinement
@@ -92,29 +93,36 @@ def _mirrored(index: int, count: int) -> int:
 
 @compiled
 def extrema(
-    octave: NDArray[np.float32], number: int, first: int, end: int, contrast: float, edge: float
+    octave: NDArray[np.float32],
+    number: int,
+    sigma: float,
+    first: int,
+    end: int,
+    contrast: float,
+    edge: float,
 ) -> NDArray[np.float32]:
     """Keypoints (n, 6) of an octave's rows from first to end: extrema of its differences in place and scale.
 
     Args:
-        number: of the octave, which the keypoints name.
+        number: of the octave, which the keypoints name. sigma: blur of its first image, pixels.
         contrast, edge: OpenCV's thresholds; of responses in grey levels from 0 to 1.
     """
     _, height, width = octave.shape
     found = np.empty((1024, 6), np.float32)
     count = 0
-    rows = np.empty((LAYERS + 2, 3, width), np.float32)  # of the differences: three at a time
+    layers = len(octave) - 3
+    rows = np.empty((layers + 2, 3, width), np.float32)  # of the differences: three at a time
     cube = np.empty((3, 3, 3), np.float32)
     mask = np.zeros((width + 7) // 8 * 8, np.uint8)
     words = mask.view(np.uint64)
-    limit = np.float32(0.5 * contrast / LAYERS * 255.0)
+    limit = np.float32(0.5 * contrast / layers * 255.0)
     first, end = max(first, _BORDER), min(end, height - _BORDER)
     for y in range(first - 1, end + 1):
         _difference(octave, y, rows)
         if y <= first:
             continue
         above, here, below = (y - 2) % 3, (y - 1) % 3, y % 3
-        for layer in range(1, LAYERS + 1):
+        for layer in range(1, layers + 1):
             _beyond_ten(rows, layer, above, here, below, limit, mask)
             for word in range(len(words)):
                 if words[word] == 0:
@@ -124,7 +132,7 @@ def extrema(
                         continue
                     if count == len(found):
                         found = np.concatenate((found, np.empty_like(found)))
-                    if _refined(octave, layer, y - 1, x, contrast, edge, cube, found[count]):
+                    if _refined(octave, sigma, layer, y - 1, x, contrast, edge, cube, found[count]):
                         found[count, OCTAVE] = number
                         count += 1
     return found[:count]
@@ -132,7 +140,7 @@ def extrema(
 
 @compiled
 def _difference(octave: NDArray[np.float32], y: int, rows: NDArray[np.float32]) -> None:
-    for layer in range(LAYERS + 2):
+    for layer in range(len(rows)):
         low, high, out = octave[layer, y], octave[layer + 1, y], rows[layer, y % 3]
         for x in range(len(out)):
             out[x] = high[x] - low[x]
@@ -175,6 +183,7 @@ def _is_extremum(rows: NDArray[np.float32], layer: int, above: int, here: int, b
 @compiled
 def _refined(
     octave: NDArray[np.float32],
+    sigma: float,
     layer: int,
     y: int,
     x: int,
@@ -184,6 +193,7 @@ def _refined(
     out: NDArray[np.float32],
 ) -> bool:
     """Put an extremum where a parabola through its neighbours has it; False: it is none, weak, or an edge."""
+    layers = len(octave) - 3
     _, height, width = octave.shape
     scale = np.float32(1.0 / 255.0)
     for _ in range(_STEPS):
@@ -217,17 +227,17 @@ def _refined(
         if abs(dx) < 0.5 and abs(dy) < 0.5 and abs(ds) < 0.5:
             response = abs(d[1, 1, 1] + 0.5 * (gx * dx + gy * dy + gs * ds))
             curvature = xx * yy - xy * xy
-            if response * LAYERS < contrast or curvature <= 0.0:
+            if response * layers < contrast or curvature <= 0.0:
                 return False
             if (xx + yy) ** 2 * edge >= (edge + 1.0) ** 2 * curvature:
                 return False
             out[X], out[Y], out[LAYER], out[RESPONSE] = x + dx, y + dy, layer, response
-            out[SCALE] = SIGMA * 2.0 ** ((layer + ds) / LAYERS)
+            out[SCALE] = sigma * 2.0 ** ((layer + ds) / layers)
             return True
-        if abs(dx) > width or abs(dy) > height or abs(ds) > LAYERS:
+        if abs(dx) > width or abs(dy) > height or abs(ds) > layers:
             return False
         x, y, layer = x + int(np.rint(dx)), y + int(np.rint(dy)), layer + int(np.rint(ds))
-        if not (1 <= layer <= LAYERS and _BORDER <= x < width - _BORDER and _BORDER <= y < height - _BORDER):
+        if not (1 <= layer <= layers and _BORDER <= x < width - _BORDER and _BORDER <= y < height - _BORDER):
             return False
     return False
 
@@ -258,13 +268,16 @@ def orientations(
         angles: (n, 18), of each the highest peak first.
 
     Returns:
-        (n,) how many each keypoint has; none where its surroundings are flat.
+        (n,) how many each keypoint has; none where its surroundings are flat, or it lies outside.
     """
     _, height, width = octave.shape
     counts = np.zeros(len(keypoints), np.int64)
     histogram = np.empty(DIRECTIONS, np.float32)
     strength, turn = np.empty(width, np.float32), np.empty(width, np.float32)
     for row in range(len(keypoints)):
+        inside = -1.0 < keypoints[row, X] < width and -1.0 < keypoints[row, Y] < height
+        if not (inside and 0.0 < keypoints[row, SCALE] < width + height):  # nor is what is no number
+            continue
         image = octave[int(keypoints[row, LAYER])]
         x, y = int(np.rint(keypoints[row, X])), int(np.rint(keypoints[row, Y]))
         window = 1.5 * keypoints[row, SCALE]

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.index.nearest import one_thread
 from featuredb.index.stacked import Stacked
 
 CODE_PARTS, CODE_BYTES = 32, 16  # 4 bits a part
@@ -81,12 +82,9 @@ class DescriptorIndex:
 
     @classmethod
     def of(cls, codes: DescriptorCodes) -> Self:
+        """Of few, or inverted lists of many."""
         if len(codes) <= _FEW:
-            flat = faiss.IndexPQ(DESCRIPTOR_SIZE, CODE_PARTS, 4, faiss.METRIC_L2)
-            faiss.copy_array_to_vector(_shipped(_CODES).ravel(), flat.pq.centroids)
-            faiss.copy_array_to_vector(codes.codes.ravel(), flat.codes)
-            flat.is_trained, flat.ntotal = True, len(codes)
-            return cls(faiss.IndexPQFastScan(flat))  # type: ignore[arg-type]  # its stubs have one form of several
+            return cls.exhaustive(codes)
         index = _empty_index()
         order = np.argsort(codes.lists, kind="stable")
         rows, sorted_codes = order.astype(np.int64), np.ascontiguousarray(codes.codes[order])
@@ -104,16 +102,32 @@ class DescriptorIndex:
         packed.nprobe = _PROBES
         return cls(packed)
 
+    @classmethod
+    def exhaustive(cls, codes: DescriptorCodes) -> Self:
+        """Without lists: a search compares a descriptor with all codes."""
+        flat = faiss.IndexPQ(DESCRIPTOR_SIZE, CODE_PARTS, 4, faiss.METRIC_L2)
+        faiss.copy_array_to_vector(_shipped(_CODES).ravel(), flat.pq.centroids)
+        faiss.copy_array_to_vector(codes.codes.ravel(), flat.codes)
+        flat.is_trained, flat.ntotal = True, len(codes)
+        return cls(faiss.IndexPQFastScan(flat))  # type: ignore[arg-type]  # its stubs have one form of several
+
     def search(self, descriptors: NDArray[np.uint8], k: int) -> NDArray[np.int64]:
         """Rows (n, k) of near ones to each descriptor (n, 128), about nearest first; -1: there are fewer."""
         if len(self) == 0 or len(descriptors) == 0:
             return np.full((len(descriptors), k), -1, np.int64)
-        asked = np.ascontiguousarray(descriptors, dtype=np.float32)
-        if len(self) <= _FEW:
-            _, row = self._index.search(asked, k)
-        else:
+        found = np.empty((len(descriptors), k), np.int64)
+        for start in range(0, len(descriptors), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            found[part] = self._search(np.ascontiguousarray(descriptors[part], dtype=np.float32), k)
+        return found
+
+    def _search(self, asked: NDArray[np.float32], k: int) -> NDArray[np.int64]:
+        if hasattr(self._index, "nprobe"):
             lists = np.argpartition(_from_lists(asked), _PROBES, axis=1)[:, :_PROBES].astype(np.int64)
             _, row = self._index.search_preassigned(asked, k, lists, np.zeros(lists.shape, np.float32))
+        else:
+            with one_thread():
+                _, row = self._index.search(asked, k)
         return np.asarray(row, dtype=np.int64)
 
 

@@ -1,5 +1,7 @@
 """Exact nearest neighbours between two small sets of descriptors."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import faiss
@@ -28,7 +30,15 @@ def nearest(query: NDArray[Any], base: NDArray[Any], k: int) -> tuple[NDArray[np
 def knn(
     query: NDArray[np.float32], base: NDArray[np.float32], k: int, metric: int = faiss.METRIC_L2
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """FAISS's exhaustive search in one thread: scores (n, k) of a metric, best first, and rows (n, k).
+    """FAISS's exhaustive search in one thread: scores (n, k) of a metric, best first, and rows (n, k)."""
+    with one_thread():
+        score, row = faiss.knn(query, base, k, metric=metric)
+    return score, row
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """FAISS on one thread in what the calling thread does.
 
     Its OpenMP and that of its OpenBLAS get into each other's way: two threads take two thirds of the time on
     two idle cores, and three times as long beside other work.
@@ -36,7 +46,6 @@ def knn(
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)
     try:
-        score, row = faiss.knn(query, base, k, metric=metric)
+        yield
     finally:
         faiss.omp_set_num_threads(before)
-    return score, row

@@ -174,7 +174,7 @@ def _keypoints(
     (image_id,) = found
     blob = _blob(database, "keypoints", image_id, np.dtype("<f4"))
     rows = np.zeros((0, 4), np.float32) if blob is None else blob.astype(np.float32)
-    if rows.shape[0] != len(xy) or (len(xy) and np.abs(rows[:, :2] - xy).max() > _SAME_PLACE_PX):
+    if len(rows) != len(xy) or not (np.abs(rows[:, :2] - xy) <= _SAME_PLACE_PX).all():
         raise IngestError(
             f"{name}: COLMAP's database and model disagree: {len(rows)} keypoints and {len(xy)} 2D points, "
             "or other places; give the database that the model was made with"

@@ -192,8 +192,6 @@ class ModelFeatures(LazyFeatures):
             )
         try:
             gray = decode_gray(photo.read_bytes(), INGEST_LIMITS)
-            angle = orientations_at(gray, found.xy, found.scale) if found.angle is None else found.angle
-            descriptors = describe_at(gray, found.xy, found.scale, angle)
         except (ImageError, OSError) as error:
             raise IngestError(f"{photo}: cannot be described anew: {error}") from error
         if gray.shape != (camera.height, camera.width):
@@ -201,6 +199,11 @@ class ModelFeatures(LazyFeatures):
                 f"{name}: expected {camera.width}x{camera.height} pixels as the model's camera has, found "
                 f"{gray.shape[1]}x{gray.shape[0]}; give the photos that the model was made of"
             )
+        try:
+            angle = orientations_at(gray, found.xy, found.scale) if found.angle is None else found.angle
+            descriptors = describe_at(gray, found.xy, found.scale, angle)
+        except ImageError as error:
+            raise IngestError(f"{name}: {error}; give the database that the model was made with") from error
         return replace(found, angle=angle, descriptors=descriptors)
 
     def _camera(self, index: int) -> Camera:

@@ -91,7 +91,7 @@ class Cluster:
         area: where they are.
         images: (i,) rows of the area's images.
         points: (p,) rows of the area's points that they see.
-        score: votes above expectation, in standard deviations; infinity where all areas are tried anyway.
+        score: votes above expectation, in standard deviations; infinity where there is no choice.
     """
 
     area: Area
@@ -120,8 +120,9 @@ def find_clusters(
         if allowed.any():
             reach.append(_Reach.of(indexed, allowed))
     small = [len(r.points) <= options.single_cluster_points for r in reach]
-    if all(small) and len(reach) <= options.max_clusters:
-        return [Cluster(area=r.area, images=r.images, points=r.points, score=np.inf) for r in reach]
+    if small == [True]:
+        (only,) = reach
+        return [Cluster(area=only.area, images=only.images, points=only.points, score=np.inf)]
     votes = _vote(reach, features, options)
     share = sum(float(v.sum()) for v in votes) / max(sum(len(r.points) for r in reach), 1)
     found: list[Cluster] = []

@@ -71,7 +71,7 @@ class _MapNeighbours:
 
     def __init__(self, features: Features, area: Area, points: NDArray[np.int64]) -> None:
         self._features, self._points = features, points
-        self._index = DescriptorIndex.of(area.codes(points))
+        self._index = DescriptorIndex.exhaustive(area.codes(points))
         self._squared, self._row = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64)
 
     def matches(self, xy: NDArray[np.float32], area: Area, options: PointMatchOptions) -> Matches:

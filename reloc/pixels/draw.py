@@ -30,9 +30,6 @@ def draw_layer(
     Args:
         rgb: of the view's camera, or resampled.
         shapes: in the view's frame. cloud: in the same; None hides nothing.
-
-    Raises:
-        MissingExtraError: a scan hides, and numba is not installed.
     """
     picture = np.ascontiguousarray(rgb).copy()
     scale = np.array([picture.shape[1] / view.camera.width, picture.shape[0] / view.camera.height])

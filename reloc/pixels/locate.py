@@ -80,9 +80,6 @@ def locate(
     Args:
         pixels: (n, 2), the centre of the photo's top-left pixel being (0.5, 0.5).
         sigma_px: one standard deviation of each coordinate of the pixels themselves.
-
-    Raises:
-        MissingExtraError: a scan is drawn, and numba is not installed.
     """
     return [_place(view, surface, np.array(pixel, dtype=np.float64), sigma_px) for pixel in pixels]
 

@@ -26,8 +26,6 @@ from tests.support.scanned_map import (
     scanned_map,
 )
 
-pytest.importorskip("numba")
-
 _ADJUSTMENT = "ingest.register.structure.adjustment"
 _STIFF = LensWidths(focal_rel=1e-6, aspect_rel=0.002, center_rel=1e-6, radial=1e-6, tangential=1e-6)
 _LONG = 1.15  # how much longer the wrong lens is

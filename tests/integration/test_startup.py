@@ -72,3 +72,13 @@ def test_pandas_is_there_for_who_wants_it() -> None:
         "import pandas; assert pa.array(pandas.Series([1.0, None])).null_count == 1"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60.0)
+
+
+def test_workers_are_forked_with_compiled_loops() -> None:
+    """To compile takes longer than a worker may take for a photo."""
+    code = (
+        "import signal; import reloc.service.workers.preload; from featuredb.features import sift_loops as loops\n"
+        "for name in ('doubled', 'blur', 'extrema', 'orientations', 'descriptors'):\n"
+        "    assert len(getattr(loops, name).signatures) == 1, name"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120.0)

@@ -22,8 +22,6 @@ from tests.support.scanned_map import (
     scanned_map,
 )
 
-pytest.importorskip("numba")
-
 
 @pytest.fixture(autouse=True)
 def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:

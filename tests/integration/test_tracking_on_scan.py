@@ -33,7 +33,6 @@ from tests.support.made_once import made_once
 from tests.support.planar_map import field_texture, view
 
 pytest.importorskip("laspy")
-pytest.importorskip("numba")
 
 _OPTIONS = TrackOptions(keyframe_every=6, answer_after=4, lost_answer_after=6, catch_up=6, min_matches=20)
 _FRAMES, _CUT = 40, range(20, 24)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from featuredb.index import descriptor_index
 from featuredb.index.descriptor_index import DescriptorCodes, DescriptorIndex, squared_distances
 from featuredb.index.nearest import nearest
 from tests.support.scenes import noisy, random_descriptors
@@ -35,6 +36,13 @@ def test_nearest_is_exact() -> None:
     truth = brute_force(query, base)
     np.testing.assert_array_equal(distance, np.sort(truth, axis=1)[:, :4])
     np.testing.assert_array_equal(np.take_along_axis(truth, row, axis=1), distance)
+
+
+@pytest.fixture(params=["codes", "lists"], autouse=True)
+def _kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All codes, as of few descriptors, or inverted lists, as of many."""
+    if request.param == "lists":
+        monkeypatch.setattr(descriptor_index, "_FEW", -1)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

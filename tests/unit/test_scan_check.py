@@ -110,7 +110,7 @@ def test_without_the_extra_a_map_with_a_scan_waits(monkeypatch: pytest.MonkeyPat
     assert growth_of(checked.feature_map.placement.evidence)["gates"]["scan"]["passes"]
 
     def missing(*_: object) -> PointCloud:
-        raise MissingExtraError("drawing needs numba: pip install 'featuredb[lidar]'")
+        raise MissingExtraError("reading a scan needs laspy: pip install 'featuredb[lidar]'")
 
     monkeypatch.setattr(scan_check, "load_cloud", missing)
     refused, why = checked_by_scan(database, grown)
