@@ -60,8 +60,8 @@ class Measured:
     after_mib: float
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = service_parser(__doc__).parse_args(argv)
+def main() -> None:
+    args = service_parser(__doc__).parse_args()
     database = Database.open(args.db)
     map_ids = enlarged(database, _POINTS)
     points = sum(m.points for m in database.snapshot().maps())
@@ -109,7 +109,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.write(f"{measured[-1]}\n")
             sys.stdout.flush()
     write_figures(args.json, figures(measured, points))
-    return 0
 
 
 def figures(measured: Sequence[Measured], points: int) -> dict[str, float]:
@@ -176,4 +175,4 @@ def _web_client(service: Service, photos: Sequence[bytes]) -> Iterator[list[floa
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

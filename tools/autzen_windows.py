@@ -31,7 +31,6 @@ Refused must be: mirrored windows, windows whose prior lies elsewhere in the sca
 least 44 in all.
 """
 
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -113,14 +112,14 @@ class WindowOutcome:
         return self.kind != "window" or self.error_m is None or self.error_m > _WRONG_M
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--seed")
     parser.set_defaults(seed=0)
     parser.add_argument("scan", type=Path)
     parser.add_argument("ortho", type=Path)
     parser.add_argument("--figure", type=Path, help="draw evidence against error")
     parser.add_argument("--photos", type=Path, nargs="*", default=[], help="folders of other places")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         database = Database.create(Path(folder) / "db")
@@ -144,7 +143,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         _draw(outcomes, args.figure)
     sigma = {f"{name}_offset_sigma_m": float(np.linalg.norm(of.sigma)) for name, of in offsets.items()}
     write_figures(args.json, figures_of(outcomes) | sigma)
-    return 0
 
 
 def _trials(place: OrthoOverScan, halves: Mapping[str, Part], folders: Sequence[Path]) -> Iterator[_Trial]:
@@ -313,4 +311,4 @@ def _rates(name: str, outcomes: Sequence[WindowOutcome], passed: Sequence[Window
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

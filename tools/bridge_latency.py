@@ -71,11 +71,11 @@ class Moments:
         return np.array([1e3 * (self.messages[us] - self.replies[us]) for us in both])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("db", type=Path)
     parser.add_argument("photo", type=Path, help="that the database localises")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     figures: dict[str, float] = {"load": os.getloadavg()[0]}
     with tempfile.TemporaryDirectory() as scratch:
         film = _film(Path(scratch) / "still.mp4", args.photo)
@@ -92,7 +92,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             server.stop()
     write_figures(args.json, figures)
-    return 0
 
 
 def _server_on_one_core(db: Path) -> ServeProcess:
@@ -196,4 +195,4 @@ def _figures(name: str, moments: Moments) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

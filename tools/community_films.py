@@ -17,7 +17,6 @@ Prints the maps and tracks.
 
 import argparse
 import shutil
-import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -119,8 +118,8 @@ def track_figures(tracks: Iterable[JudgedTrack]) -> dict[str, float]:
     }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+def main() -> None:
+    args = _arguments()
     inputs = (args.inputs or args.work) / f"community-{args.seed}"
     scripts = six_films(args.seed)
     truth = write_films(inputs / "films", scripts)
@@ -141,7 +140,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         figures |= track_figures(tracks)
         say("".join(f"\n{track.film}: {track_figures([track])}" for track in tracks))
     write_figures(args.json, figures)
-    return 0
 
 
 def _ingest(database: Path, films: Path, work: Path) -> float:
@@ -182,11 +180,11 @@ def _tracked(database: Path, films: Path, work: Path, truth: FilmsTruth) -> list
     return tracks
 
 
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+def _arguments() -> argparse.Namespace:
     parser = study_parser(__doc__, "--work", "--inputs")
     parser.add_argument("--seed", type=int, default=1, help="of town, flights and picks")
-    return parser.parse_args(argv)
+    return parser.parse_args()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -9,8 +9,6 @@ map is wrong where a camera is a metre off.
 """
 
 import shutil
-import sys
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -31,8 +29,8 @@ from tools.worlds.scan_world import make_scan_world
 _FRAMES, _DRAWS, _WRONG_M = 1200, 10, 1.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     inputs, work = args.inputs or args.work, args.work
     world = make_scan_world(inputs)
     folder = write_film(inputs / f"film-smooth-{_FRAMES}-1", film_options("smooth", _FRAMES))
@@ -55,7 +53,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"{kind}_m": float(np.median([one["median_m"] for one in placed] or [np.nan])),
         }
     write_figures(args.json, figures)
-    return 0
 
 
 def _draw(number: int, made: Path, work: Path, truth: FilmTruth) -> dict[str, float] | None:
@@ -70,4 +67,4 @@ def _draw(number: int, made: Path, work: Path, truth: FilmTruth) -> dict[str, fl
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

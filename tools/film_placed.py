@@ -8,7 +8,6 @@ distances between track and telemetry, the radius is that of the track: of the h
 """
 
 import csv
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,12 +24,11 @@ from tools.figures import study_parser, write_figures
 _WITHIN = float(chi2.ppf(0.95, 2))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("film", type=Path)
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     write_figures(args.json, film_placed(args.film, args.work))
-    return 0
 
 
 def film_placed(film: Path, work: Path) -> dict[str, float]:
@@ -84,4 +82,4 @@ def _off_telemetry(film: Path, rows: Sequence[dict[str, str]]) -> tuple[FloatArr
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

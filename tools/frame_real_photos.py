@@ -13,7 +13,6 @@ Both have to end at one pose: figures are how far apart they are, in metres and 
 
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -38,13 +37,13 @@ _EPSG = 32615  # UTM zone of the scan of `brighton`
 _SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("scan", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--lens", required=True, metavar="MODEL:PARAMS", help="COLMAP's model and parameters")
     parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     cloud = read_cloud(args.scan, _EPSG)
     names = args.photos or sorted(p.name for p in args.folder.iterdir() if p.suffix.lower() == ".jpg")
     accepted, apart, seconds = 0, [], []
@@ -73,7 +72,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "cpu_s": float(np.median(seconds or [nothing])),
     }
     write_figures(args.json, figures)
-    return 0
 
 
 def _timed(
@@ -150,4 +148,4 @@ def _apart(a: Rigid3, b: Rigid3) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

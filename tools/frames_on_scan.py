@@ -56,11 +56,11 @@ _LOW = FlightOptions(lines=2, per_line=5, oblique=0, width=1024, height_m=25.0)
 _AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--work", "--inputs")
     parser.add_argument("--towns", type=int, nargs="+", default=_TOWNS, help="seeds")
     parser.add_argument("--negatives", type=int, default=40, help="of each town")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     cv2.setNumThreads(1)
     args.work.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.work
@@ -88,7 +88,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             "mirrored_placed": sum(town["mirrored"] for town in towns),
         },
     )
-    return 0
 
 
 def _town(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
@@ -245,4 +244,4 @@ def _misplaced(feature_map: FeatureMap, rng: np.random.Generator) -> FeatureMap:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -77,11 +77,11 @@ class State:
     gates: Path | None = None
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
     parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     found = require_usable(scan_folder(args.photos, ScanOptions()), args.photos, least=2)
     photos = [replace(photo, owner=_OWNER) for photo in found]
     making = MapMakingOptions()
@@ -99,7 +99,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             state.waiting = sorted([*state.waiting, *rows])
             _take_in(state)
     write_figures(args.json, _judged(state, joint))
-    return 0
 
 
 def portions(count: int, cut: str) -> list[list[int]]:
@@ -234,4 +233,4 @@ def _judged(state: State, joint: Component) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -12,7 +12,6 @@ import resource
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -62,10 +61,10 @@ class Cost:
         return self.ours_s / self.colmap_s
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     costs = {folder.parent.name: measured(folder) for folder in args.folders}
     figures: dict[str, Any] = {
         name: asdict(cost) | {"ratio": cost.ratio, "share": cost.both / max(1, cost.colmap_photos)}
@@ -74,7 +73,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     figures["worst_ratio"] = max(cost.ratio for cost in costs.values())
     figures["fewer"] = max(cost.colmap_photos - cost.ours_photos for cost in costs.values())
     write_figures(args.json, figures)
-    return 0
 
 
 def measured(folder: Path) -> Cost:
@@ -109,4 +107,4 @@ def _processor_s(*argv: str) -> tuple[float, str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -58,17 +58,16 @@ class Landmark:
         return np.array([pose.center for pose in self.poses])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work", "--seed")
     parser.add_argument("--draws", type=int, default=40, help="of each kind and number")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     make(args.work / "untagged", "photos", args.photos)
     landmark = true_landmark(args.work / "untagged")
     figures = ingested(landmark, args.photos, args.work, args.seed)
     with threadpool_limits(1):  # matrices are small
         figures |= drawn(landmark, args.draws, args.seed)
     write_figures(args.json, figures)
-    return 0
 
 
 def true_landmark(database: Path) -> Landmark:
@@ -175,4 +174,4 @@ def _squares(error: FloatArray, covariance: FloatArray, parts: Sequence[FloatArr
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

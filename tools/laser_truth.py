@@ -12,7 +12,6 @@ the map stores of it (root mean square of its parameters: 1 is right). Worst is 
 of a median to the baseline's, or to the reported radius.
 """
 
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -47,14 +46,13 @@ class Errors:
     wanted: int = 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         figures = judged(read_laser_set(args.folder), Path(scratch) / args.folder.name)
     write_figures(args.json, figures)
-    return 0
 
 
 def judged(truth: LaserSet, work: Path) -> dict[str, float]:
@@ -170,4 +168,4 @@ def _median(values: Sequence[float]) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -20,7 +20,6 @@ and state 4 m. Printed is how far the map's cameras are off in height after a si
 """
 
 import argparse
-import sys
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -110,8 +109,8 @@ class LensDraw:
         )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+def main() -> None:
+    args = _arguments()
     figures: dict[str, float] = {}
     for sigma in _SIGMAS_M:
         with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
@@ -124,7 +123,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if bends:
         figures |= {"bent_m": float(np.median(bends)), "bent_90_m": float(np.quantile(bends, 0.9))}
     write_figures(args.json, figures)
-    return 0
 
 
 def bent(seed: int) -> float | None:
@@ -333,11 +331,11 @@ def _model_of(
     return max(read_models(output), key=lambda model: len(model.rows), default=None)
 
 
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+def _arguments() -> argparse.Namespace:
     parser = study_parser(__doc__)
     parser.add_argument("--draws", type=int, default=300)
-    return parser.parse_args(argv)
+    return parser.parse_args()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -10,9 +10,6 @@
    anchoring, localisation and renderer. Pixels whose nearest points lie at several depths have no truth.
 """
 
-import sys
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -38,8 +35,8 @@ _NEAR, _REACH_PX = 12, 12.0  # points of the scan around a pixel, and how far th
 _ONE_SURFACE_M = 0.3  # between the depths of nine tenths of them
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = scan_parser(__doc__, "--work", "--held-out").parse_args(argv)
+def main() -> None:
+    args = scan_parser(__doc__, "--work", "--held-out").parse_args()
     truth = scan_truth(args)
     scan = read_scan(args.scan, truth.frame, truth.epsg)
     rng = np.random.default_rng(_SEED)
@@ -62,7 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     for kind, those in found.items():
         figures |= {f"{kind}_located": len(those)} | miss_figures(kind, those)
     write_figures(args.json, figures)
-    return 0
 
 
 def _surfaces(database: Database, localiser: Localiser, view: AnsweredView) -> dict[str, RaySurface]:
@@ -88,4 +84,4 @@ def _truth(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -9,7 +9,6 @@
    What the scan's strips are off by is stated, as from a data sheet.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,8 +51,8 @@ class Miss:
     at_edge: bool
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     work: Path = args.work
     world = make_scan_world(args.inputs or work, _SEED)
     featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
@@ -81,7 +80,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             drawn += target.drawn(rng, surface, _PIXELS // 5)
     figures = miss_figures("answered", answered) | miss_figures("drawn", drawn)
     write_figures(args.json, figures | {"refused": refused, "located": len(answered)})
-    return 0
 
 
 class _Target:
@@ -148,4 +146,4 @@ def view_of(localiser: Localiser, data: bytes) -> AnsweredView | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -13,7 +13,6 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +36,10 @@ _FRAMES = 1200
 _PLACED = "placed.json"  # what came of the film; who starts again goes on from there
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--out", "--inputs", "--seed").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--out", "--inputs", "--seed").parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     write_figures(args.out / "paper.json", film(args))
-    return 0
 
 
 def film(args: argparse.Namespace) -> dict[str, Any]:
@@ -137,4 +135,4 @@ def frame_of(image: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

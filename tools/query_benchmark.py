@@ -8,7 +8,6 @@ Beside it, between the same queries: OpenCV's SIFT alone (3,000 features of the 
 decoding in grey. A query without its decoding is compared with the one, its decoding with the other.
 """
 
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -46,11 +45,11 @@ class Timed:
     opencv_ms: dict[str, float]  # "decode" and "sift" of the same photo, right after it
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("db")
     parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     database = Database.open(args.db)
     with capped_process(_THREADS):
         localiser = Localiser.open(database)
@@ -60,7 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             ask = partial(client.localise, exif_prior=True, timeout_s=60.0)
             served = timed(ask, args.images)
     write_figures(args.json, figures(direct, served))
-    return 0
 
 
 def timed(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list[Timed]:
@@ -108,4 +106,4 @@ def figures(direct: Sequence[Timed], served: Sequence[Timed]) -> dict[str, float
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

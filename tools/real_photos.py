@@ -62,10 +62,10 @@ class HeldOutRow:
     orientation_68_deg: float
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--held-out", nargs="+", metavar="NAME", help=f"default: every {_EVERY}th photo")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     held_out = args.held_out or photo_names(args.photos)[_EVERY // 2 :: _EVERY]
     work: Path = args.work
     part = ingest(work / "part", args.photos, held_out)
@@ -73,7 +73,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
     counts = {"usable": part.usable, "registered": part.registered, "ingest_s": part.wall_s}
     write_figures(args.json, counts | error_figures(rows))
-    return 0
 
 
 def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None) -> Ingest:
@@ -173,4 +172,4 @@ def error_figures(rows: Sequence[HeldOutRow]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -28,8 +28,8 @@ from tools.made_maps import photo_names
 from tools.real_photos import ingest, reference
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--photos", "--work").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--photos", "--work").parse_args()
     names = sorted(photo_names(args.photos), key=natural_key)
     work: Path = args.work
     for name, left_out in (("part", names[1::2]), ("whole", [])):
@@ -53,7 +53,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "unknown": len(poses.keys() - moved.keys()),
     }
     write_figures(args.json, figures | spread([e.position_m for e in off], [e.angle_deg for e in off]))
-    return 0
 
 
 def centers(feature_map: FeatureMap) -> dict[str, FloatArray]:
@@ -74,4 +73,4 @@ def film_of(photos: Path, names: Sequence[str], folder: Path) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

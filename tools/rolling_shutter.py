@@ -45,8 +45,8 @@ _START = datetime(2025, 6, 21, 12, 40, 3, tzinfo=UTC)
 _OUTSIDE = float(chi2.ppf(0.999, 3))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     figures = {"flights": 0, "active": 0, "outside": 0, "held_back": 0, "unnamed": 0}
     worst = 0.0
     for style in _STYLES:
@@ -71,7 +71,6 @@ def main(argv: Sequence[str] | None = None) -> int:
                 sys.stdout.write(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}\n")
                 sys.stdout.flush()
     write_figures(args.json, figures | {"worst_squared": worst})
-    return 0
 
 
 def film_options(style: FlightStyle, seed: int) -> FilmOptions:
@@ -162,4 +161,4 @@ def _square(error: FloatArray, covariance: FloatArray) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

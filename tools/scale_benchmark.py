@@ -16,7 +16,6 @@ import gc
 import multiprocessing
 import os
 import shutil
-import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -92,11 +91,11 @@ class Measured:
     anonymous_bytes: int
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("sources", nargs="+", metavar="DB:FOLDER")
     parser.add_argument("--points", type=int, default=1_000_000)
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     sources = [source_of(*text.rsplit(":", 1)) for text in args.sources]
     small, large = args.work / "small", args.work / f"large-{args.points}"
@@ -122,7 +121,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         more_bytes = figures[f"large_{kind}"] - figures[f"small_{kind}"]
         figures[f"{kind}_a_point"] = more_bytes / more
     write_figures(args.json, figures)
-    return 0
 
 
 def source_of(database: str, folder: str) -> CopiedMap:
@@ -296,4 +294,4 @@ def _memory(kind: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

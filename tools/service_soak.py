@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
@@ -76,10 +76,10 @@ class Events:
                     self.counts[f"broken {error.code}"] += 1
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = service_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     database = Database.open(args.db)
     photos = photos_of(args.photos, 4)
     with tempfile.TemporaryDirectory() as scratch:
@@ -114,8 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "exit_code": exit_code,
     }
     write_figures(args.json, figures)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -83,10 +82,10 @@ def stopped_under_load(database: Path, photo: bytes, after_s: float) -> Stopped:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = service_parser(__doc__)
     parser.add_argument("--stops", type=int, default=200)
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     (photo,) = photos_of(args.photos, 1)
     rng = random.Random(1)
     found = []
@@ -101,8 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "slowest_s": max(one.seconds for one in found),
     }
     write_figures(args.json, figures)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

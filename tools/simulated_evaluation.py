@@ -13,7 +13,6 @@ for every held-out photo and every negative, and compares with the truth:
   that of the exact positions.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -59,10 +58,10 @@ class Asked:
     true_in_area: Rigid3 | None
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--seed")
     parser.add_argument("--out", type=Path, default=Path("simulated-evaluation"))
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     world = make_world(args.out / "world", size="full", seed=args.seed, exact_gps=True)
     database = Database.create(args.out / "db")
@@ -76,7 +75,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     feature_map = database.snapshot().load_map(placed.map_id)
     inside = inside_over_placements(answers, area, feature_map, world, _DRAWS, args.seed)
     write_figures(args.json, inside | flat_figures(asked))
-    return 0
 
 
 def ask_world(world: World, localiser: Localiser) -> dict[str, list[Asked]]:
@@ -185,4 +183,4 @@ def _inside(error: FloatArray, covariance: FloatArray) -> tuple[bool, bool]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

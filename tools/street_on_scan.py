@@ -11,7 +11,6 @@ What is found of a town is kept in DIR.
 
 import json
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +36,10 @@ _BOUND = float(chi2.isf(1e-3, 3))
 _RADIUS_M = 200.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--work", "--inputs")
     parser.add_argument("--towns", type=int, nargs="+", default=_TOWNS, help="seeds")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     cv2.setNumThreads(1)
     args.work.mkdir(parents=True, exist_ok=True)
     towns = [_town(seed, args.inputs or args.work, args.work) for seed in args.towns]
@@ -66,7 +65,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             "elsewhere_placed": sum(bool(one["off"]) for town in towns for one in town["elsewhere"]),
         },
     )
-    return 0
 
 
 def _town(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
@@ -129,4 +127,4 @@ def _off(placed: FeatureMap, truth: Truth) -> list[tuple[float, float, float]]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -9,7 +9,6 @@ strip of four some yaws are off by 180 degrees, as there. Each strip is placed w
 
 """
 
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,16 +41,15 @@ class CameraStrip:
     angles: tuple[CameraAngles | None, ...]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = scan_parser(__doc__)
     parser.add_argument("--draws", type=int, default=200, help="simulated strips")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     with threadpool_limits(1):
         figures = measure("real", list(real_strips(scan_truth(args), args.photos)), _SEED)
         drawn = [simulated_strip(np.random.default_rng((_SEED, draw))) for draw in range(args.draws)]
         figures |= measure("simulated", drawn, _SEED)
     write_figures(args.json, figures)
-    return 0
 
 
 def measure(kind: str, strips: Sequence[CameraStrip], seed: int) -> dict[str, float]:
@@ -159,4 +157,4 @@ def simulated_strip(rng: np.random.Generator) -> CameraStrip:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -13,7 +13,6 @@ Writes into track.json for each film what `judge_film` says; with --draw how far
 lays over the film by that track is from where it belongs (tools/drawn_layer.py), too.
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -51,13 +50,13 @@ _END = 200  # frames at each end whose errors are compared; of short films, a ha
 _CUT = (0.4, 0.55)  # of the film
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--out", "--inputs", "--seed")
     parser.add_argument("--frames", type=int, default=1200)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.out
     database = anchored_map(args.out, inputs, args.seed)
@@ -75,7 +74,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             scene, track = town_of(options.world), tracked.trajectory
             results[f"{name}_layer"] = drawn_marks(args.out, film, truth, scene, track, database)
     write_figures(args.out / "track.json", results)
-    return 0
 
 
 def anchored_map(out: Path, inputs: Path, seed: int) -> Path:
@@ -218,4 +216,4 @@ def _progress(name: str) -> Callable[[int, int], None]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

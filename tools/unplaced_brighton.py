@@ -35,8 +35,8 @@ _DRAWS, _SEED = 20, 1
 _SIGMA_PX = 3.0  # of a pick, each axis
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = scan_parser(__doc__, "--work").parse_args(argv)
+def main() -> None:
+    args = scan_parser(__doc__, "--work").parse_args()
     truth = scan_truth(args)
     scan = read_scan(args.scan, truth.frame, truth.epsg)
     work: Path = args.work
@@ -47,7 +47,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
     draw = partial(_draw, work=work, map_id=summary.map_id, scan=scan, truth=truth)
     write_figures(args.json, figures | summed(all_drawn("draw", _DRAWS, draw, work), _DRAWS))
-    return 0
 
 
 def all_drawn(
@@ -118,4 +117,4 @@ def summed(placed: Sequence[dict[str, float]], draws: int) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -12,8 +12,6 @@
 """
 
 import argparse
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +30,11 @@ from tools.real_photos import ingest, reference
 _STRANGE = 10
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--strange", type=Path, required=True, metavar="FOLDER", help="photos of elsewhere")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     write_figures(args.json, grown(args, args.work))
-    return 0
 
 
 def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
@@ -97,4 +94,4 @@ def _poses(feature_map: FeatureMap, frame: LocalFrame) -> dict[str, Rigid3]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -10,8 +10,6 @@ placed map and compared with the poses that tools/scan_poses.py finds.
 """
 
 import shutil
-import sys
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -32,8 +30,8 @@ _AWAY_M, _RADIUS_M = 100.0, 250.0
 _GREY = np.array([0.299, 0.587, 0.114])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = scan_parser(__doc__, "--work").parse_args(argv)
+def main() -> None:
+    args = scan_parser(__doc__, "--work").parse_args()
     truth = scan_truth(args)
     work: Path = args.work
     figures: dict[str, object] = {"draws": _DRAWS, **unplaced_map(args.photos, work)}
@@ -46,7 +44,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         placed = all_drawn(kind, _DRAWS, partial(_draw, made=database, work=work, truth=truth), work)
         figures |= {f"{kind}_{name}": value for name, value in summed(placed, _DRAWS).items()}
     write_figures(args.json, figures)
-    return 0
 
 
 def scan_of(kind: str, scan: Path, work: Path) -> Path:
@@ -90,4 +87,4 @@ def near_words(database: Path, number: int) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

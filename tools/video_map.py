@@ -8,8 +8,6 @@
 """
 
 import shutil
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +26,8 @@ from tools.worlds.scan_world import make_scan_world
 _FRAMES = 1200
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--out").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--out").parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     world = make_scan_world(args.out)
     folder = write_film(args.out / "film-smooth", film_options("smooth", _FRAMES))
@@ -55,7 +53,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "anchored_s": clock.seconds["anchor"],
     }
     write_figures(args.out / "video_map.json", figures)
-    return 0
 
 
 def keyframe_errors(feature_map: FeatureMap, truth: FilmTruth) -> FloatArray:
@@ -70,4 +67,4 @@ def keyframe_errors(feature_map: FeatureMap, truth: FilmTruth) -> FloatArray:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
