@@ -46,7 +46,6 @@ from numpy.typing import NDArray
 from featuredb.features.decode import decode_gray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
@@ -55,7 +54,7 @@ from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import SURE_CONFIRMATION_LOG_NFA
 from ingest.register.frame_registration import FramePrior
-from tools.figures import study_parser, write_figures
+from tools.figures import off_pose, study_parser, write_figures
 from tools.ortho_over_scan import (
     Floats,
     OrthoOverScan,
@@ -205,7 +204,9 @@ def _one(
     place: OrthoOverScan, cloud: PointCloud, trial: _Trial, offset: Floats, rng: np.random.Generator
 ) -> WindowOutcome:
     camera, truth = _nadir_camera(place, trial)
-    prior = _wrong_prior(truth, rng)
+    # 20 m in space and 5 degrees about any axis, by axis.
+    sigmas = np.array([_PRIOR_M, _PRIOR_DEG]) / np.sqrt(3.0)
+    prior = FramePrior.around(off_pose(truth, rng, _PRIOR_M, _PRIOR_DEG), *sigmas.tolist())
     found = register_frame(trial.photo, camera, prior, cloud)
     tried = found.evidence.get("pose_tried")
     error = None
@@ -232,21 +233,6 @@ def _nadir_camera(place: OrthoOverScan, trial: _Trial) -> tuple[Camera, Rigid3]:
     rotation = np.diag([1.0, -1.0, -1.0])
     camera = Camera.from_focal(place.window, place.window, _HEIGHT_M / place.cell, "SIMPLE_PINHOLE")
     return camera, Rigid3(rotation=rotation, translation=-rotation @ center)
-
-
-def _wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
-    shift, axis = rng.normal(size=3), rng.normal(size=3)
-    center = truth.center + _PRIOR_M * shift / np.linalg.norm(shift)
-    rotation = so3_exp(np.radians(_PRIOR_DEG) * axis / np.linalg.norm(axis)) @ truth.rotation
-    # 20 m in space and 5 degrees about any axis, by axis.
-    sigma_m, sigma_deg = _PRIOR_M / np.sqrt(3.0), _PRIOR_DEG / np.sqrt(3.0)
-    return FramePrior(
-        cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
-        sigma_horizontal_m=sigma_m,
-        sigma_vertical_m=sigma_m,
-        sigma_heading_deg=sigma_deg,
-        sigma_tilt_deg=sigma_deg,
-    )
 
 
 def _ground_error(place: OrthoOverScan, camera: Camera, pose: Rigid3, trial: _Trial, offset: Floats) -> float:

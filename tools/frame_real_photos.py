@@ -25,16 +25,16 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from tools.figures import study_parser, write_figures
+from tools.figures import off_pose, study_parser, write_figures
 from tools.worlds.clouds import build_cloud
 
 _EPSG = 32615  # UTM zone of the scan of `brighton`
-_SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
+_OFF_M, _OFF_DEG = 15.0, 10.0
+_AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
 
 
 def main() -> None:
@@ -111,8 +111,9 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
     center = cloud.frame.enu_from_geodetic([exif.latitude_deg, exif.longitude_deg, 0.0])
     center[2] = exif.altitude_m
     pitch = -90.0 if exif.angles is None or exif.angles.pitch_deg is None else exif.angles.pitch_deg
+    rotation = _looking_north(np.radians(pitch))
     return FramePrior(
-        cam_from_local=_posed(_looking_north(np.radians(pitch)), center),
+        cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
         sigma_horizontal_m=5.0,
         sigma_vertical_m=12.0,  # heights of drones are metres to tens of metres off
         sigma_heading_deg=180.0,
@@ -122,25 +123,13 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
 
 def wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
     """15 m and 10 degrees off."""
-    shift, axis = rng.normal(size=3), rng.normal(size=3)
-    rotation = truth.rotation @ so3_exp(np.radians(10.0) * axis / np.linalg.norm(axis))
-    return FramePrior(
-        cam_from_local=_posed(rotation, truth.center + 15.0 * shift / np.linalg.norm(shift)),
-        sigma_horizontal_m=_SIGMA_M,
-        sigma_vertical_m=_SIGMA_M,
-        sigma_heading_deg=_SIGMA_DEG,
-        sigma_tilt_deg=_SIGMA_DEG,
-    )
+    return FramePrior.around(off_pose(truth, rng, _OFF_M, _OFF_DEG), _OFF_M * _AXIS, _OFF_DEG * _AXIS)
 
 
 def _looking_north(pitch_rad: float) -> FloatArray:
     forward = np.array([0.0, np.cos(pitch_rad), np.sin(pitch_rad)])
     right = np.array([1.0, 0.0, 0.0])
     return np.stack([right, np.cross(forward, right), forward])
-
-
-def _posed(rotation: FloatArray, center: FloatArray) -> Rigid3:
-    return Rigid3(rotation=rotation, translation=-rotation @ center)
 
 
 def _apart(a: Rigid3, b: Rigid3) -> tuple[float, float]:

@@ -40,7 +40,7 @@ from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from tools.figures import laid_on, study_parser, write_figures
+from tools.figures import laid_on, poses_in, study_parser, write_figures
 from tools.growth_gates import recorded
 
 _PORTIONS = 3
@@ -183,9 +183,8 @@ def _find_centers(state: State) -> None:
         if summary.status == "active":
             feature_map = snapshot.load_map(summary.map_id)
             state.frame = state.frame or feature_map.frame
-            to_first = state.frame.enu_from(feature_map.frame)
-            for image in feature_map.images:
-                state.centers[image.name] = to_first.act(image.cam_from_local.center)
+            poses = poses_in(state.frame, feature_map)
+            state.centers |= {name: pose.center for name, pose in poses.items()}
     state.waiting = [r for r in state.waiting if state.photos[r].name not in state.centers]
 
 

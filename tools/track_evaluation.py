@@ -18,12 +18,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
+from featuredb.geometry.rotation import matrix_from_quaternion, so3_log
 from featuredb.lidar.load import load_cloud
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
@@ -38,7 +37,7 @@ from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored
 from tools.commands import featuredb
 from tools.drawn_layer import drawn_marks
-from tools.figures import study_parser, write_figures
+from tools.figures import inside, off_pose, squared, study_parser, write_figures
 from tools.growth_common import say
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
 from tools.worlds.flight_path import FlightStyle, PathOptions
@@ -47,12 +46,13 @@ from tools.worlds.scan_world import make_scan_world
 _FILMS = ("smooth", "jerky", "cut")
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
 _END = 200  # frames at each end whose errors are compared; of short films, a half each
+_FRAMES = 1200
 _CUT = (0.4, 0.55)  # of the film
 
 
 def main() -> None:
     parser = study_parser(__doc__, "--out", "--inputs", "--seed")
-    parser.add_argument("--frames", type=int, default=1200)
+    parser.add_argument("--frames", type=int, default=_FRAMES)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
@@ -99,21 +99,9 @@ def finder_on(what: str, database: Path, truth: FilmTruth, seed: int) -> Finder:
     cloud = load_cloud(Database.open(database), truth.frame, scan_ids=[scan.scan_id])
     first = truth.cam_from_local[0]
     assert first is not None
-    return ScanFinder(cloud, scan.scan_id, truth.epsg, coarse_start(first, seed))
-
-
-def coarse_start(pose: Rigid3, seed: int) -> FramePrior:
-    """A pose that is off by 10 m to some side and 5 degrees about some axis, and says so."""
-    rng = np.random.default_rng((seed, 5))
-    side, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-    rotation = so3_exp(np.radians(_START_DEG) * axis) @ pose.rotation
-    return FramePrior(
-        cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ (pose.center + _START_M * side)),
-        sigma_horizontal_m=_START_M,
-        sigma_vertical_m=_START_M,
-        sigma_heading_deg=_START_DEG,
-        sigma_tilt_deg=_START_DEG,
-    )
+    start = off_pose(first, np.random.default_rng((seed, 5)), _START_M, _START_DEG)
+    prior = FramePrior.around(start, _START_M, _START_DEG)
+    return ScanFinder(cloud, scan.scan_id, truth.epsg, prior)
 
 
 def film_options(name: str, frames: int, seed: int = 1) -> FilmOptions:
@@ -126,6 +114,12 @@ def film_options(name: str, frames: int, seed: int = 1) -> FilmOptions:
         frames=frames,
         cut=None if cut is None else (cut[0], cut[1]),
     )
+
+
+def smooth_film(inputs: Path) -> tuple[Path, FilmTruth]:
+    """The film `smooth` of 1,200 frames, with its telemetry beside it, and its truth; drawn once."""
+    folder = write_film(inputs / f"film-smooth-{_FRAMES}-1", film_options("smooth", _FRAMES))
+    return folder / FILM_FILE, read_film_truth(folder)
 
 
 def axis_errors(
@@ -144,12 +138,12 @@ def axis_errors(
     return off
 
 
-def judge_film(tracked: TrackedVideo, truth: FilmTruth) -> dict[str, float]:
+def judge_film(tracked: TrackedVideo, truth: FilmTruth, most: int = _END) -> dict[str, float]:
     """The film's track against its truth.
 
     - frames, lost: of the frames that show the town. invented: poses of frames that do not.
     - mean_m, largest_m: errors of the frames that have poses. first_m, last_m: means over the first and the
-      last 200 of them, or over the halves of fewer than 400.
+      last of them, `most` or a half.
     - found_s: from the town's return to the first pose, of the film's time; 0 without a cut.
     - rate_hz: frames a second over the whole run.
     - position_95, orientation_95: shares of the errors inside these bounds. squared: mean squared error of
@@ -161,7 +155,7 @@ def judge_film(tracked: TrackedVideo, truth: FilmTruth) -> dict[str, float]:
     if not known.any():
         raise SystemExit(f"track_evaluation: no frame of {tracked.trajectory.source} has a pose")
     m = metres[known]
-    end = min(_END, max(len(m) // 2, 1))  # ends that overlap could not differ
+    end = min(most, max(len(m) // 2, 1))  # ends that overlap could not differ
     return {
         "frames": int(truth.at_home.sum()),
         "lost": int((truth.at_home & np.isnan(metres)).sum()),
@@ -183,17 +177,16 @@ def _inside(trajectory: Trajectory, off: FloatArray) -> dict[str, float]:
     few = np.argsort([p.inliers for p in points], kind="stable")[: (len(points) + 3) // 4]
     figures: dict[str, float] = {}
     for name, part in (("orientation", slice(0, 3)), ("position", slice(3, 6))):
-        squared = np.array(
+        squares = np.array(
             [
-                off[k, part] @ np.linalg.solve(p.pose.covariance[part, part], off[k, part])
+                squared(off[k, part], p.pose.covariance[part, part])
                 for k, p in zip(rows, points, strict=True)
                 if p.pose is not None
             ]
         )
-        inside = squared <= chi2.ppf(0.95, 3)
-        figures |= {f"{name}_95": float(inside.mean()), f"few_{name}_95": float(inside[few].mean())}
+        figures |= {f"{name}_95": inside(squares, 0.95), f"few_{name}_95": inside(squares[few], 0.95)}
         if name == "position":
-            figures |= {"squared": float(squared.mean()), "few_squared": float(squared[few].mean())}
+            figures |= {"squared": float(squares.mean()), "few_squared": float(squares[few].mean())}
     return figures
 
 
