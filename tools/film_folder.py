@@ -1,10 +1,9 @@
-"""Draws the films of scripts into a folder, and the truth of every frame into a file beside it."""
+"""Draws the films of scripts into a folder, with the truth of every frame."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -68,21 +67,6 @@ def write_films(folder: Path, scripts: tuple[Script, ...]) -> FilmsTruth:
     town = place_scene(scripts[0].town)
     films = {f"{s.name}.mp4": tuple(_truth(s, i) for i in range(s.frames)) for s in scripts}
     return FilmsTruth(frame=town.frame, epsg=town.epsg, films=films)
-
-
-def write_truth(path: Path, truth: FilmsTruth) -> None:
-    """The truth as a table: a row for each frame of each film."""
-    rows: list[dict[str, Any]] = []
-    for film, frames in truth.films.items():
-        for number, one in enumerate(frames):
-            row = {"film": film, "frame": number, "shot": one.piece, "kind": one.kind}
-            if one.pose is not None:
-                row |= {"xyzw": one.pose.quaternion_xyzw.tolist(), "t_m": one.pose.translation.tolist()}
-            if one.camera is not None:
-                row["focal_px"] = one.camera.focal_px
-            rows.append(row)
-    document = {"frame": asdict(truth.frame), "epsg": truth.epsg, "frames": rows}
-    path.write_text(json.dumps(document) + "\n", encoding="utf-8")
 
 
 def film_picture(script: Script, frame: int) -> Image8:

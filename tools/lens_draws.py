@@ -9,9 +9,7 @@ matching is what an ingest does: structure from motion, the adjustment, placemen
 the map. Then twenty photos that the map has not seen are localised by EXIF alone.
 
 For each sigma of the positions: shares of errors of position and orientation inside their 68 % and 95 %
-bounds, over all answers and over the quarter with fewest inliers, and how many lie outside twice their
-99.9 % bound. The answers of one draw share its lens and place, so the shares' own standard deviations are
-taken over draws.
+bounds, and how many lie outside twice their 99.9 % bound.
 
 Photos from above determine a lens' radial distortion badly, and what it is off by bends the map. One flight
 for five draws looks straight down from one height, by a barometer: heights are off by 5 m together and by
@@ -19,14 +17,11 @@ for five draws looks straight down from one height, by a barometer: heights are 
 and state 4 m. Printed is how far the map's cameras are off in height after a similarity.
 """
 
-import argparse
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +47,8 @@ from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
-from tools.figures import pose_offset, study_parser, write_figures
+from tools.figures import inside_figures, pose_offset, squared, study_parser, write_figures
+from tools.worlds.film_frame import in_order
 
 _WIDTH, _HEIGHT, _FOCAL_PX = 1200, 900, 1000.0
 _SIGMAS_M = (0.02, 0.5, 3.0)  # of positions
@@ -60,19 +56,10 @@ _DRAWS_A_LEVEL_FLIGHT = 5
 _KEYPOINT_PX = 0.5
 _SHOWN = 0.7  # of the points in view
 _QUERIES = 20
-_LEVELS = (0.68, 0.95)
+_FAR = 4.0 * float(chi2.ppf(0.999, 3))
 _KEY = "drone"
 _PARTS = (slice(0, 3), slice(3, 6))  # of an error: rotation, displacement
 _EPSG, _ORIGIN = 32632, (456_800.0, 5_429_300.0, 120.0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerErrors:
-    """Squared errors over their covariance, of three axes each, and the pose's inliers."""
-
-    position: float
-    orientation: float
-    inliers: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,15 +97,18 @@ class LensDraw:
 
 
 def main() -> None:
-    args = _arguments()
+    parser = study_parser(__doc__)
+    parser.add_argument("--draws", type=int, default=300)
+    args = parser.parse_args()
     figures: dict[str, float] = {}
     for sigma in _SIGMAS_M:
-        with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-            draws = list(pool.map(partial(drawn, sigma_m=sigma), range(args.draws)))
-        figures |= {f"{name}_{100.0 * sigma:g}cm": value for name, value in judged(draws).items()}
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        found_bends = pool.map(bent, range(max(args.draws // _DRAWS_A_LEVEL_FLIGHT, 1)))
-        bends = [bend for bend in found_bends if bend is not None]
+        answers = [one for draw in in_order(partial(drawn, sigma_m=sigma), args.draws, 2, 1) for one in draw]
+        for k, kind in enumerate(("orientation", "position")):
+            squares = [one[k] for one in answers]
+            found = inside_figures(kind, squares) | {f"{kind}_far": sum(one > _FAR for one in squares)}
+            figures |= {f"{name}_{100.0 * sigma:g}cm": value for name, value in found.items()}
+    level_flights = in_order(bent, max(args.draws // _DRAWS_A_LEVEL_FLIGHT, 1), 2, 1)
+    bends = [bend for bend in level_flights if bend is not None]
     figures["level"] = float(len(bends))
     if bends:
         figures |= {"bent_m": float(np.median(bends)), "bent_90_m": float(np.quantile(bends, 0.9))}
@@ -144,34 +134,9 @@ def bent(seed: int) -> float | None:
     return None if fit is None else float(np.std((fit.act(model.centers()) - centers[model.rows])[:, 2]))
 
 
-def judged(draws: Sequence[Sequence[AnswerErrors]]) -> dict[str, float]:
-    """Figures of all draws."""
-    answers = [answer for draw in draws for answer in draw]
-    quarter = np.quantile([a.inliers for a in answers], 0.25) if answers else 0.0
-    hardest = [a for a in answers if a.inliers <= quarter]
-    figures = {
-        "draws": float(len(draws)),
-        "empty": float(sum(not draw for draw in draws)),
-        "answers": float(len(answers)),
-    }
-    for kind in ("position", "orientation"):
-        for level in _LEVELS:
-            bound = chi2.ppf(level, 3)
-            figures[f"{kind}_{level * 100:.0f}"] = _share(answers, kind, bound)
-            figures[f"{kind}_{level * 100:.0f}_hardest"] = _share(hardest, kind, bound)
-        far = sum(getattr(a, kind) > 4.0 * chi2.ppf(0.999, 3) for a in answers)
-        middle = float(np.median([getattr(a, kind) for a in answers])) if answers else float("nan")
-        figures |= {f"{kind}_far": float(far), f"{kind}_median": middle}
-    return figures
-
-
-def _share(answers: Sequence[AnswerErrors], kind: str, bound: float) -> float:
-    """Share of the answers inside."""
-    return float(np.mean([getattr(a, kind) <= bound for a in answers])) if answers else float("nan")
-
-
-def drawn(seed: int, sigma_m: float) -> list[AnswerErrors]:
-    """One draw; empty where no map is placed."""
+def drawn(seed: int, sigma_m: float) -> list[tuple[float, float]]:
+    """Squared errors of orientation and position over their covariances of one draw's answers, of three axes
+    each; none where no map is placed."""
     scene = scene_of(seed)
     frame = LocalFrame.from_utm(*_ORIGIN, _EPSG)
     poses = flight(scene.rng)
@@ -191,8 +156,8 @@ def drawn(seed: int, sigma_m: float) -> list[AnswerErrors]:
         true = pose @ frame.enu_from(answer.frame)
         turn = np.kron(np.eye(2), answer.frame.true_enu_from_enu(answer.cam_from_local.center))
         error = turn @ pose_offset(answer.cam_from_local, true)
-        squares = [float(error[k] @ np.linalg.solve(answer.covariance[k, k], error[k])) for k in _PARTS]
-        answers.append(AnswerErrors(orientation=squares[0], position=squares[1], inliers=result.inliers))
+        orientation, position = (squared(error[k], answer.covariance[k, k]) for k in _PARTS)
+        answers.append((orientation, position))
     return answers
 
 
@@ -329,12 +294,6 @@ def _model_of(
     known = Known(photos=photos, focal_px={1: _FOCAL_PX})
     adjust_models(output, database, known, 0.5, AdjustOptions())
     return max(read_models(output), key=lambda model: len(model.rows), default=None)
-
-
-def _arguments() -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--draws", type=int, default=300)
-    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -74,23 +74,6 @@ class Query:
     place: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """Of one database: seconds, milliseconds of a query (median), shares of queries, bytes after them."""
-
-    points: int
-    first_start_s: float
-    start_s: float
-    commit_s: float
-    with_prior_ms: float
-    without_ms: float
-    answered_with_prior: float
-    answered_without: float
-    wrong: int
-    resident_bytes: int
-    anonymous_bytes: int
-
-
 def main() -> None:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("sources", nargs="+", metavar="DB:FOLDER")
@@ -103,23 +86,21 @@ def main() -> None:
     for path, points in ((small, _SMALL), (large, args.points)):
         ask[path] = city(path, sources, points)
     context = multiprocessing.get_context("spawn")
-    measured = {}
+    measured: dict[Path, dict[str, float]] = {}
     for path, queries in ask.items():
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
+        with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
             first_start_s = pool.submit(first_start, path, queries[0]).result()
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
-            measured[path] = pool.submit(measure, path, queries, first_start_s).result()
+            measured[path] = pool.submit(measure, path, queries).result() | {"first_start_s": first_start_s}
     figures: dict[str, Any] = {
         f"{size}_{name}": value
         for size, path in (("small", small), ("large", large))
-        for name, value in asdict(measured[path]).items()
+        for name, value in measured[path].items()
     }
     for name in ("first_start_s", "start_s", "commit_s", "with_prior_ms", "without_ms"):
         figures[f"times_{name.rsplit('_', 1)[0]}"] = figures[f"large_{name}"] / figures[f"small_{name}"]
-    more = measured[large].points - measured[small].points
+    more = figures["large_points"] - figures["small_points"]
     for kind in ("resident_bytes", "anonymous_bytes"):
-        more_bytes = figures[f"large_{kind}"] - figures[f"small_{kind}"]
-        figures[f"{kind}_a_point"] = more_bytes / more
+        figures[f"{kind}_a_point"] = (figures[f"large_{kind}"] - figures[f"small_{kind}"]) / more
     write_figures(args.json, figures)
 
 
@@ -225,8 +206,9 @@ def _own_cache(path: Path) -> None:
     os.environ["XDG_CACHE_HOME"] = f"{path}-cache"
 
 
-def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measured:
-    """In a process that has done nothing before."""
+def measure(path: Path, queries: Sequence[Query]) -> dict[str, float]:
+    """Of one database, in a process that has done nothing before: seconds, milliseconds of a query (median),
+    shares of queries, bytes after them."""
     _own_cache(path)
     began = time.perf_counter()
     database = Database.open(str(path))
@@ -247,19 +229,18 @@ def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measu
     gc.collect()
     resident, anonymous = _memory("VmRSS"), _memory("RssAnon")
     commit_s = _commit(database, localiser, queries[0])
-    return Measured(
-        points=points,
-        first_start_s=first_start_s,
-        start_s=start_s,
-        commit_s=commit_s,
-        with_prior_ms=1e3 * median(times[True]),
-        without_ms=1e3 * median(times[False]),
-        answered_with_prior=answered[True] / len(queries),
-        answered_without=answered[False] / len(queries),
-        wrong=wrong,
-        resident_bytes=resident,
-        anonymous_bytes=anonymous,
-    )
+    return {
+        "points": points,
+        "start_s": start_s,
+        "commit_s": commit_s,
+        "with_prior_ms": 1e3 * median(times[True]),
+        "without_ms": 1e3 * median(times[False]),
+        "answered_with_prior": answered[True] / len(queries),
+        "answered_without": answered[False] / len(queries),
+        "wrong": wrong,
+        "resident_bytes": resident,
+        "anonymous_bytes": anonymous,
+    }
 
 
 def _commit(database: Database, localiser: Localiser, query: Query) -> float:
