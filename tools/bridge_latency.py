@@ -37,6 +37,7 @@ from rosbags.typesys import Stores, get_typestore
 from featuredb.features.decode import decode_rgb
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.writer import VideoWriter
+from reloc.client.connection import client_config
 from reloc.service.session import bind_free_port
 from reloc.wire.keys import Keys
 from reloc.wire.track import TrackPose
@@ -44,6 +45,7 @@ from tools.figures import study_parser, write_figures
 from tools.serve_process import ServeProcess
 
 _WIDTH, _FRAMES, _RATE_HZ = 1280, 1200, 10.0
+_CONNECT_S = 10.0
 _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
@@ -132,10 +134,7 @@ def _stream(film: Path, endpoint: str, words: Sequence[str]) -> None:
 @contextmanager
 def _listening(key: str, endpoint: str, heard: Callable[[zenoh.Sample], None]) -> Iterator[None]:
     """A subscriber at a server, on Zenoh's own thread."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    with zenoh.open(config) as session:
+    with zenoh.open(client_config(endpoint, _CONNECT_S)) as session:
         callback = zenoh.handlers.Callback(heard, indirect=False)
         with session.declare_subscriber(key, callback):
             yield

@@ -24,6 +24,7 @@ from scipy.stats import chi2
 from featuredb.store import Database
 from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localiser import Localiser
+from tools.figures import squared
 from tools.growth_common import (
     WRONG_M,
     Album,
@@ -131,7 +132,7 @@ def ask_probes(database: Database, album: Album, upto: int) -> list[Probe]:
             center = album.truth.frame.enu_from(pose.frame).act(pose.cam_from_local.center)
             offset = center - true
             error = float(np.linalg.norm(offset))
-            normalised = float(offset @ np.linalg.solve(pose.covariance[3:, 3:], offset))
+            normalised = squared(offset, pose.covariance[3:, 3:])
         probes.append(Probe(error_m=error, normalised=normalised))
     return probes
 

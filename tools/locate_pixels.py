@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
 
 from featuredb.adjust.block import whole_camera
 from featuredb.geometry.arrays import FloatArray
@@ -32,7 +31,7 @@ from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored
 from tools.commands import featuredb
-from tools.figures import study_parser, write_figures
+from tools.figures import inside, inside_figures, squared, study_parser, write_figures
 from tools.worlds.scan_world import make_scan_world
 from tools.worlds.seen_places import SeenPlaces
 
@@ -118,8 +117,8 @@ def misses(view: AnsweredView, places: FloatArray, found: Sequence[PixelPlace]) 
         if place.utm is None or place.covariance is None:
             continue
         error = view.frame.enu_from_utm(place.utm, place.epsg) - true
-        squared = float(error @ np.linalg.solve(place.covariance, error))
-        missed.append(Miss(error_m=error, squared=squared, at_edge=place.at_edge))
+        square = squared(error, place.covariance)
+        missed.append(Miss(error_m=error, squared=square, at_edge=place.at_edge))
     return missed
 
 
@@ -127,15 +126,13 @@ def miss_figures(name: str, missed: Sequence[Miss]) -> dict[str, float]:
     """Errors in metres and shares inside the bounds, off edges and at them; `name` stands before each."""
     far = np.array([np.linalg.norm(miss.error_m) for miss in missed])
     edge = np.array([miss.at_edge for miss in missed])
-    squared = np.array([miss.squared for miss in missed])
-    inside = {share: squared < chi2.ppf(share / 100, 3) for share in (68, 95)}
+    squares = np.array([miss.squared for miss in missed])
     return {
         f"{name}_median_m": float(np.median(far)),
         f"{name}_clear_95_m": float(np.quantile(far[~edge], 0.95)),
-        f"{name}_68": float(inside[68][~edge].mean()),
-        f"{name}_95": float(inside[95][~edge].mean()),
         f"{name}_edges": float(edge.mean()),
-        f"{name}_edge_95": float(inside[95][edge].mean()) if edge.any() else float("nan"),
+        f"{name}_edge_95": inside(squares[edge], 0.95),
+        **inside_figures(name, squares[~edge]),
     }
 
 

@@ -10,7 +10,6 @@ decoding in grey. A query without its decoding is compared with the one, its dec
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -36,15 +35,6 @@ _SIDE_PX, _FEATURES = 1000, 3000
 _WITH_PRIOR = LocaliseWireRequest(options=RequestOptions(exif_prior=True))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Timed:
-    """One query: its time measured from outside, and of OpenCV."""
-
-    reply: LocaliseReply
-    wall_ms: float
-    opencv_ms: dict[str, float]  # "decode" and "sift" of the same photo, right after it
-
-
 def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("db")
@@ -58,11 +48,14 @@ def main() -> None:
         with start_server(database, options) as server, Client(server.endpoints[0]) as client:
             ask = partial(client.localise, exif_prior=True, timeout_s=60.0)
             served = timed(ask, args.images)
-    write_figures(args.json, figures(direct, served))
+    figures = {name: median(one[name] for one in served) for name in served[0]}
+    figures |= {"asked": len(served), "localised": sum(one["localised"] for one in served)}
+    write_figures(args.json, figures | {"in_process_ms": median(one["wall_ms"] for one in direct)})
 
 
-def timed(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list[Timed]:
-    """Each image five times, after one round that is not counted."""
+def timed(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list[dict[str, float]]:
+    """Each image five times, after one round that is not counted: times measured from outside, and beside
+    those of OpenCV with the same photo, right after it."""
     found = []
     contents = [path.read_bytes() for path in images]
     for number in range(_REPEAT + 1):
@@ -71,7 +64,17 @@ def timed(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list
             reply = ask(data)
             wall_ms = 1e3 * (time.perf_counter() - start)
             if number:
-                found.append(Timed(reply=reply, wall_ms=wall_ms, opencv_ms=opencv_ms(data)))
+                opencv, decode_ms = opencv_ms(data), reply.timings_ms["decode"]
+                found.append(
+                    {
+                        "wall_ms": wall_ms,
+                        "transport_ms": wall_ms - reply.timings_ms["total"],
+                        "sift_ms": opencv["sift"],
+                        "over_sift": (wall_ms - decode_ms) / opencv["sift"],
+                        "over_decode": decode_ms / opencv["decode"],
+                        "localised": reply.status == "localised",
+                    }
+                )
     return found
 
 
@@ -87,22 +90,6 @@ def opencv_ms(data: bytes) -> dict[str, float]:
     create(_FEATURES).detectAndCompute(small, None)
     clock.lap("sift")
     return clock.milliseconds()
-
-
-def figures(direct: Sequence[Timed], served: Sequence[Timed]) -> dict[str, float]:
-    """Medians of both ways of asking, and what came of the second."""
-    return {
-        "wall_ms": median(one.wall_ms for one in served),
-        "in_process_ms": median(one.wall_ms for one in direct),
-        "transport_ms": median(one.wall_ms - one.reply.timings_ms["total"] for one in served),
-        "sift_ms": median(one.opencv_ms["sift"] for one in served),
-        "over_sift": median(
-            (one.wall_ms - one.reply.timings_ms["decode"]) / one.opencv_ms["sift"] for one in served
-        ),
-        "over_decode": median(one.reply.timings_ms["decode"] / one.opencv_ms["decode"] for one in served),
-        "asked": len(served),
-        "localised": sum(one.reply.status == "localised" for one in served),
-    }
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Photos of a rolling shutter, placed by positions alone: what answers, and is it inside its bounds?
 
-    python -m tools.rolling_shutter --work FOLDER [--inputs FOLDER] [--readout-ms 30]
+    python -m tools.rolling_shutter --work FOLDER [--inputs FOLDER]
 
 1. One frame a second of the simulated films, smooth and jerky, whose rows are read out over 30 ms.
 2. Each flight is ingested as photos with EXIF, by a drone's receiver (1.5 m that wander, 0.3 s late) and by
@@ -21,7 +21,6 @@ from PIL import ExifTags, Image
 from scipy.stats import chi2
 
 from featuredb.features.exif.write import rational
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import point_jacobian
@@ -32,7 +31,7 @@ from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from tools.commands import said
-from tools.figures import study_parser, write_figures
+from tools.figures import squared, study_parser, write_figures
 from tools.worlds.film_frame import Exposure, in_order
 from tools.worlds.film_world import FilmOptions, film_frame
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
@@ -151,13 +150,9 @@ def normalised(film: FilmOptions, feature_map: FeatureMap) -> tuple[float, float
         angle = placement[1:4, 1:4] + turn @ own[:3, :3] @ turn.T
         off = pose.center - true.center
         turned = so3_log(pose.rotation.T @ true.rotation)
-        squares.append((_square(off, center), _square(turned, angle)))
+        squares.append((squared(off, center), squared(turned, angle)))
     position, orientation = np.median(squares, axis=0)
     return float(position), float(orientation)
-
-
-def _square(error: FloatArray, covariance: FloatArray) -> float:
-    return float(error @ np.linalg.solve(covariance, error))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from tools.figures import write_figures
-from tools.position_draws import LEVELS, PARTS, SIGMAS, Flight, inside, squares
+from tools.position_draws import SIGMAS, Flight, shares, squares
 from tools.scan_truth import ScanTruth, scan_parser, scan_truth
 
 _LEAST, _MOST_BEND = 5, 0.1  # photos of a real strip; its width over its length
@@ -46,13 +46,13 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=200, help="simulated strips")
     args = parser.parse_args()
     with threadpool_limits(1):
-        figures = measure("real", list(real_strips(scan_truth(args), args.photos)), _SEED)
+        figures = measure("real", list(real_strips(scan_truth(args), args.photos)))
         drawn = [simulated_strip(np.random.default_rng((_SEED, draw))) for draw in range(args.draws)]
-        figures |= measure("simulated", drawn, _SEED)
+        figures |= measure("simulated", drawn)
     write_figures(args.json, figures)
 
 
-def measure(kind: str, strips: Sequence[CameraStrip], seed: int) -> dict[str, float]:
+def measure(kind: str, strips: Sequence[CameraStrip]) -> dict[str, float]:
     """How many are placed and answer, and how often their errors lie inside their bounds."""
     figures = {f"{kind}_strips": float(len(strips))}
     for name, angles in (("", True), ("without_", False)):
@@ -64,18 +64,14 @@ def measure(kind: str, strips: Sequence[CameraStrip], seed: int) -> dict[str, fl
             if found.reason is not None:
                 continue
             answer += not found.provisional
-            camera = np.random.default_rng((seed, 5, number)).integers(len(strip.flight.xyz))
+            camera = np.random.default_rng((_SEED, 5, number)).integers(len(strip.flight.xyz))
             scores.append(squares(found, strip.flight.xyz[camera]))
             turns.append(found.figures["turn_sigma_deg"])
         figures |= {
             f"{kind}_{name}placed": len(scores) / len(strips),
             f"{kind}_{name}answer": answer / len(strips),
             f"{kind}_{name}turn_deg": float(np.median(turns)) if turns else float("nan"),
-            **{
-                f"{kind}_{name}{part}_{100 * level:.0f}": inside(scores, part, level)
-                for part in PARTS
-                for level in LEVELS
-            },
+            **shares(f"{kind}_{name}", scores),
         }
     return figures
 
