@@ -16,7 +16,7 @@ from featuredb.video.frames import open_video
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb
-from tools.worlds.film_world import FILM_FILE, FilmTruth
+from tools.worlds.film_world import FilmTruth
 from tools.worlds.seen_places import SeenPlaces
 
 _SEED, _SHOWING, _PLACES = 3, 6, 8  # frames that give places, and places of each
@@ -39,12 +39,12 @@ def drawn_marks(
     write_trajectory(folder / "track.csv", track)
     lens = truth.camera
     camera = ",".join(map(str, (lens.model, lens.width, lens.height, *lens.params)))
-    words = ("draw", str(film / FILM_FILE), str(folder / "layer.geojson"), "--database", str(database))
+    words = ("draw", str(film), str(folder / "layer.geojson"), "--database", str(database))
     more = ("--track", str(folder / "track.csv"), "--camera", camera, "--out", str(folder / "drawn.mp4"))
     featuredb(*words, *more)
     off: list[float] = []
     frames = stray = 0
-    with open_video(str(film / FILM_FILE)) as plain, open_video(str(folder / "drawn.mp4")) as drawn:
+    with open_video(str(film)) as plain, open_video(str(folder / "drawn.mp4")) as drawn:
         for before, after in zip(plain, drawn, strict=True):
             pose = truth.cam_from_local[before.index]
             if pose is None:

@@ -1,6 +1,5 @@
 """Draws the films of scripts into a folder, with the truth of every frame."""
 
-import json
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -14,12 +13,11 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import WorldOptions, other_town_of, town_of
-from featuredb.video.writer import VideoWriter, VideoWriterOptions
+from featuredb.video.writer import VideoWriterOptions
 from tools.film_scripts import HEIGHT, RATE_HZ, WIDTH, Kind, Piece, Script
-from tools.worlds.film_frame import Exposure, draw_frame, in_order
+from tools.worlds.film_frame import Exposure, draw_frame, write_frames
 from tools.worlds.flight_path import FlightPath
 
-_FORMAT = 1  # raised when the same scripts give other films
 _SAMPLES = 1
 _CARD = (38, 30, 26)
 
@@ -51,19 +49,10 @@ class FilmsTruth:
 def write_films(folder: Path, scripts: tuple[Script, ...]) -> FilmsTruth:
     """Draw what is not there yet; a film whose script is the same is left as it is."""
     folder.mkdir(parents=True, exist_ok=True)
-    stamps = folder.with_suffix(".json")
-    known = json.loads(stamps.read_text(encoding="utf-8")) if stamps.is_file() else {}
     for script in scripts:
-        stamp = f"{_FORMAT} {script.fingerprint()}"
-        file = folder / f"{script.name}.mp4"
-        if known.get(file.name) == stamp and file.is_file():
-            continue
         quality = VideoWriterOptions(crf=script.crf, preset="veryfast")
-        with VideoWriter(file, width=WIDTH, height=HEIGHT, fps=RATE_HZ, options=quality) as writer:
-            for picture in in_order(partial(film_picture, script), script.frames, 0):
-                writer.write(picture)
-        known[file.name] = stamp
-        stamps.write_text(json.dumps(known) + "\n", encoding="utf-8")
+        file, mark = folder / f"{script.name}.mp4", folder.with_name(f"{script.name}.stamp")
+        write_frames(file, partial(film_picture, script), script.frames, RATE_HZ, quality, mark, repr(script))
     town = place_scene(scripts[0].town)
     films = {f"{s.name}.mp4": tuple(_truth(s, i) for i in range(s.frames)) for s in scripts}
     return FilmsTruth(frame=town.frame, epsg=town.epsg, films=films)
@@ -103,8 +92,7 @@ def place_scene(seed: int) -> Scene:
 
 @lru_cache(maxsize=2)
 def _scene(seed: int, kind: Kind) -> Scene:
-    world = WorldOptions.short(seed)
-    return town_of(world) if kind == "place" else other_town_of(world)
+    return (town_of if kind == "place" else other_town_of)(WorldOptions.short(seed))
 
 
 @lru_cache(maxsize=8)

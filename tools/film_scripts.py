@@ -1,8 +1,6 @@
 """Scripts of films as strangers make them: shots, titles, black, a zoom, a logo, bars, bad codecs."""
 
-import hashlib
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -82,10 +80,6 @@ class Script:
         """Seconds at which a piece begins and ends."""
         first = sum(piece.frames for piece in self.pieces[:number])
         return first / RATE_HZ, (first + self.pieces[number].frames) / RATE_HZ
-
-    def fingerprint(self) -> str:
-        """Digest of what the film depends on."""
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
 
 
 def six_films(seed: int) -> tuple[Script, ...]:

@@ -33,7 +33,7 @@ from featuredb.store import Database
 from tools.commands import said
 from tools.figures import squared, study_parser, write_figures
 from tools.worlds.film_frame import Exposure, in_order
-from tools.worlds.film_world import FilmOptions, film_frame
+from tools.worlds.film_world import FilmOptions, film_frame, wandering_errors
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
 _PHOTOS, _SEEDS = 24, (1, 2)
@@ -111,10 +111,8 @@ def tagged(film: FilmOptions, pictures: Sequence[Path], rtk: bool, folder: Path)
     device = Device(make="Maker", model="Film", camera=film.camera, focal_mm=4.5, focal_35mm=26)
     rng = np.random.default_rng((film.path.seed, 74))
     sigma, late_s, keep = (_RTK_M, 0.0, 0.0) if rtk else (_RECEIVER_M, _LATE_S, np.exp(-1.0 / 20.0))
-    axes = np.array([1.0, 1.0, 2.0])
-    error = sigma * axes * rng.standard_normal(3)
-    for k, picture in enumerate(pictures):
-        error = keep * error + sigma * np.sqrt(1.0 - keep**2) * axes * rng.standard_normal(3)
+    errors = wandering_errors(rng, sigma, keep, len(pictures))
+    for k, (picture, error) in enumerate(zip(pictures, errors, strict=True)):
         time_s = film.time_s(k)
         place = pose_at(film, time_s - late_s).center + error
         shot = Shot(

@@ -1,6 +1,6 @@
 """How right tracked films are: flights over the simulated town, anchored on its scan, against true poses.
 
-    python -m tools.track_evaluation --out DIR [--films smooth jerky cut] [--seed N]
+    python -m tools.track_evaluation --out DIR [--films smooth jerky cut]
 
 1. The world of `tools.worlds.scan_world`: `featuredb ingest photos` maps the drone's photos,
    `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
@@ -13,7 +13,7 @@ Writes into track.json for each film what `judge_film` says; with --draw how far
 lays over the film by that track is from where it belongs (tools/drawn_layer.py), too.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,19 +39,19 @@ from tools.commands import featuredb
 from tools.drawn_layer import drawn_marks
 from tools.figures import inside, off_pose, squared, study_parser, write_figures
 from tools.growth_common import say
-from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
+from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, film_truth, write_film
 from tools.worlds.flight_path import FlightStyle, PathOptions
 from tools.worlds.scan_world import make_scan_world
 
 _FILMS = ("smooth", "jerky", "cut")
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
 _END = 200  # frames at each end whose errors are compared; of short films, a half each
-_FRAMES = 1200
+_FRAMES, _SEED = 1200, 1
 _CUT = (0.4, 0.55)  # of the film
 
 
 def main() -> None:
-    parser = study_parser(__doc__, "--out", "--inputs", "--seed")
+    parser = study_parser(__doc__, "--out", "--inputs")
     parser.add_argument("--frames", type=int, default=_FRAMES)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
@@ -59,15 +59,14 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.out
-    database = anchored_map(args.out, inputs, args.seed)
+    database = anchored_map(args.out, inputs)
     results: dict[str, dict[str, float]] = {}
     for name in args.films:
-        options = film_options(name, args.frames, args.seed)
-        film = inputs / f"film-{name}-{args.frames}-{args.seed}"
-        folder = write_film(film, options, 0, _progress(name))
-        truth = read_film_truth(folder)
-        finder = finder_on(args.on, database, truth, args.seed)
-        tracked = track_video(folder / FILM_FILE, finder, camera=truth.camera)
+        options = film_options(name, args.frames)
+        film = write_film(inputs / f"film-{name}-{args.frames}-{_SEED}", options) / FILM_FILE
+        truth = film_truth(options)
+        finder = finder_on(args.on, database, truth)
+        tracked = track_video(film, finder, camera=truth.camera)
         results[name] = judge_film(tracked, truth)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
         if args.draw:
@@ -76,9 +75,9 @@ def main() -> None:
     write_figures(args.out / "track.json", results)
 
 
-def anchored_map(out: Path, inputs: Path, seed: int) -> Path:
+def anchored_map(out: Path, inputs: Path) -> Path:
     """A database with the map of the drone's photos, placed on the scan; kept in `out`."""
-    world = make_scan_world(inputs, seed)
+    world = make_scan_world(inputs)
     done = out / "anchored.txt"
     if not done.exists():
         mapped = out / "mapped"
@@ -90,7 +89,7 @@ def anchored_map(out: Path, inputs: Path, seed: int) -> Path:
     return out / done.read_text()
 
 
-def finder_on(what: str, database: Path, truth: FilmTruth, seed: int) -> Finder:
+def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
     """What a film is tracked by: its map, or its scan from a coarse first pose."""
     maps = Localiser.open(Database.open(database)).areas
     if what == "map":
@@ -99,17 +98,17 @@ def finder_on(what: str, database: Path, truth: FilmTruth, seed: int) -> Finder:
     cloud = load_cloud(Database.open(database), truth.frame, scan_ids=[scan.scan_id])
     first = truth.cam_from_local[0]
     assert first is not None
-    start = off_pose(first, np.random.default_rng((seed, 5)), _START_M, _START_DEG)
+    start = off_pose(first, np.random.default_rng((_SEED, 5)), _START_M, _START_DEG)
     prior = FramePrior.around(start, _START_M, _START_DEG)
     return ScanFinder(cloud, scan.scan_id, truth.epsg, prior)
 
 
-def film_options(name: str, frames: int, seed: int = 1) -> FilmOptions:
+def film_options(name: str, frames: int) -> FilmOptions:
     style: FlightStyle = "jerky" if name == "jerky" else "smooth"
-    path = PathOptions(seed=seed, style=style, half_extent_m=(32.0, 26.0))
+    path = PathOptions(seed=_SEED, style=style, half_extent_m=(32.0, 26.0))
     cut = tuple(round(share * frames) for share in _CUT) if name == "cut" else None
     return FilmOptions(
-        world=WorldOptions.short(seed),
+        world=WorldOptions.short(_SEED),
         path=path,
         frames=frames,
         cut=None if cut is None else (cut[0], cut[1]),
@@ -118,8 +117,9 @@ def film_options(name: str, frames: int, seed: int = 1) -> FilmOptions:
 
 def smooth_film(inputs: Path) -> tuple[Path, FilmTruth]:
     """The film `smooth` of 1,200 frames, with its telemetry beside it, and its truth; drawn once."""
-    folder = write_film(inputs / f"film-smooth-{_FRAMES}-1", film_options("smooth", _FRAMES))
-    return folder / FILM_FILE, read_film_truth(folder)
+    options = film_options("smooth", _FRAMES)
+    folder = write_film(inputs / f"film-smooth-{_FRAMES}-{_SEED}", options)
+    return folder / FILM_FILE, film_truth(options)
 
 
 def axis_errors(
@@ -198,14 +198,6 @@ def _found_s(truth: FilmTruth, known: NDArray[np.bool_]) -> float:
     back = int(away[-1]) + 1
     again = np.flatnonzero(known[back:])
     return float(truth.times_s[back + again[0]] - truth.times_s[back]) if len(again) else float("inf")
-
-
-def _progress(name: str) -> Callable[[int, int], None]:
-    def told(done: int, total: int) -> None:
-        if done % 100 == 0 or done == total:
-            say(f"{name}: {done} of {total} frames drawn")
-
-    return told
 
 
 if __name__ == "__main__":
