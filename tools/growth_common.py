@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -95,8 +95,7 @@ class Registered:
         return self.error_m > WRONG_M
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class Verdict(NamedTuple):
     """One line of the contract: what was measured, and whether it holds."""
 
     name: str
@@ -268,4 +267,4 @@ def grown(database: Database, out: Path, album: Album, gates: str = "gates") -> 
 
 def none_failed(count: int) -> Verdict:
     """Of photos that a step lost by an exception that it did not foresee, not by a reason."""
-    return Verdict(name="no step failed", text=f"{count} photos lost by an exception", holds=count == 0)
+    return Verdict("no step failed", f"{count} photos lost by an exception", count == 0)

@@ -62,21 +62,21 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
     worst = max(errors, default=float("nan"))
     return [
         Verdict(
-            name="registered",
-            text=f"{share:.1%} of {len(own)} photos of the town, {_SHARE:.0%} wanted",
-            holds=share >= _SHARE,
+            "registered",
+            f"{share:.1%} of {len(own)} photos of the town, {_SHARE:.0%} wanted",
+            share >= _SHARE,
         ),
         Verdict(
-            name="median error",
-            text=f"{median:.3f} m, at most {_MEDIAN_M} m wanted; worst {worst:.2f} m",
-            holds=median <= _MEDIAN_M,
+            "median error",
+            f"{median:.3f} m, at most {_MEDIAN_M} m wanted; worst {worst:.2f} m",
+            median <= _MEDIAN_M,
         ),
         Verdict(
-            name="foreign photos",
-            text=f"{len(foreign)} of {len(album.of(*_FOREIGN))} admitted, none wanted",
-            holds=not foreign,
+            "foreign photos",
+            f"{len(foreign)} of {len(album.of(*_FOREIGN))} admitted, none wanted",
+            not foreign,
         ),
-        Verdict(name="wrong by more than 2 m", text=f"{len(wrong)}, none wanted", holds=not wrong),
+        Verdict("wrong by more than 2 m", f"{len(wrong)}, none wanted", not wrong),
     ]
 
 

@@ -37,21 +37,6 @@ _EVERY = 5  # without --held-out, one photo in so many is held out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ingest:
-    """What one ingest came to.
-
-    Attributes:
-        usable, registered: photos that were taken from the folder, and those that are in a map.
-        wall_s: of the whole command, from the start of its process on an empty database.
-    """
-
-    database: str
-    usable: int
-    registered: int
-    wall_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOutRow:
     """One held-out photo: the answer against the reference, and the 68 % radii that it states."""
 
@@ -71,12 +56,15 @@ def main() -> None:
     part = ingest(work / "part", args.photos, held_out)
     ingest(work / "whole", args.photos, ())
     rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
-    counts = {"usable": part.usable, "registered": part.registered, "ingest_s": part.wall_s}
-    write_figures(args.json, counts | error_figures(rows))
+    write_figures(args.json, part | error_figures(rows))
 
 
-def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None) -> Ingest:
+def ingest(
+    database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None
+) -> dict[str, float]:
     """Run `featuredb ingest photos` in a process of its own on a database that is not there yet.
+
+    Photos that were taken from the folder (usable) and those in a map (registered); seconds of the command.
 
     Args:
         work: work folder, which may hold what another ingest of these photos has done; default: a new one.
@@ -92,15 +80,14 @@ def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | No
     words += [] if work is None else ["--work", str(work)]
     start = time.perf_counter()
     featuredb(*words)
-    wall_s = time.perf_counter() - start
+    ingest_s = time.perf_counter() - start
     document = json.loads((report / "report.json").read_text(encoding="utf-8"))
     statuses = [photo["status"] for photo in document["photos"]]
-    return Ingest(
-        database=str(database),
-        usable=sum(status != "skipped" for status in statuses),
-        registered=statuses.count("registered"),
-        wall_s=wall_s,
-    )
+    return {
+        "usable": sum(status != "skipped" for status in statuses),
+        "registered": statuses.count("registered"),
+        "ingest_s": ingest_s,
+    }
 
 
 def reference(database: Path) -> FeatureMap:

@@ -25,13 +25,11 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.features.decode import decode_gray
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geo.utm import utm_epsg
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.descriptor_index import use_threads
@@ -43,6 +41,7 @@ from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from tools.figures import study_parser, write_figures
+from tools.service_world import cell_order, copied_map
 
 _HELD_OUT = 4  # photos of each map
 _ASKED = 40  # queries of a database
@@ -132,7 +131,6 @@ def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
     pitch = _GAP_M + max(float(np.ptp(s.feature_map.points.utm[:, :2], axis=0).max()) for s in sources)
     while total < points:
         source = sources[copies % len(sources)]
-        order = _order(copies)
         column, row = copies % side, copies // side
         frame = LocalFrame(
             latitude_deg=45.0 + row * pitch / 111_000.0,
@@ -141,8 +139,7 @@ def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
         )
         seen = source.feature_map.observations
         described = len(np.unique(seen.point_index[seen.has_descriptor]))
-        placed = _copy(source.feature_map, frame, order, f"copy-{copies}")
-        waiting.append(placed)
+        waiting.append(copied_map(source.feature_map, frame, copies, f"copy-{copies}"))
         total += described
         if len(waiting) == _AT_ONCE or total >= points:
             database.commit_maps(waiting)
@@ -156,41 +153,11 @@ def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
                 sigma_horizontal_m=_PRIOR_M,
                 sigma_vertical_m=_PRIOR_M,
             )
-            features = replace(photo, descriptors=photo.descriptors[:, order])
+            features = replace(photo, descriptors=photo.descriptors[:, cell_order(copies)])
             queries.append(Query(features=features, camera=camera, prior=prior, place=geodetic))
         copies += 1
     every = max(1, len(queries) // _ASKED)
     return queries[::every][:_ASKED]
-
-
-def _order(copy: int) -> NDArray[np.int64]:
-    """(128,) another order of a descriptor's 4 x 4 cells; the first is its own.
-
-    Corners, edges and inner cells change places among themselves: they have different weights in SIFT.
-    """
-    rng = np.random.default_rng(copy)
-    cells = np.arange(16)
-    row, column = np.divmod(cells, 4)
-    inner = ((row % 3) > 0).astype(np.int64) + ((column % 3) > 0)
-    if copy:
-        for kind in range(3):
-            alike = np.flatnonzero(inner == kind)
-            cells[alike] = rng.permutation(alike)
-    return (cells[:, None] * 8 + np.arange(8)).ravel()
-
-
-def _copy(source: FeatureMap, frame: LocalFrame, order: NDArray[np.int64], map_id: str) -> FeatureMap:
-    epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
-    local, seen = source.points_local(), source.observations
-    return replace(
-        source,
-        map_id=map_id,
-        name=map_id,
-        frame=frame,
-        epsg=epsg,
-        points=replace(source.points, utm=frame.utm_from_enu(local, epsg)),
-        observations=replace(seen, descriptors=seen.descriptors[:, order]),
-    )
 
 
 def first_start(path: Path, query: Query) -> float:

@@ -161,12 +161,6 @@ def write_album(
     return folder
 
 
-def photo_file(scene: Scene, photo: PlannedPhoto) -> bytes:
-    """The JPEG file of a planned photo."""
-    image = edited(_picture(scene, photo), photo.edits, photo.shot.seed)
-    return jpeg_bytes(image, photo.quality, _exif(photo, image))
-
-
 def _truth(home: Scene, photo: PlannedPhoto) -> TrueImage | None:
     if not photo.fact.home:
         return None
@@ -218,7 +212,8 @@ def _write(folder: Path, world: SceneSource, photos: Sequence[PlannedPhoto], num
     photo = photos[number]
     target = folder / photo.shot.name
     part = target.with_suffix(f".{os.getpid()}.part")
-    part.write_bytes(photo_file(_scene(world, photo.scene), photo))
+    image = edited(_picture(_scene(world, photo.scene), photo), photo.edits, photo.shot.seed)
+    part.write_bytes(jpeg_bytes(image, photo.quality, _exif(photo, image)))
     part.replace(target)
 
 
@@ -232,19 +227,11 @@ def write_facts(folder: Path, facts: Sequence[AlbumFact]) -> None:
 
 
 def read_facts(folder: Path) -> dict[str, AlbumFact]:
-    """Facts by name.
-
-    Raises:
-        InvalidValueError: no such file, or not one of an album.
-    """
-    path = Path(folder) / FACTS_FILE
-    try:
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        facts = [AlbumFact(**{**row, "time": datetime.fromisoformat(row["time"])}) for row in rows]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise InvalidValueError(
-            f"{path}: expected the facts of a simulated album, found {error!r}"
-        ) from error
+    """Facts by name."""
+    lines = (folder / FACTS_FILE).read_text(encoding="utf-8").splitlines()
+    facts = [
+        AlbumFact(**{**row, "time": datetime.fromisoformat(row["time"])}) for row in map(json.loads, lines)
+    ]
     return {fact.name: fact for fact in facts}
 
 

@@ -349,7 +349,7 @@ def tagged(
         for p in photos
     ]
     given = give_geotags(scene, asked, options, rng)
-    return [replace(p, geotag=tag) for p, (tag, _) in zip(photos, given, strict=True)]
+    return [replace(p, geotag=tag) for p, tag in zip(photos, given, strict=True)]
 
 
 def named(photos: list[PlannedPhoto], seed: int) -> list[PlannedPhoto]:
