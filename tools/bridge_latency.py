@@ -124,7 +124,6 @@ def _stream(film: Path, endpoint: str, words: Sequence[str]) -> None:
         [*program, "live", str(film), "--connect", endpoint, "--json"], stdout=subprocess.PIPE
     )
     bridge = subprocess.Popen([*program, "bridge", *words], stdin=live.stdout)
-    assert live.stdout is not None
     live.stdout.close()
     codes = live.wait(), bridge.wait()
     if any(codes):

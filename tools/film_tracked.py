@@ -102,7 +102,6 @@ def _keyframes(database: Path) -> int:
 def _off_telemetry(film: Path, rows: Sequence[dict[str, str]]) -> tuple[FloatArray, FloatArray]:
     """East and north from telemetry to track (n, 2) where it has a position, and the track's covariances."""
     telemetry = telemetry_of_video(film)
-    assert telemetry is not None
     at = telemetry.at([float(row["time_s"]) for row in rows])
     known = at.has_position
     there = np.column_stack([at.latitude_deg, at.longitude_deg, np.zeros(len(rows))])[known]

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from featuredb.features.exif.read import read_exif
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
+from featuredb.simworld.camera.shot import look_pose
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
@@ -62,14 +62,13 @@ def main() -> None:
         seconds.append(cpu_s)
         accepted += first.accepted and second.accepted
         if second.cam_from_local is not None:
-            apart.append(_apart(second.cam_from_local, first.cam_from_local))
-    nothing = float("nan")
+            apart.append((second.cam_from_local, first.cam_from_local))
     figures = {
         "photos": len(names),
         "accepted": accepted,
-        "largest_apart_m": max((metres for metres, _ in apart), default=nothing),
-        "largest_apart_deg": max((degrees for _, degrees in apart), default=nothing),
-        "cpu_s": float(np.median(seconds or [nothing])),
+        "largest_apart_m": max((np.linalg.norm(a.center - b.center) for a, b in apart), default=np.nan),
+        "largest_apart_deg": max((a.angle_to_deg(b) for a, b in apart), default=np.nan),
+        "cpu_s": float(np.median(seconds or [np.nan])),
     }
     write_figures(args.json, figures)
 
@@ -111,9 +110,8 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
     center = cloud.frame.enu_from_geodetic([exif.latitude_deg, exif.longitude_deg, 0.0])
     center[2] = exif.altitude_m
     pitch = -90.0 if exif.angles is None or exif.angles.pitch_deg is None else exif.angles.pitch_deg
-    rotation = _looking_north(np.radians(pitch))
     return FramePrior(
-        cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
+        cam_from_local=look_pose(center, 0.0, pitch),
         sigma_horizontal_m=5.0,
         sigma_vertical_m=12.0,  # heights of drones are metres to tens of metres off
         sigma_heading_deg=180.0,
@@ -124,16 +122,6 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
 def wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
     """15 m and 10 degrees off."""
     return FramePrior.around(off_pose(truth, rng, _OFF_M, _OFF_DEG), _OFF_M * _AXIS, _OFF_DEG * _AXIS)
-
-
-def _looking_north(pitch_rad: float) -> FloatArray:
-    forward = np.array([0.0, np.cos(pitch_rad), np.sin(pitch_rad)])
-    right = np.array([1.0, 0.0, 0.0])
-    return np.stack([right, np.cross(forward, right), forward])
-
-
-def _apart(a: Rigid3, b: Rigid3) -> tuple[float, float]:
-    return float(np.linalg.norm(a.center - b.center)), a.angle_to_deg(b)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
+from featuredb.simworld.camera.shot import look_pose
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
 from ingest.map_builder import MapIdentity, MapOptions, build_map
@@ -148,7 +149,8 @@ def drawn(seed: int, sigma_m: float) -> list[tuple[float, float]]:
     request = LocaliseRequest(camera_key=_KEY, exif_focal_px=_FOCAL_PX)
     for _ in range(_QUERIES):
         height, tilt = scene.rng.uniform(25.0, 60.0), scene.rng.uniform(0.0, 30.0)
-        pose = looking_down([*scene.rng.uniform(-35.0, 35.0, 2), height], tilt, scene.rng.uniform(0, 360))
+        place = [*scene.rng.uniform(-35.0, 35.0, 2), height]
+        pose = look_pose(place, scene.rng.uniform(0, 360), -90.0 - tilt)
         result = localise_features(scene.seen(pose)[1], request, indexed).result
         if result.pose is None:
             continue
@@ -186,24 +188,13 @@ def scene_of(seed: int) -> LensDraw:
     )
 
 
-def looking_down(center: Sequence[float], tilt_deg: float, heading_deg: float) -> Rigid3:
-    """cam_from_local of a camera at `center`, tilted from straight down."""
-    tilt, heading = np.radians([tilt_deg, heading_deg])
-    turn = Rigid3.exp(np.array([0.0, 0.0, heading, 0.0, 0.0, 0.0])).rotation
-    lean = Rigid3.exp(np.array([tilt, 0.0, 0.0, 0.0, 0.0, 0.0])).rotation
-    rotation = lean @ np.diag([1.0, -1.0, -1.0]) @ turn
-    return Rigid3(rotation=rotation, translation=-rotation @ np.array(center))
-
-
 def flight(rng: np.random.Generator, height_m: float = 0.5, tilt_deg: float = 4.0) -> list[Rigid3]:
     """Four lines of six photos, there and back, that differ by so much."""
     poses = []
     for line, y in enumerate(np.linspace(-33.0, 33.0, 4)):
         for x in np.linspace(-40.0, 40.0, 6) * (1 if line % 2 == 0 else -1):
             center = np.array([x, y, 45.0]) + rng.normal(0.0, [1.0, 1.0, height_m])
-            poses.append(
-                looking_down(center.tolist(), abs(rng.normal(0, tilt_deg)), 90.0 + 180.0 * (line % 2))
-            )
+            poses.append(look_pose(center, 90.0 + 180.0 * (line % 2), -90.0 - abs(rng.normal(0, tilt_deg))))
     return poses
 
 

@@ -63,7 +63,6 @@ def main() -> None:
 
 def _surfaces(database: Database, localiser: Localiser, view: AnsweredView) -> dict[str, RaySurface]:
     scan = scan_surface(database, view)
-    assert scan is not None
     utm = map_points_in_view(localiser.areas_of(view.map_ids[:1]), view)
     return {"scan": scan, "map": MapSurface(points=view.frame.enu_from_utm(utm, view.epsg))}
 

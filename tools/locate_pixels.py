@@ -69,7 +69,6 @@ def main() -> None:
         if view is None:
             continue
         surface = scan_surface(database, view)
-        assert surface is not None
         surface.common_m = _STRIPS_M
         target = _Target(scene, truth, photo, view)
         found = target.looked_at(rng, surface, _PIXELS)

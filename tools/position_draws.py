@@ -26,6 +26,7 @@ from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.simworld.camera.shot import look_pose
 from ingest.own_frame import held_of
 from ingest.register.gps import GpsPlacement, place_by_gps
 from tools.figures import inside_figures, squared, study_parser, write_figures
@@ -166,8 +167,6 @@ def shares(name: str, scores: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def squares(placed: GpsPlacement, camera: FloatArray) -> dict[str, float]:
     """Squared errors over their covariance: of a camera's position (3,), and of the orientation."""
-    assert placed.local_from_sfm is not None
-    assert placed.covariance is not None
     off = (_TRUE @ placed.local_from_sfm.inverse()).log()
     by_similarity = {"position": point_jacobian(camera[None])[0], "orientation": np.eye(7)[1:4]}
     return {
@@ -260,15 +259,9 @@ def simulated_flights(draw: int) -> list[Flight]:
 def _held(xyz: FloatArray, k: int, common_roll: float, rng: np.random.Generator) -> Rigid3:
     """A camera that looks ahead and down, level but for two degrees and what all have in common."""
     ahead = xyz[min(k + 1, len(xyz) - 1)] - xyz[max(k - 1, 0)]
-    heading, tilt, roll = (
-        np.arctan2(ahead[1], ahead[0]),
-        np.radians(50.0),
-        rng.normal(common_roll, np.radians(2.0)),
-    )
-    view = np.array([np.cos(heading) * np.cos(tilt), np.sin(heading) * np.cos(tilt), -np.sin(tilt)])
-    across = np.array([np.sin(heading), -np.cos(heading), 0.0])
-    level = np.stack([across, np.cross(view, across), view])
-    return Rigid3(rotation=so3_exp([0.0, 0.0, roll]) @ level, translation=np.zeros(3))
+    heading, roll = np.arctan2(ahead[1], ahead[0]), rng.normal(common_roll, np.radians(2.0))
+    held = look_pose(np.zeros(3), 90.0 - float(np.degrees(heading)), -50.0, -float(np.degrees(roll)))
+    return Rigid3(rotation=held.rotation, translation=np.zeros(3))
 
 
 if __name__ == "__main__":

@@ -36,7 +36,6 @@ def main() -> None:
     part, whole = reference(work / "part"), reference(work / "whole")
     theirs, mine = poses_in(part.frame, whole), poses_in(part.frame, part)
     sim = laid_on(*({name: pose.center for name, pose in of.items()} for of in (theirs, mine)))
-    assert sim is not None
     moved = {name: sim.act_on_pose(pose) for name, pose in theirs.items()}
     frames = film_of(args.photos, names, work / "frames")
     tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))

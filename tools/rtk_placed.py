@@ -95,7 +95,6 @@ def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
 def tagged(data: bytes, truth: Truth, place: FloatArray, error_m: float, words: str) -> bytes:
     """A photo with another position (3,) and XMP; the picture stays bit for bit."""
     header = read_header(data)
-    assert header.exif is not None
     latitude, longitude, height = (float(v) for v in truth.frame.geodetic_from_enu(place))
     gps = gps_directory((latitude, longitude, height), "ellipsoid", heading_deg=0.0, error_m=error_m)
     return with_app1(data, with_gps(data[slice(*header.exif)], gps), _XMP.format(words=words).encode())

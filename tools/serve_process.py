@@ -42,7 +42,6 @@ class CommandProcess:
             env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"},
         )
         self.errors: list[str] = []
-        assert self.process.stdout is not None
         # Read both pipes to their ends, so that the server never waits for us.
         self._reader = threading.Thread(target=lambda: self.errors.extend(self.process.stderr or ()))
         self._reader.start()
@@ -59,8 +58,6 @@ class CommandProcess:
             self.process.kill()
             raise
         self._reader.join(10)
-        assert self.process.stdout is not None
-        assert self.process.stderr is not None
         self.process.stdout.close()
         self.process.stderr.close()
         return code

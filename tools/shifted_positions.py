@@ -55,8 +55,6 @@ def main() -> None:
 def shifted_position(photo: Path) -> tuple[ExifInfo, float, float]:
     """What a photo says of itself, and its latitude and longitude 50 km further east."""
     exif = read_exif(photo.read_bytes())
-    assert exif.latitude_deg is not None
-    assert exif.longitude_deg is not None
     epsg = utm_epsg(exif.latitude_deg, exif.longitude_deg)
     utm = utm_from_geodetic((exif.latitude_deg, exif.longitude_deg, 0.0), epsg)
     latitude, longitude, _ = geodetic_from_utm(utm + np.array([_SHIFT_M, 0.0, 0.0]), epsg)

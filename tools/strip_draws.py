@@ -10,7 +10,7 @@ strip of four some yaws are off by 180 degrees, as there. Each strip is placed w
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -81,14 +81,10 @@ def real_strips(truth: ScanTruth, photos: Path) -> Iterator[CameraStrip]:
     frame, by_name = truth.frame, truth.poses
     names = sorted(by_name)
     told = [read_exif((photos / name).read_bytes()) for name in names]
-    positions = np.array(
-        [frame.enu_from_geodetic([exif.latitude_deg or 0.0, exif.longitude_deg or 0.0, 0.0]) for exif in told]
-    )
-    positions[:, 2] = [(exif.altitude_m or 0.0) - frame.height_m for exif in told]
+    positions = np.array([frame.enu_from_geodetic([e.latitude_deg, e.longitude_deg, 0.0]) for e in told])
+    positions[:, 2] = [exif.altitude_m - frame.height_m for exif in told]
     xyz = np.array([by_name[name].center for name in names])
-    times = [exif.capture_time for exif in told]
-    assert times[0] is not None
-    seconds = np.array([0.0 if time is None else (time - times[0]).total_seconds() for time in times])
+    seconds = np.array([(exif.capture_time - told[0].capture_time).total_seconds() for exif in told])
     for count in (_LEAST, _LEAST + 1):
         for first in range(len(names) - count + 1):
             rows = slice(first, first + count)
@@ -127,18 +123,11 @@ def simulated_strip(rng: np.random.Generator) -> CameraStrip:
             sigma_tilt_deg=DEFAULT_SIGMA_TILT_DEG,
         )
         off = np.radians(common + rng.normal(0.0, _EACH_DEG))
-        rotation = so3_exp([off[0], off[1], 0.0]) @ cam_from_enu(
-            told.yaw_deg or 0.0, told.pitch_deg or 0.0, 0.0
-        )
+        rotation = so3_exp([off[0], off[1], 0.0]) @ cam_from_enu(told.yaw_deg, told.pitch_deg, 0.0)
         rotation = rotation @ so3_exp([0.0, 0.0, off[2]])
         poses.append(Rigid3(rotation=rotation, translation=-rotation @ center))
         if flipped and rng.random() < 0.5:
-            told = CameraAngles(
-                yaw_deg=(told.yaw_deg or 0.0) + 180.0,
-                pitch_deg=told.pitch_deg,
-                sigma_yaw_deg=told.sigma_yaw_deg,
-                sigma_tilt_deg=told.sigma_tilt_deg,
-            )
+            told = replace(told, yaw_deg=told.yaw_deg + 180.0, roll_deg=None)
         angles.append(told)
     noise = rng.uniform(0.3, 2.0)
     rest = np.sqrt(np.maximum(SIGMAS**2 - noise**2, 0.0))

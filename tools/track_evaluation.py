@@ -97,7 +97,6 @@ def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
     (scan,) = list_scans(Database.open(database))
     cloud = load_cloud(Database.open(database), truth.frame, scan_ids=[scan.scan_id])
     first = truth.cam_from_local[0]
-    assert first is not None
     start = off_pose(first, np.random.default_rng((_SEED, 5)), _START_M, _START_DEG)
     prior = FramePrior.around(start, _START_M, _START_DEG)
     return ScanFinder(cloud, scan.scan_id, truth.epsg, prior)

@@ -116,6 +116,12 @@ class PlannedPhoto:
     orientation: int = 1
 
 
+def renamed(photo: PlannedPhoto, name: str, **fact: Any) -> PlannedPhoto:
+    """The photo under another name, and with other facts."""
+    told = replace(photo.fact, name=name, **fact)
+    return replace(photo, shot=replace(photo.shot, name=name), fact=told)
+
+
 def write_album(
     folder: Path,
     world: SceneSource,

@@ -110,26 +110,12 @@ def _watermarked(image: Image8, edit: Edit, rng: np.random.Generator) -> Image8:
     h, w = image.shape[:2]
     layer = image.copy()
     text, scale = edit.text or "(c) photo", w / 900.0
-    cv2.putText(
-        layer,
-        text,
-        (int(0.60 * w), int(0.95 * h)),
-        cv2.FONT_HERSHEY_DUPLEX,
-        scale,
-        (255, 255, 255),
-        max(1, round(2 * scale)),
-        cv2.LINE_AA,
-    )
-    cv2.putText(
-        layer,
-        text,
-        (int(0.12 * w), int(0.55 * h)),
-        cv2.FONT_HERSHEY_TRIPLEX,
-        2.2 * scale,
-        (235, 235, 235),
-        max(1, round(5 * scale)),
-        cv2.LINE_AA,
-    )
+    for (x, y), font, size, grey, thick in (
+        ((0.60, 0.95), cv2.FONT_HERSHEY_DUPLEX, scale, 255, 2),
+        ((0.12, 0.55), cv2.FONT_HERSHEY_TRIPLEX, 2.2 * scale, 235, 5),
+    ):
+        at, width = (int(x * w), int(y * h)), max(1, round(thick * scale))
+        cv2.putText(layer, text, at, font, size, (grey,) * 3, width, cv2.LINE_AA)
     return np.asarray(cv2.addWeighted(layer, edit.amount, image, 1.0 - edit.amount, 0.0), dtype=np.uint8)
 
 

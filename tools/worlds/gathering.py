@@ -10,10 +10,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import AlbumFact, PlannedPhoto
+from tools.worlds.album import PlannedPhoto, renamed
 from tools.worlds.edits import Edit
 from tools.worlds.geotags import GeotagOptions, Tagging, give_geotags
-from tools.worlds.people import Person, stored_upright, zoomed
+from tools.worlds.people import Person, planned, stored_upright, zoomed
 from tools.worlds.sights import Sight, Surroundings, look_at
 from tools.worlds.surveyed import DAYS, day_key, moment, photo_ids, shot_seed
 
@@ -296,34 +296,24 @@ def _visit(
     day, hour = int(rng.integers(DAYS)), float(rng.uniform(8.0, 19.0))
     photos = []
     for i, view in enumerate(views):
-        name = f"{town}-{visit}-{i}"
         shot = Shot(
-            name=name,
+            name=f"{town}-{visit}-{i}",
             device=view.device,
             cam_from_local=view.cam_from_local,
             time=moment(day, hour + 0.01 * i),
             seed=shot_seed(seed, 4, visit, i),
         )
         crop = Edit(kind="cropped", amount=float(rng.uniform(0.08, 0.25)))
-        fact = AlbumFact(
-            name=name,
-            photo_id="",
-            kind=kind or ("drone" if by_drone else "street"),
-            owner=person.name,
-            licence=person.licence,
-            time=shot.time,
-            home=town == "home",
-            visit=visit,
-        )
         photos.append(
-            PlannedPhoto(
-                shot=shot,
-                scene=day_key(town, day, hour),
-                fact=fact,
+            planned(
+                person,
+                shot,
+                day_key(town, day, hour),
+                kind or ("drone" if by_drone else "street"),
                 exif=person.exif,
+                home=town == "home",
+                visit=visit,
                 edits=(*([crop] if rng.random() < person.crop_share else []), *person.edits),
-                quality=person.quality,
-                sensor=person.sensor,
                 orientation=view.orientation,
             )
         )
@@ -357,15 +347,6 @@ def named(photos: list[PlannedPhoto], seed: int) -> list[PlannedPhoto]:
     ids = photo_ids(seed, len(photos))
     names = {p.shot.name: f"photos/{p.fact.owner}/{i}.jpg" for p, i in zip(photos, ids, strict=True)}
     return [
-        replace(
-            p,
-            shot=replace(p.shot, name=names[p.shot.name]),
-            fact=replace(
-                p.fact,
-                name=names[p.shot.name],
-                photo_id=photo_id,
-                copy_of=names.get(p.fact.copy_of, ""),
-            ),
-        )
+        renamed(p, names[p.shot.name], photo_id=photo_id, copy_of=names.get(p.fact.copy_of, ""))
         for p, photo_id in zip(photos, ids, strict=True)
     ]

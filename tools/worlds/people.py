@@ -1,13 +1,13 @@
 """Twelve people with cameras: what they own, how well they use it, and what they leave in their files."""
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.simworld.camera.sensor import SensorOptions
-from featuredb.simworld.camera.shot import Device
-from tools.worlds.album import ExifPolicy
+from featuredb.simworld.camera.shot import Device, Shot
+from tools.worlds.album import AlbumFact, ExifPolicy, PlannedPhoto
 from tools.worlds.edits import Edit
 
 Upright = Literal["never", "tagged", "stored"]
@@ -51,6 +51,23 @@ class Person:
     edits: tuple[Edit, ...] = ()
     crop_share: float = 0.0
     sensor: SensorOptions = field(default_factory=SensorOptions)
+
+
+def planned(
+    person: Person, shot: Shot, scene: str, kind: str, *, exif: ExifPolicy = "full", **more: Any
+) -> PlannedPhoto:
+    """A photo by a person; `more`: fields of `PlannedPhoto`, and of its fact."""
+    told = {field.name: more.pop(field.name) for field in fields(AlbumFact) if field.name in more}
+    fact = {"owner": person.name, "photo_id": "", "licence": person.licence} | told
+    return PlannedPhoto(
+        shot=shot,
+        scene=scene,
+        fact=AlbumFact(name=shot.name, kind=kind, time=shot.time, **fact),
+        exif=exif,
+        quality=person.quality,
+        sensor=person.sensor,
+        **more,
+    )
 
 
 def make_device(

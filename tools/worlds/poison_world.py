@@ -24,7 +24,7 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import Geotag, PlannedPhoto
+from tools.worlds.album import Geotag, PlannedPhoto, renamed
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.geotags import GeotagOptions, geotag_at
@@ -195,10 +195,7 @@ def _as(person: Person, name: str) -> Person:
 
 def _renamed(photo: PlannedPhoto, kind: str, batch: int) -> PlannedPhoto:
     """Provisional names of the plans differ; a forged or mirrored view has a true pose or none."""
-    name = f"{kind}-{photo.shot.name}"
-    home = kind != "liar_other"
-    fact = replace(photo.fact, name=name, kind=kind, batch=batch, home=home)
-    return replace(photo, shot=replace(photo.shot, name=name), fact=fact)
+    return renamed(photo, f"{kind}-{photo.shot.name}", kind=kind, batch=batch, home=kind != "liar_other")
 
 
 def _poisoned(photo: PlannedPhoto, home: Scene, places: Places, rng: np.random.Generator) -> PlannedPhoto:

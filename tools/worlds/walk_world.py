@@ -14,9 +14,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import AlbumFact, PlannedPhoto
+from tools.worlds.album import PlannedPhoto
 from tools.worlds.geotags import geotag_at
-from tools.worlds.people import Person, community
+from tools.worlds.people import Person, community, planned
 from tools.worlds.sights import Surroundings, look_at
 from tools.worlds.surveyed import (
     TownOptions,
@@ -158,7 +158,6 @@ def _photos(
     assert person.drone is not None
     rng = np.random.default_rng((options.seed, 82, step, who))
     day, hour = 9 * step + who, float(rng.uniform(9.0, 18.0))
-    centers = [home.enu_from_town @ eye for eye, _ in aims]
     photos = []
     for i, (eye, target) in enumerate(aims):
         photo_id = next(ids)
@@ -172,33 +171,21 @@ def _photos(
             time=moment(day, hour + 0.005 * i),
             seed=shot_seed(options.seed, 7, step, who, i),
         )
-        error = rng.normal(0, [walker.gps_sigma_m, walker.gps_sigma_m])
+        place = home.enu_from_town @ eye + np.append(rng.normal(0, walker.gps_sigma_m, 2), 0.0)
         tag = None
         if walker.gps_sigma_m > 0:
-            tag = geotag_at(
-                home,
-                centers[i] + np.append(error, 0.0),
-                float(rng.normal(0, _VERTICAL_M)),
-                walker.gps_sigma_m,
-            )
-        fact = AlbumFact(
-            name=name,
-            photo_id=photo_id,
-            kind=kind,
-            owner=owner,
-            licence=person.licence,
-            time=shot.time,
-            visit=10 * step + who,
-            batch=step,
-        )
+            tag = geotag_at(home, place, float(rng.normal(0, _VERTICAL_M)), walker.gps_sigma_m)
         photos.append(
-            PlannedPhoto(
-                shot=shot,
-                scene=day_key("home", day, hour),
-                fact=fact,
+            planned(
+                person,
+                shot,
+                day_key("home", day, hour),
+                kind,
+                photo_id=photo_id,
+                owner=owner,
+                visit=10 * step + who,
+                batch=step,
                 geotag=tag,
-                quality=person.quality,
-                sensor=person.sensor,
             )
         )
     return photos
