@@ -10,7 +10,6 @@ as one that took the deadline.
 
 import itertools
 import multiprocessing
-import sys
 import tempfile
 import threading
 import time
@@ -24,7 +23,7 @@ import requests
 from featuredb.store import Database
 from reloc.service.options import wire_name_of
 from tools.attacks import ATTACKS, Target, attack
-from tools.figures import write_figures
+from tools.figures import say, write_figures
 from tools.serve_process import beside
 from tools.service_world import (
     ATTACKER,
@@ -52,13 +51,10 @@ def main() -> None:
     points = sum(m.points for m in database.snapshot().maps())
     photos = photos_of(args.photos, 6)
     measured: dict[str, dict[str, float]] = {}
-    with (
-        tempfile.TemporaryDirectory() as scratch,
-        running_service(args.db, Path(scratch)) as service,
-    ):
+    with tempfile.TemporaryDirectory() as scratch, running_service(args.db, Path(scratch)) as service:
         expected = first_answers(service, photos)
         localised = sum(reply.status == "localised" for reply in expected)
-        sys.stdout.write(f"{points} points; {localised} of {len(expected)} questions localised\n")
+        say(f"{points} points; {localised} of {len(expected)} questions localised")
         host, port = service.gateway.endpoint.removeprefix("http://").rsplit(":", 1)
         target = Target(
             config=service.config(ATTACKER),
@@ -88,8 +84,7 @@ def main() -> None:
                 "peak_mib": max(memory),
                 "after_mib": service.server.memory_mib(),
             }
-            sys.stdout.write(f"{name}: {measured[name]}\n")
-            sys.stdout.flush()
+            say(f"{name}: {measured[name]}")
     write_figures(args.json, figures(measured) | {"points": points})
 
 

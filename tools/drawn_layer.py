@@ -115,8 +115,4 @@ def _places(scene: Scene, truth: FilmTruth) -> FloatArray:
 def _layer(places: FloatArray) -> dict[str, object]:
     """GeoJSON of latitudes, longitudes (degrees) and heights (m), (n, 3)."""
     where = [[lon, lat, height] for lat, lon, height in places.tolist()]
-    return {
-        "type": "Feature",
-        "properties": {},
-        "geometry": {"type": "MultiPoint", "coordinates": where},
-    }
+    return {"type": "Feature", "properties": {}, "geometry": {"type": "MultiPoint", "coordinates": where}}

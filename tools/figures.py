@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -101,13 +102,18 @@ def inside_figures(name: str, squares: Sequence[float] | FloatArray, size: int =
     return {f"{name}_{100 * level:.0f}": inside(squares, level, size) for level in _LEVELS}
 
 
+def say(text: str) -> None:
+    """Print a line at once, with the time."""
+    sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
+    sys.stdout.flush()
+
+
 def kept(path: Path, make: Callable[[], Any]) -> Any:
     """What a JSON file says, which `make` gives once: a study that was stopped goes on behind it."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(make()), encoding="utf-8")
-        sys.stdout.write(f"{path.stem}: {path.read_text(encoding='utf-8')}\n")
-        sys.stdout.flush()
+        say(f"{path.stem}: {path.read_text(encoding='utf-8')}")
     return json.loads(path.read_text(encoding="utf-8"))
 
 

@@ -11,7 +11,6 @@ Two registrations of each photo:
 Both have to end at one pose: figures are how far apart they are, in metres and degrees.
 """
 
-import sys
 import time
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from featuredb.simworld.camera.shot import look_pose
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from tools.figures import off_pose, study_parser, write_figures
+from tools.figures import off_pose, say, study_parser, write_figures
 from tools.worlds.clouds import build_cloud
 
 _EPSG = 32615  # UTM zone of the scan of `brighton`
@@ -80,8 +79,7 @@ def _timed(
     found = register_frame(image, camera, prior, cloud, FrameOptions(threads=2))
     cpu_s = time.process_time() - cpu
     said = "accepted" if found.accepted else f"{found.reason}: {found.message}"
-    sys.stdout.write(f"{name}: {said}, {len(found.pixels)} inliers, {cpu_s:.1f} s\n")
-    sys.stdout.flush()
+    say(f"{name}: {said}, {len(found.pixels)} inliers, {cpu_s:.1f} s")
     return found, cpu_s
 
 

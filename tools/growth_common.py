@@ -1,8 +1,6 @@
 """What the programs that measure growth share: an anchored database, contributions, errors."""
 
 import json
-import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -29,7 +27,7 @@ from reloc.localise.result import LocaliseResult
 from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
 from reloc.wire.query import LocaliseWireRequest
-from tools.figures import study_parser, write_figures
+from tools.figures import say, study_parser, write_figures
 from tools.growth_gates import WRONG_M, recorded
 from tools.worlds.album import TABLE_FILE, AlbumFact, PlannedPhoto, read_facts, write_album
 
@@ -116,11 +114,6 @@ def world_told(
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     return args.out, world(seed=args.seed)
-
-
-def say(text: str) -> None:
-    sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
-    sys.stdout.flush()
 
 
 def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) -> "Album":

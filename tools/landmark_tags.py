@@ -10,7 +10,6 @@
    have a place, answer, and lie inside the 68 % and 95 % bounds that the placement gives them.
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from ingest.own_frame import held_of
 from ingest.photos.photo import Photo, whose_cameras
 from ingest.register.gps import place_by_gps
 from tools.commands import featuredb
-from tools.figures import inside_figures, laid_on, poses_in, squared, study_parser, write_figures
+from tools.figures import inside_figures, laid_on, poses_in, say, squared, study_parser, write_figures
 from tools.made_maps import all_maps, copied, make, photo_names, position_table
 
 _EXTENT_M, _OFF_M, _STATED_M = 120.0, 8.0, 30.0
@@ -142,7 +141,7 @@ def drawn(landmark: Landmark) -> dict[str, float]:
                 )
                 scores["waiting" if placed.provisional else "answering"].append((position, orientation))
             counts = ", ".join(f"{len(of)} {name}" for name, of in scores.items())
-            sys.stdout.write(f"{kind:<8} {count:>3} tags: {counts} so far\n")
+            say(f"{kind:<8} {count:>3} tags: {counts} so far")
     result = {"draws": float(_DRAWS * len(_KINDS) * len(_COUNTS))}
     for name, of in scores.items():
         result[name] = len(of) / result["draws"]

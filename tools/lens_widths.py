@@ -35,7 +35,7 @@ from ingest.colmap.picture_shear import picture_shear
 from ingest.photos.photo import Photo
 from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
-from tools.figures import study_parser, write_figures
+from tools.figures import say, study_parser, write_figures
 from tools.made_maps import all_maps, make
 
 WIDTHS = tuple(field.name for field in fields(LensWidths))
@@ -103,10 +103,10 @@ def write_shears(databases: Sequence[Path]) -> None:
     largest = [max(all_maps(path), key=lambda one: len(one.images)) for path in databases]
     shears = np.log([picture_shear(block_of_map(one)).size for one in largest])
     for path, shear in zip(databases, np.exp(shears), strict=True):
-        sys.stdout.write(f"{path.name}: pictures sheared by {shear:.1e}\n")
+        say(f"{path.name}: pictures sheared by {shear:.1e}")
     if len(shears) > 1:
         few, hardly = np.exp(shears.mean() + shears.std(ddof=1) * norm.isf([0.05, 0.001]))
-        sys.stdout.write(f"one map in twenty is above {few:.1e}, one in a thousand above {hardly:.1e}\n")
+        say(f"one map in twenty is above {few:.1e}, one in a thousand above {hardly:.1e}")
 
 
 def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[list[Told], list[float]]:
@@ -123,7 +123,7 @@ def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[lis
         squares, freedom = lens_squares(problem.weighted())
         for one, free in zip(squares.tolist(), freedom.tolist(), strict=True):
             if np.isfinite(one):
-                sys.stdout.write(f"{folder}: photos disagree {one / free:.2f} times ({free:.0f} degrees)\n")
+                say(f"{folder}: photos disagree {one / free:.2f} times ({free:.0f} degrees)")
                 disagreement.append(one / free)
         told += _told(problem, terms, focal_px, options)
     return told, disagreement

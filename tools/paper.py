@@ -11,7 +11,6 @@ Writes paper.json.
 
 import json
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from tools.commands import featuredb
-from tools.figures import kept, study_parser, write_figures
+from tools.figures import kept, say, study_parser, write_figures
 from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import judge_film, smooth_film
 from tools.video_map import frame_of, stills_of, unplaced_film
@@ -45,7 +44,7 @@ def film_figures(work: Path, inputs: Path) -> dict[str, Any]:
     # Who starts again goes on from there.
     made = kept(work / "placed.json", lambda: placed_film(film, world.scan, truth, work))
     if made["refused"]:
-        sys.stdout.write(f"FAILED: {made['refused']}\n")
+        say(f"FAILED: {made['refused']}")
         return {"placed": 0}
     feature_map = Database.open(work / "db").snapshot().load_map(made["map_id"])
     areas = Localiser.open(Database.open(work / "db")).areas

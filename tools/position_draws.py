@@ -12,7 +12,6 @@ Then positions that have nothing to do with the photos: drawn at random within a
 photos, those of a flight shuffled, and those of another flight.
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.simworld.camera.shot import look_pose
 from ingest.own_frame import held_of
 from ingest.register.gps import GpsPlacement, place_by_gps
-from tools.figures import inside_figures, squared, study_parser, write_figures
+from tools.figures import inside_figures, say, squared, study_parser, write_figures
 from tools.made_maps import all_maps, make
 
 SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
@@ -145,8 +144,7 @@ def bounds(real: Sequence[Flight], draws: int) -> dict[str, float]:
                 own.append(squares(found, flight.xyz[rng.integers(len(flight.xyz))]))
                 answering += [] if found.provisional else own[-1:]
         scores += own
-        sys.stdout.write(f"{kind:<22} {len(own)} of {draws} placed, inside: {shares('', own)}\n")
-        sys.stdout.flush()
+        say(f"{kind:<22} {len(own)} of {draws} placed, inside: {shares('', own)}")
     tried = draws * len(_KINDS)
     return {
         "flights": float(tried),

@@ -11,7 +11,6 @@
 """
 
 import json
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
 from tools.commands import featuredb
-from tools.figures import spread, study_parser, write_figures
+from tools.figures import say, spread, study_parser, write_figures
 from tools.made_maps import photo_names
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
@@ -105,7 +104,7 @@ def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMa
     poses = {image.name: image.cam_from_local for image in truth.images}
     known = [name for name in names if name in poses]
     if left_out := [name for name in names if name not in poses]:
-        sys.stdout.write(f"not in the reference map, so left out: {', '.join(left_out)}\n")
+        say(f"not in the reference map, so left out: {', '.join(left_out)}")
     return ask_poses(database, photos, known, truth.frame, poses)
 
 
@@ -133,7 +132,7 @@ def ask_poses(
         for name in names:
             reply = client.localise(photos / name, camera=camera, timeout_s=60.0)
             rows.append(_row(name, reply, frame, poses[name]))
-            sys.stdout.write(f"{rows[-1]}\n")
+            say(f"{rows[-1]}")
     return rows
 
 

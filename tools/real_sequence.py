@@ -11,7 +11,6 @@
 
 """
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from featuredb.video.folder import natural_key
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
-from tools.figures import laid_on, poses_in, spread, study_parser, write_figures
+from tools.figures import laid_on, poses_in, say, spread, study_parser, write_figures
 from tools.made_maps import photo_names
 from tools.real_photos import ingest, reference
 
@@ -44,7 +43,7 @@ def main() -> None:
     for name, pose in poses.items():
         if name in moved:
             off.append(pose_difference(part.frame, moved[name], pose.epsg, pose.utm, pose.cam_from_utm_xyzw))
-            sys.stdout.write(f"{name}: {off[-1]}\n")
+            say(f"{name}: {off[-1]}")
     figures = {
         "frames": len(names),
         "lost": len(names) - len(poses),

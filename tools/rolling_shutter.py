@@ -10,7 +10,6 @@
 
 """
 
-import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -31,7 +30,7 @@ from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from tools.commands import said
-from tools.figures import squared, study_parser, write_figures
+from tools.figures import say, squared, study_parser, write_figures
 from tools.worlds.film_frame import Exposure, in_order
 from tools.worlds.film_world import FilmOptions, film_frame, wandering_errors
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
@@ -67,8 +66,7 @@ def main() -> None:
                 figures["unnamed"] += "rolling shutter" not in report
                 worst = max([worst, *(max(one) for one in squares)])
                 words = ", ".join(f"position {a:.1f} and orientation {b:.1f}" for a, b in squares)
-                sys.stdout.write(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}\n")
-                sys.stdout.flush()
+                say(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}")
     write_figures(args.json, figures | {"worst_squared": worst})
 
 

@@ -10,7 +10,6 @@ question must have an answer or an error of the server's, and the memory must st
 import os
 import random
 import signal
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -24,7 +23,7 @@ from featuredb.errors import ServiceError
 from featuredb.store import Database
 from reloc.client import Client
 from reloc.client.replies import NO_SERVER, TIMEOUT
-from tools.figures import write_figures
+from tools.figures import say, write_figures
 from tools.service_world import (
     ATTACKER,
     Service,
@@ -100,7 +99,7 @@ def main() -> None:
     failures = Counter(heard.failures)
     quarter = len(memory) // 4
     early, late = median(memory[quarter : 2 * quarter]), median(memory[-quarter:])
-    sys.stdout.write(f"failures {dict(failures)}, events {dict(events.counts)}, {status.reload}\n")
+    say(f"failures {dict(failures)}, events {dict(events.counts)}, {status.reload}")
     figures = {
         "asked": len(heard.seconds),
         "wrong": heard.wrong,

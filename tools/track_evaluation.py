@@ -37,8 +37,7 @@ from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored
 from tools.commands import featuredb
 from tools.drawn_layer import drawn_marks
-from tools.figures import inside, off_pose, squared, study_parser, write_figures
-from tools.growth_common import say
+from tools.figures import inside, off_pose, say, squared, study_parser, write_figures
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, film_truth, write_film
 from tools.worlds.flight_path import FlightStyle, PathOptions
 from tools.worlds.scan_world import make_scan_world

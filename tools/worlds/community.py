@@ -117,10 +117,7 @@ def plan_copies(
         lambda: (Edit(kind="resized", amount=float(rng.uniform(0.4, 0.75))),),
         lambda: (Edit(kind="watermarked", amount=0.4, text="repost"),),
         lambda: (Edit(kind="bordered", amount=float(rng.uniform(0.015, 0.05))),),
-        lambda: (
-            Edit(kind="cropped", amount=float(rng.uniform(0.1, 0.3))),
-            Edit(kind="resized", amount=0.7),
-        ),
+        lambda: (Edit(kind="cropped", amount=float(rng.uniform(0.1, 0.3))), Edit(kind="resized", amount=0.7)),
     )
     copies = []
     for i, row in enumerate(rng.choice(len(photos), min(count, len(photos)), replace=False)):

@@ -73,8 +73,7 @@ def with_copied_block(scene: Scene, source: Rect, target: Rect, *, mirrored: boo
     crown_kept, crown_taken = ~_inside(crown_at, cleared), _inside(crown_at, source)
     all_faces = Faces.concatenate([_rows(faces, kept), copy, patch])
     all_crowns = _joined(
-        _rows(crowns, crown_kept),
-        _moved_crowns(_rows(crowns, crown_taken), middle, shift, mirrored),
+        _rows(crowns, crown_kept), _moved_crowns(_rows(crowns, crown_taken), middle, shift, mirrored)
     )
     plan = scene.plan
     houses = [b for b in plan.buildings if not _inside(np.array([[b.x, b.y]]), cleared)[0]]

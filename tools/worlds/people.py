@@ -99,11 +99,7 @@ def zoomed(device: Device, factor: float) -> Device:
     camera = device.camera
     count = 2 if camera.model == "OPENCV" else 1
     lens = tuple(k / factor**1.5 for k in camera.params[count + 2 :])
-    params = (
-        *(f * factor for f in camera.params[:count]),
-        *camera.params[count : count + 2],
-        *lens,
-    )
+    params = (*(f * factor for f in camera.params[:count]), *camera.params[count : count + 2], *lens)
     return replace(
         device,
         camera=replace(camera, params=params),
@@ -119,10 +115,7 @@ def stored_upright(device: Device) -> Device:
     if camera.model == "OPENCV":
         raise InvalidValueError("stored_upright: expected a camera with one focal length, found OPENCV")
     turned = replace(
-        camera,
-        width=camera.height,
-        height=camera.width,
-        params=(f, camera.height - cy, cx, *lens),
+        camera, width=camera.height, height=camera.width, params=(f, camera.height - cy, cx, *lens)
     )
     return replace(device, camera=turned)
 

@@ -18,15 +18,7 @@ from tools.worlds.album import PlannedPhoto
 from tools.worlds.geotags import geotag_at
 from tools.worlds.people import Person, community, planned
 from tools.worlds.sights import Surroundings, look_at
-from tools.worlds.surveyed import (
-    TownOptions,
-    day_key,
-    moment,
-    photo_ids,
-    shot_seed,
-    survey_photos,
-    town_of,
-)
+from tools.worlds.surveyed import TownOptions, day_key, moment, photo_ids, shot_seed, survey_photos, town_of
 
 _PROBE = "probe"
 _TRIES = 8
