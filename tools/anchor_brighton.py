@@ -25,7 +25,7 @@ from featuredb.store import Database
 from tools.commands import anchor, featuredb
 from tools.figures import write_figures
 from tools.real_photos import HeldOutRow, ask_poses, error_figures, ingest
-from tools.scan_truth import ScanTruth, scan_parser, scan_truth
+from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
 
 def main() -> None:

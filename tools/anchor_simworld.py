@@ -20,6 +20,7 @@ from featuredb.simworld.world import Truth, World
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, newest_copy
 from tools.figures import pose_errors, poses_in, study_parser, write_figures
+from tools.made_maps import once
 from tools.real_photos import ask_poses, error_figures
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
@@ -28,20 +29,19 @@ def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
     work: Path = args.work
     world = make_scan_world(args.inputs or work)
-    mapped = work / "mapped"
-    if not mapped.exists():
-        featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
-    refused = anchored(work, mapped, world, other=True)[1]
-    database, placed = anchored(work, mapped, world, other=False)
+    refused = anchored(work, world, other=True)[1]
+    database, placed = anchored(work, world, other=False)
     figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
-    for name, path in (("gps", mapped), ("scan", database)):
+    for name, path in (("gps", work / "mapped"), ("scan", database)):
         found = judged(Database.open(path), world.world)
         figures |= {f"{name}_{key}": value for key, value in found.items()}
     write_figures(args.json, figures)
 
 
-def anchored(work: Path, mapped: Path, world: ScanWorld, *, other: bool) -> tuple[Path, bool]:
-    """A copy of the database with one of the scans, anchored; and whether the map was placed."""
+def anchored(work: Path, world: ScanWorld, *, other: bool) -> tuple[Path, bool]:
+    """A copy of the photos' database with one of the scans, anchored; and whether the map was placed."""
+    photos = str(world.world.folder / "drone")
+    mapped = once(work / "mapped", lambda path: featuredb("ingest", "photos", str(path), photos, "--quiet"))
     database = newest_copy(mapped, work / f"anchored-{'other' if other else 'own'}-intensity")
     featuredb("lidar", "add", str(database), str(world.other_scan if other else world.scan))
     map_id = Database.open(database).snapshot().maps()[0].map_id

@@ -29,9 +29,8 @@ from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb, newest_copy
 from tools.figures import say, squared, study_parser, write_figures
-from tools.film_folder import FilmsTruth, place_scene, write_films
+from tools.film_folder import FilmsTruth, place_scene, six_films, write_films
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
-from tools.film_scripts import six_films
 from tools.picked import place_by_picks, read_scan
 from tools.track_evaluation import axis_errors
 

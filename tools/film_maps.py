@@ -12,8 +12,7 @@ from PIL import Image
 
 from featuredb.store import Database
 from ingest.report.page import REPORT_JSON
-from tools.film_folder import FilmsTruth, FrameTruth
-from tools.film_scripts import HEIGHT, Script
+from tools.film_folder import HEIGHT, FilmsTruth, FrameTruth, Script
 from tools.picked import Seen
 
 Shot = tuple[str, int]  # name of a film's file, number of the piece

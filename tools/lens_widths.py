@@ -36,7 +36,7 @@ from ingest.photos.photo import Photo
 from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
 from tools.figures import say, study_parser, write_figures
-from tools.made_maps import all_maps, make
+from tools.made_maps import all_maps, make, once
 
 WIDTHS = tuple(field.name for field in fields(LensWidths))
 _DROP = float(chi2.ppf(0.95, 1)) / 2.0
@@ -211,12 +211,10 @@ def _focals(names: Sequence[str], camera_of: Sequence[int], photos: Mapping[str,
 
 def _database(folder: Path, work: Path) -> Path:
     """Of the folder's photos, made if it is not there."""
-    database = work / folder.parent.name / folder.name / "db"
-    if not database.exists():
-        control = folder.parent / "gcp_list.txt"
-        more = ("--gcp", str(control)) if control.exists() else ()
-        make(database, "photos", folder, more)
-    return database
+    control = folder.parent / "gcp_list.txt"
+    more = ("--gcp", str(control)) if control.exists() else ()
+    target = work / folder.parent.name / folder.name / "db"
+    return once(target, lambda database: make(database, "photos", folder, more))
 
 
 if __name__ == "__main__":

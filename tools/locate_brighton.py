@@ -28,7 +28,7 @@ from tools.figures import write_figures
 from tools.locate_pixels import Miss, miss_figures, misses, view_of
 from tools.picked import Scan, read_scan, visible
 from tools.real_photos import ingest
-from tools.scan_truth import scan_parser, scan_truth
+from tools.scan_poses import scan_parser, scan_truth
 
 _SEED, _PIXELS = 1, 300  # of each photo
 _NEAR, _REACH_PX = 12, 12.0  # points of the scan around a pixel, and how far they may be

@@ -30,7 +30,6 @@ from reloc.pixels.surfaces import RaySurface, scan_surface
 from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored
-from tools.commands import featuredb
 from tools.figures import inside, inside_figures, squared, study_parser, write_figures
 from tools.worlds.scan_world import make_scan_world
 from tools.worlds.seen_places import SeenPlaces
@@ -54,9 +53,7 @@ def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
     work: Path = args.work
     world = make_scan_world(args.inputs or work, _SEED)
-    featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
-    path = anchored(work, work / "mapped", world, other=False)[0]
-    database = Database.open(path)
+    database = Database.open(anchored(work, world, other=False)[0])
     scene, truth = town_of(WorldOptions.short(_SEED)), world.world.truth
     rng = np.random.default_rng(_SEED)
     localiser = Localiser.open(database)

@@ -29,7 +29,7 @@ from featuredb.simworld.camera.shot import look_pose
 from ingest.own_frame import held_of
 from ingest.register.gps import GpsPlacement, place_by_gps
 from tools.figures import inside_figures, say, squared, study_parser, write_figures
-from tools.made_maps import all_maps, make
+from tools.made_maps import all_maps, make, once
 
 SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
@@ -203,9 +203,7 @@ def unrelated(flights: Sequence[Flight], chance: int) -> dict[str, float]:
 
 def real_flight(folder: Path, work: Path) -> Flight:
     """The cameras of the largest map of a folder of photos, by its own positions."""
-    database = work / folder.parent.name
-    if not database.exists():
-        make(database, "photos", folder)
+    database = once(work / folder.parent.name, lambda path: make(path, "photos", folder))
     largest = max(all_maps(database), key=lambda one: len(one.images))
     images = sorted(
         largest.images, key=lambda image: (image.capture_time is None, image.capture_time, image.name)

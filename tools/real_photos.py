@@ -10,8 +10,6 @@
 
 """
 
-import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +26,8 @@ from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
-from tools.commands import featuredb
 from tools.figures import say, spread, study_parser, write_figures
-from tools.made_maps import photo_names
+from tools.made_maps import make, photo_names
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
 
@@ -50,43 +47,25 @@ def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--held-out", nargs="+", metavar="NAME", help=f"default: every {_EVERY}th photo")
     args = parser.parse_args()
-    held_out = args.held_out or photo_names(args.photos)[_EVERY // 2 :: _EVERY]
+    names = photo_names(args.photos)
+    held_out = args.held_out or names[_EVERY // 2 :: _EVERY]
     work: Path = args.work
     part = ingest(work / "part", args.photos, held_out)
     ingest(work / "whole", args.photos, ())
     rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
-    write_figures(args.json, part | error_figures(rows))
+    figures = {
+        "usable": len(set(names) - set(held_out)),
+        "registered": part["mapped"],
+        "ingest_s": part["seconds"],
+    }
+    write_figures(args.json, figures | error_figures(rows))
 
 
-def ingest(
-    database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None
-) -> dict[str, float]:
-    """Run `featuredb ingest photos` in a process of its own on a database that is not there yet.
-
-    Photos that were taken from the folder (usable) and those in a map (registered); seconds of the command.
-
-    Args:
-        work: work folder, which may hold what another ingest of these photos has done; default: a new one.
-
-    Raises:
-        SystemExit: there is a database already, or the command failed.
-    """
+def ingest(database: Path, photos: Path, exclude: Sequence[str], *more: str) -> dict[str, float]:
+    """Make a database that is not there yet of all photos but some, as `make` does."""
     if database.exists():
         raise SystemExit(f"{database} is there already; a map is made from nothing there")
-    report = database.with_name(f"{database.name}-report")
-    words = ["ingest", "photos", str(database), str(photos), "--quiet", "--report", str(report)]
-    words += [f"--exclude={name}" for name in exclude]
-    words += [] if work is None else ["--work", str(work)]
-    start = time.perf_counter()
-    featuredb(*words)
-    ingest_s = time.perf_counter() - start
-    document = json.loads((report / "report.json").read_text(encoding="utf-8"))
-    statuses = [photo["status"] for photo in document["photos"]]
-    return {
-        "usable": sum(status != "skipped" for status in statuses),
-        "registered": statuses.count("registered"),
-        "ingest_s": ingest_s,
-    }
+    return make(database, "photos", photos, (*(f"--exclude={name}" for name in exclude), *more))
 
 
 def reference(database: Path) -> FeatureMap:

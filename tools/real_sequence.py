@@ -31,7 +31,7 @@ def main() -> None:
     work: Path = args.work
     for name, left_out in (("part", names[1::2]), ("whole", [])):
         if not (work / name).exists():
-            ingest(work / name, args.photos, left_out, work / "cache")
+            ingest(work / name, args.photos, left_out, "--work", str(work / "cache"))
     part, whole = reference(work / "part"), reference(work / "whole")
     theirs, mine = poses_in(part.frame, whole), poses_in(part.frame, part)
     sim = laid_on(*({name: pose.center for name, pose in of.items()} for of in (theirs, mine)))

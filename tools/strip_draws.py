@@ -24,7 +24,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from tools.figures import write_figures
 from tools.position_draws import SIGMAS, Flight, shares, squares
-from tools.scan_truth import ScanTruth, scan_parser, scan_truth
+from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
 _LEAST, _MOST_BEND = 5, 0.1  # photos of a real strip; its width over its length
 _EACH_DEG, _COMMON_DEG = np.array([1.3, 1.3, 1.8]), np.array([1.5, 1.5, 2.2])  # camera x and y, up

@@ -35,7 +35,6 @@ from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored
-from tools.commands import featuredb
 from tools.drawn_layer import drawn_marks
 from tools.figures import inside, off_pose, say, squared, study_parser, write_figures
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, film_truth, write_film
@@ -58,7 +57,9 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.out
-    database = anchored_map(args.out, inputs)
+    database, placed = anchored(args.out, make_scan_world(inputs), other=False)
+    if not placed:
+        raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
     results: dict[str, dict[str, float]] = {}
     for name in args.films:
         options = film_options(name, args.frames)
@@ -72,20 +73,6 @@ def main() -> None:
             scene, track = town_of(options.world), tracked.trajectory
             results[f"{name}_layer"] = drawn_marks(args.out, film, truth, scene, track, database)
     write_figures(args.out / "track.json", results)
-
-
-def anchored_map(out: Path, inputs: Path) -> Path:
-    """A database with the map of the drone's photos, placed on the scan; kept in `out`."""
-    world = make_scan_world(inputs)
-    done = out / "anchored.txt"
-    if not done.exists():
-        mapped = out / "mapped"
-        featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
-        database, placed = anchored(out, mapped, world, other=False)
-        if not placed:
-            raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
-        done.write_text(database.name)
-    return out / done.read_text()
 
 
 def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:

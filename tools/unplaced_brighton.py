@@ -33,7 +33,7 @@ from tools.figures import kept, write_figures
 from tools.made_maps import copied, make, photo_names, with_scan
 from tools.picked import picks, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
-from tools.scan_truth import ScanTruth, scan_parser, scan_truth
+from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
 HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
 _WRONG_M = 1.0
