@@ -63,11 +63,8 @@ class Surroundings:
     def ground(self, y: float) -> float:
         """Height of the terrain, or of the bridges over the river."""
         low, high = self.scene.plan.river
-        return (
-            max(float(self.scene.plan.height(y)), 0.0)
-            if low - 2 < y < high + 2
-            else float(self.scene.plan.height(y))
-        )
+        height = float(self.scene.plan.height(y))
+        return max(height, 0.0) if low - 2 < y < high + 2 else height
 
     def worth_taking(self, camera: Camera, cam_from_local: Rigid3, nearest_m: float) -> bool:
         """Whether the view is not blocked by something close, and is not all sky or far land."""
