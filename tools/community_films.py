@@ -28,7 +28,7 @@ from featuredb.simworld.scan_world import write_scan
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb, newest_copy
-from tools.figures import say, squared, study_parser, write_figures
+from tools.figures import median, say, squared, study_parser, write_figures
 from tools.film_folder import FilmsTruth, place_scene, six_films, write_films
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
 from tools.picked import place_by_picks, read_scan
@@ -57,7 +57,7 @@ def track_figures(tracks: Mapping[str, Trajectory], truth: FilmsTruth) -> dict[s
         "tracked_share": len(metres) / max(frames, 1),
         "inside_share": sum(one <= _INSIDE for one in squares) / max(frames, 1),
         "foreign_tracked": foreign,
-        "median_m": float(np.median(metres or [np.nan])),
+        "median_m": median(metres),
         "largest_m": float(max(metres, default=np.nan)),
     }
 

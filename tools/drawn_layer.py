@@ -35,7 +35,9 @@ def drawn_marks(
     distances between a mark's centre and the pixel where its place belongs.
     """
     places = _places(scene, truth)
-    (folder / "layer.geojson").write_text(json.dumps(_layer(truth.frame.geodetic_from_enu(places))))
+    where = [[lon, lat, height] for lat, lon, height in truth.frame.geodetic_from_enu(places).tolist()]
+    layer = {"type": "Feature", "properties": {}, "geometry": {"type": "MultiPoint", "coordinates": where}}
+    (folder / "layer.geojson").write_text(json.dumps(layer))
     write_trajectory(folder / "track.csv", track)
     lens = truth.camera
     camera = ",".join(map(str, (lens.model, lens.width, lens.height, *lens.params)))
@@ -110,9 +112,3 @@ def _places(scene: Scene, truth: FilmTruth) -> FloatArray:
             seen = SeenPlaces(scene, truth.camera, pose)
             found.append(seen.places(seen.pixels(rng, _PLACES)))
     return np.concatenate(found)
-
-
-def _layer(places: FloatArray) -> dict[str, object]:
-    """GeoJSON of latitudes, longitudes (degrees) and heights (m), (n, 3)."""
-    where = [[lon, lat, height] for lat, lon, height in places.tolist()]
-    return {"type": "Feature", "properties": {}, "geometry": {"type": "MultiPoint", "coordinates": where}}

@@ -65,13 +65,17 @@ def laid_on(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) ->
     return similarity_closed_form(*(np.array([of[name] for name in both]) for of in (mine, theirs)))
 
 
+def median(values: Sequence[float] | FloatArray) -> float:
+    """NaN of none."""
+    return float(np.median(values)) if len(values) else float("nan")
+
+
 def spread(metres: Sequence[float], degrees: Sequence[float]) -> dict[str, float]:
     """Medians and largest of errors of positions and orientations; NaN where there are none."""
-    return {
-        f"{name}_{unit}": float(of(errors)) if len(errors) else float("nan")
-        for unit, errors in (("m", metres), ("deg", degrees))
-        for name, of in (("median", np.median), ("largest", np.max))
-    }
+    figures: dict[str, float] = {}
+    for unit, errors in (("m", metres), ("deg", degrees)):
+        figures |= {f"median_{unit}": median(errors), f"largest_{unit}": float(max(errors, default=np.nan))}
+    return figures
 
 
 def poses_in(frame: LocalFrame, feature_map: FeatureMap) -> dict[str, Rigid3]:

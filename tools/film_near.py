@@ -15,7 +15,7 @@ import numpy as np
 
 from featuredb.store import Database
 from tools.commands import anchor, newest_copy
-from tools.figures import study_parser, write_figures
+from tools.figures import median, study_parser, write_figures
 from tools.made_maps import once, with_scan
 from tools.track_evaluation import smooth_film
 from tools.unplaced_brighton import all_drawn, near_words
@@ -39,7 +39,7 @@ def main() -> None:
         figures |= {
             f"{kind}_placed": len(placed),
             f"{kind}_wrong": sum(one["largest_m"] > _WRONG_M for one in placed),
-            f"{kind}_m": float(np.median([one["median_m"] for one in placed] or [np.nan])),
+            f"{kind}_m": median([one["median_m"] for one in placed]),
         }
     write_figures(args.json, figures)
 

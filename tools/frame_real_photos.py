@@ -28,7 +28,7 @@ from featuredb.simworld.camera.shot import look_pose
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from tools.figures import off_pose, say, study_parser, write_figures
+from tools.figures import median, off_pose, say, study_parser, write_figures
 from tools.worlds.clouds import build_cloud
 
 _EPSG = 32615  # UTM zone of the scan of `brighton`
@@ -67,7 +67,7 @@ def main() -> None:
         "accepted": accepted,
         "largest_apart_m": max((np.linalg.norm(a.center - b.center) for a, b in apart), default=np.nan),
         "largest_apart_deg": max((a.angle_to_deg(b) for a, b in apart), default=np.nan),
-        "cpu_s": float(np.median(seconds or [np.nan])),
+        "cpu_s": median(seconds),
     }
     write_figures(args.json, figures)
 

@@ -44,7 +44,7 @@ from ingest.register.anchor.together.register import register_together
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from tools.anchor_simworld import camera_errors
-from tools.figures import kept, study_parser, write_figures
+from tools.figures import kept, median, study_parser, write_figures
 from tools.made_maps import all_maps, make, once
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
@@ -81,7 +81,7 @@ def main() -> None:
             "alone_tried": _ALONE * len(towns),
             "placed": len(placed),
             "wrong": sum(metres > _WRONG_M for metres in placed),
-            "median_m": float(np.median(placed or [np.nan])),
+            "median_m": median(placed),
             "largest_m": float(max(placed, default=np.nan)),
             "other_placed": sum(town["other"] for town in towns),
             "mirrored_placed": sum(town["mirrored"] for town in towns),

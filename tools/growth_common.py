@@ -124,10 +124,6 @@ def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) 
             say(f"{folder.name}: {done} of {total} photos")
 
     write_album(folder, options, partial(plan, options), progress=progress)
-    return open_album(folder)
-
-
-def open_album(folder: Path) -> Album:
     lines = (folder / TABLE_FILE).read_text(encoding="utf-8").splitlines()
     rows = {row["path"]: row for row in map(json.loads, lines)}
     return Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)

@@ -15,8 +15,7 @@ more than 2 m.
 import sys
 from collections.abc import Sequence
 
-import numpy as np
-
+from tools.figures import median
 from tools.growth_common import (
     Album,
     Registered,
@@ -58,7 +57,7 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
     pictures = {r.fact.name for r in mine} | {r.fact.copy_of for r in active if r.fact.kind == "copy"}
     share = len(pictures & {f.name for f in own}) / max(len(own), 1)
     errors = [r.error_m for r in mine]
-    median = float(np.median(errors)) if errors else float("nan")
+    middle = median(errors)
     worst = max(errors, default=float("nan"))
     return [
         Verdict(
@@ -68,8 +67,8 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
         ),
         Verdict(
             "median error",
-            f"{median:.3f} m, at most {_MEDIAN_M} m wanted; worst {worst:.2f} m",
-            median <= _MEDIAN_M,
+            f"{middle:.3f} m, at most {_MEDIAN_M} m wanted; worst {worst:.2f} m",
+            middle <= _MEDIAN_M,
         ),
         Verdict(
             "foreign photos",

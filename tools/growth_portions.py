@@ -39,7 +39,7 @@ from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from tools.figures import laid_on, poses_in, say, study_parser, write_figures
+from tools.figures import laid_on, median, poses_in, say, study_parser, write_figures
 from tools.growth_gates import recorded
 
 _PORTIONS = 3
@@ -214,7 +214,7 @@ def _judged(state: State, joint: Component) -> dict[str, float]:
         "joint": len(reference),
         "grown": len(both),
         "missing": len(reference.keys() - state.centers.keys()),
-        "median_m": float(np.median(apart)) if len(both) else float("nan"),
+        "median_m": median(apart),
         "largest_m": float(apart.max(initial=0)),
     }
 

@@ -27,7 +27,7 @@ from ingest.own_frame import held_of
 from ingest.photos.photo import Photo, whose_cameras
 from ingest.register.gps import place_by_gps
 from tools.commands import featuredb
-from tools.figures import inside_figures, laid_on, poses_in, say, squared, study_parser, write_figures
+from tools.figures import inside_figures, laid_on, median, poses_in, say, squared, study_parser, write_figures
 from tools.made_maps import all_maps, copied, make, photo_names, position_table
 
 _EXTENT_M, _OFF_M, _STATED_M = 120.0, 8.0, 30.0
@@ -111,8 +111,8 @@ def ingested(landmark: Landmark, photos: Path, work: Path) -> dict[str, float]:
         "photos": len(landmark.names),
         "active": len(both),
         "share": len(both) / len(landmark.names),
-        "off_m": float(np.median(off)) if off else float("nan"),
-        "shape_m": float(np.median(shape)) if shape else float("nan"),
+        "off_m": median(off),
+        "shape_m": median(shape),
     }
 
 

@@ -28,7 +28,7 @@ from featuredb.store import Database
 from reloc.localise.answer import placement_covariance
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
 from reloc.wire.query import CameraRequest
-from tools.figures import pose_errors, poses_in, study_parser, write_figures
+from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
 from tools.laser_baseline import colmap_given_the_lens
 from tools.laser_set import FRAME, LaserSet, read_laser_set, with_exif
 from tools.made_maps import all_maps, make
@@ -87,15 +87,15 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
             mine = errors.metres if unit == "m" else errors.degrees
             reported = errors.told_m if unit == "m" else errors.told_deg
             baseline = other.metres if unit == "m" else other.degrees
-            median = _median(mine)
+            middle = median(mine)
             figures |= {
-                f"{kind}_{unit}": median,
-                f"{kind}_reported_{unit}": _median(reported),
-                f"{kind}_colmap_{unit}": _median(baseline),
+                f"{kind}_{unit}": middle,
+                f"{kind}_reported_{unit}": median(reported),
+                f"{kind}_colmap_{unit}": median(baseline),
             }
-            ratios.append(median / _median(reported))
+            ratios.append(middle / median(reported))
             if unit == "m":
-                ratios.append(median / _median(baseline))
+                ratios.append(middle / median(baseline))
         ratios.append(1.0 if errors.metres and len(errors.metres) == errors.wanted else float("inf"))
     figures["worst"] = float(np.nan_to_num(ratios, nan=np.inf).max())
     return figures
@@ -147,10 +147,6 @@ def errors_of(poses: Mapping[str, Rigid3], truth: LaserSet) -> Errors:
     """Poses cam_from_local against the true ones."""
     metres, degrees = pose_errors(poses, truth.poses)
     return Errors(metres=metres.tolist(), degrees=degrees.tolist())
-
-
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
 
 
 if __name__ == "__main__":

@@ -17,12 +17,10 @@ from scipy.spatial import cKDTree
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.store import Database
-from reloc.answered_view import AnsweredView
 from reloc.localiser import Localiser
 from reloc.overlay import map_points_in_view
 from reloc.pixels.locate import locate
-from reloc.pixels.surfaces import MapSurface, RaySurface, scan_surface
+from reloc.pixels.surfaces import MapSurface, scan_surface
 from tools.anchor_brighton import anchored_on
 from tools.figures import write_figures
 from tools.locate_pixels import Miss, miss_figures, misses, view_of
@@ -53,18 +51,14 @@ def main() -> None:
         pixels, places = _truth(scan, truth.cameras[name], truth.poses[name], rng)
         true = view.frame.enu_from(truth.frame).act(places)
         asked, photos = asked + len(pixels), photos + 1
-        for kind, surface in _surfaces(database, localiser, view).items():
+        utm = map_points_in_view(localiser.areas_of(view.map_ids[:1]), view)
+        by_map = MapSurface(points=view.frame.enu_from_utm(utm, view.epsg))
+        for kind, surface in (("scan", scan_surface(database, view)), ("map", by_map)):
             found[kind] += misses(view, true, locate(view, surface, pixels))
     figures = {"photos": photos, "asked": asked}
     for kind, those in found.items():
         figures |= {f"{kind}_located": len(those)} | miss_figures(kind, those)
     write_figures(args.json, figures)
-
-
-def _surfaces(database: Database, localiser: Localiser, view: AnsweredView) -> dict[str, RaySurface]:
-    scan = scan_surface(database, view)
-    utm = map_points_in_view(localiser.areas_of(view.map_ids[:1]), view)
-    return {"scan": scan, "map": MapSurface(points=view.frame.enu_from_utm(utm, view.epsg))}
 
 
 def _truth(

@@ -60,10 +60,6 @@ class Flight:
         return place_by_gps(centers, positions, sigmas, times_s, held_of(held, angles))
 
 
-def _bias(flight: Flight, rng: np.random.Generator) -> FloatArray:
-    return np.tile(rng.normal(0.0, 1.0, 3) * SIGMAS, (len(flight.xyz), 1))
-
-
 def _white(sigma_m: float) -> Callable[[Flight, np.random.Generator], FloatArray]:
     """Noise, and as much bias as it leaves of what a plain receiver says."""
 
@@ -107,7 +103,7 @@ _KINDS: dict[str, Callable[[Flight, np.random.Generator], FloatArray]] = {
     "noise of 5 m": _white(5.0),
     "noise of 15 m": _white(15.0),
     "drift of 20 and 60 m": _drift,
-    "a bias": lambda flight, rng: _bias(flight, rng) + rng.normal(0.0, 0.3, flight.xyz.shape),
+    "a bias": lambda flight, rng: rng.normal(0.0, 1.0, 3) * SIGMAS + rng.normal(0.0, 0.3, flight.xyz.shape),
     "a fifth far out": _outliers,
     "one height for all": _one_height,
     "a lag of 2 s": _lag,

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
@@ -111,7 +110,12 @@ def inside_over_placements(
     true_centers = feature_map.frame.enu_from(world.truth.frame).act(true)
     rng = np.random.default_rng((seed, 31))
     part = _SIGMA_M / np.sqrt(2.0)  # half of the variance is shared by the flight
-    measured = [measured_covariance(area, feature_map, one.pose) for one in answers]
+    measured = []  # what answers' covariances hold besides the map's placement, in the area's axes
+    for one in answers:
+        center = one.pose.cam_from_local.center
+        back = np.kron(np.eye(2), one.pose.frame.true_enu_from_enu(center).T)
+        own = back @ one.pose.covariance @ back.T
+        measured.append(own - placement_covariance(area, feature_map, center))
     inside = []
     for _ in range(_DRAWS):
         positions = true_centers + rng.normal(0.0, part, 3) + rng.normal(0.0, part, true_centers.shape)
@@ -134,13 +138,6 @@ def inside_over_placements(
             )
     horizontal, orientation = np.mean(inside, axis=0)
     return {"inside_horizontal": float(horizontal), "inside_orientation": float(orientation)}
-
-
-def measured_covariance(area: Area, feature_map: FeatureMap, pose: LocalisedPose) -> FloatArray:
-    """What an answer's covariance (6, 6) holds besides the map's placement, in the area's axes."""
-    center = pose.cam_from_local.center
-    back = np.kron(np.eye(2), pose.frame.true_enu_from_enu(center).T)
-    return back @ pose.covariance @ back.T - placement_covariance(area, feature_map, center)
 
 
 if __name__ == "__main__":

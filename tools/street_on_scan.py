@@ -22,7 +22,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.world import Truth, read_truth
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, newest_copy
-from tools.figures import kept, squared, study_parser, write_figures
+from tools.figures import kept, median, squared, study_parser, write_figures
 from tools.made_maps import make, once
 from tools.worlds.album import TABLE_FILE
 from tools.worlds.scan_world import make_scan_world
@@ -56,7 +56,7 @@ def main() -> None:
             "right": right,
             "right_share": right / max(photos, 1),
             "outside": int((off[:, 2] > _OUTSIDE_M).sum()),
-            "median_m": float(np.median(off[:, 0])) if len(off) else float("nan"),
+            "median_m": median(off[:, 0]),
             "largest_m": float(off[:, 0].max(initial=0.0)),
             "elsewhere": sum(len(town["elsewhere"]) for town in towns),
             "elsewhere_placed": sum(bool(one["off"]) for town in towns for one in town["elsewhere"]),

@@ -22,7 +22,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from tools.figures import write_figures
+from tools.figures import median, write_figures
 from tools.position_draws import SIGMAS, Flight, shares, squares
 from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
@@ -70,7 +70,7 @@ def measure(kind: str, strips: Sequence[CameraStrip]) -> dict[str, float]:
         figures |= {
             f"{kind}_{name}placed": len(scores) / len(strips),
             f"{kind}_{name}answer": answer / len(strips),
-            f"{kind}_{name}turn_deg": float(np.median(turns)) if turns else float("nan"),
+            f"{kind}_{name}turn_deg": median(turns),
             **shares(f"{kind}_{name}", scores),
         }
     return figures

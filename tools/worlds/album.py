@@ -7,7 +7,7 @@ An album's photos lie in a folder per owner under names that give nothing away. 
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import lru_cache, partial
@@ -161,8 +161,10 @@ def write_album(
         if progress is not None:
             progress(done, len(photos))
     truths = {p.shot.name: true for p in photos if (true := _truth(home, p)) is not None}
-    write_table(folder, [(p.fact, p.geotag) for p in photos])
-    write_facts(folder, [p.fact for p in photos])
+    told = sorted(photos, key=lambda p: p.fact.name)
+    # Photos of a survey are not part of a photo site.
+    _write_lines(folder / TABLE_FILE, (_table_row(p.fact, p.geotag) for p in told if p.fact.kind != "survey"))
+    _write_lines(folder / FACTS_FILE, (asdict(p.fact) | {"time": p.fact.time.isoformat()} for p in told))
     write_truth(folder, Truth(seed=home.seed, epsg=home.epsg, frame=home.frame, images=truths))
     return folder
 
@@ -223,15 +225,6 @@ def _write(folder: Path, world: SceneSource, photos: Sequence[PlannedPhoto], num
     part.replace(target)
 
 
-def write_facts(folder: Path, facts: Sequence[AlbumFact]) -> None:
-    """Write folder/facts.jsonl, a line per photo, sorted by name."""
-    lines = [
-        json.dumps({**asdict(fact), "time": fact.time.isoformat()})
-        for fact in sorted(facts, key=lambda f: f.name)
-    ]
-    (folder / FACTS_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
 def read_facts(folder: Path) -> dict[str, AlbumFact]:
     """Facts by name."""
     lines = (folder / FACTS_FILE).read_text(encoding="utf-8").splitlines()
@@ -241,13 +234,8 @@ def read_facts(folder: Path) -> dict[str, AlbumFact]:
     return {fact.name: fact for fact in facts}
 
 
-def write_table(folder: Path, rows: Sequence[tuple[AlbumFact, Geotag | None]]) -> None:
-    """Write table.jsonl, sorted by path; photos of a survey are not part of a photo site."""
-    table = [
-        _table_row(fact, tag) for fact, tag in sorted(rows, key=lambda r: r[0].name) if fact.kind != "survey"
-    ]
-    lines = "".join(json.dumps(row) + "\n" for row in table)
-    (folder / TABLE_FILE).write_text(lines, encoding="utf-8")
+def _write_lines(path: Path, rows: Iterable[dict[str, Any]]) -> None:
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
 
 
 def _table_row(fact: AlbumFact, tag: Geotag | None) -> dict[str, Any]:

@@ -230,7 +230,8 @@ def plan_visits(
     around = Surroundings(scene)
     shares = np.array([p.weight for p in people]) / sum(p.weight for p in people)
     taken_by = np.zeros(len(people))
-    taste = rng.lognormal(0.0, 0.5, (len(people), len(places))) * _popularity(places, by_rank)
+    popularity = [1.0 / k if by_rank else s.weight**0.7 for k, s in enumerate(places, start=1)]
+    taste = rng.lognormal(0.0, 0.5, (len(people), len(places))) * popularity
     photos: list[PlannedPhoto] = []
     visit = first_visit
     while len(photos) < count:
@@ -247,12 +248,6 @@ def plan_visits(
                 f"plan_visits: only {len(photos)} of {count} photos came of {visit} visits"
             )
     return photos
-
-
-def _popularity(places: Sequence[Sight], by_rank: bool) -> FloatArray:
-    if by_rank:
-        return 1.0 / np.arange(1.0, len(places) + 1.0)
-    return np.array([s.weight**0.7 for s in places])
 
 
 def _visit(

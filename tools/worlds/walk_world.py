@@ -162,5 +162,5 @@ class _Walk:
                 "batch": step,
             }
             scene = day_key("home", day, hour)
-            photos.append(planned(person, shot, scene, kind, geotag=tag, visit=10 * step + who, **told))
+            photos.append(planned(person, shot, scene, kind, geotag=tag, **told))
         return photos
