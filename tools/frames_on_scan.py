@@ -114,13 +114,10 @@ def _registered_elsewhere(seed: int, inputs: Path, work: Path) -> int:
 
 
 def _scans(world: ScanWorld, seed: int, work: Path) -> list[Database]:
-    return [_scanned(work / f"scan-{seed}-{k}", of) for k, of in enumerate((world.scan, world.other_scan))]
-
-
-def _scanned(path: Path, scan: Path) -> Database:
-    database = Database.open(path) if path.exists() else Database.create(path)
-    add_scan(database, [scan])
-    return database
+    databases = [Database.create(work / f"scan-{seed}-{k}") for k in range(2)]
+    for database, scan in zip(databases, (world.scan, world.other_scan), strict=True):
+        add_scan(database, [scan])
+    return databases
 
 
 def _cloud(database: Database, frame: LocalFrame, box: PlanBox | None = None) -> PointCloud:

@@ -21,10 +21,8 @@ from tools.worlds.people import Person, community, planned
 from tools.worlds.sights import find_sights
 from tools.worlds.surveyed import DAYS, TownOptions, moment, shot_seed, survey_photos
 
-_TAGGED_HERE, _TAGGED_THERE = (
-    0.6,
-    0.8,
-)  # of another town's photos: claimed here; at their own place; rest none
+# Of another town's visits: claimed here, or at their own place; the rest not at all.
+_TAGGED_HERE, _TAGGED_THERE = 0.6, 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
