@@ -6,6 +6,7 @@ node is needed, and nothing is fetched when the package is installed or runs: th
 another version change VERSION and INTEGRITY (`npm view three@VERSION dist.integrity`) and run it again.
 """
 
+import argparse
 import base64
 import hashlib
 import io
@@ -30,6 +31,7 @@ FOLDER = Path(__file__).resolve().parent.parent / "reloc" / "viewer" / "assets" 
 
 
 def main() -> int:
+    argparse.ArgumentParser(description="Fetch the viewer's libraries from the npm registry.").parse_args()
     with urllib.request.urlopen(f"{REGISTRY}/three/-/three-{VERSION}.tgz", timeout=60) as response:
         tarball = response.read()
     found = "sha512-" + base64.b64encode(hashlib.sha512(tarball).digest()).decode()
