@@ -14,7 +14,6 @@
 
 """
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,11 +25,11 @@ from featuredb.store import Database
 from tools.commands import anchor, featuredb
 from tools.figures import write_figures
 from tools.real_photos import HeldOutRow, ask_poses, error_figures, ingest
-from tools.scan_truth import ScanTruth, scan_parser, scan_truth
+from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = scan_parser(__doc__, "--work", "--held-out").parse_args(argv)
+def main() -> None:
+    args = scan_parser(__doc__, "--work", "--held-out").parse_args()
     truth = scan_truth(args)
     work: Path = args.work
     database = work / "anchored"
@@ -41,7 +40,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     after = ask_poses(anchored, args.photos, args.held_out, truth.frame, truth.poses)
     figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
     write_figures(args.json, figures | stated(after) | shape)
-    return 0
 
 
 def stated(rows: Sequence[HeldOutRow]) -> dict[str, float]:
@@ -90,4 +88,4 @@ def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

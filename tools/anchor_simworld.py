@@ -1,6 +1,6 @@
 """The simulated world end to end: photos, scan, anchoring without a person, queries against the truth.
 
-    python -m tools.anchor_simworld --work DIR [--inputs DIR] [--seed N]
+    python -m tools.anchor_simworld --work DIR [--inputs DIR]
 
 1. `featuredb simworld --lidar` writes photos whose GPS has a drone's errors, an airborne scan with
    intensities only, an ortho image of another day, and the same of another town at the same place.
@@ -8,12 +8,8 @@
 3. `featuredb anchor --auto` places the map on the scan of the other town, which it must refuse, and then on
    its own.
 4. The map's cameras and the held-out queries are compared with the truth, before and after.
-
-Exit code 0 if the map was placed, and the other town's scan was refused.
 """
 
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,30 +19,29 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.world import Truth, World
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, newest_copy
-from tools.figures import study_parser, write_figures
+from tools.figures import pose_errors, poses_in, study_parser, write_figures
+from tools.made_maps import once
 from tools.real_photos import ask_poses, error_figures
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs", "--seed").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     work: Path = args.work
-    world = make_scan_world(args.inputs or work, args.seed)
-    mapped = work / "mapped"
-    if not mapped.exists():
-        featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
-    refused = anchored(work, mapped, world, other=True)[1]
-    database, placed = anchored(work, mapped, world, other=False)
+    world = make_scan_world(args.inputs or work)
+    refused = anchored(work, world, other=True)[1]
+    database, placed = anchored(work, world, other=False)
     figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
-    for name, path in (("gps", mapped), ("scan", database)):
+    for name, path in (("gps", work / "mapped"), ("scan", database)):
         found = judged(Database.open(path), world.world)
         figures |= {f"{name}_{key}": value for key, value in found.items()}
     write_figures(args.json, figures)
-    return 0 if placed and not refused else 1
 
 
-def anchored(work: Path, mapped: Path, world: ScanWorld, *, other: bool) -> tuple[Path, bool]:
-    """A copy of the database with one of the scans, anchored; and whether the map was placed."""
+def anchored(work: Path, world: ScanWorld, *, other: bool) -> tuple[Path, bool]:
+    """A copy of the photos' database with one of the scans, anchored; and whether the map was placed."""
+    photos = str(world.world.folder / "drone")
+    mapped = once(work / "mapped", lambda path: featuredb("ingest", "photos", str(path), photos, "--quiet"))
     database = newest_copy(mapped, work / f"anchored-{'other' if other else 'own'}-intensity")
     featuredb("lidar", "add", str(database), str(world.other_scan if other else world.scan))
     map_id = Database.open(database).snapshot().maps()[0].map_id
@@ -72,15 +67,9 @@ def judged(database: Database, world: World) -> dict[str, float]:
 
 def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, FloatArray]:
     """Metres and degrees between the map's images and the truth."""
-    truth_from_map = truth.frame.enu_from(feature_map.frame)
-    metres, degrees = [], []
-    for image in feature_map.images:
-        true = truth.images[f"drone/{image.name}"].cam_from_local
-        pose = image.cam_from_local @ truth_from_map.inverse()
-        metres.append(float(np.linalg.norm(pose.center - true.center)))
-        degrees.append(pose.angle_to_deg(true))
-    return np.array(metres), np.array(degrees)
+    true = {Path(image.name).name: image.cam_from_local for image in truth.group("drone")}
+    return pose_errors(poses_in(truth.frame, feature_map), true)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import zenoh
@@ -77,16 +78,11 @@ def _ask(target: Target, messages: Iterator[Message], at_once: int = _AT_ONCE) -
             thread.join()
 
 
-def _large_png(target: Target) -> None:
-    _ask(target, itertools.repeat((png(_SIDE, _SIDE, zeros((_SIDE + 1) * _SIDE)), None)))
-
-
-def _deep_png(target: Target) -> None:
-    """960 MB of pixels in 1 MB."""
-    _ask(
-        target,
-        itertools.repeat((png(_SIDE, _SIDE, zeros((_SIDE * 8 + 1) * _SIDE), bits=16, colour=6), None)),
-    )
+def _pngs(target: Target, bits: int, colour: int) -> None:
+    """As many pixels as are taken, in a small file."""
+    bytes_a_pixel = 8 if bits == 16 else 1
+    pixels = zeros((_SIDE * bytes_a_pixel + 1) * _SIDE)
+    _ask(target, itertools.repeat((png(_SIDE, _SIDE, pixels, bits=bits, colour=colour), None)))
 
 
 def _scans(target: Target) -> None:
@@ -217,8 +213,8 @@ def _grandchildren(pid: int) -> list[int]:
 
 
 ATTACKS: dict[str, Callable[[Target], None]] = {
-    "large PNG": _large_png,
-    "deep PNG": _deep_png,
+    "large PNG": partial(_pngs, bits=8, colour=0),
+    "deep PNG": partial(_pngs, bits=16, colour=6),  # 960 MB of pixels in 1 MB
     "JPEG of many scans": _scans,
     "truncated photos": _truncated,
     "hostile messages": _hostile,

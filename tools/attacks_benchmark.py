@@ -10,13 +10,11 @@ as one that took the deadline.
 
 import itertools
 import multiprocessing
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +23,7 @@ import requests
 from featuredb.store import Database
 from reloc.service.options import wire_name_of
 from tools.attacks import ATTACKS, Target, attack
-from tools.figures import write_figures
+from tools.figures import say, write_figures
 from tools.serve_process import beside
 from tools.service_world import (
     ATTACKER,
@@ -46,34 +44,17 @@ _SECONDS = 30.0  # for each attack
 _POINTS = 200_000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """One attack; times of what honest clients asked over Zenoh, and over HTTP."""
-
-    attack: str
-    asked: int
-    p99_s: float
-    failures: int
-    wrong: int
-    http_p99_s: float
-    peak_mib: float
-    after_mib: float
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    args = service_parser(__doc__).parse_args(argv)
+def main() -> None:
+    args = service_parser(__doc__).parse_args()
     database = Database.open(args.db)
     map_ids = enlarged(database, _POINTS)
     points = sum(m.points for m in database.snapshot().maps())
     photos = photos_of(args.photos, 6)
-    measured: list[Measured] = []
-    with (
-        tempfile.TemporaryDirectory() as scratch,
-        running_service(args.db, Path(scratch)) as service,
-    ):
+    measured: dict[str, dict[str, float]] = {}
+    with tempfile.TemporaryDirectory() as scratch, running_service(args.db, Path(scratch)) as service:
         expected = first_answers(service, photos)
         localised = sum(reply.status == "localised" for reply in expected)
-        sys.stdout.write(f"{points} points; {localised} of {len(expected)} questions localised\n")
+        say(f"{points} points; {localised} of {len(expected)} questions localised")
         host, port = service.gateway.endpoint.removeprefix("http://").rsplit(":", 1)
         target = Target(
             config=service.config(ATTACKER),
@@ -94,41 +75,34 @@ def main(argv: Sequence[str] | None = None) -> int:
             ):
                 time.sleep(_SECONDS)
             time.sleep(_CALM_S)
-            measured.append(
-                Measured(
-                    attack=name,
-                    asked=len(heard.seconds),
-                    p99_s=heard.p99_s(),
-                    failures=len(heard.failures),
-                    wrong=heard.wrong,
-                    http_p99_s=float(np.percentile(http, 99)),
-                    peak_mib=max(memory),
-                    after_mib=service.server.memory_mib(),
-                )
-            )
-            sys.stdout.write(f"{measured[-1]}\n")
-            sys.stdout.flush()
-    write_figures(args.json, figures(measured, points))
-    return 0
+            measured[name] = {
+                "asked": len(heard.seconds),
+                "p99_s": heard.p99_s(),
+                "failures": len(heard.failures),
+                "wrong": heard.wrong,
+                "http_p99_s": float(np.percentile(http, 99)),
+                "peak_mib": max(memory),
+                "after_mib": service.server.memory_mib(),
+            }
+            say(f"{name}: {measured[name]}")
+    write_figures(args.json, figures(measured) | {"points": points})
 
 
-def figures(measured: Sequence[Measured], points: int) -> dict[str, float]:
+def figures(measured: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Those of the quiet server, and the worst of all attacks."""
-    quiet, attacked = measured[0], measured[1:]
-    killed = [m for m in attacked if m.attack == "workers killed"]
-    others = [m for m in attacked if m not in killed]
+    quiet, killed, last = measured["quiet"], measured["workers killed"], list(measured.values())[-1]
+    others = [of for name, of in measured.items() if name not in ("quiet", "workers killed")]
     return {
-        "points": points,
-        "quiet_p99_s": quiet.p99_s,
-        "quiet_mib": quiet.peak_mib,
-        "worst_p99_s": max(m.p99_s for m in others),
-        "worst_http_p99_s": max(m.http_p99_s for m in others),
-        "failures": sum(m.failures for m in others),
-        "failures_by_kills": sum(m.failures for m in killed),
-        "wrong": sum(m.wrong for m in measured),
-        "asked": sum(m.asked for m in measured),
-        "peak_mib": max(m.peak_mib for m in measured),
-        "after_mib": measured[-1].after_mib,
+        "quiet_p99_s": quiet["p99_s"],
+        "quiet_mib": quiet["peak_mib"],
+        "worst_p99_s": max(of["p99_s"] for of in others),
+        "worst_http_p99_s": max(of["http_p99_s"] for of in others),
+        "failures": sum(of["failures"] for of in others),
+        "failures_by_kills": killed["failures"],
+        "wrong": sum(of["wrong"] for of in measured.values()),
+        "asked": sum(of["asked"] for of in measured.values()),
+        "peak_mib": max(of["peak_mib"] for of in measured.values()),
+        "after_mib": last["after_mib"],
     }
 
 
@@ -176,4 +150,4 @@ def _web_client(service: Service, photos: Sequence[bytes]) -> Iterator[list[floa
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

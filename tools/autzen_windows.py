@@ -31,7 +31,6 @@ Refused must be: mirrored windows, windows whose prior lies elsewhere in the sca
 least 44 in all.
 """
 
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +46,6 @@ from numpy.typing import NDArray
 from featuredb.features.decode import decode_gray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
@@ -56,7 +54,7 @@ from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import SURE_CONFIRMATION_LOG_NFA
 from ingest.register.frame_registration import FramePrior
-from tools.figures import study_parser, write_figures
+from tools.figures import off_pose, study_parser, write_figures
 from tools.ortho_over_scan import (
     Floats,
     OrthoOverScan,
@@ -113,14 +111,14 @@ class WindowOutcome:
         return self.kind != "window" or self.error_m is None or self.error_m > _WRONG_M
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--seed")
     parser.set_defaults(seed=0)
     parser.add_argument("scan", type=Path)
     parser.add_argument("ortho", type=Path)
     parser.add_argument("--figure", type=Path, help="draw evidence against error")
     parser.add_argument("--photos", type=Path, nargs="*", default=[], help="folders of other places")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         database = Database.create(Path(folder) / "db")
@@ -144,7 +142,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         _draw(outcomes, args.figure)
     sigma = {f"{name}_offset_sigma_m": float(np.linalg.norm(of.sigma)) for name, of in offsets.items()}
     write_figures(args.json, figures_of(outcomes) | sigma)
-    return 0
 
 
 def _trials(place: OrthoOverScan, halves: Mapping[str, Part], folders: Sequence[Path]) -> Iterator[_Trial]:
@@ -207,7 +204,9 @@ def _one(
     place: OrthoOverScan, cloud: PointCloud, trial: _Trial, offset: Floats, rng: np.random.Generator
 ) -> WindowOutcome:
     camera, truth = _nadir_camera(place, trial)
-    prior = _wrong_prior(truth, rng)
+    # 20 m in space and 5 degrees about any axis, by axis.
+    sigmas = np.array([_PRIOR_M, _PRIOR_DEG]) / np.sqrt(3.0)
+    prior = FramePrior.around(off_pose(truth, rng, _PRIOR_M, _PRIOR_DEG), *sigmas.tolist())
     found = register_frame(trial.photo, camera, prior, cloud)
     tried = found.evidence.get("pose_tried")
     error = None
@@ -234,21 +233,6 @@ def _nadir_camera(place: OrthoOverScan, trial: _Trial) -> tuple[Camera, Rigid3]:
     rotation = np.diag([1.0, -1.0, -1.0])
     camera = Camera.from_focal(place.window, place.window, _HEIGHT_M / place.cell, "SIMPLE_PINHOLE")
     return camera, Rigid3(rotation=rotation, translation=-rotation @ center)
-
-
-def _wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
-    shift, axis = rng.normal(size=3), rng.normal(size=3)
-    center = truth.center + _PRIOR_M * shift / np.linalg.norm(shift)
-    rotation = so3_exp(np.radians(_PRIOR_DEG) * axis / np.linalg.norm(axis)) @ truth.rotation
-    # 20 m in space and 5 degrees about any axis, by axis.
-    sigma_m, sigma_deg = _PRIOR_M / np.sqrt(3.0), _PRIOR_DEG / np.sqrt(3.0)
-    return FramePrior(
-        cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
-        sigma_horizontal_m=sigma_m,
-        sigma_vertical_m=sigma_m,
-        sigma_heading_deg=sigma_deg,
-        sigma_tilt_deg=sigma_deg,
-    )
 
 
 def _ground_error(place: OrthoOverScan, camera: Camera, pose: Rigid3, trial: _Trial, offset: Floats) -> float:
@@ -313,4 +297,4 @@ def _rates(name: str, outcomes: Sequence[WindowOutcome], passed: Sequence[Window
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

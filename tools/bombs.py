@@ -12,12 +12,7 @@ def png(width: int, height: int, pixels: bytes, *, bits: int = 8, colour: int = 
 
     header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
     return b"".join(
-        [
-            b"\x89PNG\r\n\x1a\n",
-            chunk(b"IHDR", header),
-            chunk(b"IDAT", pixels),
-            chunk(b"IEND", b""),
-        ]
+        [b"\x89PNG\r\n\x1a\n", chunk(b"IHDR", header), chunk(b"IDAT", pixels), chunk(b"IEND", b"")]
     )
 
 

@@ -37,6 +37,7 @@ from rosbags.typesys import Stores, get_typestore
 from featuredb.features.decode import decode_rgb
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.writer import VideoWriter
+from reloc.client.connection import client_config
 from reloc.service.session import bind_free_port
 from reloc.wire.keys import Keys
 from reloc.wire.track import TrackPose
@@ -44,6 +45,7 @@ from tools.figures import study_parser, write_figures
 from tools.serve_process import ServeProcess
 
 _WIDTH, _FRAMES, _RATE_HZ = 1280, 1200, 10.0
+_CONNECT_S = 10.0
 _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
@@ -71,11 +73,11 @@ class Moments:
         return np.array([1e3 * (self.messages[us] - self.replies[us]) for us in both])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("db", type=Path)
     parser.add_argument("photo", type=Path, help="that the database localises")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     figures: dict[str, float] = {"load": os.getloadavg()[0]}
     with tempfile.TemporaryDirectory() as scratch:
         film = _film(Path(scratch) / "still.mp4", args.photo)
@@ -92,7 +94,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             server.stop()
     write_figures(args.json, figures)
-    return 0
 
 
 def _server_on_one_core(db: Path) -> ServeProcess:
@@ -123,7 +124,6 @@ def _stream(film: Path, endpoint: str, words: Sequence[str]) -> None:
         [*program, "live", str(film), "--connect", endpoint, "--json"], stdout=subprocess.PIPE
     )
     bridge = subprocess.Popen([*program, "bridge", *words], stdin=live.stdout)
-    assert live.stdout is not None
     live.stdout.close()
     codes = live.wait(), bridge.wait()
     if any(codes):
@@ -133,10 +133,7 @@ def _stream(film: Path, endpoint: str, words: Sequence[str]) -> None:
 @contextmanager
 def _listening(key: str, endpoint: str, heard: Callable[[zenoh.Sample], None]) -> Iterator[None]:
     """A subscriber at a server, on Zenoh's own thread."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    with zenoh.open(config) as session:
+    with zenoh.open(client_config(endpoint, _CONNECT_S)) as session:
         callback = zenoh.handlers.Callback(heard, indirect=False)
         with session.declare_subscriber(key, callback):
             yield
@@ -196,4 +193,4 @@ def _figures(name: str, moments: Moments) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

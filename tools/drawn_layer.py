@@ -16,7 +16,7 @@ from featuredb.video.frames import open_video
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb
-from tools.worlds.film_world import FILM_FILE, FilmTruth
+from tools.worlds.film_world import FilmTruth
 from tools.worlds.seen_places import SeenPlaces
 
 _SEED, _SHOWING, _PLACES = 3, 6, 8  # frames that give places, and places of each
@@ -35,16 +35,18 @@ def drawn_marks(
     distances between a mark's centre and the pixel where its place belongs.
     """
     places = _places(scene, truth)
-    (folder / "layer.geojson").write_text(json.dumps(_layer(truth.frame.geodetic_from_enu(places))))
+    where = [[lon, lat, height] for lat, lon, height in truth.frame.geodetic_from_enu(places).tolist()]
+    layer = {"type": "Feature", "properties": {}, "geometry": {"type": "MultiPoint", "coordinates": where}}
+    (folder / "layer.geojson").write_text(json.dumps(layer))
     write_trajectory(folder / "track.csv", track)
     lens = truth.camera
     camera = ",".join(map(str, (lens.model, lens.width, lens.height, *lens.params)))
-    words = ("draw", str(film / FILM_FILE), str(folder / "layer.geojson"), "--database", str(database))
+    words = ("draw", str(film), str(folder / "layer.geojson"), "--database", str(database))
     more = ("--track", str(folder / "track.csv"), "--camera", camera, "--out", str(folder / "drawn.mp4"))
     featuredb(*words, *more)
     off: list[float] = []
     frames = stray = 0
-    with open_video(str(film / FILM_FILE)) as plain, open_video(str(folder / "drawn.mp4")) as drawn:
+    with open_video(str(film)) as plain, open_video(str(folder / "drawn.mp4")) as drawn:
         for before, after in zip(plain, drawn, strict=True):
             pose = truth.cam_from_local[before.index]
             if pose is None:
@@ -110,13 +112,3 @@ def _places(scene: Scene, truth: FilmTruth) -> FloatArray:
             seen = SeenPlaces(scene, truth.camera, pose)
             found.append(seen.places(seen.pixels(rng, _PLACES)))
     return np.concatenate(found)
-
-
-def _layer(places: FloatArray) -> dict[str, object]:
-    """GeoJSON of latitudes, longitudes (degrees) and heights (m), (n, 3)."""
-    where = [[lon, lat, height] for lat, lon, height in places.tolist()]
-    return {
-        "type": "Feature",
-        "properties": {},
-        "geometry": {"type": "MultiPoint", "coordinates": where},
-    }

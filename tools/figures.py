@@ -3,17 +3,21 @@
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
+from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_log
+from featuredb.geometry.rotation import so3_exp, so3_log
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.plain_json import plain
 
 _SHARED: dict[str, dict[str, Any]] = {
@@ -26,6 +30,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     "--held-out": {"type": str, "nargs": "+", "required": True, "metavar": "NAME"},
     "--seed": {"type": int, "default": 1, "help": "of what is drawn; default: 1"},
 }
+_LEVELS = (0.68, 0.95)
 
 
 def study_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
@@ -45,6 +50,13 @@ def pose_offset(pose: Rigid3, true: Rigid3) -> FloatArray:
     return np.concatenate([turn, true.center - pose.center])
 
 
+def off_pose(pose: Rigid3, rng: np.random.Generator, off_m: float, off_deg: float) -> Rigid3:
+    """A pose that is wrong by so much, to some side and about some axis."""
+    way, axis = (value / np.linalg.norm(value) for value in rng.normal(size=(2, 3)))
+    rotation = so3_exp(np.radians(off_deg) * axis) @ pose.rotation
+    return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + off_m * way))
+
+
 def laid_on(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) -> Sim3 | None:
     """The similarity that takes places (3,) onto those of the same names; None where these are too few."""
     both = sorted(mine.keys() & theirs.keys())
@@ -53,13 +65,60 @@ def laid_on(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) ->
     return similarity_closed_form(*(np.array([of[name] for name in both]) for of in (mine, theirs)))
 
 
+def median(values: Sequence[float] | FloatArray) -> float:
+    """NaN of none."""
+    return float(np.median(values)) if len(values) else float("nan")
+
+
 def spread(metres: Sequence[float], degrees: Sequence[float]) -> dict[str, float]:
     """Medians and largest of errors of positions and orientations; NaN where there are none."""
-    return {
-        f"{name}_{unit}": float(of(errors)) if len(errors) else float("nan")
-        for unit, errors in (("m", metres), ("deg", degrees))
-        for name, of in (("median", np.median), ("largest", np.max))
-    }
+    figures: dict[str, float] = {}
+    for unit, errors in (("m", metres), ("deg", degrees)):
+        figures |= {f"median_{unit}": median(errors), f"largest_{unit}": float(max(errors, default=np.nan))}
+    return figures
+
+
+def poses_in(frame: LocalFrame, feature_map: FeatureMap) -> dict[str, Rigid3]:
+    """`cam_from_local` of a map's images in a local frame, by name."""
+    here = feature_map.frame.enu_from(frame)
+    return {image.name: image.cam_from_local @ here for image in feature_map.images}
+
+
+def pose_errors(poses: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) -> tuple[FloatArray, FloatArray]:
+    """Metres and degrees (n,) between poses and true ones, of the names of both."""
+    both = [(pose, true[name]) for name, pose in poses.items() if name in true]
+    metres = np.array([np.linalg.norm(pose.center - other.center) for pose, other in both])
+    return metres, np.array([pose.angle_to_deg(other) for pose, other in both])
+
+
+def squared(error: FloatArray, covariance: FloatArray) -> float:
+    """An error (d,), squared, in units of its covariance (d, d)."""
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def inside(squares: Sequence[float] | FloatArray, level: float, size: int = 3) -> float:
+    """Share of squared errors of `size` axes that lie inside the bound of that level; NaN of none."""
+    return float(np.mean(np.asarray(squares) <= chi2.ppf(level, size))) if len(squares) else float("nan")
+
+
+def inside_figures(name: str, squares: Sequence[float] | FloatArray, size: int = 3) -> dict[str, float]:
+    """Shares of squared errors inside 68 and 95 %, as NAME_68 and NAME_95."""
+    return {f"{name}_{100 * level:.0f}": inside(squares, level, size) for level in _LEVELS}
+
+
+def say(text: str) -> None:
+    """Print a line at once, with the time."""
+    sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
+    sys.stdout.flush()
+
+
+def kept(path: Path, make: Callable[[], Any]) -> Any:
+    """What a JSON file says, which `make` gives once: a study that was stopped goes on behind it."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(make()), encoding="utf-8")
+        say(f"{path.stem}: {path.read_text(encoding='utf-8')}")
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def write_figures(path: Path | None, figures: Mapping[str, Any]) -> None:

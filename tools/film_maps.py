@@ -12,8 +12,7 @@ from PIL import Image
 
 from featuredb.store import Database
 from ingest.report.page import REPORT_JSON
-from tools.film_folder import FilmsTruth, FrameTruth
-from tools.film_scripts import HEIGHT, Script
+from tools.film_folder import HEIGHT, FilmsTruth, FrameTruth, Script
 from tools.picked import Seen
 
 Shot = tuple[str, int]  # name of a film's file, number of the piece
@@ -77,12 +76,9 @@ class FilmMaps:
         unseen = [s for s in shots if not _count([*inside, *elsewhere, *self.left], s)]
         silent = [s for s in unseen if not self._explained(s[0], shots[s])]
         return {
-            "maps": len(self.maps),
             "place_maps": len(self.of_place),
-            "largest_map": max((len(one.keyframes) for one in self.of_place), default=0),
             "place_shots": len(shots),
             "shots_in_maps": len(whole),
-            "place_keyframes_left": sum(k.truth.kind == "place" for k in self.left),
             "foreign_in_maps": sum(k.truth.kind != "place" for k in inside),
             "lost_without_reason": len(silent) + sum(not k.reason for k in self.left),
         }

@@ -8,66 +8,51 @@ places a copy of the map; then the same on the scan of another town, where nothi
 map is wrong where a camera is a metre off.
 """
 
-import shutil
-import sys
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from featuredb.store import Database
-from ingest.workspace import default_root
-from tools.commands import anchor, featuredb, newest_copy
-from tools.figures import study_parser, write_figures
-from tools.made_maps import make
-from tools.track_evaluation import film_options
-from tools.unplaced_brighton import all_drawn
-from tools.unplaced_near import near_words
-from tools.video_map import keyframe_errors
-from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
+from tools.commands import anchor, newest_copy
+from tools.figures import median, study_parser, write_figures
+from tools.made_maps import once, with_scan
+from tools.track_evaluation import smooth_film
+from tools.unplaced_brighton import all_drawn, near_words
+from tools.video_map import keyframe_errors, stills_of, unplaced_film
+from tools.worlds.film_world import FilmTruth
 from tools.worlds.scan_world import make_scan_world
 
-_FRAMES, _DRAWS, _WRONG_M = 1200, 10, 1.0
+_DRAWS, _WRONG_M = 10, 1.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     inputs, work = args.inputs or args.work, args.work
     world = make_scan_world(inputs)
-    folder = write_film(inputs / f"film-smooth-{_FRAMES}-1", film_options("smooth", _FRAMES))
-    truth = read_film_truth(folder)
-    if not (work / "db").exists():
-        work.mkdir(parents=True, exist_ok=True)
-        make(work / "making", "video", Path(shutil.copy(folder / FILM_FILE, work)))  # with nothing beside it
-        (work / "making").rename(work / "db")
+    film, truth = smooth_film(inputs)
+    made = once(work / "db", partial(unplaced_film, film))
     figures: dict[str, float] = {"draws": _DRAWS}
     for kind, scan in (("here", world.scan), ("elsewhere", world.other_scan)):
-        database = work / kind
-        if not database.exists():
-            newest_copy(work / "db", work / "scanned")
-            featuredb("lidar", "add", str(work / "scanned"), str(scan), "--quiet")
-            (work / "scanned").rename(database)
-        placed = all_drawn(kind, _DRAWS, partial(_draw, made=database, work=work, truth=truth), work)
+        scanned = with_scan(made, scan, work / kind)
+        placed = all_drawn(kind, _DRAWS, partial(_draw, made=scanned, work=work, truth=truth), work)
         figures |= {
             f"{kind}_placed": len(placed),
             f"{kind}_wrong": sum(one["largest_m"] > _WRONG_M for one in placed),
-            f"{kind}_m": float(np.median([one["median_m"] for one in placed] or [np.nan])),
+            f"{kind}_m": median([one["median_m"] for one in placed]),
         }
     write_figures(args.json, figures)
-    return 0
 
 
 def _draw(number: int, made: Path, work: Path, truth: FilmTruth) -> dict[str, float] | None:
     database = newest_copy(made, work / "placed")
     biggest = max(Database.open(database).snapshot().unplaced_maps(), key=lambda one: one.images)
-    (stills,) = (default_root(Database.open(work / "db").url) / "films").iterdir()
     near = near_words(database, number)
-    if not anchor(database, biggest.map_id, stills, work / "anchor", near, refusals=(1, 2)):
+    if not anchor(database, biggest.map_id, stills_of(made), work / "anchor", near, refusals=(1, 2)):
         return None
     off = keyframe_errors(Database.open(database).snapshot().load_map(biggest.map_id), truth)
     return {"median_m": float(np.median(off)), "largest_m": float(off.max())}
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

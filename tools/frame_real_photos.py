@@ -11,9 +11,7 @@ Two registrations of each photo:
 Both have to end at one pose: figures are how far apart they are, in metres and degrees.
 """
 
-import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -23,28 +21,28 @@ from numpy.typing import NDArray
 
 from featuredb.features.exif.read import read_exif
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
+from featuredb.simworld.camera.shot import look_pose
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from tools.figures import study_parser, write_figures
+from tools.figures import median, off_pose, say, study_parser, write_figures
 from tools.worlds.clouds import build_cloud
 
 _EPSG = 32615  # UTM zone of the scan of `brighton`
-_SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
+_OFF_M, _OFF_DEG = 15.0, 10.0
+_AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("scan", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--lens", required=True, metavar="MODEL:PARAMS", help="COLMAP's model and parameters")
     parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     cloud = read_cloud(args.scan, _EPSG)
     names = args.photos or sorted(p.name for p in args.folder.iterdir() if p.suffix.lower() == ".jpg")
     accepted, apart, seconds = 0, [], []
@@ -63,17 +61,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         seconds.append(cpu_s)
         accepted += first.accepted and second.accepted
         if second.cam_from_local is not None:
-            apart.append(_apart(second.cam_from_local, first.cam_from_local))
-    nothing = float("nan")
+            apart.append((second.cam_from_local, first.cam_from_local))
     figures = {
         "photos": len(names),
         "accepted": accepted,
-        "largest_apart_m": max((metres for metres, _ in apart), default=nothing),
-        "largest_apart_deg": max((degrees for _, degrees in apart), default=nothing),
-        "cpu_s": float(np.median(seconds or [nothing])),
+        "largest_apart_m": max((np.linalg.norm(a.center - b.center) for a, b in apart), default=np.nan),
+        "largest_apart_deg": max((a.angle_to_deg(b) for a, b in apart), default=np.nan),
+        "cpu_s": median(seconds),
     }
     write_figures(args.json, figures)
-    return 0
 
 
 def _timed(
@@ -83,8 +79,7 @@ def _timed(
     found = register_frame(image, camera, prior, cloud, FrameOptions(threads=2))
     cpu_s = time.process_time() - cpu
     said = "accepted" if found.accepted else f"{found.reason}: {found.message}"
-    sys.stdout.write(f"{name}: {said}, {len(found.pixels)} inliers, {cpu_s:.1f} s\n")
-    sys.stdout.flush()
+    say(f"{name}: {said}, {len(found.pixels)} inliers, {cpu_s:.1f} s")
     return found, cpu_s
 
 
@@ -114,7 +109,7 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
     center[2] = exif.altitude_m
     pitch = -90.0 if exif.angles is None or exif.angles.pitch_deg is None else exif.angles.pitch_deg
     return FramePrior(
-        cam_from_local=_posed(_looking_north(np.radians(pitch)), center),
+        cam_from_local=look_pose(center, 0.0, pitch),
         sigma_horizontal_m=5.0,
         sigma_vertical_m=12.0,  # heights of drones are metres to tens of metres off
         sigma_heading_deg=180.0,
@@ -124,30 +119,8 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
 
 def wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
     """15 m and 10 degrees off."""
-    shift, axis = rng.normal(size=3), rng.normal(size=3)
-    rotation = truth.rotation @ so3_exp(np.radians(10.0) * axis / np.linalg.norm(axis))
-    return FramePrior(
-        cam_from_local=_posed(rotation, truth.center + 15.0 * shift / np.linalg.norm(shift)),
-        sigma_horizontal_m=_SIGMA_M,
-        sigma_vertical_m=_SIGMA_M,
-        sigma_heading_deg=_SIGMA_DEG,
-        sigma_tilt_deg=_SIGMA_DEG,
-    )
-
-
-def _looking_north(pitch_rad: float) -> FloatArray:
-    forward = np.array([0.0, np.cos(pitch_rad), np.sin(pitch_rad)])
-    right = np.array([1.0, 0.0, 0.0])
-    return np.stack([right, np.cross(forward, right), forward])
-
-
-def _posed(rotation: FloatArray, center: FloatArray) -> Rigid3:
-    return Rigid3(rotation=rotation, translation=-rotation @ center)
-
-
-def _apart(a: Rigid3, b: Rigid3) -> tuple[float, float]:
-    return float(np.linalg.norm(a.center - b.center)), a.angle_to_deg(b)
+    return FramePrior.around(off_pose(truth, rng, _OFF_M, _OFF_DEG), _OFF_M * _AXIS, _OFF_DEG * _AXIS)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,6 +1,6 @@
 """Photos of simulated towns registered to scans that have intensities alone: one by one, and together.
 
-    python -m tools.frames_on_scan --work DIR [--inputs DIR] [--towns 101 102 ...] [--negatives 40]
+    python -m tools.frames_on_scan --work DIR [--inputs DIR]
 
 Of each town, on which nothing was chosen:
 
@@ -13,10 +13,9 @@ Of each town, on which nothing was chosen:
 What is found of a town is kept in DIR.
 """
 
-import json
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,28 +43,28 @@ from ingest.register.anchor.start.first_place import plan_box
 from ingest.register.anchor.together.register import register_together
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from tools.figures import study_parser, write_figures
-from tools.made_maps import all_maps, make
+from tools.anchor_simworld import camera_errors
+from tools.figures import kept, median, study_parser, write_figures
+from tools.made_maps import all_maps, make, once
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 _TOWNS = tuple(range(301, 311))
 _OFF_M, _OFF_DEG = 15.0, 10.0
 _RIGHT_M, _RIGHT_DEG, _WRONG_M = 0.3, 0.3, 1.0
 _PHOTOS, _ALONE = 10, 2
+_NEGATIVES = 40  # of each town
 _LOW = FlightOptions(lines=2, per_line=5, oblique=0, width=1024, height_m=25.0)
 _AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__, "--work", "--inputs")
-    parser.add_argument("--towns", type=int, nargs="+", default=_TOWNS, help="seeds")
-    parser.add_argument("--negatives", type=int, default=40, help="of each town")
-    args = parser.parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     cv2.setNumThreads(1)
-    args.work.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.work
-    towns = [_town(seed, inputs, args.work) for seed in args.towns]
-    accepted = sum(_registered_elsewhere(seed, inputs, args.work, args.negatives) for seed in args.towns)
+    towns, accepted = (
+        [kept(args.work / f"{name}-{seed}.json", partial(of, seed, inputs, args.work)) for seed in _TOWNS]
+        for name, of in (("town", _found), ("elsewhere", _registered_elsewhere))
+    )
     singles = [np.array(one) for town in towns for one in town["singles"]]
     right = sum(one[0] <= _RIGHT_M and one[1] <= _RIGHT_DEG for one in singles)
     placed = [town["own_m"] for town in towns if town["own_m"] is not None]
@@ -76,37 +75,22 @@ def main(argv: Sequence[str] | None = None) -> int:
             "tried": _PHOTOS * len(towns),
             "right_share": right / (_PHOTOS * len(towns)),
             "singles_wrong": sum(one[0] > _WRONG_M for one in singles),
-            "negatives": args.negatives * len(towns),
-            "negatives_accepted": accepted,
+            "negatives": _NEGATIVES * len(towns),
+            "negatives_accepted": sum(accepted),
             "alone": sum(town["alone"] for town in towns),
             "alone_tried": _ALONE * len(towns),
             "placed": len(placed),
             "wrong": sum(metres > _WRONG_M for metres in placed),
-            "median_m": float(np.median(placed or [np.nan])),
+            "median_m": median(placed),
             "largest_m": float(max(placed, default=np.nan)),
             "other_placed": sum(town["other"] for town in towns),
             "mirrored_placed": sum(town["mirrored"] for town in towns),
         },
     )
-    return 0
-
-
-def _town(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
-    """What is found of one town."""
-    return _kept(work / f"town-{seed}.json", lambda: _found(seed, inputs, work))
-
-
-def _kept(path: Path, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What is in a file, made once."""
-    if not path.exists():
-        found = made()
-        path.write_text(json.dumps(found))
-        sys.stdout.write(f"{path.stem}: {found}\n")
-        sys.stdout.flush()
-    return dict(json.loads(path.read_text()))
 
 
 def _found(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
+    """What is found of one town."""
     world = make_scan_world(inputs, seed)
     scans = _scans(world, seed, work)
     own = _whole(scans[0])
@@ -119,27 +103,21 @@ def _found(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
     return {"singles": singles} | _together(work / f"low-{seed}", scans, seed)
 
 
-def _registered_elsewhere(seed: int, inputs: Path, work: Path, count: int) -> int:
+def _registered_elsewhere(seed: int, inputs: Path, work: Path) -> int:
     """How many of a town's photos, each from several priors, are registered on another town's scan."""
-
-    def made() -> dict[str, Any]:
-        world = make_scan_world(inputs, seed)
-        other = _whole(_scans(world, seed, work)[1])
-        images = _singles(world)
-        found = [_single(world, images[k % len(images)], other, (seed, 1000, k))[1] for k in range(count)]
-        return {"accepted": sum(one.accepted for one in found)}
-
-    return int(_kept(work / f"elsewhere-{seed}-{count}.json", made)["accepted"])
+    world = make_scan_world(inputs, seed)
+    other, images = _whole(_scans(world, seed, work)[1]), _singles(world)
+    found = [
+        _single(world, images[k % len(images)], other, (seed, 1000, k))[1].accepted for k in range(_NEGATIVES)
+    ]
+    return sum(found)
 
 
 def _scans(world: ScanWorld, seed: int, work: Path) -> list[Database]:
-    return [_scanned(work / f"scan-{seed}-{k}", of) for k, of in enumerate((world.scan, world.other_scan))]
-
-
-def _scanned(path: Path, scan: Path) -> Database:
-    database = Database.open(path) if path.exists() else Database.create(path)
-    add_scan(database, [scan])
-    return database
+    databases = [Database.create(work / f"scan-{seed}-{k}") for k in range(2)]
+    for database, scan in zip(databases, (world.scan, world.other_scan), strict=True):
+        add_scan(database, [scan])
+    return databases
 
 
 def _cloud(database: Database, frame: LocalFrame, box: PlanBox | None = None) -> PointCloud:
@@ -170,16 +148,16 @@ def _single(
 
 def _together(folder: Path, scanned: Sequence[Database], seed: int) -> dict[str, Any]:
     """How far off the low map's cameras are, metres, median, None without a place; what else is placed."""
-    if not (folder / "db").exists():
+
+    def make_map(making: Path) -> None:
         rng = np.random.default_rng(seed)
         middle = (float(rng.uniform(-60.0, 60.0)), float(rng.uniform(-50.0, 50.0)))
         flight = replace(_LOW, center_m=middle)
-        write_world(
-            folder,
-            replace(WorldOptions.short(seed), flight=flight, queries=0, street=0, negatives_per_kind=0),
-        )
-        make(folder / "making", "photos", folder / "drone")
-        (folder / "making").rename(folder / "db")
+        options = replace(WorldOptions.short(seed), flight=flight, queries=0, street=0, negatives_per_kind=0)
+        write_world(folder, options)
+        make(making, "photos", folder / "drone")
+
+    once(folder / "db", make_map)
     truth = open_world(folder).truth
     made = max(all_maps(folder / "db"), key=lambda one: len(one.images))
     assert isinstance(made, FeatureMap)
@@ -202,18 +180,7 @@ def _together(folder: Path, scanned: Sequence[Database], seed: int) -> dict[str,
     placed = place_map(start, scans[0], tried, read, AnchorOptions()).feature_map
     own_m = None
     if placed is not None:
-        here = truth.frame.enu_from(placed.frame)
-        own_m = float(
-            np.median(
-                [
-                    np.linalg.norm(
-                        here.act(image.cam_from_local.center)
-                        - truth.images[f"drone/{image.name}"].cam_from_local.center
-                    )
-                    for image in placed.images
-                ]
-            )
-        )
+        own_m = float(np.median(camera_errors(placed, truth)[0]))
     return {
         "alone": sum(alone),
         "own_m": own_m,
@@ -245,4 +212,4 @@ def _misplaced(feature_map: FeatureMap, rng: np.random.Generator) -> FeatureMap:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

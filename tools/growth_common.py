@@ -1,15 +1,13 @@
 """What the programs that measure growth share: an anchored database, contributions, errors."""
 
 import json
-import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -29,7 +27,7 @@ from reloc.localise.result import LocaliseResult
 from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
 from reloc.wire.query import LocaliseWireRequest
-from tools.figures import study_parser, write_figures
+from tools.figures import say, study_parser, write_figures
 from tools.growth_gates import WRONG_M, recorded
 from tools.worlds.album import TABLE_FILE, AlbumFact, PlannedPhoto, read_facts, write_album
 
@@ -95,8 +93,7 @@ class Registered:
         return self.error_m > WRONG_M
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class Verdict(NamedTuple):
     """One line of the contract: what was measured, and whether it holds."""
 
     name: str
@@ -119,11 +116,6 @@ def world_told(
     return args.out, world(seed=args.seed)
 
 
-def say(text: str) -> None:
-    sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
-    sys.stdout.flush()
-
-
 def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) -> "Album":
     """The album of these options in `folder`, made or finished unless it is complete."""
 
@@ -132,10 +124,6 @@ def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) 
             say(f"{folder.name}: {done} of {total} photos")
 
     write_album(folder, options, partial(plan, options), progress=progress)
-    return open_album(folder)
-
-
-def open_album(folder: Path) -> Album:
     lines = (folder / TABLE_FILE).read_text(encoding="utf-8").splitlines()
     rows = {row["path"]: row for row in map(json.loads, lines)}
     return Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
@@ -268,4 +256,4 @@ def grown(database: Database, out: Path, album: Album, gates: str = "gates") -> 
 
 def none_failed(count: int) -> Verdict:
     """Of photos that a step lost by an exception that it did not foresee, not by a reason."""
-    return Verdict(name="no step failed", text=f"{count} photos lost by an exception", holds=count == 0)
+    return Verdict("no step failed", f"{count} photos lost by an exception", count == 0)

@@ -15,8 +15,7 @@ more than 2 m.
 import sys
 from collections.abc import Sequence
 
-import numpy as np
-
+from tools.figures import median
 from tools.growth_common import (
     Album,
     Registered,
@@ -58,25 +57,25 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
     pictures = {r.fact.name for r in mine} | {r.fact.copy_of for r in active if r.fact.kind == "copy"}
     share = len(pictures & {f.name for f in own}) / max(len(own), 1)
     errors = [r.error_m for r in mine]
-    median = float(np.median(errors)) if errors else float("nan")
+    middle = median(errors)
     worst = max(errors, default=float("nan"))
     return [
         Verdict(
-            name="registered",
-            text=f"{share:.1%} of {len(own)} photos of the town, {_SHARE:.0%} wanted",
-            holds=share >= _SHARE,
+            "registered",
+            f"{share:.1%} of {len(own)} photos of the town, {_SHARE:.0%} wanted",
+            share >= _SHARE,
         ),
         Verdict(
-            name="median error",
-            text=f"{median:.3f} m, at most {_MEDIAN_M} m wanted; worst {worst:.2f} m",
-            holds=median <= _MEDIAN_M,
+            "median error",
+            f"{middle:.3f} m, at most {_MEDIAN_M} m wanted; worst {worst:.2f} m",
+            middle <= _MEDIAN_M,
         ),
         Verdict(
-            name="foreign photos",
-            text=f"{len(foreign)} of {len(album.of(*_FOREIGN))} admitted, none wanted",
-            holds=not foreign,
+            "foreign photos",
+            f"{len(foreign)} of {len(album.of(*_FOREIGN))} admitted, none wanted",
+            not foreign,
         ),
-        Verdict(name="wrong by more than 2 m", text=f"{len(wrong)}, none wanted", holds=not wrong),
+        Verdict("wrong by more than 2 m", f"{len(wrong)}, none wanted", not wrong),
     ]
 
 

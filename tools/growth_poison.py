@@ -19,6 +19,7 @@ before, while it is in service, and after `retire`: bit for bit, but for the num
 Writes poison.json. Exit code 0 if nothing wrong was promoted and every answer came back.
 """
 
+import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -32,6 +33,7 @@ from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import move_map
+from featuredb.plain_json import plain
 from featuredb.simworld.camera.photograph import render_depth
 from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
@@ -216,23 +218,10 @@ def answers(database: Database, album: Album) -> dict[str, str]:
     for fact in [*album.of("canary"), *album.of("honest")[:20]]:
         result = answer_of(localiser, album.folder / fact.name)
         pose = result.pose
-        found[fact.name] = repr(
-            (
-                result.reason,
-                result.inliers,
-                result.matches,
-                result.confidence,
-                None
-                if pose is None
-                else (
-                    pose.utm.tobytes().hex(),
-                    pose.cam_from_utm_xyzw.tobytes().hex(),
-                    pose.covariance.tobytes().hex(),
-                    pose.map_ids,
-                    pose.lineage,
-                ),
-            )
-        )
+        figures: list[Any] = [result.reason, result.inliers, result.matches, result.confidence]
+        if pose is not None:
+            figures += [pose.utm, pose.cam_from_utm_xyzw, pose.covariance, pose.map_ids, pose.lineage]
+        found[fact.name] = json.dumps(plain(figures))
     return found
 
 
@@ -242,18 +231,18 @@ def judge(o: PoisonOutcome, clean: float, fabricated: dict[str, Any]) -> list[Ve
     kinds = ", ".join(f"{count} {kind}" for kind, count in o.wrong.items())
     return [
         Verdict(
-            name="poison",
-            text=f"{kinds or 0} photos wrong in active maps, none wanted; {o.active} of {o.sent} registered; "
+            "poison",
+            f"{kinds or 0} photos wrong in active maps, none wanted; {o.active} of {o.sent} registered; "
             f"points off the surface {o.off_share:.1%} of at most {limit:.1%}",
-            holds=not o.wrong and o.off_share <= limit,
+            not o.wrong and o.off_share <= limit,
         ),
         Verdict(
-            name="retire",
-            text=f"{o.forced} quarantined maps forced in and retired, answers "
+            "retire",
+            f"{o.forced} quarantined maps forced in and retired, answers "
             f"{'came back' if o.restored else 'DID NOT COME BACK'}; a map moved by {_MOVE_M} m: "
             f"answers {'changed' if fabricated['changed'] else 'did not change'} and "
             f"{'came back' if fabricated['restored'] else 'DID NOT COME BACK'}",
-            holds=o.restored and fabricated["restored"] and fabricated["changed"],
+            o.restored and fabricated["restored"] and fabricated["changed"],
         ),
         none_failed(o.failed),
     ]

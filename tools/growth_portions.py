@@ -14,7 +14,6 @@
    which is in metres, is left out.
 """
 
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -40,7 +39,7 @@ from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from tools.figures import laid_on, study_parser, write_figures
+from tools.figures import laid_on, median, poses_in, say, study_parser, write_figures
 from tools.growth_gates import recorded
 
 _PORTIONS = 3
@@ -50,6 +49,7 @@ _MADE_UP_DISTANCE_M = 50.0
 _EXTENT_M = 100.0  # of the camera centres of a set without GPS, when the two are compared
 _OWNER = "portions"
 _NO_BUDGET_M = 1e6
+_MAKING = MapMakingOptions()
 
 
 @dataclass(slots=True, kw_only=True)
@@ -66,7 +66,6 @@ class State:
     """
 
     photos: list[Photo]
-    making: MapMakingOptions
     work: Path
     database: Database
     waiting: list[int] = field(default_factory=list)
@@ -77,19 +76,17 @@ class State:
     gates: Path | None = None
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
     parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     found = require_usable(scan_folder(args.photos, ScanOptions()), args.photos, least=2)
     photos = [replace(photo, owner=_OWNER) for photo in found]
-    making = MapMakingOptions()
-    joint = _reconstruct(photos, list(range(len(photos))), making, args.work)[0]
+    joint = _reconstruct(photos, list(range(len(photos))), args.work)[0]
     with tempfile.TemporaryDirectory() as scratch:
         state = State(
             photos=photos,
-            making=making,
             work=args.work,
             database=Database.create(Path(scratch) / "portions"),
             joint={p.name: c for p, c in zip(joint.photos, joint.model.centers(), strict=True)},
@@ -99,7 +96,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             state.waiting = sorted([*state.waiting, *rows])
             _take_in(state)
     write_figures(args.json, _judged(state, joint))
-    return 0
 
 
 def portions(count: int, cut: str) -> list[list[int]]:
@@ -117,15 +113,15 @@ def _take_in(state: State) -> None:
         _first_map(state)
     if state.frame is None or not state.waiting:
         return
-    made = _reconstructed(state.photos, state.waiting, state.making, state.work)
+    made = _reconstructed(state.photos, state.waiting, state.work)
     with nullcontext() if state.gates is None else _recording(state, state.gates):
         report = grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
-    sys.stdout.write(f"{report.as_text()}\n")
+    say(f"{report.as_text()}")
     _find_centers(state)
 
 
 def _first_map(state: State) -> None:
-    for component in _reconstruct(state.photos, state.waiting, state.making, state.work):
+    for component in _reconstruct(state.photos, state.waiting, state.work):
         if len(component.photos) < _LEAST_FIRST:
             break
         first = component.feature_map or _made_up(state, component)
@@ -142,7 +138,8 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
     if any(photo.gps is not None for photo in component.photos):
         return None
     model = component.model
-    scale = _MADE_UP_DISTANCE_M / _viewing_distance(component)
+    offsets = model.xyz[model.point_of] - model.centers()[model.photo_of]
+    scale = _MADE_UP_DISTANCE_M / float(np.median(np.linalg.norm(offsets, axis=1)))
     placement = Placement(
         method="gcp",
         local_from_sfm=Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3)),
@@ -150,19 +147,13 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
         residual_rms_m=0.0,
         evidence={"made_up": True},
     )
-    key = features_key(state.making.extractor)
+    key = features_key(_MAKING.extractor)
     read = Workspace(root=state.work).features
     features = [read_features(read(key, photo.sha256)) for photo in component.photos]
     rows = [state.photos.index(photo) for photo in component.photos]
     return build_map(
-        model, placement, _MADE_UP_FRAME, component.photos, features, _identity(rows), state.making.maps
+        model, placement, _MADE_UP_FRAME, component.photos, features, _identity(rows), _MAKING.maps
     )
-
-
-def _viewing_distance(component: Component) -> float:
-    model = component.model
-    offsets = model.xyz[model.point_of] - model.centers()[model.photo_of]
-    return float(np.median(np.linalg.norm(offsets, axis=1)))
 
 
 def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
@@ -184,27 +175,22 @@ def _find_centers(state: State) -> None:
         if summary.status == "active":
             feature_map = snapshot.load_map(summary.map_id)
             state.frame = state.frame or feature_map.frame
-            to_first = state.frame.enu_from(feature_map.frame)
-            for image in feature_map.images:
-                state.centers[image.name] = to_first.act(image.cam_from_local.center)
+            poses = poses_in(state.frame, feature_map)
+            state.centers |= {name: pose.center for name, pose in poses.items()}
     state.waiting = [r for r in state.waiting if state.photos[r].name not in state.centers]
 
 
-def _reconstruct(
-    photos: Sequence[Photo], rows: Sequence[int], making: MapMakingOptions, work: Path
-) -> list[Component]:
+def _reconstruct(photos: Sequence[Photo], rows: Sequence[int], work: Path) -> list[Component]:
     """Reconstructions of the photos of the given rows, largest first."""
     identity: Callable[[int], MapIdentity] = lambda number: _identity([*rows, number])  # noqa: E731
-    made = _reconstructed(photos, rows, making, work)
-    done = list(place_models(made, making, identity=identity))
+    made = _reconstructed(photos, rows, work)
+    done = list(place_models(made, _MAKING, identity=identity))
     return sorted(done, key=lambda c: -len(c.photos))
 
 
-def _reconstructed(
-    photos: Sequence[Photo], rows: Sequence[int], making: MapMakingOptions, work: Path
-) -> Reconstructed:
+def _reconstructed(photos: Sequence[Photo], rows: Sequence[int], work: Path) -> Reconstructed:
     chosen = [photos[r] for r in rows]
-    return reconstruct_photos(chosen, Workspace(root=work), making, InProcessExecutor())
+    return reconstruct_photos(chosen, Workspace(root=work), _MAKING, InProcessExecutor())
 
 
 def _identity(rows: Sequence[int]) -> MapIdentity:
@@ -228,10 +214,10 @@ def _judged(state: State, joint: Component) -> dict[str, float]:
         "joint": len(reference),
         "grown": len(both),
         "missing": len(reference.keys() - state.centers.keys()),
-        "median_m": float(np.median(apart)) if len(both) else float("nan"),
+        "median_m": median(apart),
         "largest_m": float(apart.max(initial=0)),
     }
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

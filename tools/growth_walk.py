@@ -24,6 +24,7 @@ from scipy.stats import chi2
 from featuredb.store import Database
 from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localiser import Localiser
+from tools.figures import squared
 from tools.growth_common import (
     WRONG_M,
     Album,
@@ -131,7 +132,7 @@ def ask_probes(database: Database, album: Album, upto: int) -> list[Probe]:
             center = album.truth.frame.enu_from(pose.frame).act(pose.cam_from_local.center)
             offset = center - true
             error = float(np.linalg.norm(offset))
-            normalised = float(offset @ np.linalg.solve(pose.covariance[3:, 3:], offset))
+            normalised = squared(offset, pose.covariance[3:, 3:])
         probes.append(Probe(error_m=error, normalised=normalised))
     return probes
 
@@ -166,36 +167,36 @@ def judge(steps: Sequence[Step], end: Step, commits: int, world: WalkOptions) ->
     why = "not stopped" if stopped is None else f"stopped for the budget at step {stopped.step + 1}"
     return [
         Verdict(
-            name="coverage follows",
-            text=f"{reach:.0f} m from the anchor's edge, {wanted:.0f} m wanted",
-            holds=reach >= wanted,
+            "coverage follows",
+            f"{reach:.0f} m from the anchor's edge, {wanted:.0f} m wanted",
+            reach >= wanted,
         ),
         Verdict(
-            name="true error inside the bound",
-            text=f"at most {ratio:.2f} of the 95 % on Earth at every step",
-            holds=bool(steps) and ratio <= 1.0,
+            "true error inside the bound",
+            f"at most {ratio:.2f} of the 95 % on Earth at every step",
+            bool(steps) and ratio <= 1.0,
         ),
         Verdict(
-            name="probes inside their 95 %",
-            text=f"{inside} of {len(asked)} along the whole way; mean squared normalised error {mean:.1f}",
-            holds=bool(asked) and inside >= _PROBE_SHARE * len(asked),
+            "probes inside their 95 %",
+            f"{inside} of {len(asked)} along the whole way; mean squared normalised error {mean:.1f}",
+            bool(asked) and inside >= _PROBE_SHARE * len(asked),
         ),
         Verdict(
-            name="no wrong answer",
-            text=f"{sum(e > WRONG_M for e in answers)} of {len(answers)} answers at any step more than "
+            "no wrong answer",
+            f"{sum(e > WRONG_M for e in answers)} of {len(answers)} answers at any step more than "
             f"{WRONG_M} m off, worst {max(answers, default=float('nan')):.2f} m",
-            holds=bool(answers) and max(answers) <= WRONG_M,
+            bool(answers) and max(answers) <= WRONG_M,
         ),
         Verdict(
-            name="budget",
-            text=f"largest claimed drift of an active map {over:.2f} of {DRIFT_BUDGET_M:.2f} m, {why}",
-            holds=over <= DRIFT_BUDGET_M and stopped is not None,
+            "budget",
+            f"largest claimed drift of an active map {over:.2f} of {DRIFT_BUDGET_M:.2f} m, {why}",
+            over <= DRIFT_BUDGET_M and stopped is not None,
         ),
         Verdict(
-            name="second anchor",
-            text=f"worst of {len(errors)} answered probes {max(errors, default=float('nan')):.3f} m of "
+            "second anchor",
+            f"worst of {len(errors)} answered probes {max(errors, default=float('nan')):.3f} m of "
             f"{_AFTER_M} m; {len(errors)} of {len(end.probes)} answered; maps moved in {commits} commits",
-            holds=bool(errors) and max(errors) < _AFTER_M and commits == 1,
+            bool(errors) and max(errors) < _AFTER_M and commits == 1,
         ),
         none_failed(sum(s.failed for s in (*steps, end))),
     ]

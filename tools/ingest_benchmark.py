@@ -12,8 +12,6 @@ import resource
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,39 +44,20 @@ print(json.dumps(max(([m.image(i).name for i in m.reg_image_ids()] for m in mode
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cost:
-    """Of one set: processor seconds, photos in the largest model or map and in both, maps with a place."""
-
-    colmap_s: float
-    colmap_photos: int
-    ours_s: float
-    ours_photos: int
-    both: int
-    placed: int
-
-    @property
-    def ratio(self) -> float:
-        return self.ours_s / self.colmap_s
-
-
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
-    args = parser.parse_args(argv)
-    costs = {folder.parent.name: measured(folder) for folder in args.folders}
-    figures: dict[str, Any] = {
-        name: asdict(cost) | {"ratio": cost.ratio, "share": cost.both / max(1, cost.colmap_photos)}
-        for name, cost in costs.items()
-    }
-    figures["worst_ratio"] = max(cost.ratio for cost in costs.values())
-    figures["fewer"] = max(cost.colmap_photos - cost.ours_photos for cost in costs.values())
+    args = parser.parse_args()
+    figures: dict[str, Any] = {folder.parent.name: measured(folder) for folder in args.folders}
+    costs = list(figures.values())
+    figures["worst_ratio"] = max(cost["ratio"] for cost in costs)
+    figures["fewer"] = max(cost["colmap_photos"] - cost["ours_photos"] for cost in costs)
     write_figures(args.json, figures)
-    return 0
 
 
-def measured(folder: Path) -> Cost:
-    """Both programs over the photos of a folder."""
+def measured(folder: Path) -> dict[str, float]:
+    """Both programs over the photos of a folder: processor seconds, photos in the largest model or map and in
+    both, maps with a place."""
     with tempfile.TemporaryDirectory() as scratch:
         colmap_s, told = _processor_s("-c", _THEIRS, str(folder), scratch)
         database = Path(scratch) / "db"
@@ -88,14 +67,16 @@ def measured(folder: Path) -> Cost:
         maps = all_maps(database)
     theirs = set(json.loads(told.splitlines()[-1]))
     ours = {image.name for image in max(maps, key=lambda one: len(one.images)).images}
-    return Cost(
-        colmap_s=colmap_s,
-        colmap_photos=len(theirs),
-        ours_s=ours_s,
-        ours_photos=len(ours),
-        both=len(theirs & ours),
-        placed=sum(isinstance(one, FeatureMap) for one in maps),
-    )
+    return {
+        "colmap_s": colmap_s,
+        "colmap_photos": len(theirs),
+        "ours_s": ours_s,
+        "ours_photos": len(ours),
+        "ratio": ours_s / colmap_s,
+        "both": len(theirs & ours),
+        "share": len(theirs & ours) / max(1, len(theirs)),
+        "placed": sum(isinstance(one, FeatureMap) for one in maps),
+    }
 
 
 def _processor_s(*argv: str) -> tuple[float, str]:
@@ -109,4 +90,4 @@ def _processor_s(*argv: str) -> tuple[float, str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

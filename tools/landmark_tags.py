@@ -1,6 +1,6 @@
 """One landmark by many people, a third of whom say where they were: placed as well as that allows?
 
-    python -m tools.landmark_tags --photos FOLDER --work DIR [--draws 40] [--json FILE]
+    python -m tools.landmark_tags --photos FOLDER --work DIR [--json FILE]
 
 1. The photos, without positions, become a map. It is the truth, with its cameras spread over 120 m.
 2. A third of its photos get geotags that are off by 8 m, in a table that says nothing of accuracy. The table
@@ -10,8 +10,6 @@
    have a place, answer, and lie inside the 68 % and 95 % bounds that the placement gives them.
 """
 
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,12 +27,13 @@ from ingest.own_frame import held_of
 from ingest.photos.photo import Photo, whose_cameras
 from ingest.register.gps import place_by_gps
 from tools.commands import featuredb
-from tools.figures import laid_on, study_parser, write_figures
+from tools.figures import inside_figures, laid_on, median, poses_in, say, squared, study_parser, write_figures
 from tools.made_maps import all_maps, copied, make, photo_names, position_table
 
 _EXTENT_M, _OFF_M, _STATED_M = 120.0, 8.0, 30.0
 _FRAME = LocalFrame(latitude_deg=52.5186, longitude_deg=13.3750, height_m=75.0)
 _COUNTS = (5, 8, 15, 25)
+_DRAWS, _SEED = 40, 1  # of each kind and number
 _KINDS = {
     "8 m": (8.0, 0.0, 0.0),
     "far out": (8.0, 0.2, 0.0),
@@ -58,17 +57,14 @@ class Landmark:
         return np.array([pose.center for pose in self.poses])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__, "--photos", "--work", "--seed")
-    parser.add_argument("--draws", type=int, default=40, help="of each kind and number")
-    args = parser.parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--photos", "--work").parse_args()
     make(args.work / "untagged", "photos", args.photos)
     landmark = true_landmark(args.work / "untagged")
-    figures = ingested(landmark, args.photos, args.work, args.seed)
+    figures = ingested(landmark, args.photos, args.work)
     with threadpool_limits(1):  # matrices are small
-        figures |= drawn(landmark, args.draws, args.seed)
+        figures |= drawn(landmark)
     write_figures(args.json, figures)
-    return 0
 
 
 def true_landmark(database: Path) -> Landmark:
@@ -90,10 +86,10 @@ def true_landmark(database: Path) -> Landmark:
     )
 
 
-def ingested(landmark: Landmark, photos: Path, work: Path, seed: int) -> dict[str, float]:
+def ingested(landmark: Landmark, photos: Path, work: Path) -> dict[str, float]:
     """What the command makes of a table in which a third of the photos have a geotag."""
     folder = copied(photos, photo_names(photos), work / "tagged", strip=False)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     rows = rng.choice(len(landmark.names), len(landmark.names) // 3, replace=False)
     tags = _FRAME.geodetic_from_enu(landmark.xyz[rows] + rng.normal(0.0, _OFF_M, (len(rows), 3)))
     told = {landmark.names[k]: (f"{tag[0]:.7f}", f"{tag[1]:.7f}") for k, tag in zip(rows, tags, strict=True)}
@@ -104,9 +100,8 @@ def ingested(landmark: Landmark, photos: Path, work: Path, seed: int) -> dict[st
     places: dict[str, FloatArray] = {}
     for summary in snapshot.maps():
         if summary.status == "active":
-            one = snapshot.load_map(summary.map_id)
-            to_ours = _FRAME.enu_from(one.frame)
-            places |= {Path(i.name).name: to_ours.act(i.cam_from_local.center) for i in one.images}
+            poses = poses_in(_FRAME, snapshot.load_map(summary.map_id))
+            places |= {Path(name).name: pose.center for name, pose in poses.items()}
     true = dict(zip(landmark.names, landmark.xyz, strict=True))
     both = sorted(true.keys() & places.keys())
     aligned = laid_on(places, true)
@@ -114,23 +109,20 @@ def ingested(landmark: Landmark, photos: Path, work: Path, seed: int) -> dict[st
     shape = [] if aligned is None else [np.linalg.norm(aligned.act(places[n]) - true[n]) for n in both]
     return {
         "photos": len(landmark.names),
-        "tagged": len(rows),
         "active": len(both),
         "share": len(both) / len(landmark.names),
-        "off_m": float(np.median(off)) if off else float("nan"),
-        "shape_m": float(np.median(shape)) if shape else float("nan"),
+        "off_m": median(off),
+        "shape_m": median(shape),
     }
 
 
-def drawn(landmark: Landmark, draws: int, seed: int) -> dict[str, float]:
+def drawn(landmark: Landmark) -> dict[str, float]:
     """Places by drawn geotags, as ingest makes them: squared errors over their covariances."""
-    scores: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
-    tried = 0
+    scores: dict[str, list[tuple[float, float]]] = {"answering": [], "waiting": []}
     for number, (kind, (off_m, far, pinned)) in enumerate(_KINDS.items()):
         for count in _COUNTS:
-            here = {True: 0, False: 0}
-            for draw in range(draws):
-                rng = np.random.default_rng((seed, number, count, draw))
+            for draw in range(_DRAWS):
+                rng = np.random.default_rng((_SEED, number, count, draw))
                 rows = np.sort(rng.choice(len(landmark.names), count, replace=False))
                 tags = landmark.xyz[rows] + rng.normal(0.0, off_m, (count, 3))
                 out, on = rng.random(count) < far, rng.random(count) < pinned
@@ -139,40 +131,26 @@ def drawn(landmark: Landmark, draws: int, seed: int) -> dict[str, float]:
                 sigmas = np.tile([_STATED_M, _STATED_M, np.inf if draw % 2 else _STATED_M], (count, 1))
                 held = held_of(landmark.poses, (), landmark.camera_of)
                 placed = place_by_gps(landmark.xyz[rows], tags, sigmas, None, held, landmark.camera_of[rows])
-                if placed.reason is None:
-                    assert placed.local_from_sfm is not None
-                    assert placed.covariance is not None
-                    answers = not placed.provisional
-                    here[answers] += 1
-                    error = placed.local_from_sfm.inverse().log()
-                    camera = point_jacobian(landmark.xyz[[rng.integers(len(landmark.names))]])[0, :2]
-                    parts = [camera, np.eye(7)[1:4]]
-                    scores[answers].append(_squares(error, placed.covariance, parts))
-            tried += draws
-            sys.stdout.write(
-                f"{kind:<8} {count:>3} tags: {here[True]} answer, {here[False]} wait, of {draws}\n"
-            )
-    result = {"draws": float(tried)}
-    for name, of in (("answering", scores[True]), ("waiting", scores[False])):
-        result[name] = len(of) / tried
-        for k, (part, size) in enumerate((("position", 2), ("orientation", 3))):
-            for level in (0.68, 0.95):
-                inside = [score[k] <= chi2.ppf(level, size) for score in of]
-                result[f"{name}_{part}_{100 * level:.0f}"] = (
-                    float(np.mean(inside)) if inside else float("nan")
+                if placed.local_from_sfm is None or placed.covariance is None or placed.reason is not None:
+                    continue
+                error = placed.local_from_sfm.inverse().log()
+                camera = point_jacobian(landmark.xyz[[rng.integers(len(landmark.names))]])[0, :2]
+                position, orientation = (
+                    squared(rows @ error, rows @ placed.covariance @ rows.T)
+                    for rows in (camera, np.eye(7)[1:4])
                 )
-    result["far"] = float(
-        sum(p > 2 * chi2.ppf(0.999, 2) or o > 2 * chi2.ppf(0.999, 3) for p, o in scores[True])
-    )
+                scores["waiting" if placed.provisional else "answering"].append((position, orientation))
+            counts = ", ".join(f"{len(of)} {name}" for name, of in scores.items())
+            say(f"{kind:<8} {count:>3} tags: {counts} so far")
+    result = {"draws": float(_DRAWS * len(_KINDS) * len(_COUNTS))}
+    for name, of in scores.items():
+        result[name] = len(of) / result["draws"]
+        for k, (part, size) in enumerate((("position", 2), ("orientation", 3))):
+            result |= inside_figures(f"{name}_{part}", [score[k] for score in of], size)
+    limits = 2.0 * chi2.ppf(0.999, [2, 3])
+    result["far"] = float(sum((np.array(score) > limits).any() for score in scores["answering"]))
     return result
 
 
-def _squares(error: FloatArray, covariance: FloatArray, parts: Sequence[FloatArray]) -> tuple[float, float]:
-    position, orientation = (
-        float((rows @ error) @ np.linalg.solve(rows @ covariance @ rows.T, rows @ error)) for rows in parts
-    )
-    return position, orientation
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -12,10 +12,9 @@ the map stores of it (root mean square of its parameters: 1 is right). Worst is 
 of a median to the baseline's, or to the reported radius.
 """
 
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,7 @@ from featuredb.store import Database
 from reloc.localise.answer import placement_covariance
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
 from reloc.wire.query import CameraRequest
-from tools.figures import study_parser, write_figures
+from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
 from tools.laser_baseline import colmap_given_the_lens
 from tools.laser_set import FRAME, LaserSet, read_laser_set, with_exif
 from tools.made_maps import all_maps, make
@@ -40,21 +39,20 @@ from tools.real_photos import ask_poses
 class Errors:
     """Errors of one kind of poses, of `wanted`, in metres and degrees, and the 68 % radii reported."""
 
-    metres: tuple[float, ...]
-    degrees: tuple[float, ...]
-    told_m: tuple[float, ...] = ()
-    told_deg: tuple[float, ...] = ()
+    metres: Sequence[float]
+    degrees: Sequence[float]
+    told_m: Sequence[float] = ()
+    told_deg: Sequence[float] = ()
     wanted: int = 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         figures = judged(read_laser_set(args.folder), Path(scratch) / args.folder.name)
     write_figures(args.json, figures)
-    return 0
 
 
 def judged(truth: LaserSet, work: Path) -> dict[str, float]:
@@ -74,10 +72,7 @@ def judged(truth: LaserSet, work: Path) -> dict[str, float]:
         "told": answer_errors(database, asked, truth, told),
         "unknown": answer_errors(database, asked, truth, None),
     }
-    theirs = {
-        "map": pose_errors(baseline.mapped, truth.poses),
-        "asked": pose_errors(baseline.asked, truth.poses),
-    }
+    theirs = {"map": errors_of(baseline.mapped, truth), "asked": errors_of(baseline.asked, truth)}
     return figures_of(kinds, theirs) | {"lens_off": lens_error(maps, truth)}
 
 
@@ -92,15 +87,15 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
             mine = errors.metres if unit == "m" else errors.degrees
             reported = errors.told_m if unit == "m" else errors.told_deg
             baseline = other.metres if unit == "m" else other.degrees
-            median = _median(mine)
+            middle = median(mine)
             figures |= {
-                f"{kind}_{unit}": median,
-                f"{kind}_reported_{unit}": _median(reported),
-                f"{kind}_colmap_{unit}": _median(baseline),
+                f"{kind}_{unit}": middle,
+                f"{kind}_reported_{unit}": median(reported),
+                f"{kind}_colmap_{unit}": median(baseline),
             }
-            ratios.append(median / _median(reported))
+            ratios.append(middle / median(reported))
             if unit == "m":
-                ratios.append(median / _median(baseline))
+                ratios.append(middle / median(baseline))
         ratios.append(1.0 if errors.metres and len(errors.metres) == errors.wanted else float("inf"))
     figures["worst"] = float(np.nan_to_num(ratios, nan=np.inf).max())
     return figures
@@ -119,20 +114,20 @@ def lens_error(maps: Sequence[FeatureMap], truth: LaserSet) -> float:
 
 def map_errors(maps: Sequence[FeatureMap], truth: LaserSet) -> Errors:
     """Of the cameras of placed maps, as they lie."""
-    poses, told_m, told_deg = {}, [], []
+    poses: dict[str, Rigid3] = {}
+    told_m, told_deg = [], []
     for one in maps:
         area = build_area([one])
-        turn = FRAME.enu_from(one.frame)
+        poses |= poses_in(FRAME, one)
         for image in one.images:
             pose = image.cam_from_local
-            poses[image.name] = pose @ turn.inverse()
             world_from_cam = np.kron(np.eye(2), pose.rotation.T)
             own = np.zeros((6, 6)) if image.covariance is None else image.covariance
             covariance = world_from_cam @ own @ world_from_cam.T
             covariance += placement_covariance(area, one, pose.center)
             told_m.append(error_radius(covariance[3:, 3:]))
             told_deg.append(float(np.degrees(error_radius(covariance[:3, :3]))))
-    return pose_errors(poses, truth.poses, told_m, told_deg, len(truth.mapped))
+    return replace(errors_of(poses, truth), told_m=told_m, told_deg=told_deg, wanted=len(truth.mapped))
 
 
 def answer_errors(database: Database, photos: Path, truth: LaserSet, camera: CameraRequest | None) -> Errors:
@@ -140,34 +135,19 @@ def answer_errors(database: Database, photos: Path, truth: LaserSet, camera: Cam
     rows = ask_poses(database, photos, truth.asked, FRAME, truth.poses, camera)
     found = [row for row in rows if row.error is not None]
     return Errors(
-        metres=tuple(row.error.position_m for row in found if row.error is not None),
-        degrees=tuple(row.error.angle_deg for row in found if row.error is not None),
-        told_m=tuple(row.position_68_m for row in found),
-        told_deg=tuple(row.orientation_68_deg for row in found),
+        metres=[row.error.position_m for row in found if row.error is not None],
+        degrees=[row.error.angle_deg for row in found if row.error is not None],
+        told_m=[row.position_68_m for row in found],
+        told_deg=[row.orientation_68_deg for row in found],
         wanted=len(truth.asked),
     )
 
 
-def pose_errors(
-    poses: Mapping[str, Rigid3],
-    truth: Mapping[str, Rigid3],
-    told_m: Sequence[float] = (),
-    told_deg: Sequence[float] = (),
-    wanted: int = 0,
-) -> Errors:
+def errors_of(poses: Mapping[str, Rigid3], truth: LaserSet) -> Errors:
     """Poses cam_from_local against the true ones."""
-    return Errors(
-        metres=tuple(float(np.linalg.norm(p.center - truth[name].center)) for name, p in poses.items()),
-        degrees=tuple(p.angle_to_deg(truth[name]) for name, p in poses.items()),
-        told_m=tuple(told_m),
-        told_deg=tuple(told_deg),
-        wanted=wanted,
-    )
-
-
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
+    metres, degrees = pose_errors(poses, truth.poses)
+    return Errors(metres=metres.tolist(), degrees=degrees.tolist())
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -9,9 +9,7 @@ matching is what an ingest does: structure from motion, the adjustment, placemen
 the map. Then twenty photos that the map has not seen are localised by EXIF alone.
 
 For each sigma of the positions: shares of errors of position and orientation inside their 68 % and 95 %
-bounds, over all answers and over the quarter with fewest inliers, and how many lie outside twice their
-99.9 % bound. The answers of one draw share its lens and place, so the shares' own standard deviations are
-taken over draws.
+bounds, and how many lie outside twice their 99.9 % bound.
 
 Photos from above determine a lens' radial distortion badly, and what it is off by bends the map. One flight
 for five draws looks straight down from one height, by a barometer: heights are off by 5 m together and by
@@ -19,15 +17,11 @@ for five draws looks straight down from one height, by a barometer: heights are 
 and state 4 m. Printed is how far the map's cameras are off in height after a similarity.
 """
 
-import argparse
-import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +36,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
+from featuredb.simworld.camera.shot import look_pose
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
 from ingest.map_builder import MapIdentity, MapOptions, build_map
@@ -53,7 +48,8 @@ from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
-from tools.figures import pose_offset, study_parser, write_figures
+from tools.figures import inside_figures, pose_offset, squared, study_parser, write_figures
+from tools.worlds.film_frame import in_order
 
 _WIDTH, _HEIGHT, _FOCAL_PX = 1200, 900, 1000.0
 _SIGMAS_M = (0.02, 0.5, 3.0)  # of positions
@@ -61,19 +57,10 @@ _DRAWS_A_LEVEL_FLIGHT = 5
 _KEYPOINT_PX = 0.5
 _SHOWN = 0.7  # of the points in view
 _QUERIES = 20
-_LEVELS = (0.68, 0.95)
+_FAR = 4.0 * float(chi2.ppf(0.999, 3))
 _KEY = "drone"
 _PARTS = (slice(0, 3), slice(3, 6))  # of an error: rotation, displacement
 _EPSG, _ORIGIN = 32632, (456_800.0, 5_429_300.0, 120.0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerErrors:
-    """Squared errors over their covariance, of three axes each, and the pose's inliers."""
-
-    position: float
-    orientation: float
-    inliers: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,21 +97,23 @@ class LensDraw:
         )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+def main() -> None:
+    parser = study_parser(__doc__)
+    parser.add_argument("--draws", type=int, default=300)
+    args = parser.parse_args()
     figures: dict[str, float] = {}
     for sigma in _SIGMAS_M:
-        with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-            draws = list(pool.map(partial(drawn, sigma_m=sigma), range(args.draws)))
-        figures |= {f"{name}_{100.0 * sigma:g}cm": value for name, value in judged(draws).items()}
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        found_bends = pool.map(bent, range(max(args.draws // _DRAWS_A_LEVEL_FLIGHT, 1)))
-        bends = [bend for bend in found_bends if bend is not None]
+        answers = [one for draw in in_order(partial(drawn, sigma_m=sigma), args.draws, 2, 1) for one in draw]
+        for k, kind in enumerate(("orientation", "position")):
+            squares = [one[k] for one in answers]
+            found = inside_figures(kind, squares) | {f"{kind}_far": sum(one > _FAR for one in squares)}
+            figures |= {f"{name}_{100.0 * sigma:g}cm": value for name, value in found.items()}
+    level_flights = in_order(bent, max(args.draws // _DRAWS_A_LEVEL_FLIGHT, 1), 2, 1)
+    bends = [bend for bend in level_flights if bend is not None]
     figures["level"] = float(len(bends))
     if bends:
         figures |= {"bent_m": float(np.median(bends)), "bent_90_m": float(np.quantile(bends, 0.9))}
     write_figures(args.json, figures)
-    return 0
 
 
 def bent(seed: int) -> float | None:
@@ -146,34 +135,9 @@ def bent(seed: int) -> float | None:
     return None if fit is None else float(np.std((fit.act(model.centers()) - centers[model.rows])[:, 2]))
 
 
-def judged(draws: Sequence[Sequence[AnswerErrors]]) -> dict[str, float]:
-    """Figures of all draws."""
-    answers = [answer for draw in draws for answer in draw]
-    quarter = np.quantile([a.inliers for a in answers], 0.25) if answers else 0.0
-    hardest = [a for a in answers if a.inliers <= quarter]
-    figures = {
-        "draws": float(len(draws)),
-        "empty": float(sum(not draw for draw in draws)),
-        "answers": float(len(answers)),
-    }
-    for kind in ("position", "orientation"):
-        for level in _LEVELS:
-            bound = chi2.ppf(level, 3)
-            figures[f"{kind}_{level * 100:.0f}"] = _share(answers, kind, bound)
-            figures[f"{kind}_{level * 100:.0f}_hardest"] = _share(hardest, kind, bound)
-        far = sum(getattr(a, kind) > 4.0 * chi2.ppf(0.999, 3) for a in answers)
-        middle = float(np.median([getattr(a, kind) for a in answers])) if answers else float("nan")
-        figures |= {f"{kind}_far": float(far), f"{kind}_median": middle}
-    return figures
-
-
-def _share(answers: Sequence[AnswerErrors], kind: str, bound: float) -> float:
-    """Share of the answers inside."""
-    return float(np.mean([getattr(a, kind) <= bound for a in answers])) if answers else float("nan")
-
-
-def drawn(seed: int, sigma_m: float) -> list[AnswerErrors]:
-    """One draw; empty where no map is placed."""
+def drawn(seed: int, sigma_m: float) -> list[tuple[float, float]]:
+    """Squared errors of orientation and position over their covariances of one draw's answers, of three axes
+    each; none where no map is placed."""
     scene = scene_of(seed)
     frame = LocalFrame.from_utm(*_ORIGIN, _EPSG)
     poses = flight(scene.rng)
@@ -185,7 +149,8 @@ def drawn(seed: int, sigma_m: float) -> list[AnswerErrors]:
     request = LocaliseRequest(camera_key=_KEY, exif_focal_px=_FOCAL_PX)
     for _ in range(_QUERIES):
         height, tilt = scene.rng.uniform(25.0, 60.0), scene.rng.uniform(0.0, 30.0)
-        pose = looking_down([*scene.rng.uniform(-35.0, 35.0, 2), height], tilt, scene.rng.uniform(0, 360))
+        place = [*scene.rng.uniform(-35.0, 35.0, 2), height]
+        pose = look_pose(place, scene.rng.uniform(0, 360), -90.0 - tilt)
         result = localise_features(scene.seen(pose)[1], request, indexed).result
         if result.pose is None:
             continue
@@ -193,8 +158,8 @@ def drawn(seed: int, sigma_m: float) -> list[AnswerErrors]:
         true = pose @ frame.enu_from(answer.frame)
         turn = np.kron(np.eye(2), answer.frame.true_enu_from_enu(answer.cam_from_local.center))
         error = turn @ pose_offset(answer.cam_from_local, true)
-        squares = [float(error[k] @ np.linalg.solve(answer.covariance[k, k], error[k])) for k in _PARTS]
-        answers.append(AnswerErrors(orientation=squares[0], position=squares[1], inliers=result.inliers))
+        orientation, position = (squared(error[k], answer.covariance[k, k]) for k in _PARTS)
+        answers.append((orientation, position))
     return answers
 
 
@@ -223,24 +188,13 @@ def scene_of(seed: int) -> LensDraw:
     )
 
 
-def looking_down(center: Sequence[float], tilt_deg: float, heading_deg: float) -> Rigid3:
-    """cam_from_local of a camera at `center`, tilted from straight down."""
-    tilt, heading = np.radians([tilt_deg, heading_deg])
-    turn = Rigid3.exp(np.array([0.0, 0.0, heading, 0.0, 0.0, 0.0])).rotation
-    lean = Rigid3.exp(np.array([tilt, 0.0, 0.0, 0.0, 0.0, 0.0])).rotation
-    rotation = lean @ np.diag([1.0, -1.0, -1.0]) @ turn
-    return Rigid3(rotation=rotation, translation=-rotation @ np.array(center))
-
-
 def flight(rng: np.random.Generator, height_m: float = 0.5, tilt_deg: float = 4.0) -> list[Rigid3]:
     """Four lines of six photos, there and back, that differ by so much."""
     poses = []
     for line, y in enumerate(np.linspace(-33.0, 33.0, 4)):
         for x in np.linspace(-40.0, 40.0, 6) * (1 if line % 2 == 0 else -1):
             center = np.array([x, y, 45.0]) + rng.normal(0.0, [1.0, 1.0, height_m])
-            poses.append(
-                looking_down(center.tolist(), abs(rng.normal(0, tilt_deg)), 90.0 + 180.0 * (line % 2))
-            )
+            poses.append(look_pose(center, 90.0 + 180.0 * (line % 2), -90.0 - abs(rng.normal(0, tilt_deg))))
     return poses
 
 
@@ -333,11 +287,5 @@ def _model_of(
     return max(read_models(output), key=lambda model: len(model.rows), default=None)
 
 
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = study_parser(__doc__)
-    parser.add_argument("--draws", type=int, default=300)
-    return parser.parse_args(argv)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -35,8 +35,8 @@ from ingest.colmap.picture_shear import picture_shear
 from ingest.photos.photo import Photo
 from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
-from tools.figures import study_parser, write_figures
-from tools.made_maps import all_maps, make
+from tools.figures import say, study_parser, write_figures
+from tools.made_maps import all_maps, make, once
 
 WIDTHS = tuple(field.name for field in fields(LensWidths))
 _DROP = float(chi2.ppf(0.95, 1)) / 2.0
@@ -103,10 +103,10 @@ def write_shears(databases: Sequence[Path]) -> None:
     largest = [max(all_maps(path), key=lambda one: len(one.images)) for path in databases]
     shears = np.log([picture_shear(block_of_map(one)).size for one in largest])
     for path, shear in zip(databases, np.exp(shears), strict=True):
-        sys.stdout.write(f"{path.name}: pictures sheared by {shear:.1e}\n")
+        say(f"{path.name}: pictures sheared by {shear:.1e}")
     if len(shears) > 1:
         few, hardly = np.exp(shears.mean() + shears.std(ddof=1) * norm.isf([0.05, 0.001]))
-        sys.stdout.write(f"one map in twenty is above {few:.1e}, one in a thousand above {hardly:.1e}\n")
+        say(f"one map in twenty is above {few:.1e}, one in a thousand above {hardly:.1e}")
 
 
 def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[list[Told], list[float]]:
@@ -123,7 +123,7 @@ def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[lis
         squares, freedom = lens_squares(problem.weighted())
         for one, free in zip(squares.tolist(), freedom.tolist(), strict=True):
             if np.isfinite(one):
-                sys.stdout.write(f"{folder}: photos disagree {one / free:.2f} times ({free:.0f} degrees)\n")
+                say(f"{folder}: photos disagree {one / free:.2f} times ({free:.0f} degrees)")
                 disagreement.append(one / free)
         told += _told(problem, terms, focal_px, options)
     return told, disagreement
@@ -211,12 +211,10 @@ def _focals(names: Sequence[str], camera_of: Sequence[int], photos: Mapping[str,
 
 def _database(folder: Path, work: Path) -> Path:
     """Of the folder's photos, made if it is not there."""
-    database = work / folder.parent.name / folder.name / "db"
-    if not database.exists():
-        control = folder.parent / "gcp_list.txt"
-        more = ("--gcp", str(control)) if control.exists() else ()
-        make(database, "photos", folder, more)
-    return database
+    control = folder.parent / "gcp_list.txt"
+    more = ("--gcp", str(control)) if control.exists() else ()
+    target = work / folder.parent.name / folder.name / "db"
+    return once(target, lambda database: make(database, "photos", folder, more))
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ def measure(command: list[str]) -> dict[str, float]:
     return {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_tree_mib": peak / 2**20}
 
 
-def main() -> int:
+def main() -> None:
     """Make the scan unless it is there, add it to a fresh database, print what it took as JSON."""
     parser = study_parser(__doc__)
     parser.add_argument("--points", type=int, default=5_000_000)
@@ -119,8 +119,7 @@ def main() -> int:
     figures = measure(run)
     figures["points_per_cpu_second"] = args.points / figures["cpu_seconds"]
     write_figures(args.json, {k: round(v, 1) for k, v in figures.items()})
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

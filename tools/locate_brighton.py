@@ -10,9 +10,6 @@
    anchoring, localisation and renderer. Pixels whose nearest points lie at several depths have no truth.
 """
 
-import sys
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -20,26 +17,24 @@ from scipy.spatial import cKDTree
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.store import Database
-from reloc.answered_view import AnsweredView
 from reloc.localiser import Localiser
 from reloc.overlay import map_points_in_view
 from reloc.pixels.locate import locate
-from reloc.pixels.surfaces import MapSurface, RaySurface, scan_surface
+from reloc.pixels.surfaces import MapSurface, scan_surface
 from tools.anchor_brighton import anchored_on
 from tools.figures import write_figures
 from tools.locate_pixels import Miss, miss_figures, misses, view_of
 from tools.picked import Scan, read_scan, visible
 from tools.real_photos import ingest
-from tools.scan_truth import scan_parser, scan_truth
+from tools.scan_poses import scan_parser, scan_truth
 
 _SEED, _PIXELS = 1, 300  # of each photo
 _NEAR, _REACH_PX = 12, 12.0  # points of the scan around a pixel, and how far they may be
 _ONE_SURFACE_M = 0.3  # between the depths of nine tenths of them
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = scan_parser(__doc__, "--work", "--held-out").parse_args(argv)
+def main() -> None:
+    args = scan_parser(__doc__, "--work", "--held-out").parse_args()
     truth = scan_truth(args)
     scan = read_scan(args.scan, truth.frame, truth.epsg)
     rng = np.random.default_rng(_SEED)
@@ -56,20 +51,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         pixels, places = _truth(scan, truth.cameras[name], truth.poses[name], rng)
         true = view.frame.enu_from(truth.frame).act(places)
         asked, photos = asked + len(pixels), photos + 1
-        for kind, surface in _surfaces(database, localiser, view).items():
+        utm = map_points_in_view(localiser.areas_of(view.map_ids[:1]), view)
+        by_map = MapSurface(points=view.frame.enu_from_utm(utm, view.epsg))
+        for kind, surface in (("scan", scan_surface(database, view)), ("map", by_map)):
             found[kind] += misses(view, true, locate(view, surface, pixels))
     figures = {"photos": photos, "asked": asked}
     for kind, those in found.items():
         figures |= {f"{kind}_located": len(those)} | miss_figures(kind, those)
     write_figures(args.json, figures)
-    return 0
-
-
-def _surfaces(database: Database, localiser: Localiser, view: AnsweredView) -> dict[str, RaySurface]:
-    scan = scan_surface(database, view)
-    assert scan is not None
-    utm = map_points_in_view(localiser.areas_of(view.map_ids[:1]), view)
-    return {"scan": scan, "map": MapSurface(points=view.frame.enu_from_utm(utm, view.epsg))}
 
 
 def _truth(
@@ -88,4 +77,4 @@ def _truth(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -9,13 +9,11 @@
    What the scan's strips are off by is stated, as from a data sheet.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
 
 from featuredb.adjust.block import whole_camera
 from featuredb.geometry.arrays import FloatArray
@@ -32,8 +30,7 @@ from reloc.pixels.surfaces import RaySurface, scan_surface
 from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored
-from tools.commands import featuredb
-from tools.figures import study_parser, write_figures
+from tools.figures import inside, inside_figures, squared, study_parser, write_figures
 from tools.worlds.scan_world import make_scan_world
 from tools.worlds.seen_places import SeenPlaces
 
@@ -52,13 +49,11 @@ class Miss:
     at_edge: bool
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     work: Path = args.work
     world = make_scan_world(args.inputs or work, _SEED)
-    featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
-    path = anchored(work, work / "mapped", world, other=False)[0]
-    database = Database.open(path)
+    database = Database.open(anchored(work, world, other=False)[0])
     scene, truth = town_of(WorldOptions.short(_SEED)), world.world.truth
     rng = np.random.default_rng(_SEED)
     localiser = Localiser.open(database)
@@ -71,7 +66,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         if view is None:
             continue
         surface = scan_surface(database, view)
-        assert surface is not None
         surface.common_m = _STRIPS_M
         target = _Target(scene, truth, photo, view)
         found = target.looked_at(rng, surface, _PIXELS)
@@ -81,7 +75,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             drawn += target.drawn(rng, surface, _PIXELS // 5)
     figures = miss_figures("answered", answered) | miss_figures("drawn", drawn)
     write_figures(args.json, figures | {"refused": refused, "located": len(answered)})
-    return 0
 
 
 class _Target:
@@ -120,8 +113,8 @@ def misses(view: AnsweredView, places: FloatArray, found: Sequence[PixelPlace]) 
         if place.utm is None or place.covariance is None:
             continue
         error = view.frame.enu_from_utm(place.utm, place.epsg) - true
-        squared = float(error @ np.linalg.solve(place.covariance, error))
-        missed.append(Miss(error_m=error, squared=squared, at_edge=place.at_edge))
+        square = squared(error, place.covariance)
+        missed.append(Miss(error_m=error, squared=square, at_edge=place.at_edge))
     return missed
 
 
@@ -129,15 +122,13 @@ def miss_figures(name: str, missed: Sequence[Miss]) -> dict[str, float]:
     """Errors in metres and shares inside the bounds, off edges and at them; `name` stands before each."""
     far = np.array([np.linalg.norm(miss.error_m) for miss in missed])
     edge = np.array([miss.at_edge for miss in missed])
-    squared = np.array([miss.squared for miss in missed])
-    inside = {share: squared < chi2.ppf(share / 100, 3) for share in (68, 95)}
+    squares = np.array([miss.squared for miss in missed])
     return {
         f"{name}_median_m": float(np.median(far)),
         f"{name}_clear_95_m": float(np.quantile(far[~edge], 0.95)),
-        f"{name}_68": float(inside[68][~edge].mean()),
-        f"{name}_95": float(inside[95][~edge].mean()),
         f"{name}_edges": float(edge.mean()),
-        f"{name}_edge_95": float(inside[95][edge].mean()) if edge.any() else float("nan"),
+        f"{name}_edge_95": inside(squares[edge], 0.95),
+        **inside_figures(name, squares[~edge]),
     }
 
 
@@ -148,4 +139,4 @@ def view_of(localiser: Localiser, data: bytes) -> AnsweredView | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -5,14 +5,13 @@
 The folder is ingested into a new database.
 Prints how many photos are in the largest map, in any map, and in how many, placed or not, and
 what the placement of the first leaves between positions and the map (of --gcp: ground control points, of
-which no other position is known). Exit code 0 if there is a map.
+which no other position is known).
 """
 
 import io
-import sys
+import shutil
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from PIL import Image
@@ -27,36 +26,21 @@ _SUFFIXES = (".jpg", ".jpeg", ".png")
 _GPS_IFD = 34853
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Made:
-    """What an ingest came to.
-
-    Attributes:
-        largest, mapped: photos in the largest map, and in any.
-        maps: with a place and without. seconds: of the command.
-        residual_m: root mean square of the first placed map's; NaN without one.
-    """
-
-    largest: int
-    mapped: int
-    maps: int
-    placed: int
-    seconds: float
-    residual_m: float = float("nan")
-
-
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--gcp", type=Path, default=None, metavar="FILE", help="control points of the photos")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     control = () if args.gcp is None else ("--gcp", str(args.gcp))
     made = make(args.work / "db", "photos", args.photos, control)
-    write_figures(args.json, asdict(made) | {"photos": len(photo_names(args.photos))})
-    return 0 if made.maps else 1
+    write_figures(args.json, made | {"photos": len(photo_names(args.photos))})
 
 
-def make(database: Path, kind: str, source: Path, more: Sequence[str] = ()) -> Made:
-    """Ingest photos or a film, with more arguments, and count what is in maps."""
+def make(database: Path, kind: str, source: Path, more: Sequence[str] = ()) -> dict[str, float]:
+    """Ingest photos or a film, with more arguments, and count what is in maps.
+
+    Photos in the largest map and in any (mapped), maps with a place and without, those placed, seconds of the
+    command, and the root mean square that is left of the first placed map.
+    """
     start = time.monotonic()
     featuredb("ingest", kind, str(database), str(source), "--quiet", *more, may_refuse=True)
     seconds = time.monotonic() - start
@@ -64,14 +48,34 @@ def make(database: Path, kind: str, source: Path, more: Sequence[str] = ()) -> M
     placed = snapshot.maps()
     sizes = [*(m.images for m in placed), *(m.images for m in snapshot.unplaced_maps())]
     residual_m = [snapshot.load_map(m.map_id).placement.residual_rms_m for m in placed[:1]]
-    return Made(
-        largest=max(sizes, default=0),
-        mapped=sum(sizes),
-        maps=len(sizes),
-        placed=len(placed),
-        seconds=seconds,
-        residual_m=residual_m[0] if residual_m else float("nan"),
-    )
+    return {
+        "largest": max(sizes, default=0),
+        "mapped": sum(sizes),
+        "maps": len(sizes),
+        "placed": len(placed),
+        "seconds": seconds,
+        "residual_m": residual_m[0] if residual_m else float("nan"),
+    }
+
+
+def once(target: Path, make: Callable[[Path], object]) -> Path:
+    """`target`, which `make` makes once under another name: what is half made is made anew."""
+    if not target.exists():
+        making = target.with_name("making")
+        shutil.rmtree(making, ignore_errors=True)
+        make(making)
+        making.rename(target)
+    return target
+
+
+def with_scan(source: Path, scan: Path, target: Path) -> Path:
+    """A copy of a database with a scan, made once."""
+
+    def add(making: Path) -> None:
+        shutil.copytree(source, making)
+        featuredb("lidar", "add", str(making), str(scan), "--quiet")
+
+    return once(target, add)
 
 
 def all_maps(database: Path) -> list[AnyMap]:
@@ -112,4 +116,4 @@ def without_position(jpeg: bytes) -> bytes:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -98,7 +98,6 @@ def place_of(path: Path, frame: LocalFrame, epsg: int, cloud: PointCloud) -> Ort
     inside = ((pixel >= 0) & (pixel < (w, h))).all(axis=1)
     at, z = pixel[inside] @ (1, w), cloud.xyz[inside, 2].astype(np.float32)
     count = np.bincount(at, minlength=w * h).reshape(h, w)
-    assert cloud.intensity is not None
     total = np.bincount(at, cloud.intensity[inside].astype(float), minlength=w * h).reshape(h, w)
     lowest, top = np.full(w * h, np.inf, np.float32), np.full(w * h, -np.inf, np.float32)
     np.minimum.at(lowest, at, z)

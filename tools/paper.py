@@ -9,11 +9,8 @@ which no adjustment's own error softens, and beside it from the map's adjusted k
 Writes paper.json.
 """
 
-import argparse
 import json
 import shutil
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,91 +18,67 @@ import numpy as np
 
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from ingest.workspace import default_root
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from tools.commands import featuredb
-from tools.figures import study_parser, write_figures
-from tools.made_maps import make
+from tools.figures import kept, say, study_parser, write_figures
 from tools.picked import Seen, place_by_picks, read_scan
-from tools.track_evaluation import axis_errors, film_options
-from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
+from tools.track_evaluation import judge_film, smooth_film
+from tools.video_map import frame_of, stills_of, unplaced_film
+from tools.worlds.film_world import FilmTruth
 from tools.worlds.scan_world import make_scan_world
 
-_FRAMES = 1200
-_PLACED = "placed.json"  # what came of the film; who starts again goes on from there
+_SEED = 1
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--out", "--inputs", "--seed").parse_args(argv)
-    args.out.mkdir(parents=True, exist_ok=True)
-    write_figures(args.out / "paper.json", film(args))
-    return 0
+def main() -> None:
+    args = study_parser(__doc__, "--out", "--inputs").parse_args()
+    write_figures(args.out / "paper.json", film_figures(args.out / "film", args.inputs or args.out))
 
 
-def film(args: argparse.Namespace) -> dict[str, Any]:
+def film_figures(work: Path, inputs: Path) -> dict[str, Any]:
     """A film that says nothing of its place, placed by one frame, tracked from end to end."""
-    inputs = args.inputs or args.out
     world = make_scan_world(inputs)
-    folder = write_film(inputs / f"film-smooth-{_FRAMES}-1", film_options("smooth", _FRAMES))
-    truth = read_film_truth(folder)
-    work = args.out / "film"
-    if not (work / _PLACED).exists():
-        write_figures(work / _PLACED, placed_film(folder / FILM_FILE, world.scan, truth, work, args.seed))
-    made = json.loads((work / _PLACED).read_text(encoding="utf-8"))
+    film, truth = smooth_film(inputs)
+    # Who starts again goes on from there.
+    made = kept(work / "placed.json", lambda: placed_film(film, world.scan, truth, work))
     if made["refused"]:
-        sys.stdout.write(f"FAILED: {made['refused']}\n")
+        say(f"FAILED: {made['refused']}")
         return {"placed": 0}
     feature_map = Database.open(work / "db").snapshot().load_map(made["map_id"])
     areas = Localiser.open(Database.open(work / "db")).areas
     camera = feature_map.cameras[0].scaled_to(truth.camera.width, truth.camera.height)
-    tracked = track_video(work / FILM_FILE, MapFinder(areas), camera=camera)
-    off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
-    metres = np.linalg.norm(off[:, 3:], axis=1)
-    figures = track_figures(metres) | {"placed": 1, "keyframes": made["keyframes"], "made_s": made["made_s"]}
-    figures["adjusted_m"] = from_keyframes(tracked, feature_map)
-    figures["rate_hz"] = len(metres) / tracked.seconds["total"]
+    tracked = track_video(work / film.name, MapFinder(areas), camera=camera)
+    figures = judge_film(tracked, truth, len(truth.times_s) // 4)
     times = json.loads((work / "anchor" / "anchor.json").read_text(encoding="utf-8"))["times_s"]
-    figures["frame_s"] = times.get("(B) one frame, median", float("nan"))
-    figures["projection_s"] = times.get("(C) structure projection, all frames", float("nan"))
-    return figures
+    return figures | {
+        "placed": 1,
+        "last_over_first": figures["last_m"] / figures["first_m"],
+        "adjusted_m": from_keyframes(tracked, feature_map),
+        "made_s": made["made_s"],
+        "frame_s": times.get("(B) one frame, median", float("nan")),
+        "projection_s": times.get("(C) structure projection, all frames", float("nan")),
+    }
 
 
-def placed_film(film_file: Path, scan: Path, truth: FilmTruth, work: Path, seed: int) -> dict[str, Any]:
-    """The film's map in `work`/db, placed by picks in one frame: its id, keyframes, seconds; or why not."""
+def placed_film(film: Path, scan: Path, truth: FilmTruth, work: Path) -> dict[str, Any]:
+    """The film's map in `work`/db, placed by picks in one frame: its id and seconds; or why not."""
     shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    bare, database = Path(shutil.copy(film_file, work)), work / "db"  # with nothing beside it
-    made = make(database, "video", bare)
+    database = work / "db"
+    made = unplaced_film(film, database)
     featuredb("lidar", "add", str(database), str(scan), "--quiet")
     unplaced = Database.open(database).snapshot().unplaced_maps()
     if not unplaced:
         return {"refused": "no map came of the film"}
     biggest = max(unplaced, key=lambda one: one.images)
-    stills = next((default_root(Database.open(database).url) / "films").iterdir())
     seen = seen_in_the_middle(database, biggest.map_id, truth)
     cloud = read_scan(scan, truth.frame, truth.epsg)
-    placed = place_by_picks(database, biggest.map_id, stills, seen, cloud, work, seed)
+    placed = place_by_picks(database, biggest.map_id, stills_of(database), seen, cloud, work, _SEED)
     return {
         "refused": "" if placed else "the map was not placed by the picks of one frame",
         "map_id": biggest.map_id,
-        "keyframes": biggest.images,
-        "made_s": made.seconds,
-    }
-
-
-def track_figures(metres: np.ndarray) -> dict[str, float]:
-    """Mean error of all frames with a pose, of the first and of the last quarter; frames without one."""
-    quarter = len(metres) // 4
-    first, last = float(np.nanmean(metres[:quarter])), float(np.nanmean(metres[-quarter:]))
-    return {
-        "lost": int(np.isnan(metres).sum()),
-        "mean_m": float(np.nanmean(metres)),
-        "first_m": first,
-        "last_m": last,
-        "last_over_first": last / first,
-        "largest_m": float(np.nanmax(metres)),
+        "made_s": made["seconds"],
     }
 
 
@@ -131,10 +104,5 @@ def seen_in_the_middle(database: Path, map_id: str, truth: FilmTruth) -> Seen:
     return Seen(image=image, camera=truth.camera, cam_from_local=pose)
 
 
-def frame_of(image: str) -> int:
-    """The number of the film's frame that a keyframe is, by its name."""
-    return int("".join(c for c in Path(image).stem if c.isdigit()))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -75,13 +75,7 @@ def visible(scan: Scan, camera: Camera, cam_from_local: Rigid3) -> tuple[NDArray
 
 
 def place_by_picks(
-    database: Path,
-    map_id: str,
-    photos: Path,
-    seen: Seen,
-    scan: Scan,
-    work: Path,
-    seed: int,
+    database: Path, map_id: str, photos: Path, seen: Seen, scan: Scan, work: Path, seed: int
 ) -> bool:
     """Place a map on its scan by six picks with 3 px of error in one image; whether it was placed."""
     drawn = picks(scan, seen.camera, seen.cam_from_local, np.random.default_rng(seed), _SIGMA_PX)

@@ -1,6 +1,6 @@
 """Are placements by positions of any quality as uncertain as they say, and can chance place a map?
 
-    python -m tools.position_draws --work DIR [--photos FOLDER ...] [--draws 25] [--chance 1000] [--json FILE]
+    python -m tools.position_draws --work DIR [--photos FOLDER ...] [--draws 25] [--json FILE]
 
 Flights are the largest maps of the folders, made by an ordinary ingest, and five simulated ones; where a
 flight's cameras are then is the truth. Positions are made from it in the ways below, and the flight is placed
@@ -12,13 +12,11 @@ Then positions that have nothing to do with the photos: drawn at random within a
 photos, those of a flight shuffled, and those of another flight.
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
@@ -27,16 +25,17 @@ from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.simworld.camera.shot import look_pose
 from ingest.own_frame import held_of
 from ingest.register.gps import GpsPlacement, place_by_gps
-from tools.figures import study_parser, write_figures
-from tools.made_maps import all_maps, make
+from tools.figures import inside_figures, say, squared, study_parser, write_figures
+from tools.made_maps import all_maps, make, once
 
 SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
 _SHUFFLES = 4  # of each flight
 PARTS = ("position", "orientation")
-LEVELS = (0.68, 0.95)
+_CHANCE, _SEED = 1000, 1  # draws of random positions
 _COMMON_ROLL_DEG = 1.5  # of simulated flights, as placements assume
 
 
@@ -59,10 +58,6 @@ class Flight:
         ]
         times_s = self.times_s[: len(positions)]
         return place_by_gps(centers, positions, sigmas, times_s, held_of(held, angles))
-
-
-def _bias(flight: Flight, rng: np.random.Generator) -> FloatArray:
-    return np.tile(rng.normal(0.0, 1.0, 3) * SIGMAS, (len(flight.xyz), 1))
 
 
 def _white(sigma_m: float) -> Callable[[Flight, np.random.Generator], FloatArray]:
@@ -108,97 +103,79 @@ _KINDS: dict[str, Callable[[Flight, np.random.Generator], FloatArray]] = {
     "noise of 5 m": _white(5.0),
     "noise of 15 m": _white(15.0),
     "drift of 20 and 60 m": _drift,
-    "a bias": lambda flight, rng: _bias(flight, rng) + rng.normal(0.0, 0.3, flight.xyz.shape),
+    "a bias": lambda flight, rng: rng.normal(0.0, 1.0, 3) * SIGMAS + rng.normal(0.0, 0.3, flight.xyz.shape),
     "a fifth far out": _outliers,
     "one height for all": _one_height,
     "a lag of 2 s": _lag,
 }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("--photos", type=Path, nargs="*", default=[], metavar="FOLDER")
     parser.add_argument("--draws", type=int, default=25, help="of each kind")
-    parser.add_argument("--chance", type=int, default=1000, help="draws of random positions")
-    parser.add_argument("--seed", type=int, default=1)
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     real = [real_flight(folder, args.work) for folder in args.photos]
     with threadpool_limits(1):  # matrices are small
-        figures = bounds(real, args.draws, args.seed)
-        figures |= unrelated([*real, *simulated_flights(args.seed, 0)], args.chance, args.seed, args.draws)
+        figures = bounds(real, args.draws)
+        figures |= unrelated([*real, *simulated_flights(0)], _CHANCE)
     write_figures(args.json, figures)
-    return 0
 
 
-def bounds(real: Sequence[Flight], draws: int, seed: int) -> dict[str, float]:
+def bounds(real: Sequence[Flight], draws: int) -> dict[str, float]:
     """Every kind of error on every flight in turn: what is placed, and whether its bounds hold.
 
     Simulated flights are drawn anew for each draw: how their photos are held is an error as well.
     """
     scores: list[dict[str, float]] = []
     answering: list[dict[str, float]] = []
-    tried = 0
     for number, (kind, error) in enumerate(_KINDS.items()):
         own: list[dict[str, float]] = []
-        active = 0
-        reasons: list[str] = []
         for draw in range(draws):
-            rng = np.random.default_rng((seed, number, draw))
-            flights = [*real, *simulated_flights(seed, draw)]
+            rng = np.random.default_rng((_SEED, number, draw))
+            flights = [*real, *simulated_flights(draw)]
             flight = flights[draw % len(flights)]
             found = flight.placed(flight.xyz + error(flight, rng))
-            if found.reason is not None:
-                reasons.append(f"{flight.name}: {found.reason}")
-                continue
-            own.append(squares(found, flight.xyz[rng.integers(len(flight.xyz))]))
-            if not found.provisional:
-                active += 1
-                answering.append(own[-1])
-        tried, scores = tried + draws, scores + own
-        held_in = "; ".join(
-            f"{part} {inside(own, part, 0.68):.0%} and {inside(own, part, 0.95):.0%}" for part in PARTS
-        )
-        sys.stdout.write(
-            f"{kind:<22} {len(own)} of {draws} placed, {active} answer, inside 68 and 95 %: {held_in}"
-            f"{'; ' + ', '.join(sorted(set(reasons))) if reasons else ''}\n"
-        )
-        sys.stdout.flush()
+            if found.reason is None:
+                own.append(squares(found, flight.xyz[rng.integers(len(flight.xyz))]))
+                answering += [] if found.provisional else own[-1:]
+        scores += own
+        say(f"{kind:<22} {len(own)} of {draws} placed, inside: {shares('', own)}")
+    tried = draws * len(_KINDS)
     return {
         "flights": float(tried),
         "placed": len(scores) / tried,
         "answer": len(answering) / tried,
-        **{f"answering_{part}_95": inside(answering, part, 0.95) for part in PARTS},
-        **{f"{part}_{100 * level:.0f}": inside(scores, part, level) for part in PARTS for level in LEVELS},
+        **shares("answering_", answering),
+        **shares("", scores),
     }
+
+
+def shares(name: str, scores: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Of what `squares` says: shares inside the bounds of position and orientation; `name` before each."""
+    figures: dict[str, float] = {}
+    for part in PARTS:
+        figures |= inside_figures(f"{name}{part}", [score[part] for score in scores])
+    return figures
 
 
 def squares(placed: GpsPlacement, camera: FloatArray) -> dict[str, float]:
     """Squared errors over their covariance: of a camera's position (3,), and of the orientation."""
-    assert placed.local_from_sfm is not None
-    assert placed.covariance is not None
     off = (_TRUE @ placed.local_from_sfm.inverse()).log()
     by_similarity = {"position": point_jacobian(camera[None])[0], "orientation": np.eye(7)[1:4]}
-    result = {}
-    for part, rows in by_similarity.items():
-        error = rows @ off
-        result[part] = float(error @ np.linalg.solve(rows @ placed.covariance @ rows.T, error))
-    return result
+    return {
+        part: squared(rows @ off, rows @ placed.covariance @ rows.T) for part, rows in by_similarity.items()
+    }
 
 
-def inside(scores: Sequence[dict[str, float]], part: str, level: float) -> float:
-    return float(np.mean([score[part] <= chi2.ppf(level, 3) for score in scores]))
+def unrelated(flights: Sequence[Flight], chance: int) -> dict[str, float]:
+    """Positions that have nothing to do with the photos: how many flights would answer.
 
-
-def unrelated(flights: Sequence[Flight], chance: int, seed: int, most: int = _SHUFFLES) -> dict[str, float]:
-    """Positions that have nothing to do with the photos: how many flights would answer, or have a place.
-
-    Args:
-        chance: draws of random positions.
-        most: of shuffles of each flight's positions, and of other flights whose positions it is given.
+    `chance` draws of random positions, each flight's own in another order, and those of each other flight.
     """
     found: dict[str, list[GpsPlacement]] = {"random": [], "shuffled": [], "other": []}
     for draw in range(chance):
-        rng = np.random.default_rng((seed, 99, draw))
+        rng = np.random.default_rng((_SEED, 99, draw))
         flight, count = flights[draw % len(flights)], int(rng.integers(3, 9))
         rows = np.sort(rng.choice(len(flight.xyz), count, replace=False))
         held = tuple(flight.cam_from_local[row] for row in rows)
@@ -208,31 +185,21 @@ def unrelated(flights: Sequence[Flight], chance: int, seed: int, most: int = _SH
         drawn = np.column_stack([rng.uniform(-500.0, 500.0, (count, 2)), rng.uniform(0.0, 100.0, count)])
         found["random"].append(part.placed(drawn))
     for k, flight in enumerate(flights):
-        for draw in range(min(most, _SHUFFLES)):
-            rng = np.random.default_rng((seed, 98, k, draw))
+        for draw in range(_SHUFFLES):
+            rng = np.random.default_rng((_SEED, 98, k, draw))
             found["shuffled"].append(flight.placed(flight.xyz[rng.permutation(len(flight.xyz))]))
-        for other in [*flights[:k], *flights[k + 1 :]][:most]:
+        for other in [*flights[:k], *flights[k + 1 :]]:
             found["other"].append(flight.placed(other.xyz[: len(flight.xyz)]))
     figures: dict[str, float] = {}
     for kind, placements in found.items():
-        there = [p for p in placements if p.reason is None]
-        figures |= {
-            f"{kind}_placed": float(len(there)),
-            f"{kind}_answer": float(sum(not p.provisional for p in there)),
-        }
-        figures[f"{kind}"] = float(len(placements))
-        sys.stdout.write(
-            f"{kind} positions: of {len(placements)} {len(there)} have a place, "
-            f"{figures[f'{kind}_answer']:.0f} would answer\n"
-        )
+        answer = sum(p.reason is None and not p.provisional for p in placements)
+        figures |= {kind: float(len(placements)), f"{kind}_answer": float(answer)}
     return figures
 
 
 def real_flight(folder: Path, work: Path) -> Flight:
     """The cameras of the largest map of a folder of photos, by its own positions."""
-    database = work / folder.parent.name
-    if not database.exists():
-        make(database, "photos", folder)
+    database = once(work / folder.parent.name, lambda path: make(path, "photos", folder))
     largest = max(all_maps(database), key=lambda one: len(one.images))
     images = sorted(
         largest.images, key=lambda image: (image.capture_time is None, image.capture_time, image.name)
@@ -251,9 +218,9 @@ def real_flight(folder: Path, work: Path) -> Flight:
     )
 
 
-def simulated_flights(seed: int, draw: int) -> list[Flight]:
+def simulated_flights(draw: int) -> list[Flight]:
     """Strips to and fro, a spiral, a walk around a house, and a winding street."""
-    rng = np.random.default_rng((seed, 7, draw))
+    rng = np.random.default_rng((_SEED, 7, draw))
     flights = []
     rolls = np.radians(rng.normal(0.0, _COMMON_ROLL_DEG, 5))
     for name, lines, per, size in (("strips", 4, 8, 160.0), ("two strips", 2, 9, 120.0)):
@@ -284,16 +251,10 @@ def simulated_flights(seed: int, draw: int) -> list[Flight]:
 def _held(xyz: FloatArray, k: int, common_roll: float, rng: np.random.Generator) -> Rigid3:
     """A camera that looks ahead and down, level but for two degrees and what all have in common."""
     ahead = xyz[min(k + 1, len(xyz) - 1)] - xyz[max(k - 1, 0)]
-    heading, tilt, roll = (
-        np.arctan2(ahead[1], ahead[0]),
-        np.radians(50.0),
-        rng.normal(common_roll, np.radians(2.0)),
-    )
-    view = np.array([np.cos(heading) * np.cos(tilt), np.sin(heading) * np.cos(tilt), -np.sin(tilt)])
-    across = np.array([np.sin(heading), -np.cos(heading), 0.0])
-    level = np.stack([across, np.cross(view, across), view])
-    return Rigid3(rotation=so3_exp([0.0, 0.0, roll]) @ level, translation=np.zeros(3))
+    heading, roll = np.arctan2(ahead[1], ahead[0]), rng.normal(common_roll, np.radians(2.0))
+    held = look_pose(np.zeros(3), 90.0 - float(np.degrees(heading)), -50.0, -float(np.degrees(roll)))
+    return Rigid3(rotation=held.rotation, translation=np.zeros(3))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -8,14 +8,11 @@ Beside it, between the same queries: OpenCV's SIFT alone (3,000 features of the 
 decoding in grey. A query without its decoding is compared with the one, its decoding with the other.
 """
 
-import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import cv2
 import numpy as np
@@ -37,20 +34,11 @@ _SIDE_PX, _FEATURES = 1000, 3000
 _WITH_PRIOR = LocaliseWireRequest(options=RequestOptions(exif_prior=True))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Timed:
-    """One query: its time measured from outside, and of OpenCV."""
-
-    reply: LocaliseReply
-    wall_ms: float
-    opencv_ms: dict[str, float]  # "decode" and "sift" of the same photo, right after it
-
-
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("db")
     parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     database = Database.open(args.db)
     with capped_process(_THREADS):
         localiser = Localiser.open(database)
@@ -59,12 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         with start_server(database, options) as server, Client(server.endpoints[0]) as client:
             ask = partial(client.localise, exif_prior=True, timeout_s=60.0)
             served = timed(ask, args.images)
-    write_figures(args.json, figures(direct, served))
-    return 0
+    figures = {name: median(one[name] for one in served) for name in served[0]}
+    figures |= {"asked": len(served), "localised": sum(one["localised"] for one in served)}
+    write_figures(args.json, figures | {"in_process_ms": median(one["wall_ms"] for one in direct)})
 
 
-def timed(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list[Timed]:
-    """Each image five times, after one round that is not counted."""
+def timed(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list[dict[str, float]]:
+    """Each image five times, after one round that is not counted: times measured from outside, and beside
+    those of OpenCV with the same photo, right after it."""
     found = []
     contents = [path.read_bytes() for path in images]
     for number in range(_REPEAT + 1):
@@ -73,7 +63,17 @@ def timed(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path]) -> list
             reply = ask(data)
             wall_ms = 1e3 * (time.perf_counter() - start)
             if number:
-                found.append(Timed(reply=reply, wall_ms=wall_ms, opencv_ms=opencv_ms(data)))
+                opencv, decode_ms = opencv_ms(data), reply.timings_ms["decode"]
+                found.append(
+                    {
+                        "wall_ms": wall_ms,
+                        "transport_ms": wall_ms - reply.timings_ms["total"],
+                        "sift_ms": opencv["sift"],
+                        "over_sift": (wall_ms - decode_ms) / opencv["sift"],
+                        "over_decode": decode_ms / opencv["decode"],
+                        "localised": reply.status == "localised",
+                    }
+                )
     return found
 
 
@@ -82,30 +82,12 @@ def opencv_ms(data: bytes) -> dict[str, float]:
     clock = StageClock()
     gray = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     clock.lap("decode")
-    assert gray is not None
     small = shrunk(np.asarray(gray, dtype=np.uint8), _SIDE_PX)
     clock.lap("shrink")
-    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
-    create(_FEATURES).detectAndCompute(small, None)
+    cv2.SIFT_create(_FEATURES).detectAndCompute(small, None)
     clock.lap("sift")
     return clock.milliseconds()
 
 
-def figures(direct: Sequence[Timed], served: Sequence[Timed]) -> dict[str, float]:
-    """Medians of both ways of asking, and what came of the second."""
-    return {
-        "wall_ms": median(one.wall_ms for one in served),
-        "in_process_ms": median(one.wall_ms for one in direct),
-        "transport_ms": median(one.wall_ms - one.reply.timings_ms["total"] for one in served),
-        "sift_ms": median(one.opencv_ms["sift"] for one in served),
-        "over_sift": median(
-            (one.wall_ms - one.reply.timings_ms["decode"]) / one.opencv_ms["sift"] for one in served
-        ),
-        "over_decode": median(one.reply.timings_ms["decode"] / one.opencv_ms["decode"] for one in served),
-        "asked": len(served),
-        "localised": sum(one.reply.status == "localised" for one in served),
-    }
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -10,9 +10,6 @@
 
 """
 
-import json
-import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,26 +26,10 @@ from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
-from tools.commands import featuredb
-from tools.figures import spread, study_parser, write_figures
-from tools.made_maps import photo_names
+from tools.figures import say, spread, study_parser, write_figures
+from tools.made_maps import make, photo_names
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ingest:
-    """What one ingest came to.
-
-    Attributes:
-        usable, registered: photos that were taken from the folder, and those that are in a map.
-        wall_s: of the whole command, from the start of its process on an empty database.
-    """
-
-    database: str
-    usable: int
-    registered: int
-    wall_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,46 +43,29 @@ class HeldOutRow:
     orientation_68_deg: float
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--held-out", nargs="+", metavar="NAME", help=f"default: every {_EVERY}th photo")
-    args = parser.parse_args(argv)
-    held_out = args.held_out or photo_names(args.photos)[_EVERY // 2 :: _EVERY]
+    args = parser.parse_args()
+    names = photo_names(args.photos)
+    held_out = args.held_out or names[_EVERY // 2 :: _EVERY]
     work: Path = args.work
     part = ingest(work / "part", args.photos, held_out)
     ingest(work / "whole", args.photos, ())
     rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
-    counts = {"usable": part.usable, "registered": part.registered, "ingest_s": part.wall_s}
-    write_figures(args.json, counts | error_figures(rows))
-    return 0
+    figures = {
+        "usable": len(set(names) - set(held_out)),
+        "registered": part["mapped"],
+        "ingest_s": part["seconds"],
+    }
+    write_figures(args.json, figures | error_figures(rows))
 
 
-def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None) -> Ingest:
-    """Run `featuredb ingest photos` in a process of its own on a database that is not there yet.
-
-    Args:
-        work: work folder, which may hold what another ingest of these photos has done; default: a new one.
-
-    Raises:
-        SystemExit: there is a database already, or the command failed.
-    """
+def ingest(database: Path, photos: Path, exclude: Sequence[str], *more: str) -> dict[str, float]:
+    """Make a database that is not there yet of all photos but some, as `make` does."""
     if database.exists():
         raise SystemExit(f"{database} is there already; a map is made from nothing there")
-    report = database.with_name(f"{database.name}-report")
-    words = ["ingest", "photos", str(database), str(photos), "--quiet", "--report", str(report)]
-    words += [f"--exclude={name}" for name in exclude]
-    words += [] if work is None else ["--work", str(work)]
-    start = time.perf_counter()
-    featuredb(*words)
-    wall_s = time.perf_counter() - start
-    document = json.loads((report / "report.json").read_text(encoding="utf-8"))
-    statuses = [photo["status"] for photo in document["photos"]]
-    return Ingest(
-        database=str(database),
-        usable=sum(status != "skipped" for status in statuses),
-        registered=statuses.count("registered"),
-        wall_s=wall_s,
-    )
+    return make(database, "photos", photos, (*(f"--exclude={name}" for name in exclude), *more))
 
 
 def reference(database: Path) -> FeatureMap:
@@ -119,7 +83,7 @@ def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMa
     poses = {image.name: image.cam_from_local for image in truth.images}
     known = [name for name in names if name in poses]
     if left_out := [name for name in names if name not in poses]:
-        sys.stdout.write(f"not in the reference map, so left out: {', '.join(left_out)}\n")
+        say(f"not in the reference map, so left out: {', '.join(left_out)}")
     return ask_poses(database, photos, known, truth.frame, poses)
 
 
@@ -147,7 +111,7 @@ def ask_poses(
         for name in names:
             reply = client.localise(photos / name, camera=camera, timeout_s=60.0)
             rows.append(_row(name, reply, frame, poses[name]))
-            sys.stdout.write(f"{rows[-1]}\n")
+            say(f"{rows[-1]}")
     return rows
 
 
@@ -173,4 +137,4 @@ def error_figures(rows: Sequence[HeldOutRow]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -11,34 +11,31 @@
 
 """
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import pose_difference
 from featuredb.store import Database
 from featuredb.video.folder import natural_key
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
-from tools.figures import laid_on, spread, study_parser, write_figures
+from tools.figures import laid_on, poses_in, say, spread, study_parser, write_figures
 from tools.made_maps import photo_names
 from tools.real_photos import ingest, reference
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--photos", "--work").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--photos", "--work").parse_args()
     names = sorted(photo_names(args.photos), key=natural_key)
     work: Path = args.work
     for name, left_out in (("part", names[1::2]), ("whole", [])):
         if not (work / name).exists():
-            ingest(work / name, args.photos, left_out, work / "cache")
+            ingest(work / name, args.photos, left_out, "--work", str(work / "cache"))
     part, whole = reference(work / "part"), reference(work / "whole")
-    sim = laid_on(centers(whole), centers(part))
-    assert sim is not None
-    moved = {image.name: sim.act_on_pose(image.cam_from_local) for image in whole.images}
+    theirs, mine = poses_in(part.frame, whole), poses_in(part.frame, part)
+    sim = laid_on(*({name: pose.center for name, pose in of.items()} for of in (theirs, mine)))
+    moved = {name: sim.act_on_pose(pose) for name, pose in theirs.items()}
     frames = film_of(args.photos, names, work / "frames")
     tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
     poses = {name: p.pose for name, p in zip(names, tracked.trajectory.points, strict=True) if p.pose}
@@ -46,19 +43,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, pose in poses.items():
         if name in moved:
             off.append(pose_difference(part.frame, moved[name], pose.epsg, pose.utm, pose.cam_from_utm_xyzw))
-            sys.stdout.write(f"{name}: {off[-1]}\n")
+            say(f"{name}: {off[-1]}")
     figures = {
         "frames": len(names),
         "lost": len(names) - len(poses),
         "unknown": len(poses.keys() - moved.keys()),
     }
     write_figures(args.json, figures | spread([e.position_m for e in off], [e.angle_deg for e in off]))
-    return 0
-
-
-def centers(feature_map: FeatureMap) -> dict[str, FloatArray]:
-    """Of a map's cameras, by the names of its images."""
-    return {image.name: image.cam_from_local.center for image in feature_map.images}
 
 
 def film_of(photos: Path, names: Sequence[str], folder: Path) -> Path:
@@ -74,4 +65,4 @@ def film_of(photos: Path, names: Sequence[str], folder: Path) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,6 +1,6 @@
 """Photos of a rolling shutter, placed by positions alone: what answers, and is it inside its bounds?
 
-    python -m tools.rolling_shutter --work FOLDER [--inputs FOLDER] [--readout-ms 30]
+    python -m tools.rolling_shutter --work FOLDER [--inputs FOLDER]
 
 1. One frame a second of the simulated films, smooth and jerky, whose rows are read out over 30 ms.
 2. Each flight is ingested as photos with EXIF, by a drone's receiver (1.5 m that wander, 0.3 s late) and by
@@ -10,7 +10,6 @@
 
 """
 
-import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -21,7 +20,6 @@ from PIL import ExifTags, Image
 from scipy.stats import chi2
 
 from featuredb.features.exif.write import rational
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import point_jacobian
@@ -32,9 +30,9 @@ from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from tools.commands import said
-from tools.figures import study_parser, write_figures
+from tools.figures import say, squared, study_parser, write_figures
 from tools.worlds.film_frame import Exposure, in_order
-from tools.worlds.film_world import FilmOptions, film_frame
+from tools.worlds.film_world import FilmOptions, film_frame, wandering_errors
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
 _PHOTOS, _SEEDS = 24, (1, 2)
@@ -45,8 +43,8 @@ _START = datetime(2025, 6, 21, 12, 40, 3, tzinfo=UTC)
 _OUTSIDE = float(chi2.ppf(0.999, 3))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     figures = {"flights": 0, "active": 0, "outside": 0, "held_back": 0, "unnamed": 0}
     worst = 0.0
     for style in _STYLES:
@@ -68,10 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 figures["unnamed"] += "rolling shutter" not in report
                 worst = max([worst, *(max(one) for one in squares)])
                 words = ", ".join(f"position {a:.1f} and orientation {b:.1f}" for a, b in squares)
-                sys.stdout.write(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}\n")
-                sys.stdout.flush()
+                say(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}")
     write_figures(args.json, figures | {"worst_squared": worst})
-    return 0
 
 
 def film_options(style: FlightStyle, seed: int) -> FilmOptions:
@@ -113,10 +109,8 @@ def tagged(film: FilmOptions, pictures: Sequence[Path], rtk: bool, folder: Path)
     device = Device(make="Maker", model="Film", camera=film.camera, focal_mm=4.5, focal_35mm=26)
     rng = np.random.default_rng((film.path.seed, 74))
     sigma, late_s, keep = (_RTK_M, 0.0, 0.0) if rtk else (_RECEIVER_M, _LATE_S, np.exp(-1.0 / 20.0))
-    axes = np.array([1.0, 1.0, 2.0])
-    error = sigma * axes * rng.standard_normal(3)
-    for k, picture in enumerate(pictures):
-        error = keep * error + sigma * np.sqrt(1.0 - keep**2) * axes * rng.standard_normal(3)
+    errors = wandering_errors(rng, sigma, keep, len(pictures))
+    for k, (picture, error) in enumerate(zip(pictures, errors, strict=True)):
         time_s = film.time_s(k)
         place = pose_at(film, time_s - late_s).center + error
         shot = Shot(
@@ -152,14 +146,10 @@ def normalised(film: FilmOptions, feature_map: FeatureMap) -> tuple[float, float
         angle = placement[1:4, 1:4] + turn @ own[:3, :3] @ turn.T
         off = pose.center - true.center
         turned = so3_log(pose.rotation.T @ true.rotation)
-        squares.append((_square(off, center), _square(turned, angle)))
+        squares.append((squared(off, center), squared(turned, angle)))
     position, orientation = np.median(squares, axis=0)
     return float(position), float(orientation)
 
 
-def _square(error: FloatArray, covariance: FloatArray) -> float:
-    return float(error @ np.linalg.solve(covariance, error))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -12,8 +12,6 @@ Believed is what gives a map whose place is known to 4 cm (a standard deviation 
 """
 
 import re
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,8 +45,8 @@ _MOST = ("--max-features", "4000", "--quiet")
 _POINTS, _MARK_PX = 9, 0.5
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--work", "--inputs").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     flight = FlightOptions(lines=3, per_line=5, oblique=3, width=1024)
     options = replace(WorldOptions.short(_SEED), flight=flight, queries=0, street=0, negatives_per_kind=0)
     inputs = (args.inputs or args.work) / f"rtk-flight-{_SEED}"
@@ -67,7 +65,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     figures["worst_sigma_m"] = max(figures[f"{way}_sigma_m"] for way in _WAYS)
     figures["active"] = sum(figures[f"{way}_active"] for way in _WAYS)
     write_figures(args.json, figures)
-    return 0
 
 
 def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
@@ -98,7 +95,6 @@ def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
 def tagged(data: bytes, truth: Truth, place: FloatArray, error_m: float, words: str) -> bytes:
     """A photo with another position (3,) and XMP; the picture stays bit for bit."""
     header = read_header(data)
-    assert header.exif is not None
     latitude, longitude, height = (float(v) for v in truth.frame.geodetic_from_enu(place))
     gps = gps_directory((latitude, longitude, height), "ellipsoid", heading_deg=0.0, error_m=error_m)
     return with_app1(data, with_gps(data[slice(*header.exif)], gps), _XMP.format(words=words).encode())
@@ -175,4 +171,4 @@ def marked(image: TrueImage, depth: np.ndarray, spot: FloatArray) -> FloatArray 
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

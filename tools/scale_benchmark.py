@@ -16,23 +16,20 @@ import gc
 import multiprocessing
 import os
 import shutil
-import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.features.decode import decode_gray
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geo.utm import utm_epsg
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.descriptor_index import use_threads
@@ -44,6 +41,7 @@ from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from tools.figures import study_parser, write_figures
+from tools.service_world import cell_order, copied_map
 
 _HELD_OUT = 4  # photos of each map
 _ASKED = 40  # queries of a database
@@ -75,28 +73,11 @@ class Query:
     place: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """Of one database: seconds, milliseconds of a query (median), shares of queries, bytes after them."""
-
-    points: int
-    first_start_s: float
-    start_s: float
-    commit_s: float
-    with_prior_ms: float
-    without_ms: float
-    answered_with_prior: float
-    answered_without: float
-    wrong: int
-    resident_bytes: int
-    anonymous_bytes: int
-
-
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("sources", nargs="+", metavar="DB:FOLDER")
     parser.add_argument("--points", type=int, default=1_000_000)
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     sources = [source_of(*text.rsplit(":", 1)) for text in args.sources]
     small, large = args.work / "small", args.work / f"large-{args.points}"
@@ -104,25 +85,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path, points in ((small, _SMALL), (large, args.points)):
         ask[path] = city(path, sources, points)
     context = multiprocessing.get_context("spawn")
-    measured = {}
+    measured: dict[Path, dict[str, float]] = {}
     for path, queries in ask.items():
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
+        with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
             first_start_s = pool.submit(first_start, path, queries[0]).result()
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
-            measured[path] = pool.submit(measure, path, queries, first_start_s).result()
+            measured[path] = pool.submit(measure, path, queries).result() | {"first_start_s": first_start_s}
     figures: dict[str, Any] = {
         f"{size}_{name}": value
         for size, path in (("small", small), ("large", large))
-        for name, value in asdict(measured[path]).items()
+        for name, value in measured[path].items()
     }
     for name in ("first_start_s", "start_s", "commit_s", "with_prior_ms", "without_ms"):
         figures[f"times_{name.rsplit('_', 1)[0]}"] = figures[f"large_{name}"] / figures[f"small_{name}"]
-    more = measured[large].points - measured[small].points
+    more = figures["large_points"] - figures["small_points"]
     for kind in ("resident_bytes", "anonymous_bytes"):
-        more_bytes = figures[f"large_{kind}"] - figures[f"small_{kind}"]
-        figures[f"{kind}_a_point"] = more_bytes / more
+        figures[f"{kind}_a_point"] = (figures[f"large_{kind}"] - figures[f"small_{kind}"]) / more
     write_figures(args.json, figures)
-    return 0
 
 
 def source_of(database: str, folder: str) -> CopiedMap:
@@ -153,7 +131,6 @@ def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
     pitch = _GAP_M + max(float(np.ptp(s.feature_map.points.utm[:, :2], axis=0).max()) for s in sources)
     while total < points:
         source = sources[copies % len(sources)]
-        order = _order(copies)
         column, row = copies % side, copies // side
         frame = LocalFrame(
             latitude_deg=45.0 + row * pitch / 111_000.0,
@@ -162,8 +139,7 @@ def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
         )
         seen = source.feature_map.observations
         described = len(np.unique(seen.point_index[seen.has_descriptor]))
-        placed = _copy(source.feature_map, frame, order, f"copy-{copies}")
-        waiting.append(placed)
+        waiting.append(copied_map(source.feature_map, frame, copies, f"copy-{copies}"))
         total += described
         if len(waiting) == _AT_ONCE or total >= points:
             database.commit_maps(waiting)
@@ -177,41 +153,11 @@ def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
                 sigma_horizontal_m=_PRIOR_M,
                 sigma_vertical_m=_PRIOR_M,
             )
-            features = replace(photo, descriptors=photo.descriptors[:, order])
+            features = replace(photo, descriptors=photo.descriptors[:, cell_order(copies)])
             queries.append(Query(features=features, camera=camera, prior=prior, place=geodetic))
         copies += 1
     every = max(1, len(queries) // _ASKED)
     return queries[::every][:_ASKED]
-
-
-def _order(copy: int) -> NDArray[np.int64]:
-    """(128,) another order of a descriptor's 4 x 4 cells; the first is its own.
-
-    Corners, edges and inner cells change places among themselves: they have different weights in SIFT.
-    """
-    rng = np.random.default_rng(copy)
-    cells = np.arange(16)
-    row, column = np.divmod(cells, 4)
-    inner = ((row % 3) > 0).astype(np.int64) + ((column % 3) > 0)
-    if copy:
-        for kind in range(3):
-            alike = np.flatnonzero(inner == kind)
-            cells[alike] = rng.permutation(alike)
-    return (cells[:, None] * 8 + np.arange(8)).ravel()
-
-
-def _copy(source: FeatureMap, frame: LocalFrame, order: NDArray[np.int64], map_id: str) -> FeatureMap:
-    epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
-    local, seen = source.points_local(), source.observations
-    return replace(
-        source,
-        map_id=map_id,
-        name=map_id,
-        frame=frame,
-        epsg=epsg,
-        points=replace(source.points, utm=frame.utm_from_enu(local, epsg)),
-        observations=replace(seen, descriptors=seen.descriptors[:, order]),
-    )
 
 
 def first_start(path: Path, query: Query) -> float:
@@ -227,8 +173,9 @@ def _own_cache(path: Path) -> None:
     os.environ["XDG_CACHE_HOME"] = f"{path}-cache"
 
 
-def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measured:
-    """In a process that has done nothing before."""
+def measure(path: Path, queries: Sequence[Query]) -> dict[str, float]:
+    """Of one database, in a process that has done nothing before: seconds, milliseconds of a query (median),
+    shares of queries, bytes after them."""
     _own_cache(path)
     began = time.perf_counter()
     database = Database.open(str(path))
@@ -249,19 +196,18 @@ def measure(path: Path, queries: Sequence[Query], first_start_s: float) -> Measu
     gc.collect()
     resident, anonymous = _memory("VmRSS"), _memory("RssAnon")
     commit_s = _commit(database, localiser, queries[0])
-    return Measured(
-        points=points,
-        first_start_s=first_start_s,
-        start_s=start_s,
-        commit_s=commit_s,
-        with_prior_ms=1e3 * median(times[True]),
-        without_ms=1e3 * median(times[False]),
-        answered_with_prior=answered[True] / len(queries),
-        answered_without=answered[False] / len(queries),
-        wrong=wrong,
-        resident_bytes=resident,
-        anonymous_bytes=anonymous,
-    )
+    return {
+        "points": points,
+        "start_s": start_s,
+        "commit_s": commit_s,
+        "with_prior_ms": 1e3 * median(times[True]),
+        "without_ms": 1e3 * median(times[False]),
+        "answered_with_prior": answered[True] / len(queries),
+        "answered_without": answered[False] / len(queries),
+        "wrong": wrong,
+        "resident_bytes": resident,
+        "anonymous_bytes": anonymous,
+    }
 
 
 def _commit(database: Database, localiser: Localiser, query: Query) -> float:
@@ -296,4 +242,4 @@ def _memory(kind: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -14,8 +14,7 @@ as in a map (`ExifInfo.camera_key`), and measures its own accuracy:
 import argparse
 import json
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.features.exif.read import read_exif
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from tools.figures import study_parser
 from tools.scan_to_photo import (
     Lens,
     PosedPicture,
@@ -39,15 +42,61 @@ _BLOCK_PX = 200  # correspondences of one block, in the full photo, stay in one 
 _ROUNDS = ((0, 3), (0, 1, 2, 3, 4), tuple(range(7)))  # lens parameters that are free, coarse to fine
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("scan", type=Path, metavar="SCAN", help="LAS or LAZ with colour, and its CRS")
     parser.add_argument("photos", type=Path, metavar="FOLDER", help="its photos")
     parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="write there")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
+    write_poses(args.scan, args.photos, args.poses)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScanTruth:
+    """Cameras and poses `cam_from_local` of photos by name, in a local frame; epsg: of the scan."""
+
+    frame: LocalFrame
+    epsg: int
+    cameras: dict[str, Camera]
+    poses: dict[str, Rigid3]
+
+
+def scan_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
+    """What studies of photos with a scan are told; arguments as those of `study_parser`."""
+    parser = study_parser(doc, "--photos", "--scan", *shared)
+    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
+    return parser
+
+
+def scan_truth(args: argparse.Namespace) -> ScanTruth:
+    """The file of --poses, made unless it is there; `args`: of `scan_parser`."""
+    if not args.poses.exists():
+        write_poses(args.scan, args.photos, args.poses)
+    document = json.loads(args.poses.read_text(encoding="utf-8"))
+    easting, northing, height = document["origin"]
+    epsg = int(document["crs"].removeprefix("EPSG:"))
+    cameras = {
+        key: Camera(model=one["model"], width=one["width"], height=one["height"], params=tuple(one["params"]))
+        for key, one in document["cameras"].items()
+    }
+    return ScanTruth(
+        frame=LocalFrame.from_utm(easting, northing, height, epsg),
+        epsg=epsg,
+        cameras={name: cameras[entry["camera"]] for name, entry in document["poses"].items()},
+        poses={
+            name: Rigid3(
+                rotation=np.array(entry["cam_from_local_rotation"]),
+                translation=np.array(entry["cam_from_local_translation"]),
+            )
+            for name, entry in document["poses"].items()
+        },
+    )
+
+
+def write_poses(scan: Path, photos: Path, path: Path) -> None:
+    """Register the photos of a folder, and write what `register` says."""
     cv2.setNumThreads(1)
-    args.poses.write_text(json.dumps(register(args.scan, args.photos), indent=1) + "\n")
-    return 0
+    path.write_text(json.dumps(register(scan, photos), indent=1) + "\n")
 
 
 def register(scan_path: Path, folder: Path) -> dict[str, Any]:
@@ -146,4 +195,4 @@ def _say(text: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -140,11 +140,7 @@ def first_pose(photo: NDArray[np.uint8], lens: Lens, raster: tuple, scan_feature
     )
     up = filled[at[:, 1].round().astype(int), at[:, 0].round().astype(int)]
     world = np.column_stack(
-        [
-            low[0] + (at[:, 0] + 0.5) * RASTER_M,
-            low[1] + (picture.shape[0] - at[:, 1] - 0.5) * RASTER_M,
-            up,
-        ]
+        [low[0] + (at[:, 0] + 0.5) * RASTER_M, low[1] + (picture.shape[0] - at[:, 1] - 0.5) * RASTER_M, up]
     )
     done, rvec, tvec, inliers = cv2.solvePnPRansac(
         world,

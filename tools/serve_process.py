@@ -7,23 +7,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-_PROGRAM = """
-import sys
-from importlib.metadata import EntryPoint
-from featuredb.cli.main import build_parser, run_command
-entries = [
-    EntryPoint(name=name, value=f"reloc.cli.{name}:register", group="featuredb.commands")
-    for name in ("commands", "gateway")
-]
-args = build_parser(entries).parse_args(sys.argv[1:])
-sys.exit(run_command(args.run, args))
-"""
 
 
 class CommandProcess:
@@ -35,14 +22,13 @@ class CommandProcess:
 
     def __init__(self, *argv: object) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM, *map(str, argv)],
+            [sys.executable, "-m", "featuredb.cli", *map(str, argv)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"},
         )
         self.errors: list[str] = []
-        assert self.process.stdout is not None
         # Read both pipes to their ends, so that the server never waits for us.
         self._reader = threading.Thread(target=lambda: self.errors.extend(self.process.stderr or ()))
         self._reader.start()
@@ -59,8 +45,6 @@ class CommandProcess:
             self.process.kill()
             raise
         self._reader.join(10)
-        assert self.process.stdout is not None
-        assert self.process.stderr is not None
         self.process.stdout.close()
         self.process.stderr.close()
         return code
@@ -97,14 +81,10 @@ class ServeProcess(CommandProcess):
 
 def _pss_kib(pid: int) -> int:
     try:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+        text = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii")
     except OSError:  # it has ended meanwhile
         return 0
-    sizes: Counter[str] = Counter()
-    for line in lines[1:]:
-        name, size = line.split()[:2]
-        sizes[name] = int(size)
-    return sizes["Pss:"]
+    return next((int(line.split()[1]) for line in text.splitlines() if line.startswith("Pss:")), 0)
 
 
 def children(pid: int) -> list[int]:

@@ -10,11 +10,10 @@ question must have an answer or an error of the server's, and the memory must st
 import os
 import random
 import signal
-import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
@@ -24,7 +23,7 @@ from featuredb.errors import ServiceError
 from featuredb.store import Database
 from reloc.client import Client
 from reloc.client.replies import NO_SERVER, TIMEOUT
-from tools.figures import write_figures
+from tools.figures import say, write_figures
 from tools.service_world import (
     ATTACKER,
     Service,
@@ -76,10 +75,10 @@ class Events:
                     self.counts[f"broken {error.code}"] += 1
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = service_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     database = Database.open(args.db)
     photos = photos_of(args.photos, 4)
     with tempfile.TemporaryDirectory() as scratch:
@@ -100,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     failures = Counter(heard.failures)
     quarter = len(memory) // 4
     early, late = median(memory[quarter : 2 * quarter]), median(memory[-quarter:])
-    sys.stdout.write(f"failures {dict(failures)}, events {dict(events.counts)}, {status.reload}\n")
+    say(f"failures {dict(failures)}, events {dict(events.counts)}, {status.reload}")
     figures = {
         "asked": len(heard.seconds),
         "wrong": heard.wrong,
@@ -114,8 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "exit_code": exit_code,
     }
     write_figures(args.json, figures)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,6 +1,6 @@
 """Does a server that is stopped in the middle of its load end, cleanly and in time?
 
-    python -m tools.service_stops DB PHOTOS [--stops 200]
+    python -m tools.service_stops DB PHOTOS
 
 Each time a server process is started, asked by several clients at once, and told to stop by SIGTERM at a
 random moment. Clean is: exit code 0 within the time that queries in hand may take, nothing left of its
@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from tools.figures import write_figures
 from tools.serve_process import ServeProcess, children
 from tools.service_world import photos_of, service_parser
 
-_CLIENTS = 4
+_STOPS, _CLIENTS = 200, 4
 _STOP_S = 30.0  # ten for queries in hand, ten for live sessions, ten for the inbox
 _LOG_LINES = 200  # a trace of every thread has some hundred
 _LATEST_S = 2.0  # the last moment of the signal, after the first question
@@ -83,14 +82,12 @@ def stopped_under_load(database: Path, photo: bytes, after_s: float) -> Stopped:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = service_parser(__doc__)
-    parser.add_argument("--stops", type=int, default=200)
-    args = parser.parse_args(argv)
+def main() -> None:
+    args = service_parser(__doc__).parse_args()
     (photo,) = photos_of(args.photos, 1)
     rng = random.Random(1)
     found = []
-    for number in range(args.stops):
+    for number in range(_STOPS):
         found.append(stopped_under_load(args.db, photo, rng.uniform(0.0, _LATEST_S)))
         if not found[-1].clean:
             sys.stdout.write(f"stop {number}: {replace(found[-1], log=())}\n{''.join(found[-1].log)}")
@@ -101,8 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "slowest_s": max(one.seconds for one in found),
     }
     write_figures(args.json, figures)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -14,10 +14,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from featuredb.errors import ServiceError
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import utm_epsg
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from reloc.authority.folder import Authority
@@ -76,10 +78,7 @@ def service_parser(doc: str | None) -> argparse.ArgumentParser:
 
 
 def enlarged(database: Database, points: int) -> list[str]:
-    """Copies of the oldest map, each beside the last, until the database has so many points; all map ids.
-
-    A copy has descriptors as real as the map's: their 16 cells are shuffled, in an order of its own.
-    """
+    """Copies of the oldest map, each beside the last, until the database has so many points; all map ids."""
     snapshot = database.snapshot()
     summary = snapshot.maps()[0]
     original = snapshot.load_map(summary.map_id)
@@ -88,19 +87,41 @@ def enlarged(database: Database, points: int) -> list[str]:
 
 
 def moved(original: FeatureMap, number: int) -> FeatureMap:
-    """A copy beside it; see `enlarged`."""
-    rng = np.random.default_rng(number)
+    """A copy beside it."""
     step = 200.0 * np.array([number % 4, number // 4, 0.0])
     origin = original.frame.utm_from_enu(np.zeros(3), original.epsg) + step
-    cells = original.observations.descriptors.reshape(-1, 16, 8)[:, rng.permutation(16)]
+    frame = LocalFrame.from_utm(*origin.tolist(), original.epsg)
+    return copied_map(original, frame, number, f"{original.map_id}-moved-{number}")
+
+
+def copied_map(source: FeatureMap, frame: LocalFrame, number: int, map_id: str) -> FeatureMap:
+    """The map at another place, with descriptors as real as its own: their cells are in another order."""
+    epsg, seen = utm_epsg(frame.latitude_deg, frame.longitude_deg), source.observations
     return replace(
-        original,
-        map_id=f"{original.map_id}-moved-{number}",
-        name=f"{original.name} moved {number}",
-        frame=LocalFrame.from_utm(float(origin[0]), float(origin[1]), float(origin[2]), original.epsg),
-        points=replace(original.points, utm=original.points.utm + step),
-        observations=replace(original.observations, descriptors=cells.reshape(-1, 128)),
+        source,
+        map_id=map_id,
+        name=map_id,
+        frame=frame,
+        epsg=epsg,
+        points=replace(source.points, utm=frame.utm_from_enu(source.points_local(), epsg)),
+        observations=replace(seen, descriptors=seen.descriptors[:, cell_order(number)]),
     )
+
+
+def cell_order(copy: int) -> NDArray[np.int64]:
+    """(128,) another order of a descriptor's 4 x 4 cells; the first is its own.
+
+    Corners, edges and inner cells change places among themselves: they have different weights in SIFT.
+    """
+    rng = np.random.default_rng(copy)
+    cells = np.arange(16)
+    row, column = np.divmod(cells, 4)
+    inner = ((row % 3) > 0).astype(np.int64) + ((column % 3) > 0)
+    if copy:
+        for kind in range(3):
+            alike = np.flatnonzero(inner == kind)
+            cells[alike] = rng.permutation(alike)
+    return (cells[:, None] * 8 + np.arange(8)).ravel()
 
 
 def photos_of(folder: Path, count: int) -> list[bytes]:

@@ -10,8 +10,6 @@
 """
 
 import re
-import sys
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -29,8 +27,8 @@ from tools.made_maps import copied, photo_names, position_table
 _SHIFT_M = 50_000.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--photos", "--scan", "--work").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--photos", "--scan", "--work").parse_args()
     names = photo_names(args.photos)
     right = copied(args.photos, names[::2], args.work / "right", strip=False)
     shifted = copied(args.photos, names[1::2], args.work / "shifted", strip=False)
@@ -52,14 +50,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     contribute(Database.open(grown), [contribution(shifted / name) for name in names[1::2]])
     figures["grow_km"] = told_km("grow", str(grown))
     write_figures(args.json, figures)
-    return 0
 
 
 def shifted_position(photo: Path) -> tuple[ExifInfo, float, float]:
     """What a photo says of itself, and its latitude and longitude 50 km further east."""
     exif = read_exif(photo.read_bytes())
-    assert exif.latitude_deg is not None
-    assert exif.longitude_deg is not None
     epsg = utm_epsg(exif.latitude_deg, exif.longitude_deg)
     utm = utm_from_geodetic((exif.latitude_deg, exif.longitude_deg, 0.0), epsg)
     latitude, longitude, _ = geodetic_from_utm(utm + np.array([_SHIFT_M, 0.0, 0.0]), epsg)
@@ -98,4 +93,4 @@ def told_km(*words: str) -> float | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -13,15 +13,13 @@ for every held-out photo and every negative, and compares with the truth:
   that of the exact positions.
 """
 
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
@@ -35,68 +33,51 @@ from ingest.register.gps import place_by_gps
 from reloc.localise.answer import placement_covariance
 from reloc.localise.result import LocalisedPose
 from reloc.localiser import Localiser
-from tools.figures import pose_offset, study_parser, write_figures
+from tools.figures import pose_offset, poses_in, study_parser, write_figures
 from tools.growth_common import answer_of
 
 _DRAWS = 300  # of placements
 _SIGMA_M = 0.02  # of each axis, as the demo ingests exact positions
-# An answer, and the true cam_from_local in the frame of the answer.
-Pair = tuple[LocalisedPose, Rigid3]
+_WRONG_M = 5.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Asked:
-    """One query.
-
-    Attributes:
-        pose: the answer; None where not localised.
-        error: against the truth; None likewise, or where there is none.
-        true_in_area: true cam_from_local in the frame of the answer; None likewise.
-    """
+class Asked(NamedTuple):
+    """One query: the answer, its error, and the true cam_from_local in its frame; None: there is none."""
 
     pose: LocalisedPose | None
-    error: PoseError | None
-    true_in_area: Rigid3 | None
+    error: PoseError | None = None
+    true: Rigid3 | None = None
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--seed")
     parser.add_argument("--out", type=Path, default=Path("simulated-evaluation"))
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     world = make_world(args.out / "world", size="full", seed=args.seed, exact_gps=True)
     database = Database.create(args.out / "db")
     if not database.snapshot().maps():
         ingest_world(world, database, args.out / "report", exact_gps=True)
     localiser = Localiser.open(database)
-    asked = ask_world(world, localiser)
-    answers = [(a.pose, a.true_in_area) for a in asked["drone"] if a.pose and a.true_in_area]
+    photos = {"drone": world.images("queries"), "street": world.images("street")}
+    photos |= {kind: world.negatives(kind) for kind in NEGATIVE_KINDS}
+    asked = {group: [ask(world, localiser, path) for path in paths] for group, paths in photos.items()}
+    answers = [one for one in asked["drone"] if one.true]
     (area,) = (indexed.area for indexed in localiser.areas)
     (placed,) = area.maps
     feature_map = database.snapshot().load_map(placed.map_id)
-    inside = inside_over_placements(answers, area, feature_map, world, _DRAWS, args.seed)
+    inside = inside_over_placements(answers, area, feature_map, world, args.seed)
     write_figures(args.json, inside | flat_figures(asked))
-    return 0
 
 
-def ask_world(world: World, localiser: Localiser) -> dict[str, list[Asked]]:
-    """Ask for every photo that is not in the map: by drone, from the street, and each kind of negative."""
-    photos = {"drone": world.images("queries"), "street": world.images("street")}
-    photos |= {kind: world.negatives(kind) for kind in NEGATIVE_KINDS}
-    return {group: [_ask(world, localiser, path) for path in paths] for group, paths in photos.items()}
-
-
-def _ask(world: World, localiser: Localiser, path: Path) -> Asked:
+def ask(world: World, localiser: Localiser, path: Path) -> Asked:
+    """Ask for a photo that is not in the map."""
     pose = answer_of(localiser, path).pose
-    name = path.relative_to(world.folder).as_posix()
-    true, frame = world.truth.images.get(name), world.truth.frame
+    true, frame = world.truth.images.get(path.relative_to(world.folder).as_posix()), world.truth.frame
     if pose is None or true is None:
-        return Asked(pose=pose, error=None, true_in_area=None)
-    return Asked(
-        pose=pose,
-        error=pose_difference(frame, true.cam_from_local, pose.epsg, pose.utm, pose.cam_from_utm_xyzw),
-        true_in_area=true.cam_from_local @ frame.enu_from(pose.frame),
-    )
+        return Asked(pose)
+    error = pose_difference(frame, true.cam_from_local, pose.epsg, pose.utm, pose.cam_from_utm_xyzw)
+    return Asked(pose, error, true.cam_from_local @ frame.enu_from(pose.frame))
 
 
 def flat_figures(asked: dict[str, list[Asked]]) -> dict[str, float]:
@@ -110,7 +91,7 @@ def flat_figures(asked: dict[str, list[Asked]]) -> dict[str, float]:
         "within": drone.within,
         "median_m": drone.position_m[0],
         "median_deg": drone.angle_deg[0],
-        "wrong": sum(a.error is not None and a.error.position_m > 5.0 for a in everything),
+        "wrong": sum(a.error is not None and a.error.position_m > _WRONG_M for a in everything),
         "negatives": len(negatives),
         "negatives_answered": sum(a.pose is not None for a in negatives),
         "street": len(asked["street"]),
@@ -118,71 +99,46 @@ def flat_figures(asked: dict[str, list[Asked]]) -> dict[str, float]:
     }
 
 
-def survey_positions(centers: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Positions with 2 cm of error per axis, half of its variance shared by the flight."""
-    part = _SIGMA_M / np.sqrt(2.0)
-    return centers + rng.normal(0.0, part, 3) + rng.normal(0.0, part, centers.shape)
-
-
 def inside_over_placements(
-    answers: Sequence[Pair], area: Area, feature_map: FeatureMap, world: World, draws: int, seed: int
+    answers: Sequence[Asked], area: Area, feature_map: FeatureMap, world: World, seed: int
 ) -> dict[str, float]:
-    """Shares of errors within the reported 68 % radii, and of how many draws: others a gate refused."""
-    centers_sfm, true_centers = _flight(feature_map, world)
+    """Shares of errors within the reported 68 % radii, over drawn placements."""
+    placement, poses = feature_map.placement, poses_in(feature_map.frame, feature_map)
+    names = sorted(poses)  # in the order of the flight
+    centers_sfm = placement.local_from_sfm.inverse().act([poses[name].center for name in names])
+    true = [world.truth.images[f"drone/{name}"].cam_from_local.center for name in names]
+    true_centers = feature_map.frame.enu_from(world.truth.frame).act(true)
     rng = np.random.default_rng((seed, 31))
-    sigmas = np.full(true_centers.shape, _SIGMA_M)
-    measured = [measured_covariance(area, feature_map, pose) for pose, _ in answers]
-    inside, placed = [], 0
-    for _ in range(draws):
-        again = place_by_gps(centers_sfm, survey_positions(true_centers, rng), sigmas)
+    part = _SIGMA_M / np.sqrt(2.0)  # half of the variance is shared by the flight
+    measured = []  # what answers' covariances hold besides the map's placement, in the area's axes
+    for one in answers:
+        center = one.pose.cam_from_local.center
+        back = np.kron(np.eye(2), one.pose.frame.true_enu_from_enu(center).T)
+        own = back @ one.pose.covariance @ back.T
+        measured.append(own - placement_covariance(area, feature_map, center))
+    inside = []
+    for _ in range(_DRAWS):
+        positions = true_centers + rng.normal(0.0, part, 3) + rng.normal(0.0, part, true_centers.shape)
+        again = place_by_gps(centers_sfm, positions, np.full(positions.shape, _SIGMA_M))
         if again.reason is not None or again.local_from_sfm is None or again.covariance is None:
-            continue
-        placed += 1
-        moved_map = _placed_by(feature_map, again.local_from_sfm, again.covariance)
-        motion = again.local_from_sfm @ feature_map.placement.local_from_sfm.inverse()
+            continue  # a gate refuses it
+        told = replace(placement, local_from_sfm=again.local_from_sfm, covariance=again.covariance)
+        moved_map = replace(feature_map, placement=told)
+        motion = again.local_from_sfm @ placement.local_from_sfm.inverse()
         turn = np.kron(np.eye(2), motion.rotation)
-        for (pose, true), own in zip(answers, measured, strict=True):
-            moved = motion.act_on_pose(pose.cam_from_local)
+        for one, own in zip(answers, measured, strict=True):
+            moved = motion.act_on_pose(one.pose.cam_from_local)
             covariance = turn @ own @ turn.T + placement_covariance(area, moved_map, moved.center)
-            inside.append(_inside(pose_offset(moved, true), covariance))
+            error = pose_offset(moved, one.true)
+            inside.append(
+                (
+                    np.hypot(*error[3:5]) <= error_radius(covariance[3:5, 3:5]),
+                    np.linalg.norm(error[:3]) <= error_radius(covariance[:3, :3]),
+                )
+            )
     horizontal, orientation = np.mean(inside, axis=0)
-    return {
-        "placements": placed,
-        "inside_horizontal": float(horizontal),
-        "inside_orientation": float(orientation),
-    }
-
-
-def _flight(feature_map: FeatureMap, world: World) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) camera centres in the order of the flight: in the structure's frame, and true local ones."""
-    images = sorted(feature_map.images, key=lambda image: image.name)
-    true = [world.truth.images[f"drone/{image.name}"].cam_from_local.center for image in images]
-    placed = np.array([image.cam_from_local.center for image in images])
-    return (
-        feature_map.placement.local_from_sfm.inverse().act(placed),
-        feature_map.frame.enu_from(world.truth.frame).act(np.array(true)),
-    )
-
-
-def measured_covariance(area: Area, feature_map: FeatureMap, pose: LocalisedPose) -> FloatArray:
-    """What an answer's covariance (6, 6) holds besides the map's placement, in the area's axes."""
-    center = pose.cam_from_local.center
-    back = np.kron(np.eye(2), pose.frame.true_enu_from_enu(center).T)
-    return back @ pose.covariance @ back.T - placement_covariance(area, feature_map, center)
-
-
-def _placed_by(feature_map: FeatureMap, local_from_sfm: Any, covariance: FloatArray) -> FeatureMap:
-    placement = replace(feature_map.placement, local_from_sfm=local_from_sfm, covariance=covariance)
-    return replace(feature_map, placement=placement)
-
-
-def _inside(error: FloatArray, covariance: FloatArray) -> tuple[bool, bool]:
-    """Whether the horizontal error and that of the orientation are within their 68 % radii."""
-    return (
-        bool(np.hypot(*error[3:5]) <= error_radius(covariance[3:5, 3:5])),
-        bool(np.linalg.norm(error[:3]) <= error_radius(covariance[:3, :3])),
-    )
+    return {"inside_horizontal": float(horizontal), "inside_orientation": float(orientation)}
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,6 +1,6 @@
 """Maps of street photos placed on the scan of their town by its outlines: how many, how right?
 
-    python -m tools.street_on_scan --work DIR [--inputs DIR] [--towns 306 307 ...]
+    python -m tools.street_on_scan --work DIR [--inputs DIR]
 
 Of each town, 60 photos by ten people, a third of them with geotags of 10 m (`tools.worlds.street_people`),
 are ingested, and each map of ten photos and more is placed by `featuredb anchor --near --auto` on the town's
@@ -9,9 +9,7 @@ nothing may be placed.
 What is found of a town is kept in DIR.
 """
 
-import json
-import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +22,8 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.world import Truth, read_truth
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, newest_copy
-from tools.figures import study_parser, write_figures
-from tools.made_maps import make
+from tools.figures import kept, median, squared, study_parser, write_figures
+from tools.made_maps import make, once
 from tools.worlds.album import TABLE_FILE
 from tools.worlds.scan_world import make_scan_world
 from tools.worlds.street_people import StreetOptions, write_street_album
@@ -37,13 +35,11 @@ _BOUND = float(chi2.isf(1e-3, 3))
 _RADIUS_M = 200.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__, "--work", "--inputs")
-    parser.add_argument("--towns", type=int, nargs="+", default=_TOWNS, help="seeds")
-    args = parser.parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
     cv2.setNumThreads(1)
-    args.work.mkdir(parents=True, exist_ok=True)
-    towns = [_town(seed, args.inputs or args.work, args.work) for seed in args.towns]
+    inputs, work = args.inputs or args.work, args.work
+    towns = [kept(work / f"town-{seed}.json", partial(_town, seed, inputs, work)) for seed in _TOWNS]
     here = [one for town in towns for one in town["here"]]
     placed = [one for one in here if one["off"]]
     off = np.array([pair for one in placed for pair in one["off"]]).reshape(-1, 3)
@@ -60,33 +56,23 @@ def main(argv: Sequence[str] | None = None) -> int:
             "right": right,
             "right_share": right / max(photos, 1),
             "outside": int((off[:, 2] > _OUTSIDE_M).sum()),
-            "median_m": float(np.median(off[:, 0])) if len(off) else float("nan"),
+            "median_m": median(off[:, 0]),
             "largest_m": float(off[:, 0].max(initial=0.0)),
             "elsewhere": sum(len(town["elsewhere"]) for town in towns),
             "elsewhere_placed": sum(bool(one["off"]) for town in towns for one in town["elsewhere"]),
         },
     )
-    return 0
 
 
 def _town(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
-    """What is found of one town, made once."""
-    path = work / f"town-{seed}.json"
-    if not path.exists():
-        world = make_scan_world(inputs, seed)
-        album = write_street_album(inputs / f"street-{seed}", StreetOptions(seed=seed))
-        made = work / f"made-{seed}"
-        if not made.exists():
-            make(work / "making", "photos", album / TABLE_FILE)
-            (work / "making").rename(made)
-        found = {
-            kind: _placed(made, scan, album, work)
-            for kind, scan in (("here", world.scan), ("elsewhere", world.other_scan))
-        }
-        path.write_text(json.dumps(found))
-        sys.stdout.write(f"town {seed}: {found}\n")
-        sys.stdout.flush()
-    return dict(json.loads(path.read_text()))
+    """What is found of one town."""
+    world = make_scan_world(inputs, seed)
+    album = write_street_album(inputs / f"street-{seed}", StreetOptions(seed=seed))
+    made = once(work / f"made-{seed}", lambda making: make(making, "photos", album / TABLE_FILE))
+    return {
+        kind: _placed(made, scan, album, work)
+        for kind, scan in (("here", world.scan), ("elsewhere", world.other_scan))
+    }
 
 
 def _placed(made: Path, scan: Path, album: Path, work: Path) -> list[dict[str, Any]]:
@@ -120,13 +106,12 @@ def _off(placed: FeatureMap, truth: Truth) -> list[tuple[float, float, float]]:
         true = truth.images[image.name].cam_from_local @ here
         off = image.cam_from_local.center - true.center
         jacobian = point_jacobian(image.cam_from_local.center)
-        covariance = jacobian @ placed.placement.covariance @ jacobian.T
+        square = squared(off, jacobian @ placed.placement.covariance @ jacobian.T)
         metres = float(np.linalg.norm(off))
-        squared = float(off @ np.linalg.solve(covariance, off))
-        bound = metres * float(np.sqrt(_BOUND / squared)) if squared > 0.0 else np.inf
+        bound = metres * float(np.sqrt(_BOUND / square)) if square > 0.0 else np.inf
         found.append((metres, image.cam_from_local.angle_to_deg(true), max(metres - bound, 0.0)))
     return found
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

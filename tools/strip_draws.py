@@ -9,9 +9,8 @@ strip of four some yaws are off by 180 degrees, as there. Each strip is placed w
 
 """
 
-import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +22,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from tools.figures import write_figures
-from tools.position_draws import LEVELS, PARTS, SIGMAS, Flight, inside, squares
-from tools.scan_truth import ScanTruth, scan_parser, scan_truth
+from tools.figures import median, write_figures
+from tools.position_draws import SIGMAS, Flight, shares, squares
+from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
 _LEAST, _MOST_BEND = 5, 0.1  # photos of a real strip; its width over its length
 _EACH_DEG, _COMMON_DEG = np.array([1.3, 1.3, 1.8]), np.array([1.5, 1.5, 2.2])  # camera x and y, up
@@ -42,19 +41,18 @@ class CameraStrip:
     angles: tuple[CameraAngles | None, ...]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = scan_parser(__doc__)
     parser.add_argument("--draws", type=int, default=200, help="simulated strips")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     with threadpool_limits(1):
-        figures = measure("real", list(real_strips(scan_truth(args), args.photos)), _SEED)
+        figures = measure("real", list(real_strips(scan_truth(args), args.photos)))
         drawn = [simulated_strip(np.random.default_rng((_SEED, draw))) for draw in range(args.draws)]
-        figures |= measure("simulated", drawn, _SEED)
+        figures |= measure("simulated", drawn)
     write_figures(args.json, figures)
-    return 0
 
 
-def measure(kind: str, strips: Sequence[CameraStrip], seed: int) -> dict[str, float]:
+def measure(kind: str, strips: Sequence[CameraStrip]) -> dict[str, float]:
     """How many are placed and answer, and how often their errors lie inside their bounds."""
     figures = {f"{kind}_strips": float(len(strips))}
     for name, angles in (("", True), ("without_", False)):
@@ -66,18 +64,14 @@ def measure(kind: str, strips: Sequence[CameraStrip], seed: int) -> dict[str, fl
             if found.reason is not None:
                 continue
             answer += not found.provisional
-            camera = np.random.default_rng((seed, 5, number)).integers(len(strip.flight.xyz))
+            camera = np.random.default_rng((_SEED, 5, number)).integers(len(strip.flight.xyz))
             scores.append(squares(found, strip.flight.xyz[camera]))
             turns.append(found.figures["turn_sigma_deg"])
         figures |= {
             f"{kind}_{name}placed": len(scores) / len(strips),
             f"{kind}_{name}answer": answer / len(strips),
-            f"{kind}_{name}turn_deg": float(np.median(turns)) if turns else float("nan"),
-            **{
-                f"{kind}_{name}{part}_{100 * level:.0f}": inside(scores, part, level)
-                for part in PARTS
-                for level in LEVELS
-            },
+            f"{kind}_{name}turn_deg": median(turns),
+            **shares(f"{kind}_{name}", scores),
         }
     return figures
 
@@ -87,14 +81,10 @@ def real_strips(truth: ScanTruth, photos: Path) -> Iterator[CameraStrip]:
     frame, by_name = truth.frame, truth.poses
     names = sorted(by_name)
     told = [read_exif((photos / name).read_bytes()) for name in names]
-    positions = np.array(
-        [frame.enu_from_geodetic([exif.latitude_deg or 0.0, exif.longitude_deg or 0.0, 0.0]) for exif in told]
-    )
-    positions[:, 2] = [(exif.altitude_m or 0.0) - frame.height_m for exif in told]
+    positions = np.array([frame.enu_from_geodetic([e.latitude_deg, e.longitude_deg, 0.0]) for e in told])
+    positions[:, 2] = [exif.altitude_m - frame.height_m for exif in told]
     xyz = np.array([by_name[name].center for name in names])
-    times = [exif.capture_time for exif in told]
-    assert times[0] is not None
-    seconds = np.array([0.0 if time is None else (time - times[0]).total_seconds() for time in times])
+    seconds = np.array([(exif.capture_time - told[0].capture_time).total_seconds() for exif in told])
     for count in (_LEAST, _LEAST + 1):
         for first in range(len(names) - count + 1):
             rows = slice(first, first + count)
@@ -133,18 +123,11 @@ def simulated_strip(rng: np.random.Generator) -> CameraStrip:
             sigma_tilt_deg=DEFAULT_SIGMA_TILT_DEG,
         )
         off = np.radians(common + rng.normal(0.0, _EACH_DEG))
-        rotation = so3_exp([off[0], off[1], 0.0]) @ cam_from_enu(
-            told.yaw_deg or 0.0, told.pitch_deg or 0.0, 0.0
-        )
+        rotation = so3_exp([off[0], off[1], 0.0]) @ cam_from_enu(told.yaw_deg, told.pitch_deg, 0.0)
         rotation = rotation @ so3_exp([0.0, 0.0, off[2]])
         poses.append(Rigid3(rotation=rotation, translation=-rotation @ center))
         if flipped and rng.random() < 0.5:
-            told = CameraAngles(
-                yaw_deg=(told.yaw_deg or 0.0) + 180.0,
-                pitch_deg=told.pitch_deg,
-                sigma_yaw_deg=told.sigma_yaw_deg,
-                sigma_tilt_deg=told.sigma_tilt_deg,
-            )
+            told = replace(told, yaw_deg=told.yaw_deg + 180.0, roll_deg=None)
         angles.append(told)
     noise = rng.uniform(0.3, 2.0)
     rest = np.sqrt(np.maximum(SIGMAS**2 - noise**2, 0.0))
@@ -159,4 +142,4 @@ def simulated_strip(rng: np.random.Generator) -> CameraStrip:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,6 +1,6 @@
 """How right tracked films are: flights over the simulated town, anchored on its scan, against true poses.
 
-    python -m tools.track_evaluation --out DIR [--films smooth jerky cut] [--seed N]
+    python -m tools.track_evaluation --out DIR [--films smooth jerky cut]
 
 1. The world of `tools.worlds.scan_world`: `featuredb ingest photos` maps the drone's photos,
    `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
@@ -13,18 +13,16 @@ Writes into track.json for each film what `judge_film` says; with --draw how far
 lays over the film by that track is from where it belongs (tools/drawn_layer.py), too.
 """
 
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
+from featuredb.geometry.rotation import matrix_from_quaternion, so3_log
 from featuredb.lidar.load import load_cloud
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
@@ -37,62 +35,47 @@ from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored
-from tools.commands import featuredb
 from tools.drawn_layer import drawn_marks
-from tools.figures import study_parser, write_figures
-from tools.growth_common import say
-from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
+from tools.figures import inside, off_pose, say, squared, study_parser, write_figures
+from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, film_truth, write_film
 from tools.worlds.flight_path import FlightStyle, PathOptions
 from tools.worlds.scan_world import make_scan_world
 
 _FILMS = ("smooth", "jerky", "cut")
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
 _END = 200  # frames at each end whose errors are compared; of short films, a half each
+_FRAMES, _SEED = 1200, 1
 _CUT = (0.4, 0.55)  # of the film
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = study_parser(__doc__, "--out", "--inputs", "--seed")
-    parser.add_argument("--frames", type=int, default=1200)
+def main() -> None:
+    parser = study_parser(__doc__, "--out", "--inputs")
+    parser.add_argument("--frames", type=int, default=_FRAMES)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.out
-    database = anchored_map(args.out, inputs, args.seed)
+    database, placed = anchored(args.out, make_scan_world(inputs), other=False)
+    if not placed:
+        raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
     results: dict[str, dict[str, float]] = {}
     for name in args.films:
-        options = film_options(name, args.frames, args.seed)
-        film = inputs / f"film-{name}-{args.frames}-{args.seed}"
-        folder = write_film(film, options, 0, _progress(name))
-        truth = read_film_truth(folder)
-        finder = finder_on(args.on, database, truth, args.seed)
-        tracked = track_video(folder / FILM_FILE, finder, camera=truth.camera)
+        options = film_options(name, args.frames)
+        film = write_film(inputs / f"film-{name}-{args.frames}-{_SEED}", options) / FILM_FILE
+        truth = film_truth(options)
+        finder = finder_on(args.on, database, truth)
+        tracked = track_video(film, finder, camera=truth.camera)
         results[name] = judge_film(tracked, truth)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
         if args.draw:
             scene, track = town_of(options.world), tracked.trajectory
             results[f"{name}_layer"] = drawn_marks(args.out, film, truth, scene, track, database)
     write_figures(args.out / "track.json", results)
-    return 0
 
 
-def anchored_map(out: Path, inputs: Path, seed: int) -> Path:
-    """A database with the map of the drone's photos, placed on the scan; kept in `out`."""
-    world = make_scan_world(inputs, seed)
-    done = out / "anchored.txt"
-    if not done.exists():
-        mapped = out / "mapped"
-        featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
-        database, placed = anchored(out, mapped, world, other=False)
-        if not placed:
-            raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
-        done.write_text(database.name)
-    return out / done.read_text()
-
-
-def finder_on(what: str, database: Path, truth: FilmTruth, seed: int) -> Finder:
+def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
     """What a film is tracked by: its map, or its scan from a coarse first pose."""
     maps = Localiser.open(Database.open(database)).areas
     if what == "map":
@@ -100,34 +83,28 @@ def finder_on(what: str, database: Path, truth: FilmTruth, seed: int) -> Finder:
     (scan,) = list_scans(Database.open(database))
     cloud = load_cloud(Database.open(database), truth.frame, scan_ids=[scan.scan_id])
     first = truth.cam_from_local[0]
-    assert first is not None
-    return ScanFinder(cloud, scan.scan_id, truth.epsg, coarse_start(first, seed))
+    start = off_pose(first, np.random.default_rng((_SEED, 5)), _START_M, _START_DEG)
+    prior = FramePrior.around(start, _START_M, _START_DEG)
+    return ScanFinder(cloud, scan.scan_id, truth.epsg, prior)
 
 
-def coarse_start(pose: Rigid3, seed: int) -> FramePrior:
-    """A pose that is off by 10 m to some side and 5 degrees about some axis, and says so."""
-    rng = np.random.default_rng((seed, 5))
-    side, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-    rotation = so3_exp(np.radians(_START_DEG) * axis) @ pose.rotation
-    return FramePrior(
-        cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ (pose.center + _START_M * side)),
-        sigma_horizontal_m=_START_M,
-        sigma_vertical_m=_START_M,
-        sigma_heading_deg=_START_DEG,
-        sigma_tilt_deg=_START_DEG,
-    )
-
-
-def film_options(name: str, frames: int, seed: int = 1) -> FilmOptions:
+def film_options(name: str, frames: int) -> FilmOptions:
     style: FlightStyle = "jerky" if name == "jerky" else "smooth"
-    path = PathOptions(seed=seed, style=style, half_extent_m=(32.0, 26.0))
+    path = PathOptions(seed=_SEED, style=style, half_extent_m=(32.0, 26.0))
     cut = tuple(round(share * frames) for share in _CUT) if name == "cut" else None
     return FilmOptions(
-        world=WorldOptions.short(seed),
+        world=WorldOptions.short(_SEED),
         path=path,
         frames=frames,
         cut=None if cut is None else (cut[0], cut[1]),
     )
+
+
+def smooth_film(inputs: Path) -> tuple[Path, FilmTruth]:
+    """The film `smooth` of 1,200 frames, with its telemetry beside it, and its truth; drawn once."""
+    options = film_options("smooth", _FRAMES)
+    folder = write_film(inputs / f"film-smooth-{_FRAMES}-{_SEED}", options)
+    return folder / FILM_FILE, film_truth(options)
 
 
 def axis_errors(
@@ -146,12 +123,12 @@ def axis_errors(
     return off
 
 
-def judge_film(tracked: TrackedVideo, truth: FilmTruth) -> dict[str, float]:
+def judge_film(tracked: TrackedVideo, truth: FilmTruth, most: int = _END) -> dict[str, float]:
     """The film's track against its truth.
 
     - frames, lost: of the frames that show the town. invented: poses of frames that do not.
     - mean_m, largest_m: errors of the frames that have poses. first_m, last_m: means over the first and the
-      last 200 of them, or over the halves of fewer than 400.
+      last of them, `most` or a half.
     - found_s: from the town's return to the first pose, of the film's time; 0 without a cut.
     - rate_hz: frames a second over the whole run.
     - position_95, orientation_95: shares of the errors inside these bounds. squared: mean squared error of
@@ -163,7 +140,7 @@ def judge_film(tracked: TrackedVideo, truth: FilmTruth) -> dict[str, float]:
     if not known.any():
         raise SystemExit(f"track_evaluation: no frame of {tracked.trajectory.source} has a pose")
     m = metres[known]
-    end = min(_END, max(len(m) // 2, 1))  # ends that overlap could not differ
+    end = min(most, max(len(m) // 2, 1))  # ends that overlap could not differ
     return {
         "frames": int(truth.at_home.sum()),
         "lost": int((truth.at_home & np.isnan(metres)).sum()),
@@ -185,17 +162,16 @@ def _inside(trajectory: Trajectory, off: FloatArray) -> dict[str, float]:
     few = np.argsort([p.inliers for p in points], kind="stable")[: (len(points) + 3) // 4]
     figures: dict[str, float] = {}
     for name, part in (("orientation", slice(0, 3)), ("position", slice(3, 6))):
-        squared = np.array(
+        squares = np.array(
             [
-                off[k, part] @ np.linalg.solve(p.pose.covariance[part, part], off[k, part])
+                squared(off[k, part], p.pose.covariance[part, part])
                 for k, p in zip(rows, points, strict=True)
                 if p.pose is not None
             ]
         )
-        inside = squared <= chi2.ppf(0.95, 3)
-        figures |= {f"{name}_95": float(inside.mean()), f"few_{name}_95": float(inside[few].mean())}
+        figures |= {f"{name}_95": inside(squares, 0.95), f"few_{name}_95": inside(squares[few], 0.95)}
         if name == "position":
-            figures |= {"squared": float(squared.mean()), "few_squared": float(squared[few].mean())}
+            figures |= {"squared": float(squares.mean()), "few_squared": float(squares[few].mean())}
     return figures
 
 
@@ -209,13 +185,5 @@ def _found_s(truth: FilmTruth, known: NDArray[np.bool_]) -> float:
     return float(truth.times_s[back + again[0]] - truth.times_s[back]) if len(again) else float("inf")
 
 
-def _progress(name: str) -> Callable[[int, int], None]:
-    def told(done: int, total: int) -> None:
-        if done % 100 == 0 or done == total:
-            say(f"{name}: {done} of {total} frames drawn")
-
-    return told
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

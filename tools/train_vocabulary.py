@@ -70,11 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def train_vocabulary(
-    descriptors: Sequence[NDArray[np.uint8]],
-    *,
-    words: int = 128,
-    dimensions: int = 32,
-    seed: int = 0,
+    descriptors: Sequence[NDArray[np.uint8]], *, words: int = 128, dimensions: int = 32, seed: int = 0
 ) -> Vocabulary:
     """Principal components and k-means of some descriptors of each photo, with fixed random choices.
 

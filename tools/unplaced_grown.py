@@ -12,32 +12,28 @@
 """
 
 import argparse
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from tools.commands import featuredb
-from tools.figures import spread, study_parser, write_figures
+from tools.figures import pose_errors, poses_in, spread, study_parser, write_figures
 from tools.made_maps import copied, photo_names
 from tools.real_photos import ingest, reference
 
 _STRANGE = 10
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--strange", type=Path, required=True, metavar="FOLDER", help="photos of elsewhere")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     write_figures(args.json, grown(args, args.work))
-    return 0
 
 
 def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
@@ -61,7 +57,8 @@ def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
     poses = placed_like(maps["placed"], truth)
     for name in ("placed", "loose"):
         if name in maps:
-            figures |= {f"{name}_{what}": v for what, v in errors(maps[name], truth.frame, poses).items()}
+            off = spread(*pose_errors(poses_in(truth.frame, maps[name]), poses))
+            figures |= {f"{name}_{what}": value for what, value in off.items()}
     if "loose" in maps:
         figures["bound_m"] = maps["loose"].placement.evidence["growth"]["drift_m"]
     return figures
@@ -69,7 +66,7 @@ def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
 
 def placed_like(feature_map: FeatureMap, truth: FeatureMap) -> dict[str, Rigid3]:
     """The poses of the truth, moved by a similarity to where a map has its photos, turned as these are."""
-    mine, poses = _poses(feature_map, truth.frame), _poses(truth, truth.frame)
+    mine, poses = poses_in(truth.frame, feature_map), poses_in(truth.frame, truth)
     shared = [name for name in mine if name in poses]
     turn = Rotation.from_matrix([mine[n].rotation.T @ poses[n].rotation for n in shared]).mean().as_matrix()
     true = np.array([turn @ poses[n].center for n in shared])
@@ -80,21 +77,5 @@ def placed_like(feature_map: FeatureMap, truth: FeatureMap) -> dict[str, Rigid3]
     return {name: move.act_on_pose(pose) for name, pose in poses.items()}
 
 
-def errors(feature_map: FeatureMap, frame: LocalFrame, true: dict[str, Rigid3]) -> dict[str, float]:
-    """Of the photos' centres (metres) and orientations (degrees) from the true poses in a frame."""
-    metres: list[float] = []
-    degrees: list[float] = []
-    for name, pose in _poses(feature_map, frame).items():
-        if name in true:
-            metres.append(float(np.linalg.norm(true[name].center - pose.center)))
-            degrees.append(pose.angle_to_deg(true[name]))
-    return spread(metres, degrees)
-
-
-def _poses(feature_map: FeatureMap, frame: LocalFrame) -> dict[str, Rigid3]:
-    there = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
-    return {image.name: there.act_on_pose(image.cam_from_local) for image in feature_map.images}
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

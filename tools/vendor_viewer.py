@@ -31,10 +31,8 @@ FOLDER = Path(__file__).resolve().parent.parent / "reloc" / "viewer" / "assets" 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Fetch the viewer's libraries from the npm registry.")
-    parser.add_argument("--registry", default=REGISTRY, metavar="URL", help=f"default {REGISTRY}")
-    registry = parser.parse_args().registry.rstrip("/")
-    with urllib.request.urlopen(f"{registry}/three/-/three-{VERSION}.tgz", timeout=60) as response:
+    argparse.ArgumentParser(description="Fetch the viewer's libraries from the npm registry.").parse_args()
+    with urllib.request.urlopen(f"{REGISTRY}/three/-/three-{VERSION}.tgz", timeout=60) as response:
         tarball = response.read()
     found = "sha512-" + base64.b64encode(hashlib.sha512(tarball).digest()).decode()
     if found != INTEGRITY:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from featuredb.errors import InvalidValueError
 from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import read_truth
@@ -174,8 +173,3 @@ def test_traps_stand_where_they_should() -> None:
     assert all(p.edits[0].kind == "mirrored" for p in kinds["mirrored"])
     assert all(p.scene.startswith("forged/") for p in kinds["forged"])
     assert not any(p.fact.home for p in kinds["liar_other"])
-
-
-def test_a_folder_without_facts_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidValueError, match="simulated album"):
-        read_facts(tmp_path)

@@ -7,7 +7,7 @@ from tools.strip_draws import measure, simulated_strip
 
 def test_strips_answer_with_angles_rather_than_without() -> None:
     strips = [simulated_strip(np.random.default_rng((3, draw))) for draw in range(4)]
-    figures = measure("simulated", strips, 1)
+    figures = measure("simulated", strips)
     assert figures["simulated_placed"] == 1.0
     assert figures["simulated_answer"] >= 0.5
     assert figures["simulated_without_answer"] < figures["simulated_answer"]

@@ -144,7 +144,7 @@ REAL: tuple[Row, ...] = (
         name="brighton-near",
         claim="`brighton` without GPS: a map of 14 photos, looked for within 250 m of a point 100 m off; ten "
         "points each with the scan's colours, with grey values as intensities, and on a mirrored scan",
-        commands=f"tools.unplaced_near --photos {BRIGHTON} --scan {SCAN} "
+        commands=f"tools.unplaced_brighton --near --photos {BRIGHTON} --scan {SCAN} "
         f"--poses {POSES} --work {{work}}/near {OUT}",
         text="{colour_placed} and {intensity_placed} of {draws} placed, {colour_wrong} and {intensity_wrong} "
         "wrong; the 4 others median {colour_median_m:.2f} and {intensity_median_m:.2f} m, "
@@ -170,7 +170,7 @@ REAL: tuple[Row, ...] = (
         name="karma-placed",
         claim="`karma.mp4`, 12 s by a drone straight ahead: placed by its telemetry; its track against its "
         "own GPS, inside the 95 % radius that it states",
-        commands=f"tools.film_placed {{data}}/video/karma.mp4 --work {{work}} {OUT}",
+        commands=f"tools.film_tracked {{data}}/video/karma.mp4 --work {{work}} {OUT}",
         text="{mapped} of {keyframes} keyframes, {tracked} frames tracked; radius {radius_m:.1f} m, off by "
         "{rms_m:.1f} m (root mean square) and {largest_m:.1f} m at most; {inside:.1%} of {compared} inside",
         limits="24 <= mapped, 1 <= active, 0.95 <= inside",
@@ -192,7 +192,7 @@ REAL: tuple[Row, ...] = (
         claim="`karma.mp4`, 12 s by a drone, becomes a map without a place (paper: 98 of 115 films), and is "
         "followed in its frame; at keyframes the track agrees with the map's own cameras, relative to the "
         "distance of the points",
-        commands=f"tools.film_in_map {{data}}/video/karma.mp4 --work {{work}} {OUT}",
+        commands=f"tools.film_tracked {{data}}/video/karma.mp4 --no-telemetry --work {{work}} {OUT}",
         text="{mapped} of {keyframes} keyframes, {tracked} of {frames} frames; {center_rel:.2%} and "
         "{angle_deg:.2f} degrees",
         limits="0.8 <= mapped_share, 0.9 <= tracked_share, center_rel <= 0.01",

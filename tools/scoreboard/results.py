@@ -41,11 +41,7 @@ class Result:
 
 
 def result_now(
-    row: str,
-    commit: str,
-    figures: Mapping[str, float | int | str | None],
-    seconds: float,
-    failure: str = "",
+    row: str, commit: str, figures: Mapping[str, float | int | str | None], seconds: float, failure: str = ""
 ) -> Result:
     """A result of this machine, today."""
     return Result(

@@ -7,7 +7,7 @@ An album's photos lie in a folder per owner under names that give nothing away. 
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import lru_cache, partial
@@ -116,6 +116,12 @@ class PlannedPhoto:
     orientation: int = 1
 
 
+def renamed(photo: PlannedPhoto, name: str, **fact: Any) -> PlannedPhoto:
+    """The photo under another name, and with other facts."""
+    told = replace(photo.fact, name=name, **fact)
+    return replace(photo, shot=replace(photo.shot, name=name), fact=told)
+
+
 def write_album(
     folder: Path,
     world: SceneSource,
@@ -155,16 +161,12 @@ def write_album(
         if progress is not None:
             progress(done, len(photos))
     truths = {p.shot.name: true for p in photos if (true := _truth(home, p)) is not None}
-    write_table(folder, [(p.fact, p.geotag) for p in photos])
-    write_facts(folder, [p.fact for p in photos])
+    told = sorted(photos, key=lambda p: p.fact.name)
+    # Photos of a survey are not part of a photo site.
+    _write_lines(folder / TABLE_FILE, (_table_row(p.fact, p.geotag) for p in told if p.fact.kind != "survey"))
+    _write_lines(folder / FACTS_FILE, (asdict(p.fact) | {"time": p.fact.time.isoformat()} for p in told))
     write_truth(folder, Truth(seed=home.seed, epsg=home.epsg, frame=home.frame, images=truths))
     return folder
-
-
-def photo_file(scene: Scene, photo: PlannedPhoto) -> bytes:
-    """The JPEG file of a planned photo."""
-    image = edited(_picture(scene, photo), photo.edits, photo.shot.seed)
-    return jpeg_bytes(image, photo.quality, _exif(photo, image))
 
 
 def _truth(home: Scene, photo: PlannedPhoto) -> TrueImage | None:
@@ -218,43 +220,22 @@ def _write(folder: Path, world: SceneSource, photos: Sequence[PlannedPhoto], num
     photo = photos[number]
     target = folder / photo.shot.name
     part = target.with_suffix(f".{os.getpid()}.part")
-    part.write_bytes(photo_file(_scene(world, photo.scene), photo))
+    image = edited(_picture(_scene(world, photo.scene), photo), photo.edits, photo.shot.seed)
+    part.write_bytes(jpeg_bytes(image, photo.quality, _exif(photo, image)))
     part.replace(target)
 
 
-def write_facts(folder: Path, facts: Sequence[AlbumFact]) -> None:
-    """Write folder/facts.jsonl, a line per photo, sorted by name."""
-    lines = [
-        json.dumps({**asdict(fact), "time": fact.time.isoformat()})
-        for fact in sorted(facts, key=lambda f: f.name)
-    ]
-    (folder / FACTS_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
 def read_facts(folder: Path) -> dict[str, AlbumFact]:
-    """Facts by name.
-
-    Raises:
-        InvalidValueError: no such file, or not one of an album.
-    """
-    path = Path(folder) / FACTS_FILE
-    try:
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        facts = [AlbumFact(**{**row, "time": datetime.fromisoformat(row["time"])}) for row in rows]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise InvalidValueError(
-            f"{path}: expected the facts of a simulated album, found {error!r}"
-        ) from error
+    """Facts by name."""
+    lines = (folder / FACTS_FILE).read_text(encoding="utf-8").splitlines()
+    facts = [
+        AlbumFact(**{**row, "time": datetime.fromisoformat(row["time"])}) for row in map(json.loads, lines)
+    ]
     return {fact.name: fact for fact in facts}
 
 
-def write_table(folder: Path, rows: Sequence[tuple[AlbumFact, Geotag | None]]) -> None:
-    """Write table.jsonl, sorted by path; photos of a survey are not part of a photo site."""
-    table = [
-        _table_row(fact, tag) for fact, tag in sorted(rows, key=lambda r: r[0].name) if fact.kind != "survey"
-    ]
-    lines = "".join(json.dumps(row) + "\n" for row in table)
-    (folder / TABLE_FILE).write_text(lines, encoding="utf-8")
+def _write_lines(path: Path, rows: Iterable[dict[str, Any]]) -> None:
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
 
 
 def _table_row(fact: AlbumFact, tag: Geotag | None) -> dict[str, Any]:

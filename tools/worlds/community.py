@@ -13,18 +13,16 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import AlbumFact, PlannedPhoto, Subject
+from tools.worlds.album import PlannedPhoto, Subject, renamed
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.geotags import ACCURACY_SHARE, GeotagOptions, geotag_at
-from tools.worlds.people import Person, community
+from tools.worlds.people import Person, community, planned
 from tools.worlds.sights import find_sights
 from tools.worlds.surveyed import DAYS, TownOptions, moment, shot_seed, survey_photos
 
-_TAGGED_HERE, _TAGGED_THERE = (
-    0.6,
-    0.8,
-)  # of another town's photos: claimed here; at their own place; rest none
+# Of another town's visits: claimed here, or at their own place; the rest not at all.
+_TAGGED_HERE, _TAGGED_THERE = 0.6, 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,36 +115,23 @@ def plan_copies(
         lambda: (Edit(kind="resized", amount=float(rng.uniform(0.4, 0.75))),),
         lambda: (Edit(kind="watermarked", amount=0.4, text="repost"),),
         lambda: (Edit(kind="bordered", amount=float(rng.uniform(0.015, 0.05))),),
-        lambda: (
-            Edit(kind="cropped", amount=float(rng.uniform(0.1, 0.3))),
-            Edit(kind="resized", amount=0.7),
-        ),
+        lambda: (Edit(kind="cropped", amount=float(rng.uniform(0.1, 0.3))), Edit(kind="resized", amount=0.7)),
     )
     copies = []
     for i, row in enumerate(rng.choice(len(photos), min(count, len(photos)), replace=False)):
         original = photos[int(row)]
         others = [p for p in people if p.name != original.fact.owner]
         owner = others[int(rng.integers(len(others)))]
-        name = f"copy-{i}"
         keeps_tag = original.geotag is not None and rng.random() < 0.4
-        copies.append(
-            replace(
-                original,
-                shot=replace(original.shot, name=name),
-                edits=original.edits + ways[i % len(ways)](),
-                quality=int(rng.integers(60, 82)),
-                exif="none",
-                geotag=original.geotag if keeps_tag else None,
-                fact=replace(
-                    original.fact,
-                    name=name,
-                    kind="copy",
-                    owner=owner.name,
-                    licence=owner.licence,
-                    copy_of=original.shot.name,
-                ),
-            )
+        copy = replace(
+            original,
+            edits=original.edits + ways[i % len(ways)](),
+            quality=int(rng.integers(60, 82)),
+            exif="none",
+            geotag=original.geotag if keeps_tag else None,
         )
+        fact = {"owner": owner.name, "licence": owner.licence, "copy_of": original.shot.name}
+        copies.append(renamed(copy, f"copy-{i}", kind="copy", **fact))
     return copies
 
 
@@ -169,25 +154,16 @@ def _plan_nowhere(options: CommunityOptions, people: tuple[Person, ...], home: S
             time=moment(int(rng.integers(DAYS)), float(rng.uniform(8, 22))),
             seed=shot_seed(options.seed, 5, i),
         )
-        fact = AlbumFact(
-            name=name,
-            photo_id="",
-            kind=subject,
-            owner=person.name,
-            licence=person.licence,
-            time=shot.time,
-            home=False,
-        )
         photos.append(
-            PlannedPhoto(
-                shot=shot,
-                scene="home/0/000",
-                fact=fact,
-                geotag=geotag_at(home, spot, 0.0, None) if has_tag else None,
+            planned(
+                person,
+                shot,
+                "home/0/000",
+                subject,
                 exif=person.exif,
+                home=False,
+                geotag=geotag_at(home, spot, 0.0, None) if has_tag else None,
                 subject=subject,
-                quality=person.quality,
-                sensor=person.sensor,
             )
         )
     return photos

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -11,9 +10,6 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.simworld.town.texture import Image8
 
-EditKind = Literal[
-    "resized", "cropped", "bordered", "watermarked", "mirrored", "pasted", "moved", "painted_over", "warped"
-]
 _TWO_FOCALS = ("OPENCV", "PINHOLE", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 
@@ -30,7 +26,7 @@ class Edit:
         text: of a watermark.
     """
 
-    kind: EditKind
+    kind: str
     amount: float = 1.0
     text: str = ""
 
@@ -57,8 +53,7 @@ def edited_camera(camera: Camera, edits: tuple[Edit, ...], seed: int) -> Camera 
         if edit.kind == "mirrored":
             return None
         if edit.kind == "resized":
-            width, height = _resized_size(camera.width, camera.height, edit.amount)
-            camera = _resized_camera(camera, width, height)
+            camera = camera.scaled_to(*_resized_size(camera.width, camera.height, edit.amount))
         elif edit.kind == "cropped":
             x0, y0, width, height = _crop(
                 camera.width, camera.height, edit.amount, np.random.default_rng((seed, 91, i))
@@ -72,15 +67,6 @@ def edited_camera(camera: Camera, edits: tuple[Edit, ...], seed: int) -> Camera 
 
 def _resized_size(width: int, height: int, factor: float) -> tuple[int, int]:
     return max(16, round(width * factor)), max(16, round(height * factor))
-
-
-def _resized_camera(camera: Camera, width: int, height: int) -> Camera:
-    sx, sy = width / camera.width, height / camera.height
-    params = list(camera.params)
-    # One focal length: the sides' factors differ by rounding only.
-    factors = [sx, sy, sx, sy] if camera.model in _TWO_FOCALS else [0.5 * (sx + sy), sx, sy]
-    params[: len(factors)] = [p * f for p, f in zip(params, factors, strict=False)]
-    return replace(camera, width=width, height=height, params=tuple(params))
 
 
 def _shifted(camera: Camera, dx: float, dy: float, width: int, height: int) -> Camera:
@@ -124,26 +110,12 @@ def _watermarked(image: Image8, edit: Edit, rng: np.random.Generator) -> Image8:
     h, w = image.shape[:2]
     layer = image.copy()
     text, scale = edit.text or "(c) photo", w / 900.0
-    cv2.putText(
-        layer,
-        text,
-        (int(0.60 * w), int(0.95 * h)),
-        cv2.FONT_HERSHEY_DUPLEX,
-        scale,
-        (255, 255, 255),
-        max(1, round(2 * scale)),
-        cv2.LINE_AA,
-    )
-    cv2.putText(
-        layer,
-        text,
-        (int(0.12 * w), int(0.55 * h)),
-        cv2.FONT_HERSHEY_TRIPLEX,
-        2.2 * scale,
-        (235, 235, 235),
-        max(1, round(5 * scale)),
-        cv2.LINE_AA,
-    )
+    for (x, y), font, size, grey, thick in (
+        ((0.60, 0.95), cv2.FONT_HERSHEY_DUPLEX, scale, 255, 2),
+        ((0.12, 0.55), cv2.FONT_HERSHEY_TRIPLEX, 2.2 * scale, 235, 5),
+    ):
+        at, width = (int(x * w), int(y * h)), max(1, round(thick * scale))
+        cv2.putText(layer, text, at, font, size, (grey,) * 3, width, cv2.LINE_AA)
     return np.asarray(cv2.addWeighted(layer, edit.amount, image, 1.0 - edit.amount, 0.0), dtype=np.uint8)
 
 

@@ -4,15 +4,15 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import chain, pairwise
+from pathlib import Path
 from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.photograph import moving_cars, scene_look
@@ -20,8 +20,11 @@ from featuredb.simworld.camera.raster import render
 from featuredb.simworld.camera.sensor import SensorOptions, expose
 from featuredb.simworld.town.scene import Faces, Scene
 from featuredb.simworld.town.texture import Image8
+from featuredb.video.writer import VideoWriter, VideoWriterOptions
 
 _GLITTER_HZ = 5.0  # how often the water looks new
+_SHUTTER_S = 1 / 100
+_SENSOR = SensorOptions(exposure_sigma_ev=0.0, white_balance_sigma=0.0)
 _BANDS = 12  # of rows, where they are not exposed at once
 _CHUNK = 4  # frames that travel to a process at a time
 T = TypeVar("T")
@@ -32,22 +35,15 @@ class Exposure:
     """How a frame is exposed.
 
     Attributes:
-        shutter_s: how long; what moves meanwhile is blurred. samples: pictures of that time that are
-            averaged; each looks through other parts of the pixels.
+        samples: pictures of its time, in which what moves is blurred, that are averaged; each looks through
+            other parts of the pixels.
         readout_s: rolling shutter, from the first row to the last; the frame's time is its middle row's.
         ev: stops brighter than the scene is.
-        sensor: noise and lens; what it says of exposure and white balance is not used.
     """
 
-    shutter_s: float = 1 / 100
     samples: int = 4
     readout_s: float = 0.0
     ev: float = 0.0
-    sensor: SensorOptions = field(default_factory=SensorOptions)
-
-    def __post_init__(self) -> None:
-        if not (self.samples > 0 and self.shutter_s >= 0 and self.readout_s >= 0):
-            raise InvalidValueError(f"Exposure: value out of range in {self}")
 
 
 def draw_frame(
@@ -69,7 +65,7 @@ def draw_frame(
     light: NDArray[np.float32] = np.zeros((camera.height, camera.width, 3), np.float32)
     n = exposure.samples
     for k in range(n):
-        moment_s = time_s + exposure.shutter_s * ((k + 0.5) / n - 0.5)
+        moment_s = time_s + _SHUTTER_S * ((k + 0.5) / n - 0.5)
         shifted = _shifted(camera, k, n)
         for top, bottom, later_s in _bands(camera.height, exposure.readout_s):
             part = _rows(shifted, top, bottom)
@@ -78,9 +74,31 @@ def draw_frame(
             assert rendered.rgb is not None
             light[top:bottom] += rendered.rgb
     light *= 2.0**exposure.ev / n
-    sensor = replace(exposure.sensor, exposure_sigma_ev=0.0, white_balance_sigma=0.0)
     rng = np.random.default_rng((seeds[0], 72, seeds[1]))
-    return expose(np.clip(light, 0, 255).astype(np.uint8), rng, sensor)
+    return expose(np.clip(light, 0, 255).astype(np.uint8), rng, _SENSOR)
+
+
+def write_frames(
+    file: Path,
+    draw: Callable[[int], Image8],
+    count: int,
+    rate_hz: float,
+    options: VideoWriterOptions,
+    mark: Path,
+    stamp: str,
+    workers: int = 0,
+) -> None:
+    """A film of the pictures `draw(i)`; it is left as it is where the file `mark` has the stamp."""
+    if mark.is_file() and mark.read_text(encoding="utf-8") == stamp:
+        return
+    mark.unlink(missing_ok=True)
+    pictures = in_order(draw, count, workers)
+    first = next(pictures)
+    height, width = first.shape[:2]
+    with VideoWriter(file, width=width, height=height, fps=rate_hz, options=options) as writer:
+        for picture in chain([first], pictures):
+            writer.write(picture)
+    mark.write_text(stamp, encoding="utf-8")
 
 
 def in_order(draw: Callable[[int], T], count: int, workers: int = 0, chunk: int = _CHUNK) -> Iterator[T]:

@@ -1,23 +1,18 @@
-"""Writes films of a simulated town: a drone's flight as mp4, its telemetry, and the true pose of every frame.
+"""Writes films of a simulated town: a drone's flight as mp4, its telemetry; and the true pose of every frame.
 
 The film shows the town of a `WorldOptions`, so that maps of that world's photos, and its scan, are of the
 place that the film shows. Cars drive, water glitters, the light changes; a frame is exposed while the camera
-moves. Beside `film.mp4` stand `film.srt`, as DJI's drones write it, and `film.json`, the truth.
+moves. Beside `film.mp4` stands `film.srt`, as DJI's drones write it.
 """
 
-import hashlib
-import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -25,14 +20,13 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import WorldOptions, other_town_of, town_of
-from featuredb.video.writer import VideoWriter, VideoWriterOptions
-from tools.worlds.film_frame import Exposure, draw_frame, in_order
+from featuredb.video.writer import VideoWriterOptions
+from tools.worlds.film_frame import Exposure, draw_frame, write_frames
 from tools.worlds.flight_path import FlightPath, PathOptions
 
-Progress = Callable[[int, int], None]
-
-FILM_FILE, TRUTH_FILE, TELEMETRY_FILE = "film.mp4", "film.json", "film.srt"
-_FORMAT = 1  # raised when the same options give other files
+FILM_FILE, TELEMETRY_FILE = "film.mp4", "film.srt"
+GPS_SIGMA_M = 1.5  # of the telemetry: errors that wander
+TELEMETRY_LATE_S = 0.3  # how much later than the picture the telemetry is
 _START = datetime(2025, 6, 21, 12, 40, 3, tzinfo=UTC)
 
 
@@ -47,8 +41,6 @@ class FilmOptions:
         ev_range: stops between the darkest and the brightest exposure, which follow each other slowly, and
             leap once where the flight is jerky.
         cut: frames (first, last + 1) that show another town, or None.
-        gps_sigma_m: of the telemetry: errors that wander.
-        telemetry_late_s: how much later than the picture the telemetry is.
     """
 
     world: WorldOptions = field(default_factory=WorldOptions)
@@ -60,16 +52,6 @@ class FilmOptions:
     exposure: Exposure = field(default_factory=Exposure)
     ev_range: float = 0.7
     cut: tuple[int, int] | None = None
-    gps_sigma_m: float = 1.5
-    telemetry_late_s: float = 0.3
-
-    def __post_init__(self) -> None:
-        if not (self.frames > 0 and self.rate_hz > 0 and self.exposure.readout_s <= 1 / self.rate_hz):
-            raise InvalidValueError(f"FilmOptions: value out of range in {self}")
-        if self.cut is not None and not 0 <= self.cut[0] < self.cut[1] <= self.frames:
-            raise InvalidValueError(
-                f"FilmOptions.cut: expected frames within 0 to {self.frames}, found {self.cut}"
-            )
 
     @property
     def camera(self) -> Camera:
@@ -86,16 +68,6 @@ class FilmOptions:
         """Whether the frame shows the town."""
         return self.cut is None or not self.cut[0] <= frame < self.cut[1]
 
-    def fingerprint(self) -> str:
-        """Digest of what the files depend on."""
-        options = asdict(self)
-        options["world"].pop("workers")
-        options |= options.pop("exposure")
-        options.pop("ev")
-        if options["readout_s"] == 0:
-            options.pop("readout_s")  # films that were written before there was one
-        return hashlib.sha256(json.dumps([_FORMAT, options], sort_keys=True).encode()).hexdigest()
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilmTruth:
@@ -103,7 +75,7 @@ class FilmTruth:
 
     Attributes:
         camera: true intrinsics. frame, epsg: local frame of the poses, UTM zone of answers.
-        times_s: (n,) seconds. at_home: (n,) bool; other frames show a place that no map knows.
+        times_s: (n,) seconds.
         cam_from_local: true poses; None where the frame does not show the town.
     """
 
@@ -111,72 +83,46 @@ class FilmTruth:
     frame: LocalFrame
     epsg: int
     times_s: FloatArray
-    at_home: NDArray[np.bool_]
     cam_from_local: tuple[Rigid3 | None, ...]
 
+    @property
+    def at_home(self) -> NDArray[np.bool_]:
+        """(n,) of frames that show the town; others show a place that no map knows."""
+        return np.array([pose is not None for pose in self.cam_from_local])
 
-def write_film(
-    folder: Path, options: FilmOptions, workers: int = 0, progress: Progress | None = None
-) -> Path:
-    """Write film, telemetry and truth into `folder`; a folder that holds just these is left as it is.
+
+def write_film(folder: Path, options: FilmOptions, workers: int = 0) -> Path:
+    """Write film and telemetry into `folder`; a folder that holds just these is left as it is.
 
     Args:
         workers: processes; 0 takes one per core.
-        progress: called with (frames done, frames in all).
-
-    Raises:
-        OSError: the folder cannot be written.
     """
-    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    truth_file = folder / TRUTH_FILE
-    if truth_file.is_file() and _read(truth_file).get("fingerprint") == options.fingerprint():
-        return folder
-    # The truth comes last: a folder with it is complete.
-    truth_file.unlink(missing_ok=True)
-    tags = {"creation_time": _START.isoformat()}
-    with VideoWriter(
-        folder / FILM_FILE,
-        width=options.width,
-        height=options.height,
-        fps=options.rate_hz,
-        options=VideoWriterOptions(preset="veryfast", tags=tags),
-    ) as writer:
-        for done, picture in enumerate(
-            in_order(partial(film_frame, options), options.frames, workers), start=1
-        ):
-            writer.write(picture)
-            if progress is not None:
-                progress(done, options.frames)
     (folder / TELEMETRY_FILE).write_text(_telemetry(options), encoding="utf-8")
-    truth_file.write_text(json.dumps(_truth_json(options)) + "\n", encoding="utf-8")
+    tags = {"creation_time": _START.isoformat()}
+    write_frames(
+        folder / FILM_FILE,
+        partial(film_frame, options),
+        options.frames,
+        options.rate_hz,
+        VideoWriterOptions(preset="veryfast", tags=tags),
+        folder / f"{FILM_FILE}.stamp",
+        repr(options),
+        workers,
+    )
     return folder
 
 
-def read_film_truth(folder: Path) -> FilmTruth:
-    """The truth of a film that was written before.
-
-    Raises:
-        InvalidValueError: there is none.
-    """
-    path = Path(folder) / TRUTH_FILE
-    try:
-        document = _read(path)
-        poses = [
-            None if p is None else Rigid3.from_quaternion(p["quaternion_xyzw"], p["translation_m"])
-            for p in document["cam_from_local"]
-        ]
-        camera = document["camera"] | {"params": tuple(document["camera"]["params"])}
-        return FilmTruth(
-            camera=Camera(**camera),
-            frame=LocalFrame(**document["frame"]),
-            epsg=document["epsg"],
-            times_s=np.array(document["times_s"], dtype=np.float64),
-            at_home=np.array([p is not None for p in poses]),
-            cam_from_local=tuple(poses),
-        )
-    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
-        raise InvalidValueError(f"{path}: expected the truth of a simulated film, found {error!r}") from error
+def film_truth(options: FilmOptions) -> FilmTruth:
+    """The truth of a film."""
+    scene, path, frames = _scene(options, True), _path(options, True), range(options.frames)
+    return FilmTruth(
+        camera=options.camera,
+        frame=scene.frame,
+        epsg=scene.epsg,
+        times_s=np.array([options.time_s(i) for i in frames]),
+        cam_from_local=tuple(path.pose(options.time_s(i)) if options.at_home(i) else None for i in frames),
+    )
 
 
 def film_frame(options: FilmOptions, frame: int) -> Image8:
@@ -188,6 +134,15 @@ def film_frame(options: FilmOptions, frame: int) -> Image8:
     return draw_frame(_scene(options, home), options.camera, pose_at, time_s, exposure, seeds)
 
 
+def wandering_errors(rng: np.random.Generator, sigma_m: float, keep: float, count: int) -> FloatArray:
+    """(count, 3) errors of a receiver, twice as large in height; each keeps a share of the one before."""
+    axes = sigma_m * np.array([1.0, 1.0, 2.0])
+    errors = [axes * rng.standard_normal(3)]
+    for _ in range(count):
+        errors.append(keep * errors[-1] + np.sqrt(1.0 - keep**2) * axes * rng.standard_normal(3))
+    return np.array(errors[1:])
+
+
 def _exposure_ev(options: FilmOptions, time_s: float) -> float:
     slow = 0.5 * options.ev_range * np.sin(2.0 * np.pi * time_s / 17.0)
     leaps = options.path.style == "jerky" and time_s > 0.6 * options.frames / options.rate_hz
@@ -196,9 +151,7 @@ def _exposure_ev(options: FilmOptions, time_s: float) -> float:
 
 @lru_cache(maxsize=2)
 def _scene(options: FilmOptions, home: bool) -> Scene:
-    if home:
-        return town_of(options.world)
-    return other_town_of(options.world)
+    return (town_of if home else other_town_of)(options.world)
 
 
 @lru_cache(maxsize=2)
@@ -207,70 +160,26 @@ def _path(options: FilmOptions, home: bool) -> FlightPath:
     return FlightPath(_scene(options, home), path)
 
 
-def _truth_json(options: FilmOptions) -> dict[str, Any]:
-    scene, path = _scene(options, True), _path(options, True)
-    camera = options.camera
-    poses = [path.pose(options.time_s(i)) if options.at_home(i) else None for i in range(options.frames)]
-    return {
-        "fingerprint": options.fingerprint(),
-        "epsg": scene.epsg,
-        "frame": asdict(scene.frame),
-        "camera": {
-            "model": camera.model,
-            "width": camera.width,
-            "height": camera.height,
-            "params": list(camera.params),
-        },
-        "times_s": [options.time_s(i) for i in range(options.frames)],
-        "cam_from_local": [
-            None
-            if pose is None
-            else {
-                "quaternion_xyzw": pose.quaternion_xyzw.tolist(),
-                "translation_m": pose.translation.tolist(),
-            }
-            for pose in poses
-        ],
-    }
-
-
 def _telemetry(options: FilmOptions) -> str:
     """Subtitles in DJI's bracketed dialect, a block a frame, late, with an error that wanders."""
     rng = np.random.default_rng((options.path.seed, 73))
-    keep = np.exp(-1.0 / (options.rate_hz * 20.0))  # forgets in twenty seconds
-    error = options.gps_sigma_m * rng.standard_normal(3) * (1.0, 1.0, 2.0)
+    keep = float(np.exp(-1.0 / (options.rate_hz * 20.0)))  # forgets in twenty seconds
     blocks = []
-    for i in range(options.frames):
-        time_s = options.time_s(i)
-        home = options.at_home(i)
-        scene = _scene(options, home)
-        error = keep * error + options.gps_sigma_m * np.sqrt(1.0 - keep**2) * rng.standard_normal(3) * (
-            1.0,
-            1.0,
-            2.0,
-        )
-        place = _path(options, home).pose(time_s - options.telemetry_late_s).center + error
-        latitude, longitude, height = scene.frame.geodetic_from_enu(place)
-        ground = scene.frame.height_m
-        start, end = _clock(time_s), _clock(time_s + 1.0 / options.rate_hz)
+    for i, error in enumerate(wandering_errors(rng, GPS_SIGMA_M, keep, options.frames)):
+        time_s, home = options.time_s(i), options.at_home(i)
+        frame = _scene(options, home).frame
+        place = _path(options, home).pose(time_s - TELEMETRY_LATE_S).center + error
+        latitude, longitude, height = (float(v) for v in frame.geodetic_from_enu(place))
         moment = _START + timedelta(seconds=time_s)
         blocks.append(
-            f"{i + 1}\n{start} --> {end}\n"
+            f"{i + 1}\n{_clock(time_s)} --> {_clock(time_s + 1.0 / options.rate_hz)}\n"
             f'<font size="28">FrameCnt: {i + 1}, DiffTime: {1000 / options.rate_hz:.0f}ms\n'
             f"{moment:%Y-%m-%d %H:%M:%S}.{moment.microsecond // 1000:03d}\n"
-            f"[latitude: {float(latitude):.6f}] [longitude: {float(longitude):.6f}] "
-            f"[rel_alt: {float(height) - ground:.3f} abs_alt: {float(height):.3f}] </font>\n\n"
+            f"[latitude: {latitude:.6f}] [longitude: {longitude:.6f}] "
+            f"[rel_alt: {height - frame.height_m:.3f} abs_alt: {height:.3f}] </font>\n\n"
         )
     return "".join(blocks)
 
 
 def _clock(time_s: float) -> str:
-    milli = round(1000 * time_s)
-    hours, rest = divmod(milli, 3_600_000)
-    minutes, rest = divmod(rest, 60_000)
-    seconds, milli = divmod(rest, 1000)
-    return f"{hours:02d}:{minutes:02d}:{seconds:02d},{milli:03d}"
-
-
-def _read(path: Path) -> dict[str, Any]:
-    return dict(json.loads(path.read_text(encoding="utf-8")))
+    return f"{datetime.min + timedelta(milliseconds=round(1000 * time_s)):%H:%M:%S,%f}"[:-3]

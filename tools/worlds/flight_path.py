@@ -28,7 +28,7 @@ class PathOptions:
     Attributes:
         seed: of the way. style: smooth; or jerky: gusts, and turns on the spot of up to 95 degrees in 0.8 s.
         duration_s: of the flight.
-        half_extent_m: it stays within (+-x, +-y) of `center_m`, town axes.
+        half_extent_m: it stays within (+-x, +-y) of the town's middle, town axes.
         heights_m: over the town's origin. speed_m_s: over ground.
         down_deg: how far below the horizon it looks.
         river: whether the way leads over the water and looks down on it.
@@ -37,7 +37,6 @@ class PathOptions:
     seed: int = 1
     style: FlightStyle = "smooth"
     duration_s: float = 40.0
-    center_m: tuple[float, float] = (0.0, 0.0)
     half_extent_m: tuple[float, float] = (70.0, 55.0)
     heights_m: tuple[float, float] = (42.0, 60.0)
     speed_m_s: float = 8.0
@@ -45,8 +44,6 @@ class PathOptions:
     river: bool = True
 
     def __post_init__(self) -> None:
-        if not (self.duration_s > 0 and self.speed_m_s > 0 and min(self.half_extent_m) > 0):
-            raise InvalidValueError(f"PathOptions: value out of range in {self}")
         if not _CLEAR_M <= self.heights_m[0] <= self.heights_m[1]:
             raise InvalidValueError(
                 f"PathOptions.heights_m: expected {_CLEAR_M} m or more, found {self.heights_m}"
@@ -131,8 +128,7 @@ def _headings(places: FloatArray) -> FloatArray:
 
 def _inside(options: PathOptions, rng: np.random.Generator) -> FloatArray:
     half = np.asarray(options.half_extent_m)
-    xy = np.asarray(options.center_m) + rng.uniform(-half, half)
-    return np.array([*xy, rng.uniform(*options.heights_m)])
+    return np.array([*rng.uniform(-half, half), rng.uniform(*options.heights_m)])
 
 
 def _snaps(options: PathOptions, rng: np.random.Generator) -> list[tuple[float, float]]:

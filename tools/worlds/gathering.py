@@ -1,6 +1,6 @@
 """Photos that people take of a town: visits to sights, then geotags, numbers and file names."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,10 +10,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import AlbumFact, PlannedPhoto
+from tools.worlds.album import PlannedPhoto, renamed
 from tools.worlds.edits import Edit
 from tools.worlds.geotags import GeotagOptions, Tagging, give_geotags
-from tools.worlds.people import Person, stored_upright, zoomed
+from tools.worlds.people import Person, planned, stored_upright, zoomed
 from tools.worlds.sights import Sight, Surroundings, look_at
 from tools.worlds.surveyed import DAYS, day_key, moment, photo_ids, shot_seed
 
@@ -40,9 +40,6 @@ class Viewpoint:
     eye: FloatArray
     target: FloatArray
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-DroneMode = Callable[[Person, Sight, Surroundings, int, np.random.Generator], list[Viewpoint]]
 
 
 def ground_visit(
@@ -93,16 +90,11 @@ def drone_visit(
     shares = [0.36, 0.2, 0.2, 0.12, 0.12] if low else [0.3, 0.08, 0.12, 0.25, 0.25]
     mode = str(rng.choice(names, p=shares))
     views = []
-    for look in DRONE_MODES[mode](person, sight, around, count, rng):
+    for look in getattr(_Flight(person, sight, around, count, rng), mode)():
         wobble = rng.normal(0, [1.5, 1.2, 0.6 + 1.5 * (1 - person.skill)])
-        turn = (look.turn_deg[0] + wobble[0], look.turn_deg[1] + wobble[1], look.turn_deg[2] + wobble[2])
-        view = _view(
-            around,
-            Viewpoint(eye=look.eye, target=look.target, turn_deg=turn),
-            person.drone,
-            1,
-            _NEAREST_DRONE_M,
-        )
+        heading, pitch, roll = (float(turn) for turn in np.add(look.turn_deg, wobble))
+        turned = replace(look, turn_deg=(heading, pitch, roll))
+        view = _view(around, turned, person.drone, 1, _NEAREST_DRONE_M)
         if view is not None:
             views.append(view)
     return views
@@ -121,107 +113,90 @@ def _view(
     return View(device=device, cam_from_local=pose, orientation=orientation)
 
 
-def _height(person: Person, rng: np.random.Generator) -> float:
-    low, high = person.heights_m
-    return float(low * (high / low) ** rng.random())
+class _Flight:
+    """A flight at a sight: each way of flying gives so many viewpoints, or fewer."""
 
+    def __init__(
+        self, person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
+    ) -> None:
+        self._person, self._sight, self._around, self._count, self._rng = person, sight, around, count, rng
+        self._target = np.asarray(sight.target)
 
-def _orbit(
-    person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Viewpoint]:
-    """A part of a circle, 8 to 20 degrees between photos; the town lies behind the sight or under it."""
-    above = _height(person, rng)
-    radius = sight.radius + above * float(rng.uniform(0.5, 1.6))
-    start, step = float(rng.uniform(0, 360)), float(rng.choice([-1, 1]) * rng.uniform(8, 20))
-    target = np.asarray(sight.target)
-    looks = []
-    for i in range(count):
-        a = np.radians(start + step * i)
-        eye = target + radius * np.array([np.cos(a), np.sin(a), 0.0]) + rng.normal(0, 0.8, 3)
-        eye[2] = around.ground(float(target[1])) + above
-        looks.append(Viewpoint(eye=eye, target=target))
-    return looks
+    def _height(self) -> float:
+        low, high = self._person.heights_m
+        return float(low * (high / low) ** self._rng.random())
 
+    def _at(self, place: FloatArray, above: float) -> FloatArray:
+        """A place so high above the ground."""
+        return np.array([*place[:2], self._around.ground(float(place[1])) + above])
 
-def _climb(
-    person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Viewpoint]:
-    """Take-off before the sight: from the height of a person's head up, camera lowered as it rises."""
-    x, y, eye_z = sight.stands[int(rng.integers(len(sight.stands)))]
-    top = max(_height(person, rng), 12.0)
-    away = np.array([x, y]) - sight.target[:2]
-    away /= max(float(np.linalg.norm(away)), 1.0)
-    looks = []
-    for height in 2.0 * (top / 2.0) ** np.linspace(0.0, 1.0, max(count, 2)):
-        back = 0.35 * height * away + rng.normal(0, 0.4, 2)
-        eye = np.array([x + back[0], y + back[1], eye_z - 1.6 + height])
-        looks.append(Viewpoint(eye=eye, target=np.asarray(sight.target)))
-    return looks[:count]
+    def orbit(self) -> list[Viewpoint]:
+        """A part of a circle, 8 to 20 degrees between photos; the town lies behind the sight or under it."""
+        rng, above = self._rng, self._height()
+        radius = self._sight.radius + above * float(rng.uniform(0.5, 1.6))
+        start, step = float(rng.uniform(0, 360)), float(rng.choice([-1, 1]) * rng.uniform(8, 20))
+        height = self._at(self._target, above)[2]
+        looks = []
+        for i in range(self._count):
+            eye = self._target + radius * _ahead(start + step * i) + rng.normal(0, 0.8, 3)
+            looks.append(Viewpoint(eye=np.array([*eye[:2], height]), target=self._target))
+        return looks
 
+    def climb(self) -> list[Viewpoint]:
+        """Take-off before the sight: from the height of a person's head up, camera lowered as it rises."""
+        x, y, eye_z = self._sight.stands[int(self._rng.integers(len(self._sight.stands)))]
+        top = max(self._height(), 12.0)
+        away = np.array([x, y]) - self._target[:2]
+        away /= max(float(np.linalg.norm(away)), 1.0)
+        looks = []
+        for height in 2.0 * (top / 2.0) ** np.linspace(0.0, 1.0, max(self._count, 2)):
+            back = 0.35 * height * away + self._rng.normal(0, 0.4, 2)
+            eye = np.array([x + back[0], y + back[1], eye_z - 1.6 + height])
+            looks.append(Viewpoint(eye=eye, target=self._target))
+        return looks[: self._count]
 
-def _along(
-    person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Viewpoint]:
-    """Forward over the town towards and past the sight, camera 20 to 45 degrees down."""
-    above = min(_height(person, rng), 45.0)
-    heading = float(rng.choice([0.0, 90.0, 180.0, 270.0]) + rng.normal(0, 8))
-    ahead = np.array([np.cos(np.radians(heading)), np.sin(np.radians(heading)), 0.0])
-    step, down = above * float(rng.uniform(0.2, 0.45)), float(rng.uniform(20, 45))
-    target = np.asarray(sight.target)
-    looks = []
-    for i in range(count):
-        eye = target + ahead * step * (i - 0.7 * count)
-        eye[2] = around.ground(float(eye[1])) + above
+    def along(self) -> list[Viewpoint]:
+        """Forward over the town towards and past the sight, camera 20 to 45 degrees down."""
+        rng, above = self._rng, min(self._height(), 45.0)
+        ahead = _ahead(float(rng.choice([0.0, 90.0, 180.0, 270.0]) + rng.normal(0, 8)))
+        step, down = above * float(rng.uniform(0.2, 0.45)), float(rng.uniform(20, 45))
         reach = above / np.tan(np.radians(down))
-        looks.append(Viewpoint(eye=eye, target=eye + ahead * reach - [0, 0, above]))
-    return looks
+        return self._hops(above, ahead * step, 0.7, ahead * reach)
+
+    def down(self) -> list[Viewpoint]:
+        """Straight down in hops of a quarter to a half of the height, some with the camera a bit forward."""
+        rng, above = self._rng, max(self._height(), 30.0)
+        ahead = _ahead(float(rng.uniform(0, 360)))
+        lean = float(rng.choice([0.02, 0.15, 0.35]))
+        step = above * float(rng.uniform(0.25, 0.5))
+        return self._hops(above, ahead * step, 0.5, ahead * lean * above)
+
+    def _hops(self, above: float, step: FloatArray, before: float, look: FloatArray) -> list[Viewpoint]:
+        """Over the sight step by step, a share of the way before it; `look`: to where on the ground."""
+        eyes = [self._at(self._target + step * (i - before * self._count), above) for i in range(self._count)]
+        return [Viewpoint(eye=eye, target=eye + look - [0, 0, above]) for eye in eyes]
+
+    def overview(self) -> list[Viewpoint]:
+        """The town from above its rim, or panned from one place: high, 15 to 45 degrees down."""
+        rng, (low, high) = self._rng, self._person.heights_m
+        above = float(rng.uniform(max(60.0, low), max(75.0, high)))
+        angle, down = float(rng.uniform(0, 360)), float(rng.uniform(15, 45))
+        eye = self._at(self._target - above / np.tan(np.radians(down)) * _ahead(angle), above)
+        pan = float(rng.choice([0.0, 12.0, 20.0]))
+        hop = (0.0 if pan else 0.3 * above) * _ahead(angle + 90.0)
+        count, looks = min(self._count, 5), []
+        for i in range(count):
+            offset = i - 0.5 * (count - 1)
+            here = eye + hop * offset + rng.normal(0, 0.7, 3)
+            turn_deg = (pan * offset, 0.0, 0.0)
+            looks.append(Viewpoint(eye=here, target=self._target + hop * offset, turn_deg=turn_deg))
+        return looks
 
 
-def _down(
-    person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Viewpoint]:
-    """Straight down in hops of a quarter to a half of the height, some with the camera a little forward."""
-    above = max(_height(person, rng), 30.0)
-    heading = float(rng.uniform(0, 360))
-    ahead = np.array([np.cos(np.radians(heading)), np.sin(np.radians(heading)), 0.0])
-    lean = float(rng.choice([0.02, 0.15, 0.35]))
-    step = above * float(rng.uniform(0.25, 0.5))
-    looks = []
-    for i in range(count):
-        eye = np.asarray(sight.target) + ahead * step * (i - 0.5 * count)
-        eye[2] = around.ground(float(eye[1])) + above
-        looks.append(Viewpoint(eye=eye, target=eye + ahead * lean * above - [0, 0, above]))
-    return looks
-
-
-def _overview(
-    person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Viewpoint]:
-    """The town from above its rim, or panned from one place: high, 15 to 45 degrees down."""
-    above = float(rng.uniform(max(60.0, person.heights_m[0]), max(75.0, person.heights_m[1])))
-    angle, down = float(rng.uniform(0, 360)), float(rng.uniform(15, 45))
-    a = np.radians(angle)
-    eye = np.asarray(sight.target) - above / np.tan(np.radians(down)) * np.array([np.cos(a), np.sin(a), 0.0])
-    eye[2] = around.ground(float(eye[1])) + above
-    pan = float(rng.choice([0.0, 12.0, 20.0]))
-    hop = 0.0 if pan else 0.3 * above
-    side = np.array([-np.sin(a), np.cos(a), 0.0])
-    looks = []
-    for i in range(min(count, 5)):
-        offset = i - 0.5 * (min(count, 5) - 1)
-        here = eye + side * hop * offset + rng.normal(0, 0.7, 3)
-        aim = np.asarray(sight.target) + side * hop * offset
-        looks.append(Viewpoint(eye=here, target=aim, turn_deg=(pan * offset, 0.0, 0.0)))
-    return looks
-
-
-DRONE_MODES: dict[str, DroneMode] = {
-    "orbit": _orbit,
-    "climb": _climb,
-    "along": _along,
-    "down": _down,
-    "overview": _overview,
-}
+def _ahead(angle_deg: float) -> FloatArray:
+    """The direction of that angle, from the x axis."""
+    angle = np.radians(angle_deg)
+    return np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def plan_visits(
@@ -255,7 +230,8 @@ def plan_visits(
     around = Surroundings(scene)
     shares = np.array([p.weight for p in people]) / sum(p.weight for p in people)
     taken_by = np.zeros(len(people))
-    taste = rng.lognormal(0.0, 0.5, (len(people), len(places))) * _popularity(places, by_rank)
+    popularity = [1.0 / k if by_rank else s.weight**0.7 for k, s in enumerate(places, start=1)]
+    taste = rng.lognormal(0.0, 0.5, (len(people), len(places))) * popularity
     photos: list[PlannedPhoto] = []
     visit = first_visit
     while len(photos) < count:
@@ -274,12 +250,6 @@ def plan_visits(
     return photos
 
 
-def _popularity(places: Sequence[Sight], by_rank: bool) -> FloatArray:
-    if by_rank:
-        return 1.0 / np.arange(1.0, len(places) + 1.0)
-    return np.array([s.weight**0.7 for s in places])
-
-
 def _visit(
     person: Person,
     sight: Sight,
@@ -296,34 +266,24 @@ def _visit(
     day, hour = int(rng.integers(DAYS)), float(rng.uniform(8.0, 19.0))
     photos = []
     for i, view in enumerate(views):
-        name = f"{town}-{visit}-{i}"
         shot = Shot(
-            name=name,
+            name=f"{town}-{visit}-{i}",
             device=view.device,
             cam_from_local=view.cam_from_local,
             time=moment(day, hour + 0.01 * i),
             seed=shot_seed(seed, 4, visit, i),
         )
         crop = Edit(kind="cropped", amount=float(rng.uniform(0.08, 0.25)))
-        fact = AlbumFact(
-            name=name,
-            photo_id="",
-            kind=kind or ("drone" if by_drone else "street"),
-            owner=person.name,
-            licence=person.licence,
-            time=shot.time,
-            home=town == "home",
-            visit=visit,
-        )
         photos.append(
-            PlannedPhoto(
-                shot=shot,
-                scene=day_key(town, day, hour),
-                fact=fact,
+            planned(
+                person,
+                shot,
+                day_key(town, day, hour),
+                kind or ("drone" if by_drone else "street"),
                 exif=person.exif,
+                home=town == "home",
+                visit=visit,
                 edits=(*([crop] if rng.random() < person.crop_share else []), *person.edits),
-                quality=person.quality,
-                sensor=person.sensor,
                 orientation=view.orientation,
             )
         )
@@ -349,7 +309,7 @@ def tagged(
         for p in photos
     ]
     given = give_geotags(scene, asked, options, rng)
-    return [replace(p, geotag=tag) for p, (tag, _) in zip(photos, given, strict=True)]
+    return [replace(p, geotag=tag) for p, tag in zip(photos, given, strict=True)]
 
 
 def named(photos: list[PlannedPhoto], seed: int) -> list[PlannedPhoto]:
@@ -357,15 +317,6 @@ def named(photos: list[PlannedPhoto], seed: int) -> list[PlannedPhoto]:
     ids = photo_ids(seed, len(photos))
     names = {p.shot.name: f"photos/{p.fact.owner}/{i}.jpg" for p, i in zip(photos, ids, strict=True)}
     return [
-        replace(
-            p,
-            shot=replace(p.shot, name=names[p.shot.name]),
-            fact=replace(
-                p.fact,
-                name=names[p.shot.name],
-                photo_id=photo_id,
-                copy_of=names.get(p.fact.copy_of, ""),
-            ),
-        )
+        renamed(p, names[p.shot.name], photo_id=photo_id, copy_of=names.get(p.fact.copy_of, ""))
         for p, photo_id in zip(photos, ids, strict=True)
     ]

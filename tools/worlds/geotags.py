@@ -2,16 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import Geotag
 
-GeotagState = Literal["near", "far", "none"]
 _FAR_M = (1_000.0, 12_000.0)
 _HEIGHT_SIGMA_M = 15.0  # of the heights, where there are any
 ACCURACY_SHARE = 0.6  # of the tagged photos, those that say how accurate they are
@@ -30,10 +27,6 @@ class GeotagOptions:
     sigma_m: float = 30.0
     far_share: float = 0.1
 
-    def __post_init__(self) -> None:
-        if not (self.sigma_m >= 0 and 0 <= self.far_share <= 1):
-            raise InvalidValueError(f"GeotagOptions: value out of range in {self}")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tagging:
@@ -47,14 +40,14 @@ class Tagging:
 
 def give_geotags(
     scene: Scene, photos: Sequence[Tagging], options: GeotagOptions, rng: np.random.Generator
-) -> list[tuple[Geotag | None, GeotagState]]:
-    """A geotag for each photo, and what it is worth.
+) -> list[Geotag | None]:
+    """A geotag for each photo.
 
     Geotags of the far kind claim the same accuracy as others: nothing in a file gives them away.
     """
     far = _far_ones(photos, options.far_share, rng)
     shared: dict[int, FloatArray] = {}
-    given: list[tuple[Geotag | None, GeotagState]] = []
+    given: list[Geotag | None] = []
     for i, photo in enumerate(photos):
         share = np.sqrt(0.5) * options.sigma_m
         common = shared.setdefault(photo.visit, rng.normal(0, share, 2)) if photo.visit >= 0 else None
@@ -64,13 +57,13 @@ def give_geotags(
         claimed = float(np.clip(np.round(options.sigma_m * rng.lognormal(0.0, 0.4)), 3, 200))
         says = rng.random() < ACCURACY_SHARE
         if not photo.tagged:
-            given.append((None, "none"))
+            given.append(None)
             continue
         if i in far:
             error = far[i]
         height = None if photo.by_hand else height_error
-        tag = geotag_at(scene, photo.center + np.append(error, 0.0), height, claimed if says else None)
-        given.append((tag, "far" if i in far else "near"))
+        center = photo.center + np.append(error, 0.0)
+        given.append(geotag_at(scene, center, height, claimed if says else None))
     return given
 
 

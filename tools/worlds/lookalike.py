@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.town.scene import (
-    TEXTURES,
-    Building,
-    Ellipsoids,
-    Faces,
-    GroundPlan,
-    Scene,
-    texture_index,
-)
+from featuredb.simworld.town.scene import TEXTURES, Ellipsoids, Faces, GroundPlan, Scene, texture_index
 from featuredb.simworld.town.solids import face
 from featuredb.simworld.town.town import BUILDING_ID
 
@@ -59,35 +51,35 @@ def with_copied_block(scene: Scene, source: Rect, target: Rect, *, mirrored: boo
     if abs(source[1] - target[1]) > 0.01 or abs(source[3] - target[3]) > 0.01:
         raise InvalidValueError(f"with_copied_block: expected blocks of one row, found {source} and {target}")
     middle = 0.5 * (source[0] + source[2])
-    shift = 0.5 * (target[0] + target[2]) - middle
-    half = 0.5 * (source[2] - source[0])
+    shift, half = 0.5 * (target[0] + target[2]) - middle, 0.5 * (source[2] - source[0])
     place = (middle + shift - half, source[1], middle + shift + half, source[3])
     cleared = (min(place[0], target[0]), source[1], max(place[2], target[2]), source[3])
+    sign, start = (-1.0, 2 * middle + shift) if mirrored else (1.0, shift)  # x becomes sign x + start
     faces = scene.faces.moved(scene.enu_from_town.T, np.zeros(3))  # in town axes
-    crowns = _in_town(scene)
-    face_at, crown_at = _object_centers(faces), crowns.center
+    face_at = _object_centers(faces)
     fixed = np.isin(faces.texture, [texture_index(t) for t in _GROUND_TEXTURES])
     kept, taken = fixed | ~_inside(face_at, cleared), ~fixed & _inside(face_at, source)
-    copy = _moved(_rows(faces, taken), middle, shift, mirrored)
+    copy = _moved(_rows(faces, taken), sign, start)
     patch = _ground_patch(scene.plan, source, shift, mirrored).shaded(scene.plan.to_sun)
-    crown_kept, crown_taken = ~_inside(crown_at, cleared), _inside(crown_at, source)
-    all_faces = Faces.concatenate([_rows(faces, kept), copy, patch])
-    all_crowns = _joined(
-        _rows(crowns, crown_kept),
-        _moved_crowns(_rows(crowns, crown_taken), middle, shift, mirrored),
-    )
-    plan = scene.plan
-    houses = [b for b in plan.buildings if not _inside(np.array([[b.x, b.y]]), cleared)[0]]
+    crowns = replace(scene.ellipsoids, center=scene.ellipsoids.center @ scene.enu_from_town)
+    moved = _rows(crowns, _inside(crowns.center, source))
+    at = moved.center * [sign, 1.0, 1.0] + [start, 0.0, 0.0]
+    moved = replace(moved, center=at, object_id=moved.object_id + _ID_SHIFT)
+    parts = (_rows(crowns, ~_inside(crowns.center, cleared)), moved)
+    names = [field.name for field in fields(Ellipsoids)]
+    trees = Ellipsoids(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    houses = [b for b in scene.plan.buildings if not _inside(np.array([[b.x, b.y]]), cleared)[0]]
     houses += [
-        _moved_building(b, middle, shift, mirrored)
-        for b in plan.buildings
+        replace(b, x=sign * b.x + start, yaw_deg=180.0 - b.yaw_deg if mirrored else b.yaw_deg)
+        for b in scene.plan.buildings
         if _inside(np.array([[b.x, b.y]]), source)[0]
     ]
+    all_faces = Faces.concatenate([_rows(faces, kept), copy, patch])
     return replace(
         scene,
-        plan=replace(plan, buildings=tuple(houses)),
+        plan=replace(scene.plan, buildings=tuple(houses)),
         faces=all_faces.moved(scene.enu_from_town, np.zeros(3)),
-        ellipsoids=replace(all_crowns, center=all_crowns.center @ scene.enu_from_town.T),
+        ellipsoids=replace(trees, center=trees.center @ scene.enu_from_town.T),
     )
 
 
@@ -131,45 +123,20 @@ def _rows(things: T, rows: NDArray[np.bool_]) -> T:
     return type(things)(**{field.name: getattr(things, field.name)[rows] for field in fields(things)})
 
 
-def _joined(a: Ellipsoids, b: Ellipsoids) -> Ellipsoids:
-    names = Ellipsoids.__dataclass_fields__
-    return Ellipsoids(**{name: np.concatenate([getattr(a, name), getattr(b, name)]) for name in names})
-
-
-def _in_town(scene: Scene) -> Ellipsoids:
-    return replace(scene.ellipsoids, center=scene.ellipsoids.center @ scene.enu_from_town)
-
-
-def _moved(faces: Faces, middle: float, shift: float, mirrored: bool) -> Faces:
-    """The faces shifted along x, or mirrored in x = middle before.
+def _moved(faces: Faces, sign: float, start: float) -> Faces:
+    """The faces of which x becomes sign x + start.
 
     A mirrored face has its edges exchanged, so that its outside stays outside; the texture is printed
     the wrong way round.
     """
-    ids = faces.object_id + _ID_SHIFT
-    if not mirrored:
-        return replace(faces, origin=faces.origin + np.array([shift, 0.0, 0.0]), object_id=ids)
-    flip = np.array([-1.0, 1.0, 1.0])
-    return replace(
-        faces,
-        origin=faces.origin * flip + [2 * middle + shift, 0.0, 0.0],
-        edge_s=faces.edge_t * flip,
-        edge_t=faces.edge_s * flip,
-        uv=faces.uv[:, [0, 1, 4, 5, 2, 3]],
-        object_id=ids,
+    flip = np.array([sign, 1.0, 1.0])
+    moved = replace(
+        faces, origin=faces.origin * flip + [start, 0.0, 0.0], object_id=faces.object_id + _ID_SHIFT
     )
-
-
-def _moved_crowns(crowns: Ellipsoids, middle: float, shift: float, mirrored: bool) -> Ellipsoids:
-    sign, start = (-1.0, 2 * middle + shift) if mirrored else (1.0, shift)
-    center = crowns.center * [sign, 1.0, 1.0] + [start, 0.0, 0.0]
-    return replace(crowns, center=center, object_id=crowns.object_id + _ID_SHIFT)
-
-
-def _moved_building(b: Building, middle: float, shift: float, mirrored: bool) -> Building:
-    if not mirrored:
-        return replace(b, x=b.x + shift)
-    return replace(b, x=2 * middle + shift - b.x, yaw_deg=180.0 - b.yaw_deg)
+    if sign > 0:
+        return moved
+    edges = {"edge_s": faces.edge_t * flip, "edge_t": faces.edge_s * flip}
+    return replace(moved, **edges, uv=faces.uv[:, [0, 1, 4, 5, 2, 3]])
 
 
 def _ground_patch(plan: GroundPlan, source: Rect, shift: float, mirrored: bool) -> Faces:

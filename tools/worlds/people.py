@@ -1,13 +1,13 @@
 """Twelve people with cameras: what they own, how well they use it, and what they leave in their files."""
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.simworld.camera.sensor import SensorOptions
-from featuredb.simworld.camera.shot import Device
-from tools.worlds.album import ExifPolicy
+from featuredb.simworld.camera.shot import Device, Shot
+from tools.worlds.album import AlbumFact, ExifPolicy, PlannedPhoto
 from tools.worlds.edits import Edit
 
 Upright = Literal["never", "tagged", "stored"]
@@ -53,6 +53,23 @@ class Person:
     sensor: SensorOptions = field(default_factory=SensorOptions)
 
 
+def planned(
+    person: Person, shot: Shot, scene: str, kind: str, *, exif: ExifPolicy = "full", **more: Any
+) -> PlannedPhoto:
+    """A photo by a person; `more`: fields of `PlannedPhoto`, and of its fact."""
+    told = {field.name: more.pop(field.name) for field in fields(AlbumFact) if field.name in more}
+    fact = {"owner": person.name, "photo_id": "", "licence": person.licence} | told
+    return PlannedPhoto(
+        shot=shot,
+        scene=scene,
+        fact=AlbumFact(name=shot.name, kind=kind, time=shot.time, **fact),
+        exif=exif,
+        quality=person.quality,
+        sensor=person.sensor,
+        **more,
+    )
+
+
 def make_device(
     make: str,
     model: str,
@@ -82,11 +99,7 @@ def zoomed(device: Device, factor: float) -> Device:
     camera = device.camera
     count = 2 if camera.model == "OPENCV" else 1
     lens = tuple(k / factor**1.5 for k in camera.params[count + 2 :])
-    params = (
-        *(f * factor for f in camera.params[:count]),
-        *camera.params[count : count + 2],
-        *lens,
-    )
+    params = (*(f * factor for f in camera.params[:count]), *camera.params[count : count + 2], *lens)
     return replace(
         device,
         camera=replace(camera, params=params),
@@ -102,10 +115,7 @@ def stored_upright(device: Device) -> Device:
     if camera.model == "OPENCV":
         raise InvalidValueError("stored_upright: expected a camera with one focal length, found OPENCV")
     turned = replace(
-        camera,
-        width=camera.height,
-        height=camera.width,
-        params=(f, camera.height - cy, cx, *lens),
+        camera, width=camera.height, height=camera.width, params=(f, camera.height - cy, cx, *lens)
     )
     return replace(device, camera=turned)
 

@@ -24,7 +24,7 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import Geotag, PlannedPhoto
+from tools.worlds.album import Geotag, PlannedPhoto, renamed
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.geotags import GeotagOptions, geotag_at
@@ -168,15 +168,25 @@ def plan_poison(options: PoisonOptions) -> list[PlannedPhoto]:
         taken = plan_visits(scene, owners, towns[sights], count, seed, town, first_visit=1000 * i, kind=kind)
         rng = np.random.default_rng((seed, 58))
         taken = tagged(scene, taken, owners, _TAGS, rng)
-        taken = [_poisoned(p, home, places, rng) for p in taken]
-        photos += [_renamed(p, kind, batch) for p in taken]
+        # A forged or mirrored view has a true pose or none.
+        photos += [
+            renamed(
+                _poisoned(p, home, places, rng),
+                f"{kind}-{p.shot.name}",
+                kind=kind,
+                batch=batch,
+                home=kind != "liar_other",
+            )
+            for p in taken
+        ]
     return named(photos, options.seed)
 
 
 def _sights_of(options: PoisonOptions, home: Scene, places: Places) -> dict[str, Sequence[Sight]]:
     center, seed, n = options.flight.center_m, options.seed, options.sights
+    x0, y0, x1, y1 = places.mapped
     return {
-        "town": find_sights(home, n, seed, center, _wider(places.mapped, 45.0)),
+        "town": find_sights(home, n, seed, center, (x0 - 45.0, y0 - 45.0, x1 + 45.0, y1 + 45.0)),
         "mapped": find_sights(home, n, seed, center, places.mapped),
         "target": find_sights(home, 4, seed, center, places.target),
         "mirror_target": find_sights(home, 4, seed, center, places.mirror_target),
@@ -184,21 +194,9 @@ def _sights_of(options: PoisonOptions, home: Scene, places: Places) -> dict[str,
     }
 
 
-def _wider(rect: Rect, margin: float) -> Rect:
-    return rect[0] - margin, rect[1] - margin, rect[2] + margin, rect[3] + margin
-
-
 def _as(person: Person, name: str) -> Person:
     """The same cameras in other hands, who leave all their positions in their files."""
     return replace(person, name=name, exif="full", tags=1.0, by_hand=False, edits=())
-
-
-def _renamed(photo: PlannedPhoto, kind: str, batch: int) -> PlannedPhoto:
-    """Provisional names of the plans differ; a forged or mirrored view has a true pose or none."""
-    name = f"{kind}-{photo.shot.name}"
-    home = kind != "liar_other"
-    fact = replace(photo.fact, name=name, kind=kind, batch=batch, home=home)
-    return replace(photo, shot=replace(photo.shot, name=name), fact=fact)
 
 
 def _poisoned(photo: PlannedPhoto, home: Scene, places: Places, rng: np.random.Generator) -> PlannedPhoto:

@@ -23,13 +23,11 @@ class Sight:
     """Something that people photograph, in town axes, metres.
 
     Attributes:
-        name: for people.
         target: what they aim at. radius: half its size.
         weight: popularity.
         stands: eye positions from which it is seen from the ground.
     """
 
-    name: str
     target: tuple[float, float, float]
     radius: float
     weight: float
@@ -65,11 +63,8 @@ class Surroundings:
     def ground(self, y: float) -> float:
         """Height of the terrain, or of the bridges over the river."""
         low, high = self.scene.plan.river
-        return (
-            max(float(self.scene.plan.height(y)), 0.0)
-            if low - 2 < y < high + 2
-            else float(self.scene.plan.height(y))
-        )
+        height = float(self.scene.plan.height(y))
+        return max(height, 0.0) if low - 2 < y < high + 2 else height
 
     def worth_taking(self, camera: Camera, cam_from_local: Rigid3, nearest_m: float) -> bool:
         """Whether the view is not blocked by something close, and is not all sky or far land."""
@@ -100,15 +95,15 @@ def find_sights(
     candidates = _named_targets(scene, within, rng)
     spread = 0.35 * max(scene.plan.size)
     scored = []
-    for name, target, radius, weight in candidates:
+    for target, radius, weight in candidates:
         away = np.hypot(target[0] - center_m[0], target[1] - center_m[1]) / spread
-        scored.append((weight * float(np.exp(-0.5 * away**2) + 0.1), name, target, radius))
+        scored.append((weight * float(np.exp(-0.5 * away**2) + 0.1), target, radius))
     scored.sort(key=lambda entry: -entry[0])
     sights = []
-    for weight, name, target, radius in scored:
+    for weight, target, radius in scored:
         stands = _stands(around, target, radius, rng)
         if stands:
-            sights.append(Sight(name=name, target=target, radius=radius, weight=weight, stands=stands))
+            sights.append(Sight(target=target, radius=radius, weight=weight, stands=stands))
         if len(sights) == count:
             break
     return sights
@@ -118,25 +113,24 @@ def _inside(point: tuple[float, float, float], rect: Rect) -> bool:
     return rect[0] <= point[0] <= rect[2] and rect[1] <= point[1] <= rect[3]
 
 
-Target = tuple[str, tuple[float, float, float], float, float]
+Target = tuple[tuple[float, float, float], float, float]
 
 
 def _named_targets(scene: Scene, within: Rect | None, rng: np.random.Generator) -> list[Target]:
     targets: list[Target] = []
     houses: list[Target] = []
-    for i, b in enumerate(scene.plan.buildings):
+    for b in scene.plan.buildings:
         kind, weight = _kind_of(b)
         if kind == "tower":
             continue  # its church stands beside it
         height = 0.5 * (b.eaves + float(scene.plan.height(b.y)))
-        target = (f"{kind} {i}", (b.x, b.y, height), 0.5 * max(b.width, b.depth), weight)
+        target = ((b.x, b.y, height), 0.5 * max(b.width, b.depth), weight)
         (houses if kind == "house" else targets).append(target)
     for s in scene.plan.streets:
         if s.along == "y":
-            y = 0.5 * sum(scene.plan.river)
-            targets.append((f"bridge {s.at:.0f}", (s.at, y, 0.8), 8.0, 3.0))
+            targets.append(((s.at, 0.5 * sum(scene.plan.river), 0.8), 8.0, 3.0))
     if within is not None:
-        targets, houses = ([t for t in those if _inside(t[1], within)] for those in (targets, houses))
+        targets, houses = ([t for t in those if _inside(t[0], within)] for those in (targets, houses))
     picked = rng.permutation(len(houses))[: max(8, len(houses) // 10)]
     return targets + [houses[int(i)] for i in picked]
 

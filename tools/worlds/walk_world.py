@@ -5,8 +5,8 @@ arrive), probes/ (never contributed: what coverage and error are measured on, of
 survey_far/. Kinds: survey, survey_far, walk, probe.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,19 +14,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import AlbumFact, PlannedPhoto
+from tools.worlds.album import PlannedPhoto
 from tools.worlds.geotags import geotag_at
-from tools.worlds.people import Person, community
+from tools.worlds.people import community, planned
 from tools.worlds.sights import Surroundings, look_at
-from tools.worlds.surveyed import (
-    TownOptions,
-    day_key,
-    moment,
-    photo_ids,
-    shot_seed,
-    survey_photos,
-    town_of,
-)
+from tools.worlds.surveyed import TownOptions, day_key, moment, photo_ids, shot_seed, survey_photos, town_of
 
 _PROBE = "probe"
 _TRIES = 8
@@ -89,17 +81,13 @@ def plan_walk(options: WalkOptions) -> list[PlannedPhoto]:
         flight = replace(options.flight, center_m=(at, _middle(options)))
         for p in survey_photos(home, flight, options.seed + seed, folder=folder):
             photos.append(replace(p, fact=replace(p.fact, kind=folder)))
-    around = Surroundings(home)
-    people = {p.name: p for p in community(options.width)}
-    ids = iter(photo_ids(options.seed, 4 * options.steps * (options.per_step + options.probes)))
+    walk = _Walk(options, home)
     for step in range(options.steps):
         rng = np.random.default_rng((options.seed, 81, step))
         for who, walker in enumerate(WALKERS):
-            looks = _step(around, walker, people[walker.owner], options, step, options.per_step, rng)
-            photos += _photos(options, home, walker, people[walker.owner], looks, step, who, ids, "walk")
+            photos += walk.photos(walker, walk.aims(walker, step, options.per_step, rng), step, who, "walk")
         walker = WALKERS[step % len(WALKERS)]
-        looks = _step(around, walker, people[walker.owner], options, step, options.probes, rng)
-        photos += _photos(options, home, walker, people[walker.owner], looks, step, 9, ids, _PROBE)
+        photos += walk.photos(walker, walk.aims(walker, step, options.probes, rng), step, 9, _PROBE)
     return photos
 
 
@@ -111,94 +99,68 @@ def _middle(options: WalkOptions) -> float:
 Aim = tuple[FloatArray, FloatArray]
 
 
-def _step(
-    around: Surroundings,
-    walker: Walker,
-    person: Person,
-    options: WalkOptions,
-    step: int,
-    count: int,
-    rng: np.random.Generator,
-) -> list[Aim]:
-    """Eyes and targets (town axes) of one person in one step: spread over the step and a little before it,
-    looking ahead, back or aside, as free of obstacles as a drone has to be."""
-    assert person.drone is not None
-    start = options.start_m + options.step_m * step
-    found: list[Aim] = []
-    for i in range(count):
-        for _ in range(_TRIES):
-            x = start + options.step_m * ((i + rng.random()) / count * 1.4 - 0.4)
-            y = _middle(options) + float(rng.normal(0, walker.across_m))
-            above = walker.heights_m[0] + float(rng.random()) * (walker.heights_m[1] - walker.heights_m[0])
-            down = np.radians(rng.uniform(*walker.down_deg))
-            turn = float(rng.choice([0.0, 180.0, 90.0, -90.0], p=[0.5, 0.2, 0.15, 0.15]))
-            heading = np.radians(turn) + rng.normal(0, 0.2)
-            eye = np.array([x, y, around.ground(y) + above])
-            reach = above / np.tan(down)
-            target = eye + np.array([reach * np.cos(heading), reach * np.sin(heading), -above])
-            pose = look_at(around.scene, eye, target)
-            if around.free(eye) and around.worth_taking(person.drone.camera, pose, 3.0):
-                found.append((eye, target))
-                break
-    return found
+class _Walk:
+    """Where people go, and what they photograph."""
 
+    def __init__(self, options: WalkOptions, home: Scene) -> None:
+        self._options, self._home, self._around = options, home, Surroundings(home)
+        self._people = {p.name: p for p in community(options.width)}
+        count = 4 * options.steps * (options.per_step + options.probes)
+        self._ids = iter(photo_ids(options.seed, count))
 
-def _photos(
-    options: WalkOptions,
-    home: Scene,
-    walker: Walker,
-    person: Person,
-    aims: list[Aim],
-    step: int,
-    who: int,
-    ids: Iterator[str],
-    kind: str,
-) -> list[PlannedPhoto]:
-    """The planned photos of one person's step; a step is a day, and nobody flies at the same hour."""
-    assert person.drone is not None
-    rng = np.random.default_rng((options.seed, 82, step, who))
-    day, hour = 9 * step + who, float(rng.uniform(9.0, 18.0))
-    centers = [home.enu_from_town @ eye for eye, _ in aims]
-    photos = []
-    for i, (eye, target) in enumerate(aims):
-        photo_id = next(ids)
-        owner = person.name if kind == "walk" else _PROBE
-        name = f"{'photos/' + owner if kind == 'walk' else 'probes'}/{photo_id}.jpg"
-        wobble = rng.normal(0, [1.5, 1.0, 0.8])
-        shot = Shot(
-            name=name,
-            device=person.drone,
-            cam_from_local=look_at(home, eye, target, (wobble[0], wobble[1], wobble[2])),
-            time=moment(day, hour + 0.005 * i),
-            seed=shot_seed(options.seed, 7, step, who, i),
-        )
-        error = rng.normal(0, [walker.gps_sigma_m, walker.gps_sigma_m])
-        tag = None
-        if walker.gps_sigma_m > 0:
-            tag = geotag_at(
-                home,
-                centers[i] + np.append(error, 0.0),
-                float(rng.normal(0, _VERTICAL_M)),
-                walker.gps_sigma_m,
+    def aims(self, walker: Walker, step: int, count: int, rng: np.random.Generator) -> list[Aim]:
+        """Eyes and targets (town axes) of one person in one step: spread over the step and a little before
+        it, looking ahead, back or aside, as free of obstacles as a drone has to be."""
+        options, drone = self._options, self._people[walker.owner].drone
+        assert drone is not None
+        found: list[Aim] = []
+        for i in range(count):
+            for _ in range(_TRIES):
+                along = step + ((i + rng.random()) / count * 1.4 - 0.4)
+                y = _middle(options) + float(rng.normal(0, walker.across_m))
+                low, high = walker.heights_m
+                above = low + float(rng.random()) * (high - low)
+                down = np.radians(rng.uniform(*walker.down_deg))
+                turn = float(rng.choice([0.0, 180.0, 90.0, -90.0], p=[0.5, 0.2, 0.15, 0.15]))
+                heading = np.radians(turn) + rng.normal(0, 0.2)
+                x = options.start_m + options.step_m * along
+                eye = np.array([x, y, self._around.ground(y) + above])
+                reach = above / np.tan(down)
+                target = eye + np.array([reach * np.cos(heading), reach * np.sin(heading), -above])
+                pose = look_at(self._home, eye, target)
+                if self._around.free(eye) and self._around.worth_taking(drone.camera, pose, 3.0):
+                    found.append((eye, target))
+                    break
+        return found
+
+    def photos(self, walker: Walker, aims: list[Aim], step: int, who: int, kind: str) -> list[PlannedPhoto]:
+        """The photos of one person's step; a step is a day, and nobody flies at the same hour."""
+        person, home, seed = self._people[walker.owner], self._home, self._options.seed
+        assert person.drone is not None
+        rng = np.random.default_rng((seed, 82, step, who))
+        day, hour = 9 * step + who, float(rng.uniform(9.0, 18.0))
+        photos = []
+        for i, (eye, target) in enumerate(aims):
+            photo_id = next(self._ids)
+            wobble = rng.normal(0, [1.5, 1.0, 0.8])
+            shot = Shot(
+                name=f"{'photos/' + person.name if kind == 'walk' else 'probes'}/{photo_id}.jpg",
+                device=person.drone,
+                cam_from_local=look_at(home, eye, target, (wobble[0], wobble[1], wobble[2])),
+                time=moment(day, hour + 0.005 * i),
+                seed=shot_seed(seed, 7, step, who, i),
             )
-        fact = AlbumFact(
-            name=name,
-            photo_id=photo_id,
-            kind=kind,
-            owner=owner,
-            licence=person.licence,
-            time=shot.time,
-            visit=10 * step + who,
-            batch=step,
-        )
-        photos.append(
-            PlannedPhoto(
-                shot=shot,
-                scene=day_key("home", day, hour),
-                fact=fact,
-                geotag=tag,
-                quality=person.quality,
-                sensor=person.sensor,
-            )
-        )
-    return photos
+            place = home.enu_from_town @ eye + np.append(rng.normal(0, walker.gps_sigma_m, 2), 0.0)
+            tag = None
+            if walker.gps_sigma_m > 0:
+                tag = geotag_at(home, place, float(rng.normal(0, _VERTICAL_M)), walker.gps_sigma_m)
+            owner = person.name if kind == "walk" else _PROBE
+            told: dict[str, Any] = {
+                "photo_id": photo_id,
+                "owner": owner,
+                "visit": 10 * step + who,
+                "batch": step,
+            }
+            scene = day_key("home", day, hour)
+            photos.append(planned(person, shot, scene, kind, geotag=tag, **told))
+        return photos
