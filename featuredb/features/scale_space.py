@@ -106,7 +106,7 @@ class ScaleSpace:
     @cached_property
     def octaves(self) -> list[NDArray[np.float32]]:
         """(6, h, w) each: blurred by 1.6 pixels and by a third of an octave more each time."""
-        first = self._blurred(_loops().doubled(self._gray), (SIGMA**2 - (2.0 * _CAMERA_BLUR) ** 2) ** 0.5)
+        first = self._blurred(_pyramid().doubled(self._gray), (SIGMA**2 - (2.0 * _CAMERA_BLUR) ** 2) ** 0.5)
         octaves: list[NDArray[np.float32]] = []
         while not octaves or min(first.shape) >= _LEAST_PX:
             octave = np.empty((LAYERS + 3, *first.shape), np.float32)
@@ -124,7 +124,9 @@ class ScaleSpace:
         out = np.empty_like(image) if out is None else out
         kernel = cv2.getGaussianKernel(round(8.0 * sigma_px + 1.0) | 1, sigma_px, cv2.CV_32F)
         weights = np.ascontiguousarray(kernel[len(kernel) // 2 :, 0])
-        mapped(lambda rows: _loops().blur(image, weights, *rows, out), self._bands(len(image)), self._threads)
+        mapped(
+            lambda rows: _pyramid().blur(image, weights, *rows, out), self._bands(len(image)), self._threads
+        )
         return out
 
     def keypoints(self, contrast_threshold: float, edge_threshold: float) -> ScaleSpacePoints:
@@ -184,6 +186,10 @@ class ScaleSpace:
             mine = np.flatnonzero(points.rows[:, OCTAVE] == number)
             parts += [(octave, mine[k : k + _AT_ONCE]) for k in range(0, len(mine), _AT_ONCE)]
         return parts
+
+
+def _pyramid() -> ModuleType:
+    return compiled_module("featuredb.features.pyramid_loops")
 
 
 def _loops() -> ModuleType:

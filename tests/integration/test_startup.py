@@ -77,8 +77,9 @@ def test_pandas_is_there_for_who_wants_it() -> None:
 def test_workers_are_forked_with_compiled_loops() -> None:
     """To compile takes longer than a worker may take for a photo."""
     code = (
-        "import signal; import reloc.service.workers.preload; from featuredb.features import sift_loops as loops\n"
-        "for name in ('doubled', 'blur', 'extrema', 'orientations', 'descriptors'):\n"
-        "    assert len(getattr(loops, name).signatures) == 1, name"
+        "import reloc.service.workers.preload; from featuredb.features import pyramid_loops, sift_loops\n"
+        "for loops, names in ((pyramid_loops, 'doubled blur'), (sift_loops, 'extrema orientations descriptors')):\n"
+        "    for name in names.split():\n"
+        "        assert len(getattr(loops, name).signatures) == 1, name"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120.0)
