@@ -78,7 +78,8 @@ def test_workers_are_forked_with_compiled_loops() -> None:
     """To compile takes longer than a worker may take for a photo."""
     code = (
         "import reloc.service.workers.preload; from featuredb.features import pyramid_loops, sift_loops\n"
-        "for loops, names in ((pyramid_loops, 'doubled blur'), (sift_loops, 'extrema orientations descriptors')):\n"
+        "sets = ((pyramid_loops, 'doubled blur'), (sift_loops, 'extrema orientations descriptors'))\n"
+        "for loops, names in sets:\n"
         "    for name in names.split():\n"
         "        assert len(getattr(loops, name).signatures) == 1, name"
     )
