@@ -11,8 +11,6 @@ hull of the whole map's points in plan.
 """
 
 import shutil
-import sys
-from collections.abc import Sequence
 from dataclasses import fields
 
 from scipy.spatial import ConvexHull
@@ -28,8 +26,8 @@ _EVERY = 5  # one photo in so many is held out
 _COVERS = (1600, 800, 400, 200, 100, 50, 25, 12)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__, "--photos", "--work").parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__, "--photos", "--work").parse_args()
     held_out = photo_names(args.photos)[_EVERY // 2 :: _EVERY]
     ingest(args.work / "whole", args.photos, ())
     ingest(args.work / "part", args.photos, held_out)
@@ -53,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     whole = curve["cover_all"]
     for of in curve.values():
         of["size_ratio"] = of["megabytes"] / whole["megabytes"]
+        of["kept"] = of["answered"] / max(whole["answered"], 1)
     write_figures(args.json, {"km2": km2, **curve})
-    return 0
 
 
 def segments(database: Database) -> list[Segment]:
@@ -64,4 +62,4 @@ def segments(database: Database) -> list[Segment]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

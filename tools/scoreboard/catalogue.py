@@ -8,6 +8,8 @@ from tools.scoreboard.simulated_rows import SIMULATED
 from tools.scoreboard.words import BRIGHTON, OUT, same
 
 _row = partial(Row, group="speed")
+# Points for each image that a thinned map keeps.
+_COVERS = ("all", "800", "200", "50", "12")
 # Sets whose ingest is timed.
 _INGESTED = ("brighton", "lewis", "copr", "seneca")
 # A database of `brighton`, which the next command uses.
@@ -60,6 +62,33 @@ SPEED: tuple[Row, ...] = (
         ),
         limits="worst_ratio <= 0.5, fewer <= 0",
         minutes=35,
+    ),
+    _row(
+        name="memory-curve",
+        claim="`seneca`'s map of all photos but every fifth, thinned to so many points for each image; the "
+        "others over Zenoh, against a map of all",
+        commands=f"tools.memory_curve --photos {{data}}/seneca/images --work {{work}}/maps {OUT}",
+        figures={
+            f"cover_{cover}_{name}": f"cover_{cover}.{name}"
+            for cover in _COVERS
+            for name in (
+                "megabytes_a_km2",
+                "size_ratio",
+                "answered",
+                "asked",
+                "kept",
+                "median_m",
+                "largest_m",
+            )
+        },
+        text="points an image, megabytes a km2, answered, median error: "
+        + "; ".join(
+            f"{cover} {{cover_{cover}_megabytes_a_km2:.0f}} {{cover_{cover}_answered:.0f}} of "
+            f"{{cover_{cover}_asked:.0f}} {{cover_{cover}_median_m:.2f}} m"
+            for cover in _COVERS
+        ),
+        limits="0.9 <= cover_200_kept",
+        minutes=12,
     ),
     _row(
         name="scale-1m",
