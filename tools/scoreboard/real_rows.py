@@ -59,6 +59,21 @@ _STRIPS = (
 
 REAL: tuple[Row, ...] = (
     _row(
+        name="mixed-folder",
+        claim="eight sets of seven places by many cameras, with positions and without, in one folder",
+        commands="tools.mixed_folder "
+        + " ".join(
+            f"{name}={{data}}/{name}/images" for name in ("brighton", "lewis", "seneca", "copr", "reichstag")
+        )
+        + " sacre_coeur={data}/sacre_coeur/mapping courtyard={data}/strecha/fountain-P11/images "
+        f"courtyard={{data}}/strecha/entry-P10/images --work {{work}}/maps {OUT}",
+        figures=same("photos maps placed seconds"),
+        text="{mapped} of {photos} photos in {maps} maps, {in_largest} in the largest of each place; {mixed} "
+        "maps mix places; {placed} have a place",
+        limits="mixed <= 0, 7 <= places, 0.8 <= least_share",
+        minutes=15,
+    ),
+    _row(
         name="brighton-held-out",
         form="quick",
         claim="`brighton`: 14 of 18 photos become a map; the 4 others over Zenoh, against a map of all 18",
