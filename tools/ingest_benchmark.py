@@ -23,6 +23,7 @@ _NEIGHBOURS = 15
 _SIDE_PX = 1600
 _THEIRS = f"""
 import json, sys
+import numpy
 import pycolmap
 photos, work = sys.argv[1:]
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
@@ -32,7 +33,8 @@ features.max_image_size = {_SIDE_PX}
 database = work + "/colmap.db"
 pycolmap.extract_features(database, photos, extraction_options=features)
 with pycolmap.Database.open(database) as opened:
-    placed = opened.num_pose_priors()
+    priors = opened.read_all_pose_priors()  # one each, with gravity alone where a photo has no position
+placed = all(numpy.isfinite(prior.position).all() for prior in priors)
 if placed:
     pairs = pycolmap.SpatialPairingOptions()
     pairs.max_num_neighbors = {_NEIGHBOURS}
