@@ -127,7 +127,7 @@ def simulated_strip(rng: np.random.Generator) -> CameraStrip:
         rotation = rotation @ so3_exp([0.0, 0.0, off[2]])
         poses.append(Rigid3(rotation=rotation, translation=-rotation @ center))
         if flipped and rng.random() < 0.5:
-            told = replace(told, yaw_deg=told.yaw_deg + 180.0, roll_deg=None)
+            told = replace(told, yaw_deg=told.yaw_deg + 180.0)
         angles.append(told)
     noise = rng.uniform(0.3, 2.0)
     rest = np.sqrt(np.maximum(SIGMAS**2 - noise**2, 0.0))

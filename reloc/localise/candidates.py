@@ -91,7 +91,7 @@ class Cluster:
         area: where they are.
         images: (i,) rows of the area's images.
         points: (p,) rows of the area's points that they see.
-        score: votes above expectation, in standard deviations; infinity where there is no choice.
+        score: votes above expectation, in standard deviations; infinity where all areas are tried anyway.
     """
 
     area: Area
@@ -113,16 +113,16 @@ def find_clusters(
         beyond: images that may see what a camera within this prior sees are left out: they were tried.
     """
     reach: list[_Reach] = []
+    most = options.single_cluster_points
     for indexed in areas:
         allowed = images_in_reach(indexed.area, prior, options)
         if beyond is not None:
             allowed &= ~images_in_reach(indexed.area, beyond, options)
         if allowed.any():
             reach.append(_Reach.of(indexed, allowed))
-    small = [len(r.points) <= options.single_cluster_points for r in reach]
-    if small == [True]:
-        (only,) = reach
-        return [Cluster(area=only.area, images=only.images, points=only.points, score=np.inf)]
+    if sum(len(r.points) for r in reach) <= most and len(reach) <= options.max_clusters:
+        return [Cluster(area=r.area, images=r.images, points=r.points, score=np.inf) for r in reach]
+    small = [len(r.points) <= most for r in reach]
     votes = _vote(reach, features, options)
     share = sum(float(v.sum()) for v in votes) / max(sum(len(r.points) for r in reach), 1)
     found: list[Cluster] = []

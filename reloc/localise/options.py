@@ -21,8 +21,8 @@ class CandidateOptions:
             so many of the best spread features are matched against each of the others, and those that match
             best are tried.
         max_clusters: clusters that are tried, best first.
-        single_cluster_points: an area with at most so many points in reach is matched as a whole; without
-            voting where it is the only one: matching it costs less than voting would.
+        single_cluster_points: an area with at most so many points in reach is matched as a whole. Where
+            all areas have no more together, and are few, all are, without voting, which would cost more.
         prior_sigmas: images within so many standard deviations of the prior are in reach ...
         prior_reach: ... plus so many times the distance from which they look at their scene.
     """

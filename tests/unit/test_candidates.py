@@ -148,13 +148,13 @@ def test_no_small_area_is_lost_among_many() -> None:
         assert len(clusters) == 3
         assert clusters[0].area.maps[0].map_id == f"place-{seed}"
         assert np.isfinite([c.score for c in clusters]).all()
-    # Of few areas none is left out, but the photo's own comes first, so that the others need not be tried.
+    # Few that have few points are all tried; of more points the photo's own come first.
     few = find_clusters(areas[:3], photo_of(2), None, CandidateOptions())
-    assert few[0].area.maps[0].map_id == "place-2"
-    assert len(few) == 3
-    assert few[1].score < 0.5 * few[0].score
-    (alone,) = find_clusters(areas[:1], photo_of(0), None, CandidateOptions())
-    assert alone.score == np.inf
+    assert [c.score for c in few] == [np.inf] * 3
+    more = find_clusters(areas[:3], photo_of(2), None, CandidateOptions(single_cluster_points=400))
+    assert len(more) == 3
+    assert more[0].area.maps[0].map_id == "place-2"
+    assert more[1].score < 0.5 * more[0].score
 
 
 def test_a_small_area_does_not_push_aside_the_clusters_of_a_large_one() -> None:
