@@ -38,8 +38,8 @@ def main() -> None:
     for cover in (None, *_COVERS):
         database = args.work / f"cover-{cover}"
         shutil.copytree(args.work / "part", database)
-        for found in Database.open(database).snapshot().maps() if cover else ():
-            featuredb("thin", str(database), found.map_id, "--cover", str(cover))
+        for map_id in active(Database.open(database)) if cover else ():
+            featuredb("thin", str(database), map_id, "--cover", str(cover))
         rows = error_figures(ask(Database.open(database), args.photos, held_out, truth))
         laid_out = segments(Database.open(database))
         size = sum(getattr(one, field.name).nbytes for one in laid_out for field in fields(one))
@@ -55,10 +55,13 @@ def main() -> None:
     write_figures(args.json, {"km2": km2, **curve})
 
 
+def active(database: Database) -> list[str]:
+    return [found.map_id for found in database.snapshot().maps() if found.status == "active"]
+
+
 def segments(database: Database) -> list[Segment]:
     snapshot = database.snapshot()
-    active = [summary.map_id for summary in snapshot.maps() if summary.status == "active"]
-    return [segment_of(snapshot.load_map(map_id)) for map_id in active]
+    return [segment_of(snapshot.load_map(map_id)) for map_id in active(database)]
 
 
 if __name__ == "__main__":
