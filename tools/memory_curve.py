@@ -4,7 +4,7 @@
 
 A map of all photos but every fifth is made, and one of all of them, whose poses of the others are the
 reference. Copies of the first database are thinned (`featuredb thin --cover N`), from 1,600 points that each
-image needs to 12, and each is asked for the held-out photos over Zenoh, with nothing but the file.
+image needs to 15, and each is asked for the held-out photos over Zenoh, with nothing but the file.
 
 Bytes are those of what a server lays out for searching (`featuredb.index.segment`). The area is the convex
 hull of the whole map's points in plan.
@@ -23,7 +23,7 @@ from tools.made_maps import photo_names
 from tools.real_photos import ask, error_figures, ingest, reference
 
 _EVERY = 5  # one photo in so many is held out
-_COVERS = (1600, 800, 400, 200, 100, 50, 25, 12)
+_COVERS = (1600, 800, 400, 200, 100, 50, 25, 15)
 
 
 def main() -> None:

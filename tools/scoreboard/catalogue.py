@@ -9,7 +9,7 @@ from tools.scoreboard.words import BRIGHTON, OUT, same
 
 _row = partial(Row, group="speed")
 # Points for each image that a thinned map keeps.
-_COVERS = ("all", "800", "200", "50", "12")
+_COVERS = ("all", "800", "200", "50", "15")
 # Sets whose ingest is timed.
 _INGESTED = ("brighton", "lewis", "copr", "seneca")
 # A database of `brighton`, which the next command uses.
