@@ -1,13 +1,17 @@
 """Numba at one place: the decorator of compiled loops, the way to modules that need it, and their threads."""
 
 import importlib
+import logging
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from types import ModuleType
 from typing import Any, TypeVar
 
 from featuredb.errors import InvalidValueError
+
+_LOG = logging.getLogger(__name__)
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -61,9 +65,15 @@ def compiled(function: F) -> F:
     options = {"nogil": True, "error_model": "numpy"}
     try:
         decorated: F = numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # there is no folder that may be written to: it is compiled in each process
+    except RuntimeError:  # there is no folder that may be written to
+        _warn_once()
         decorated = numba.njit(**options)(function)
     return decorated
+
+
+@cache
+def _warn_once() -> None:
+    _LOG.warning("no folder for compiled loops: each process compiles them; set NUMBA_CACHE_DIR to a folder")
 
 
 def compiled_module(name: str) -> ModuleType:

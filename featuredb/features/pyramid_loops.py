@@ -45,11 +45,8 @@ def blur(
         for x in range(width):
             middle[x] = weights[0] * here[x]
         for k in range(1, reach + 1):
-            above, below, weight = (
-                image[_mirrored(y - k, height)],
-                image[_mirrored(y + k, height)],
-                weights[k],
-            )
+            above, below = image[_mirrored(y - k, height)], image[_mirrored(y + k, height)]
+            weight = weights[k]
             for x in range(width):
                 middle[x] += weight * (above[x] + below[x])
         for k in range(1, reach + 1):

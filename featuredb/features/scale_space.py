@@ -34,7 +34,7 @@ class ScaleSpacePoints:
     """Keypoints in the scale space of an image.
 
     Attributes:
-        rows: (n, 6) float32, as the loops have them (`sift_loops`).
+        rows: (n, 6) float32: x, y and scale in the octave's pixels, octave, layer, response (`sift_loops`).
     """
 
     rows: NDArray[np.float32]
@@ -54,7 +54,7 @@ class ScaleSpacePoints:
     @property
     def xy(self) -> NDArray[np.float32]:
         """(n, 2) pixels of the image; centre of the top-left pixel (0.5, 0.5)."""
-        # The first pixels of all octaves are one.
+        # The first pixel of each octave is the first of the doubled image, whose centre is at 0.25.
         return (self.rows[:, :2] * self._pixels[:, None] + np.float32(0.25)).astype(np.float32)
 
     @property
@@ -121,6 +121,7 @@ class ScaleSpace:
     def _blurred(
         self, image: NDArray[np.float32], sigma_px: float, out: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
+        """The image (h, w) blurred by a Gaussian, cut at four standard deviations as in OpenCV's SIFT."""
         out = np.empty_like(image) if out is None else out
         kernel = cv2.getGaussianKernel(round(8.0 * sigma_px + 1.0) | 1, sigma_px, cv2.CV_32F)
         weights = np.ascontiguousarray(kernel[len(kernel) // 2 :, 0])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from featuredb.compiled import compiled
 
-# Numba keeps what it has compiled until this file changes: what the loops are made with is said here.
+# Said here, not imported: Numba keeps what it has compiled until this file changes.
 X, Y, SCALE, OCTAVE, LAYER, RESPONSE = range(6)
 DIRECTIONS = 36  # bins of an orientation's histogram
 _BORDER = 5  # pixels in which no extremum is looked for

