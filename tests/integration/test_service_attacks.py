@@ -16,6 +16,7 @@ from featuredb.store import Database
 from reloc.client import CameraRequest, Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
+from tests.support.live import wait_until
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
 from tools.bombs import png, progressive_jpeg, zeros
 from tools.serve_process import ServeProcess
@@ -139,13 +140,11 @@ def test_slow_queries_leave_time_for_those_who_wait(database: Path) -> None:
     process = ServeProcess(database, "--deadline", 10)
     try:
         with Client(process.endpoint) as client, ThreadPoolExecutor(7) as pool:
-            while len(process.workers) < 2:
-                time.sleep(0.01)
+            wait_until(lambda: client.status().queue.ready == 2, "both workers are ready")
             for worker in process.workers:
                 os.kill(worker, signal.SIGSTOP)
             hung = [pool.submit(refusal, client, plain) for _ in range(2)]
-            while client.status().queue.busy < 2:
-                time.sleep(0.01)
+            wait_until(lambda: client.status().queue.busy == 2, "both workers have a query")
             asked = [pool.submit(client.localise, plain) for _ in range(3)]
             assert [f.result().status for f in asked] == ["not_localised"] * 3
             assert [f.result().code for f in hung] == ["DEADLINE"] * 2
