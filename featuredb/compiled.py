@@ -9,6 +9,8 @@ from functools import cache
 from types import ModuleType
 from typing import Any, TypeVar
 
+import cv2
+
 from featuredb.errors import InvalidValueError
 
 _LOG = logging.getLogger(__name__)
@@ -34,6 +36,11 @@ def thread_count(wanted: int) -> int:
         return wanted
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(usable, _MOST)
+
+
+def opencv_threads() -> int:
+    """As many as OpenCV may use in this process, up to four."""
+    return min(max(cv2.getNumThreads(), 1), _MOST)
 
 
 def mapped(function: Callable[[T], R], items: Sequence[T], threads: int) -> list[R]:

@@ -253,8 +253,13 @@ class Localiser:
             )
         return self._unplaced[named[0]].get()
 
-    def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
+    def localise(
+        self, gray: NDArray[np.uint8], request: LocaliseRequest, size: tuple[int, int] | None = None
+    ) -> LocaliseResult:
         """Pose of the image (h, w) uint8, or the reason why there is none.
+
+        Args:
+            size: width and height of the image at full size, where `gray` is a smaller copy.
 
         Raises:
             MapNotFoundError: the request names maps that the snapshot does not serve.
@@ -266,9 +271,9 @@ class Localiser:
         if own is not None:
             unplaced, area = own
             told = replace(request, prior=None, own_position=None, beyond=None, map_ids=None)
-            return in_own_frame(localise(gray, told, [area], self.options, self.snapshot), unplaced)
+            return in_own_frame(localise(gray, told, [area], self.options, self.snapshot, size), unplaced)
         areas = self.areas_of(request.map_ids)
-        return self._with_lineage(localise(gray, request, areas, self.options, self.snapshot))
+        return self._with_lineage(localise(gray, request, areas, self.options, self.snapshot, size))
 
     def _with_lineage(self, result: LocaliseResult) -> LocaliseResult:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""

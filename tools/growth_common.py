@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from featuredb.features.decode import decode_gray
+from featuredb.features.decode import decode_gray, probe
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.world import Truth, read_truth
@@ -226,7 +226,7 @@ def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     """The answer to a photo, asked as a client does that knows nothing but the file."""
     data = photo.read_bytes()
     gray = decode_gray(data)
-    return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray))
+    return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, probe(data)))
 
 
 def conclude(out: Path, name: str, verdicts: Sequence[Verdict]) -> int:

@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--side", type=int, default=1000, metavar="PX", help="longer side; default: 1000")
     parser.add_argument("--features", type=int, default=3000, metavar="N", help="default: 3000")
     args = parser.parse_args(argv)
-    options = ExtractorOptions(max_side_px=args.side, max_features=args.features, oversample=1.25)
+    options = ExtractorOptions(first_octave_px=2 * args.side, max_features=args.features, oversample=1.25)
     cv2.setNumThreads(1)
     counts = {"ours": 0, "opencv": 0, "across": 0}
     ours_s, opencv_s = [], []

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from featuredb.features.extractor import ExtractorOptions, rootsift_8bit
 from featuredb.features.scale_space import LAYERS, SIGMA, ScaleSpace, ScaleSpacePoints
-from featuredb.features.shrink import shrunk
 
-# The smallest diameter that the extractor finds: half a layer below the first, in the doubled image.
-_FINEST_PX = 0.999 * 2.0 * SIGMA * 2.0 ** (0.5 / LAYERS - 1.0)
+# The smallest diameter that the extractor finds: half a layer above the first octave's first image.
+_FINEST_PX = 0.999 * 2.0 * SIGMA * 2.0 ** (0.5 / LAYERS)
 
 
 def describe_at(
@@ -58,10 +57,9 @@ def orientations_at(
 def _placed(
     gray: NDArray[np.uint8], xy: NDArray[np.float32], scale: NDArray[np.float32]
 ) -> tuple[ScaleSpace, ScaleSpacePoints]:
-    small = shrunk(gray, ExtractorOptions().max_side_px)
-    if float(scale.min()) * max(small.shape) / max(gray.shape) < _FINEST_PX:
-        small = gray
-    ratio = np.array(small.shape[::-1]) / gray.shape[::-1]
-    space = ScaleSpace(small)
+    space = ScaleSpace(gray, ExtractorOptions().first_octave_px)
+    if float(scale.min()) * max(space.width, space.height) / max(gray.shape) < _FINEST_PX:
+        space = ScaleSpace(gray, 2 * max(gray.shape))
+    ratio = np.array([space.width, space.height]) / gray.shape[::-1]
     places, diameters = xy.astype(np.float64) * ratio, scale.astype(np.float64) * ratio.mean()
     return space, ScaleSpacePoints.at(places, diameters, len(space.octaves))

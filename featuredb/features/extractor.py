@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.features import Features
 from featuredb.features.scale_space import LAYERS, SIGMA, ScaleSpace
-from featuredb.features.shrink import shrunk
 
 # Raise when a change to this module makes descriptors that older maps cannot be compared with.
 _DESCRIPTOR_VERSION = "rootsift8-opencv-1"
@@ -23,8 +22,9 @@ class ExtractorOptions:
     """How features are extracted.
 
     Attributes:
-        max_side_px: the image is area-averaged down to this longer side first. SIFT is scale-invariant,
-            so maps and queries may differ in it.
+        first_octave_px: longer side of the scale space's first octave; larger images are area-averaged
+            down to it first, smaller ones enlarged, at most twice. SIFT is scale-invariant, so maps and
+            queries may differ in it.
         max_features: the strongest, spatially spread, are kept. For maps many: on `brighton` 12,000 instead
             of 6,000 double the observations and halve what poses move by between subsets of the photos.
         oversample: the spread selection chooses among this many times as many of the strongest keypoints.
@@ -33,7 +33,7 @@ class ExtractorOptions:
         upright: angles are set to zero, for image pairs whose rotation is known; more distinctive.
     """
 
-    max_side_px: int = 1600
+    first_octave_px: int = 2400
     max_features: int = 12_000
     oversample: float = 2.5
     contrast_threshold: float = 0.02
@@ -41,9 +41,9 @@ class ExtractorOptions:
     upright: bool = False
 
     def __post_init__(self) -> None:
-        if not 64 <= self.max_side_px <= 32_000:
+        if not 64 <= self.first_octave_px <= 64_000:
             raise InvalidValueError(
-                f"ExtractorOptions.max_side_px: expected 64..32000 px, found {self.max_side_px}"
+                f"ExtractorOptions.first_octave_px: expected 64..64000 px, found {self.first_octave_px}"
             )
         if not 1 <= self.max_features <= 1_000_000:
             raise InvalidValueError(
@@ -67,11 +67,14 @@ class ExtractorOptions:
         )
 
 
-def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) -> Features:
+def extract(
+    gray: NDArray[np.uint8], options: ExtractorOptions | None = None, size: tuple[int, int] | None = None
+) -> Features:
     """Detect and describe the features of one image.
 
     Args:
         gray: (h, w) uint8, pixels as stored in the file (EXIF orientation not applied).
+        size: width and height of the image at full size, where `gray` is a smaller copy.
 
     Returns:
         Features in full-size pixels, strongest and best-spread first.
@@ -82,15 +85,14 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
     options = options or ExtractorOptions()
     if gray.ndim != 2 or gray.dtype != np.uint8:
         raise ImageError(f"extract: expected a (h, w) uint8 image, found {gray.shape} {gray.dtype}")
-    height, width = gray.shape
+    width, height = size or gray.shape[::-1]
     if min(height, width) < 32:
         raise ImageError(f"extract: expected at least 32x32 pixels, found {width}x{height}")
-    small = shrunk(gray, options.max_side_px)
-    space = ScaleSpace(small)
+    space = ScaleSpace(gray, options.first_octave_px)
     points = space.keypoints(options.contrast_threshold, options.edge_threshold)
     points = points.take(np.arange(min(len(points), int(options.oversample * options.max_features))))
     points = points.take(
-        spread_strongest(points.xy, points.response, small.shape[1], small.shape[0], options.max_features)
+        spread_strongest(points.xy, points.response, space.width, space.height, options.max_features)
     )
     if options.upright:
         angle = np.zeros(len(points), np.float32)
@@ -99,7 +101,7 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
         rows = np.repeat(np.arange(len(points)), counts)[: options.max_features]
         angle = angles[rows, np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]]
         points = points.take(rows)
-    ratio = np.array([width / small.shape[1], height / small.shape[0]])
+    ratio = np.array([width / space.width, height / space.height])
     return Features(
         xy=(points.xy * ratio).astype(np.float32),
         scale=points.diameter * np.float32(ratio.mean()),

@@ -1,28 +1,9 @@
-"""Compiled loops of images: doubled and blurred; import them through `compiled_module`."""
+"""A compiled loop that blurs images; import it through `compiled_module`."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.compiled import compiled
-
-
-@compiled
-def doubled(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Twice as large an image, by linear interpolation."""
-    height, width = gray.shape
-    out = np.empty((2 * height, 2 * width), np.float32)
-    between = np.empty(width, np.float32)
-    near, far = np.float32(0.75), np.float32(0.25)
-    for i in range(2 * height):
-        other = min(max(i // 2 + 2 * (i % 2) - 1, 0), height - 1)
-        for j in range(width):
-            between[j] = near * gray[i // 2, j] + far * gray[other, j]
-        row = out[i]
-        row[0], row[2 * width - 1] = between[0], between[width - 1]
-        for j in range(width - 1):
-            row[2 * j + 1] = near * between[j] + far * between[j + 1]
-            row[2 * j + 2] = near * between[j + 1] + far * between[j]
-    return out
 
 
 @compiled

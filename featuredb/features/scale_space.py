@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.compiled import compiled_module, mapped
+from featuredb.compiled import compiled_module, mapped, opencv_threads
 from featuredb.errors import ImageError
+from featuredb.features.shrink import fitted_size, shrunk
 from featuredb.geometry.arrays import FloatArray
 
 LAYERS, SIGMA = 3, 1.6
@@ -23,7 +24,6 @@ _CAMERA_BLUR = 0.5  # of any photo, in its pixels
 _LEAST_PX = 12  # a side of an octave: less has no extrema
 _BAND_ROWS = 200  # for a thread at least
 _AT_ONCE = 500  # keypoints for a thread
-_MOST_THREADS = 4
 _MOST_ORIENTATIONS = 18  # of a keypoint: each second direction can be a peak
 
 _Part = tuple[NDArray[np.float32], NDArray[np.intp]]
@@ -48,18 +48,17 @@ class ScaleSpacePoints:
 
     @property
     def _pixels(self) -> NDArray[np.float32]:
-        """(n,) pixels of the image in one of the octave."""
-        return np.asarray(2.0 ** (self.rows[:, OCTAVE] - 1.0), dtype=np.float32)
+        """(n,) pixels of the first octave in one of the keypoint's."""
+        return np.asarray(2.0 ** self.rows[:, OCTAVE], dtype=np.float32)
 
     @property
     def xy(self) -> NDArray[np.float32]:
-        """(n, 2) pixels of the image; centre of the top-left pixel (0.5, 0.5)."""
-        # The first pixel of each octave is the first of the doubled image, whose centre is at 0.25.
-        return (self.rows[:, :2] * self._pixels[:, None] + np.float32(0.25)).astype(np.float32)
+        """(n, 2) pixels of the first octave; centre of the top-left pixel (0.5, 0.5), as in each octave."""
+        return (self.rows[:, :2] * self._pixels[:, None] + np.float32(0.5)).astype(np.float32)
 
     @property
     def diameter(self) -> NDArray[np.float32]:
-        """(n,) pixels of the image: twice the scale."""
+        """(n,) pixels of the first octave: twice the scale."""
         return 2.0 * self.rows[:, SCALE] * self._pixels
 
     @property
@@ -71,7 +70,8 @@ class ScaleSpacePoints:
     def at(cls, xy: FloatArray, diameter: FloatArray, octaves: int) -> Self:
         """Where the scale space would have found keypoints of these places (n, 2) and diameters (n,).
 
-        One between two layers may get the other one. Those too large for its octaves are in the last.
+        Both in pixels of the first octave. One between two layers may get the other one. Those too large for
+        its octaves are in the last.
 
         Raises:
             ImageError: a place or diameter is no finite number, or a diameter is not above zero.
@@ -79,12 +79,12 @@ class ScaleSpacePoints:
         if not (np.isfinite(xy).all() and np.isfinite(diameter).all() and (diameter > 0.0).all()):
             raise ImageError("expected keypoints with finite places and diameters above 0 px, found others")
         step = np.rint(LAYERS * np.log2(diameter / (2.0 * SIGMA)))
-        octave = np.clip((step - 1) // LAYERS + 1, 0, octaves - 1)
-        layer = np.clip(step - LAYERS * (octave - 1), 0, LAYERS)
-        pixels = 2.0 ** (octave - 1.0)
+        octave = np.clip((step - 1) // LAYERS, 0, octaves - 1)
+        layer = np.clip(step - LAYERS * octave, 0, LAYERS)
+        pixels = 2.0**octave
         rows = [
-            (xy[:, 0] - 0.25) / pixels,
-            (xy[:, 1] - 0.25) / pixels,
+            (xy[:, 0] - 0.5) / pixels,
+            (xy[:, 1] - 0.5) / pixels,
             0.5 * diameter / pixels,
             octave,
             layer,
@@ -94,19 +94,35 @@ class ScaleSpacePoints:
 
 
 class ScaleSpace:
-    """Octaves of an image (h, w) uint8, the first of which is twice its size.
+    """Octaves of an image.
 
     On as many threads as OpenCV may use in this process, up to four; results are the same for any number.
+
+    Attributes:
+        width, height: of the first octave.
     """
 
-    def __init__(self, gray: NDArray[np.uint8]) -> None:
-        self._gray = np.require(gray, requirements=["C", "W"])  # the loops are compiled for these alone
-        self._threads = min(max(cv2.getNumThreads(), 1), _MOST_THREADS)
+    def __init__(self, gray: NDArray[np.uint8], side_px: int) -> None:
+        """
+        Args:
+            gray: (h, w) uint8.
+            side_px: longer side of the first octave; of a small image at most twice its own.
+        """
+        self._gray = gray
+        longer = max(gray.shape)
+        self._enlarged = min(max(side_px / longer, 1.0), 2.0)
+        height, width = gray.shape
+        if self._enlarged == 1.0:
+            self.width, self.height = fitted_size(width, height, side_px)
+        else:
+            self.width, self.height = round(width * self._enlarged), round(height * self._enlarged)
+        self._threads = opencv_threads()
 
     @cached_property
     def octaves(self) -> list[NDArray[np.float32]]:
         """(6, h, w) each: blurred by 1.6 pixels and by a third of an octave more each time."""
-        first = self._blurred(_pyramid().doubled(self._gray), (SIGMA**2 - (2.0 * _CAMERA_BLUR) ** 2) ** 0.5)
+        camera_blur = self._enlarged * _CAMERA_BLUR
+        first = self._blurred(self._resized, (SIGMA**2 - camera_blur**2) ** 0.5)
         octaves: list[NDArray[np.float32]] = []
         while not octaves or min(first.shape) >= _LEAST_PX:
             octave = np.empty((LAYERS + 3, *first.shape), np.float32)
@@ -117,6 +133,15 @@ class ScaleSpace:
             octaves.append(octave)
             first = octave[LAYERS, ::2, ::2]
         return octaves
+
+    @property
+    def _resized(self) -> NDArray[np.float32]:
+        # Whole grey levels would be too coarse between the pixels.
+        if self._enlarged == 1.0:
+            return shrunk(self._gray, max(self.width, self.height)).astype(np.float32)
+        size = (self.width, self.height)
+        enlarged = cv2.resize(self._gray.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+        return np.asarray(enlarged, dtype=np.float32)
 
     def _blurred(
         self, image: NDArray[np.float32], sigma_px: float, out: NDArray[np.float32] | None = None

@@ -17,6 +17,7 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.compiled import compiled_module, mapped, opencv_threads
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.index.nearest import one_thread
 from featuredb.index.stacked import Stacked
@@ -126,9 +127,14 @@ class DescriptorIndex:
             lists = np.argpartition(_from_lists(asked), _PROBES, axis=1)[:, :_PROBES].astype(np.int64)
             _, row = self._index.search_preassigned(asked, k, lists, np.zeros(lists.shape, np.float32))
         else:
-            with one_thread():
-                _, row = self._index.search(asked, k)
+            parts = np.array_split(asked, opencv_threads())
+            row = np.concatenate(mapped(lambda part: self._flat(part, k), parts, len(parts)))
         return np.asarray(row, dtype=np.int64)
+
+    def _flat(self, asked: NDArray[np.float32], k: int) -> NDArray[np.int64]:
+        with one_thread():
+            row: NDArray[np.int64] = self._index.search(asked, k)[1]
+        return row
 
 
 def squared_distances(
@@ -139,12 +145,18 @@ def squared_distances(
 ) -> NDArray[np.float32]:
     """Exact squared distances (m,) of pairs of descriptors, a row of `query` and one of `base` each."""
     squared = np.empty(len(base_rows), np.float32)
+    loops = compiled_module("featuredb.index.distance_loops")
+    query = np.require(query, requirements=["C", "W"])  # the loop is compiled for these alone
     for start in range(0, len(base_rows), _CHUNK):
         part = slice(start, start + _CHUNK)
-        difference = base[base_rows[part]].astype(np.float32)
-        difference -= query[query_rows[part]]
-        squared[part] = np.einsum("ij,ij->i", difference, difference)
+        loops.pair_distances(query, query_rows[part], base[base_rows[part]], squared[part])
     return squared
+
+
+def warm_up() -> None:
+    """Load the compiled loop, or compile it, now: processes that are forked then have it."""
+    none = np.zeros((1, DESCRIPTOR_SIZE), np.uint8)
+    squared_distances(none, np.zeros(1, np.int64), none, np.zeros(1, np.int64))
 
 
 def _empty_index() -> Any:

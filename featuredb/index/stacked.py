@@ -28,6 +28,8 @@ class Stacked(Generic[_Scalar]):
 
     def __getitem__(self, rows: NDArray[np.integer]) -> NDArray[_Scalar]:
         """Rows, in any shape: (..., *shape of a row)."""
+        if len(self._parts) == 1 and (not rows.size or rows.min() >= 0):
+            return np.asarray(self._parts[0][rows])
         flat = np.ravel(rows)
         if len(flat) and not 0 <= flat.min() <= flat.max() < len(self):
             raise IndexError(f"expected rows from 0 to {len(self) - 1}, found {flat.min()} to {flat.max()}")

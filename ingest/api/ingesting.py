@@ -111,7 +111,7 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
 
     keep_focal = bool(asked.get("keep_focal"))
     making = MapMakingOptions(
-        extractor=ExtractorOptions(**given(max_features="max_features", max_side_px="max_side")),
+        extractor=ExtractorOptions(**given(max_features="max_features", first_octave_px="max_side")),
         sfm=SfmOptions(refine_focal=not keep_focal, **given(camera_model="camera_model")),
         maps=MapOptions(**given(height_datum="height_datum", min_track_length="min_track_length")),
         **given(cameras="cameras"),

@@ -116,7 +116,7 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         type=int,
         help="per photo; default: 12000, for films 5000; fewer match faster",
     )
-    group.add_argument("--max-side", type=int, metavar="PX", help="default: 1600")
+    group.add_argument("--max-side", type=int, metavar="PX", help="features are looked for at; default: 2400")
     group.add_argument(
         "--min-track-length",
         type=int,

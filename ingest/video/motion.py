@@ -168,7 +168,7 @@ def _sharpness(gray: NDArray[np.uint8]) -> float:
     return float(cv2.Laplacian(gray, cv2.CV_32F).std()) / max(spread, 1.0)
 
 
-SCENE_FEATURES = ExtractorOptions(max_side_px=640, max_features=600)  # of each frame
+SCENE_FEATURES = ExtractorOptions(first_octave_px=1280, max_features=600)  # of each frame
 MAX_RATIO = 0.8  # of a match's distance to that of the next best one
 
 # By which matches may miss a similarity of the picture, a share of the longer side; depth moves them.

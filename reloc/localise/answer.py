@@ -17,7 +17,7 @@ from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.lens_prior import lens_of, opencv_by_lens
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import Inliers, LocalisedPose, place_on_earth
-from reloc.localise.self_calibration import joint_jacobians
+from reloc.localise.self_calibration import joint_jacobians, lens_jacobians
 
 _DAMPING = 1e-9
 
@@ -218,28 +218,34 @@ def _moved_points(
     feature_map = area.maps[main]
     points = np.unique(rows)
     images, of = area.images_that_see(points)
+    seen_by, photo_of = np.unique(images, return_inverse=True)
+    photos = [area.image(int(image)) for image in seen_by]
     place = {int(image_id): k for k, image_id in enumerate(modes.image_id)}
-    turn = area.frame.enu_from(feature_map.frame)
-    normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, modes.poses.shape[2]))
-    for image in np.unique(images):
-        photo = area.image(int(image))
-        if photo.image_id not in place:
-            return None
-        sees = of[images == image]
-        camera = feature_map.cameras[photo.camera_id]
-        pose = photo.cam_from_local @ turn.inverse()
-        if camera.model != "OPENCV":
-            return None
-        by_point, by_pose = joint_jacobians(camera, pose, area.points[points[sees]])
-        in_camera = pose.act(area.points[points[sees]])
-        by_camera = by_point @ pose.rotation.T
-        left = np.concatenate([-by_camera @ skew(in_camera), by_camera], axis=2)
-        mode = modes.poses[place[photo.image_id]].copy()
-        mode[3:] *= area.image_reach[image]
-        pixels = left @ mode
-        pixels += by_pose[:, :, 6:] @ _as_lens_of(camera, modes.lenses[photo.camera_id])
-        normal[sees] += np.swapaxes(by_point, 1, 2) @ by_point
-        right[sees] -= np.swapaxes(by_point, 1, 2) @ pixels
+    cameras = [feature_map.cameras[photo.camera_id] for photo in photos]
+    if any(p.image_id not in place or c.model != "OPENCV" for p, c in zip(photos, cameras, strict=True)):
+        return None
+    to_map = area.frame.enu_from(feature_map.frame).inverse()
+    poses = [photo.cam_from_local @ to_map for photo in photos]
+    rotation = np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3)[photo_of]
+    shift = np.array([pose.translation for pose in poses]).reshape(-1, 3)[photo_of]
+    in_camera = np.einsum("kij,kj->ki", rotation, area.points[points[of]]) + shift
+    mode = modes.poses[[place[photo.image_id] for photo in photos]]
+    mode[:, 3:] *= area.image_reach[seen_by, None, None]
+    by_camera, pixels = np.empty((len(of), 2, 3)), np.empty((len(of), 2, modes.poses.shape[2]))
+    for camera_id in {photo.camera_id for photo in photos}:
+        own = np.array([photo.camera_id == camera_id for photo in photos])[photo_of]
+        camera = feature_map.cameras[camera_id]
+        by_camera[own], by_lens = lens_jacobians(camera, in_camera[own])
+        pixels[own] = by_lens @ _as_lens_of(camera, modes.lenses[camera_id])
+    by_turn_and_shift = np.concatenate([-by_camera @ skew(in_camera), by_camera], axis=2)
+    by_point = by_camera @ rotation
+    normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, pixels.shape[2]))
+    for photo in range(len(photos)):  # each sees a point once
+        mine = photo_of == photo
+        moved = pixels[mine] + by_turn_and_shift[mine] @ mode[photo]
+        transposed = by_point[mine].swapaxes(1, 2)
+        normal[of[mine]] += transposed @ by_point[mine]
+        right[of[mine]] -= transposed @ moved
     trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
     return points, np.linalg.solve(normal + _DAMPING * trace * np.eye(3), right)
 

@@ -63,11 +63,13 @@ def localise(
     areas: Sequence[IndexedArea],
     options: LocaliseOptions | None = None,
     snapshot: int = 0,
+    size: tuple[int, int] | None = None,
 ) -> LocaliseResult:
     """Pose of a photo.
 
     Args:
         gray: (h, w) uint8, pixels as stored in the file.
+        size: width and height of the photo at full size, where `gray` is a smaller copy.
         areas: the indexed maps to search; those of another extractor than the options' are left out.
         snapshot: version of the database that the areas come from, passed through.
 
@@ -79,7 +81,7 @@ def localise(
     options = options or LocaliseOptions()
     areas = usable_areas(areas, options.extractor.fingerprint)
     clock = StageClock()
-    features = extract(gray, options.extractor)
+    features = extract(gray, options.extractor, size)
     clock.lap("features")
     return _localised(features, request, areas, options, snapshot, clock).result
 

@@ -124,8 +124,7 @@ def guided_matches(
     tree = cKDTree(features.xy)
     pairs = tree.sparse_distance_matrix(cKDTree(pixels), radius, output_type="coo_matrix")
     feature, point = pairs.row.astype(np.int64), rows[pairs.col]
-    difference = features.descriptors[feature].astype(np.float32) - area.descriptors[point]
-    distance = np.sqrt(np.einsum("ij,ij->i", difference, difference))
+    distance = np.sqrt(squared_distances(features.descriptors, feature, area.descriptors, point))
     close = distance < options.guided_max_distance
     return _one_to_one(features.xy, feature[close], point[close], distance[close])
 
@@ -162,8 +161,8 @@ def _one_to_one(
     _, first = np.unique(point, return_index=True)
     first.sort()
     feature, point = feature[first], point[first]
-    place = np.round(xy[feature] * 2.0).astype(np.int64)
-    _, first = np.unique(place, axis=0, return_index=True)
+    half = np.round(xy[feature] * 2.0).astype(np.int64)
+    _, first = np.unique((half[:, 1] << 32) + half[:, 0], return_index=True)
     first.sort()
     return Matches(feature=feature[first], point=point[first])
 

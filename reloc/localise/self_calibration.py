@@ -59,13 +59,19 @@ def calibrate(
 def joint_jacobians(
     camera: Camera, cam_from_local: Rigid3, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of pixels by points (k, 2, 3), and by pose and lens (k, 2, 6 + n), n as in `lens_of`.
+    """Derivatives of pixels by points (k, 2, 3), and by pose and lens (k, 2, 6 + n), n as in `lens_of`."""
+    by_camera, by_lens = lens_jacobians(camera, cam_from_local.act(points))
+    by_point, by_pose = chain_to_pose(by_camera, cam_from_local, points)
+    return by_point, np.concatenate([by_pose, by_lens], axis=2)
+
+
+def lens_jacobians(camera: Camera, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of pixels by points (k, 2, 3) in camera axes, and by the lens (k, 2, n), n as in `lens_of`.
 
     In closed form: pixel = (f, f (1 + aspect)) d(u, v) + c with (u, v) = (x, y) / z and Brown's distortion d.
     """
     lens = lens_of(camera)
     focal, _, _, k1, aspect, k2, p1, p2 = whole_lens(lens)
-    in_camera = cam_from_local.act(points)
     depth = in_camera[:, 2]
     uv = in_camera[:, :2] / depth[:, None]
     u, v = uv.T
@@ -80,18 +86,17 @@ def joint_jacobians(
     along_v = stretch + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v
     by_uv = scale[:, None] * np.stack([along_u, across, across, along_v], axis=1).reshape(-1, 2, 2)
     by_camera = np.concatenate([by_uv, -by_uv @ uv[:, :, None]], axis=2) / depth[:, None, None]
-    by_point, by_pose = chain_to_pose(by_camera, cam_from_local, points)
     by_lens = [
         bent * [1.0, 1.0 + aspect],
-        np.tile([1.0, 0.0], (len(points), 1)),
-        np.tile([0.0, 1.0], (len(points), 1)),
+        np.tile([1.0, 0.0], (len(in_camera), 1)),
+        np.tile([0.0, 1.0], (len(in_camera), 1)),
         scale * squared[:, None] * uv,
         focal * bent * [0.0, 1.0],
         scale * (squared**2)[:, None] * uv,
         scale * first,
         scale * second,
     ]
-    return by_point, np.concatenate([by_pose, np.stack(by_lens[: len(lens)], axis=2)], axis=2)
+    return by_camera, np.stack(by_lens[: len(lens)], axis=2)
 
 
 def covariance_from_information(information: FloatArray) -> FloatArray:

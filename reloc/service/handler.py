@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import (
     ImageError,
@@ -14,8 +13,9 @@ from featuredb.errors import (
     MapNotFoundError,
     UnplacedBesideOthersError,
 )
-from featuredb.features.decode import DEFAULT_LIMITS, DecodeLimits, decode_gray
+from featuredb.features.decode import DEFAULT_LIMITS, DecodeLimits, decode_gray, probe
 from featuredb.features.exif.read import read_exif
+from featuredb.features.stored_image import ImageHeader
 from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.stage_clock import StageClock
@@ -53,11 +53,13 @@ def answer_query(
     """
     clock = StageClock()
     try:
-        gray = decode_gray(data, limits)
+        header = probe(data, limits)
+        side_px = localiser.options.extractor.first_octave_px
+        gray = decode_gray(data, limits, header=header, side_px=side_px)
         clock.lap("decode")
-        request = localise_request(wire_request, data, gray)
+        request = localise_request(wire_request, data, header)
         clock.lap("exif")
-        result = localiser.localise(gray, request)
+        result = localiser.localise(gray, request, (header.width, header.height))
     except ImageError as error:
         raise image_refused(error) from error
     except IncompatibleExtractorError as error:
@@ -71,18 +73,18 @@ def answer_query(
     return reply.model_copy(update={"timings_ms": clock.milliseconds()})
 
 
-def localise_request(
-    wire_request: LocaliseWireRequest, data: bytes, gray: NDArray[np.uint8]
-) -> LocaliseRequest:
+def localise_request(wire_request: LocaliseWireRequest, data: bytes, header: ImageHeader) -> LocaliseRequest:
     """What the localiser needs to know, from the request and the file's EXIF.
+
+    Args:
+        data: bytes of the image file. header: of `probe`.
 
     Raises:
         RequestError: BAD_REQUEST, the camera is none, or does not fit the image.
     """
-    height, width = gray.shape
-    exif = read_exif(data)
+    exif = read_exif(data, header)
     lens = wire_request.camera
-    camera = None if lens is None else query_camera(lens, width, height)
+    camera = None if lens is None else query_camera(lens, header.width, header.height)
     return LocaliseRequest(
         camera=camera,
         camera_prior=None if lens is None or camera is None else _camera_prior(lens, camera),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from featuredb.features.decode import decode_gray
+from featuredb.features.decode import decode_gray, probe
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_from_geodetic
@@ -96,7 +96,9 @@ def test_a_photos_own_position_settles_which_of_two_places_it_shows(
     for name in ("DJI_0027.JPG", "DJI_0025.JPG"):
         data = (photos / name).read_bytes()
         gray = decode_gray(data)
-        told = localise_request(LocaliseWireRequest(options=RequestOptions(exif_prior=True)), data, gray)
+        told = localise_request(
+            LocaliseWireRequest(options=RequestOptions(exif_prior=True)), data, probe(data)
+        )
         assert told.own_position is not None
         assert localise(gray, replace(told, own_position=None), areas).reason == "AMBIGUOUS"
         found = localise(gray, told, areas)

@@ -248,6 +248,16 @@ def test_giving_up_early_changes_no_answer(
             assert np.array_equal(a.pose.utm, b.pose.utm)
 
 
+def test_a_smaller_copy_gives_the_pose_in_pixels_of_the_photo(
+    area: IndexedArea, photo: NDArray[np.uint8]
+) -> None:
+    small = np.asarray(cv2.resize(photo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    found = localise(small, KNOWN, [area], size=(photo.shape[1], photo.shape[0]))
+    assert found.pose is not None
+    metres, degrees = pose_errors(found, POSE)
+    assert max(metres, degrees) < 0.2
+
+
 def test_a_blank_photo_has_too_few_features(area: IndexedArea) -> None:
     result = localise(np.full((480, 640), 90, np.uint8), KNOWN, [area])
     assert result.reason == "TOO_FEW_FEATURES"

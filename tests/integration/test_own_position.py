@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from featuredb.features.decode import probe
 from featuredb.features.extractor import extract
 from featuredb.maps.feature_map import FeatureMap
 from reloc.localise import localise as module
@@ -152,8 +153,10 @@ def test_the_wire_asks_for_it(photo: NDArray[np.uint8]) -> None:
     file = BytesIO()
     Image.fromarray(photo).save(file, "JPEG", exif=exif)
     wants = LocaliseWireRequest(options=RequestOptions(exif_prior=True))
-    asked = localise_request(wants, file.getvalue(), photo)
+    asked = localise_request(wants, file.getvalue(), probe(file.getvalue()))
     assert asked.own_position is not None
     assert (asked.own_position.latitude_deg, asked.own_position.longitude_deg) == (46.5, -91.75)
     assert asked.prior is None
-    assert localise_request(LocaliseWireRequest(), file.getvalue(), photo).own_position is None
+    assert (
+        localise_request(LocaliseWireRequest(), file.getvalue(), probe(file.getvalue())).own_position is None
+    )

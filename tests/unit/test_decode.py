@@ -106,6 +106,33 @@ def test_a_cut_jpeg_with_an_end_marker_behind_is_refused(part: float) -> None:
     assert _code(data[:cut].rstrip(b"\xff") + b"\xff\xd9") == "truncated"
 
 
+@pytest.mark.parametrize(
+    ("side_px", "by"), [(SIZE[0] + 1, 1), (SIZE[0] // 2 + 1, 1), (SIZE[0] // 2, 2), (64, 2)]
+)
+@pytest.mark.parametrize("options", [{}, {"progressive": True}])
+def test_a_large_jpeg_is_decoded_smaller(side_px: int, by: int, options: dict[str, object]) -> None:
+    data = _encode(_scene(), "JPEG", quality=95, **options)
+    whole, small = decode_gray(data), decode_gray(data, header=probe(data), side_px=side_px)
+    assert small.shape == (-(-SIZE[1] // by), -(-SIZE[0] // by))
+    cut = whole[: SIZE[1] // by * by, : SIZE[0] // by * by].astype(float)
+    mean = cut.reshape(SIZE[1] // by, by, SIZE[0] // by, by).mean((1, 3))
+    assert np.abs(small[: mean.shape[0], : mean.shape[1]] - mean).mean() < 2.0
+
+
+def test_what_is_no_jpeg_is_decoded_whole() -> None:
+    assert decode_gray(_encode(_scene(), "PNG"), side_px=32).shape == (SIZE[1], SIZE[0])
+
+
+@pytest.mark.parametrize("part", [0.2, 0.5, 0.8])
+def test_a_cut_jpeg_is_refused_when_decoded_smaller(part: float) -> None:
+    data = _encode(_scene(), "JPEG", quality=95)
+    start = data.index(b"\xff\xda")
+    data = data[: start + int(part * (len(data) - start))].rstrip(b"\xff") + b"\xff\xd9"
+    with pytest.raises(ImageError) as caught:
+        decode_gray(data, side_px=SIZE[0] // 2)
+    assert caught.value.code == "truncated"
+
+
 @pytest.mark.parametrize("options", [{}, {"progressive": True}])
 def test_a_picture_that_really_is_the_fill_grey_passes(options: dict[str, object]) -> None:
     image = Image.new("L", SIZE, 128)

@@ -39,7 +39,7 @@ def test_centres_of_blobs_within_a_twentieth_of_a_pixel(factor: float, sigma: fl
     centers = (grid * [90, 90] + [70, 70]) * factor + rng.uniform(-3, 3, (6, 2))
     width, height = round(320 * factor), round(240 * factor)
     found = extract(
-        blobs(width, height, centers, sigma), ExtractorOptions(max_side_px=320, contrast_threshold=0.01)
+        blobs(width, height, centers, sigma), ExtractorOptions(first_octave_px=640, contrast_threshold=0.01)
     )
     assert (found.width, found.height) == (width, height)
     errors = []
@@ -54,7 +54,7 @@ def test_centres_of_blobs_within_a_twentieth_of_a_pixel(factor: float, sigma: fl
 def test_scale_is_in_full_size_pixels() -> None:
     """A blob twice as large in an image twice as large, shrunk by two, has twice the diameter."""
     center = np.array([[100.3, 99.6]])
-    options = ExtractorOptions(max_side_px=200, contrast_threshold=0.01)
+    options = ExtractorOptions(first_octave_px=400, contrast_threshold=0.01)
     small = extract(blobs(200, 200, center, 6.0), options)
     large = extract(blobs(400, 400, 2 * center, 12.0), options)
     strongest = [float(f.scale[np.argmax(f.response)]) for f in (small, large)]
@@ -167,7 +167,7 @@ def test_no_feature_is_there_twice() -> None:
 def test_the_fingerprint_names_the_space_of_descriptors() -> None:
     plain = ExtractorOptions()
     assert ExtractorOptions(upright=True).fingerprint != plain.fingerprint
-    assert ExtractorOptions(max_features=10, max_side_px=640).fingerprint == plain.fingerprint
+    assert ExtractorOptions(max_features=10, first_octave_px=640).fingerprint == plain.fingerprint
     assert extract(texture(64, 64), plain).fingerprint == plain.fingerprint
 
 
@@ -263,7 +263,7 @@ def test_what_is_no_gray_image_is_refused(image: np.ndarray) -> None:
         extract(image)
 
 
-@pytest.mark.parametrize("wrong", [{"max_side_px": 10}, {"max_side_px": 10**6}, {"max_features": 0}])
+@pytest.mark.parametrize("wrong", [{"first_octave_px": 10}, {"first_octave_px": 10**6}, {"max_features": 0}])
 def test_options_out_of_range_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(InvalidValueError, match="expected"):
         ExtractorOptions(**wrong)

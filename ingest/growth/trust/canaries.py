@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from featuredb.features.decode import DecodeLimits, decode_gray
+from featuredb.features.decode import decode_gray, probe
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
@@ -135,9 +135,9 @@ def run_canaries(
 def check_known(database: Database, canary: Canary, before: Localiser, after: Localiser) -> CanaryCheck:
     """Ask one known query of both."""
     data = load_canary_image(database, canary)
-    gray = decode_gray(data, DecodeLimits())
+    gray, header = decode_gray(data), probe(data)
     asked = LocaliseWireRequest.model_validate_json(json.dumps(dict(canary.request)))
-    request = localise_request(asked, data, gray)
+    request = localise_request(asked, data, header)
     results = [localiser.localise(gray, request) for localiser in (before, after)]
     misses = [_miss_of_known(result.pose, canary.pose) for result in results]
     if canary.pose is None:
@@ -155,8 +155,8 @@ def answer_now(database: Database, image: bytes) -> tuple[KnownPose | None, int]
         ImageError: no usable image.
     """
     localiser = Localiser.open(database)
-    gray = decode_gray(image, DecodeLimits())
-    result = localiser.localise(gray, localise_request(LocaliseWireRequest(), image, gray))
+    request = localise_request(LocaliseWireRequest(), image, probe(image))
+    result = localiser.localise(decode_gray(image), request)
     if result.pose is None:
         return None, localiser.snapshot
     known = KnownPose(

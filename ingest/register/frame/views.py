@@ -124,7 +124,7 @@ class FrameViews:
         return extract(
             self.gray,
             ExtractorOptions(
-                max_side_px=max(round(1.25 * self.features_side_px), 64),
+                first_octave_px=max(round(2.5 * self.features_side_px), 64),
                 max_features=5000,
                 oversample=1.5,
                 contrast_threshold=0.01,

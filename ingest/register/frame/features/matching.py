@@ -16,7 +16,9 @@ from ingest.register.frame.sources import source_image
 from ingest.register.frame_registration import RenderSource
 
 # The product's, with a lower contrast threshold than photos get, since renders are smooth.
-_EXTRACTOR = ExtractorOptions(max_side_px=1600, max_features=3000, oversample=1.5, contrast_threshold=0.008)
+_EXTRACTOR = ExtractorOptions(
+    first_octave_px=3200, max_features=3000, oversample=1.5, contrast_threshold=0.008
+)
 # A feature whose surroundings differ by more than this share in depth lies on a silhouette: what it shows is
 # two things, and its depth is a guess.
 _MAX_DEPTH_STEP = 0.04
