@@ -135,7 +135,7 @@ class Camera:
         """
         points = _rows("Camera.project", points_cam, 3)
         pixels = np.asarray(self.to_pycolmap().img_from_cam(points), dtype=np.float64)
-        limit = _tan_of_fold(self.model, self.params)
+        limit = _tan_of_fold(self.model, self.params[_FIRST_RADIAL.get(self.model, len(self.params)) :])
         if np.isfinite(limit):
             pixels[np.hypot(points[:, 0], points[:, 1]) >= limit * points[:, 2]] = np.nan
         return pixels
@@ -178,14 +178,21 @@ def _rows(name: str, value: ArrayLike, columns: int) -> FloatArray:
     return np.ascontiguousarray(array)
 
 
+# Where the distortion begins among a model's parameters.
+_FIRST_RADIAL = {
+    **{"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4},
+    **{"SIMPLE_RADIAL_FISHEYE": 3, "RADIAL_FISHEYE": 3, "OPENCV_FISHEYE": 4},
+}
+
+
 @lru_cache(maxsize=256)
-def _tan_of_fold(model: str, params: tuple[float, ...]) -> float:
+def _tan_of_fold(model: str, distortion: tuple[float, ...]) -> float:
     """Tangent of the angle off the axis where the radial distortion stops growing, or infinity.
 
     The distorted radius is r (1 + k1 r^2 + k2 r^4 + ...) (a quotient of two such polynomials in FULL_OPENCV),
     r being the tangent of the angle, or the angle itself in a fisheye. Tangential terms are small beside it.
     """
-    numerator, denominator = _radial_polynomials(model, params)
+    numerator, denominator = _radial_polynomials(model, distortion)
     derivative = numerator.deriv() * denominator - numerator * denominator.deriv()
     roots = derivative.roots()
     real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
@@ -195,13 +202,10 @@ def _tan_of_fold(model: str, params: tuple[float, ...]) -> float:
     return float(np.tan(fold)) if fold < np.pi / 2 else np.inf
 
 
-def _radial_polynomials(model: str, params: tuple[float, ...]) -> "tuple[Polynomial, Polynomial]":
+def _radial_polynomials(model: str, k: tuple[float, ...]) -> "tuple[Polynomial, Polynomial]":
     """Numerator and denominator, in r, of the distorted radius."""
     from numpy.polynomial import Polynomial
 
-    first = {"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
-    first |= {"SIMPLE_RADIAL_FISHEYE": 3, "RADIAL_FISHEYE": 3, "OPENCV_FISHEYE": 4}
-    k = params[first[model] :] if model in first else ()
     above: tuple[float, ...] = k
     below: tuple[float, ...] = ()
     if model == "OPENCV":

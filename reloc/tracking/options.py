@@ -85,10 +85,10 @@ class TrackOptions:
     min_matches: int = 30
     max_unconfirmed: int = 3
     keyframes: ExtractorOptions = field(
-        default_factory=lambda: ExtractorOptions(first_octave_px=1440, max_features=1500, oversample=1.0)
+        default_factory=lambda: ExtractorOptions(first_octave_px=1200, max_features=1500, oversample=1.0)
     )
     fine_keyframes: ExtractorOptions = field(
-        default_factory=lambda: ExtractorOptions(first_octave_px=2560, max_features=6000, oversample=1.0)
+        default_factory=lambda: ExtractorOptions(first_octave_px=2000, max_features=6000, oversample=1.0)
     )
     localise: LocaliseOptions = field(default_factory=LocaliseOptions)
 

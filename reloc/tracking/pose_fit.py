@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.compiled import compiled_module
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -12,7 +13,7 @@ from featuredb.geometry.rigid3 import Rigid3
 _REFERENCE_SIDE_PX = 1280  # of the frames that these are for: lengths grow with them
 _LOSS_PX, _TOLERANCE_PX = 1.0, 4.0  # of the Cauchy loss; beyond which a landmark does not agree with the pose
 _ITERATIONS = 10
-_STILL = 1e-6  # radians, and metres over distance: a thousandth of a pixel
+_STILL = 1e-5  # radians, and metres over distance: a hundredth of a pixel
 # Least eigenvalue of scaled normal equations that have no one solution: one or two points over and over and
 # points on a line have 2e-15 and less; a patch of 10 cm, seen from 50 m, still has 2e-7.
 _SINGULAR = 1e-12
@@ -74,6 +75,7 @@ def fit_pose(
     focal_rel = doubt.focal_rel
     scale = max(camera.width, camera.height) / _REFERENCE_SIDE_PX
     seen = camera.unproject(pixels)
+    points = np.ascontiguousarray(points, dtype=np.float64)
     focal, loss = camera.focal_px, _LOSS_PX * scale
     pose, zoom = start, 0.0
     depth = max(float(np.median(start.act(points)[:, 2])), 1e-6)
@@ -81,30 +83,33 @@ def fit_pose(
     # What was known of the focal length weighs as much as pixels that are off by half the loss's scale.
     known_focal = (0.5 * loss / focal_rel) ** 2 if focal_rel > 0.0 else 0.0
     count = 7 if focal_rel > 0.0 else 6
+    linearised = compiled_module("reloc.tracking.fit_loops").linearised
+    residual, jacobian = np.empty((2, len(points))), np.empty((7, 2, len(points)))
+    normal, gradient = np.empty((7, 7)), np.empty(7)
+
+    def linearise() -> None:
+        longer = focal * float(np.exp(zoom))
+        places = (pose.rotation, pose.translation, points, seen)
+        linearised(*places, focal, longer, loss, residual, jacobian, normal, gradient)
+
     for _ in range(_ITERATIONS):
-        residual, jacobian = _linearised(pose, points, seen, focal, zoom, count)
-        squared = (residual * residual).sum(axis=0)
-        known = np.isfinite(squared)
-        weight = np.where(known, 1.0 / (1.0 + squared / loss**2), 0.0)
-        weighted = jacobian * weight
-        normal = _product(weighted, jacobian)
+        linearise()
         if not _is_determined(normal[:6, :6]):
             return None
-        gradient = _product(weighted, np.where(known, residual, 0.0)[None])[:, 0]
-        normal[6:, 6:] += known_focal
-        gradient[6:] += known_focal * zoom
-        step = -np.linalg.solve(normal, gradient)
+        normal[6, 6] += known_focal
+        gradient[6] += known_focal * zoom
+        step = -np.linalg.solve(normal[:count, :count], gradient[:count])
         pose = Rigid3.exp(step[:6]) @ pose
         zoom += float(step[6]) if count == 7 else 0.0
         if np.abs(step * still[:count]).max() < _STILL:
             break
-    residual, jacobian = _linearised(pose, points, seen, focal, zoom, count)
+    linearise()
     distance = np.hypot(*residual)
     inlier = np.asarray(distance < _TOLERANCE_PX * scale)
     if inlier.sum() < 4:
         return None
     variance = float((distance[inlier] ** 2).sum()) / max(2 * int(inlier.sum()) - count, 1)
-    agreeing = jacobian[:, :, inlier]
+    agreeing = jacobian[:count, :, inlier]
     normal = _product(agreeing, agreeing)
     if not _is_determined(normal[:6, :6]):
         return None
@@ -126,6 +131,13 @@ def fit_pose(
     )
 
 
+def warm_up() -> None:
+    """Load the compiled loop, or compile it, now: processes that are forked then have it."""
+    camera = Camera(model="PINHOLE", width=640, height=480, params=(600.0, 600.0, 320.0, 240.0))
+    points = np.array([[-1.0, -1.0, 9.0], [1.0, -1.0, 10.0], [1.0, 1.0, 11.0], [-1.0, 1.0, 12.0]])
+    fit_pose(camera, camera.project(points), points, Rigid3.identity())
+
+
 def _product(first: FloatArray, second: FloatArray) -> FloatArray:
     """(a, b) sums over pixels and axes of (a, 2, n) times (b, 2, n)."""
     sums: FloatArray = first.reshape(len(first), -1) @ second.reshape(len(second), -1).T
@@ -141,34 +153,6 @@ def _is_determined(normal: FloatArray) -> bool:
     if not (np.isfinite(normal).all() and scale.all()):
         return False
     return bool(np.linalg.eigvalsh(normal / np.outer(scale, scale))[0] > _SINGULAR)
-
-
-def _linearised(
-    pose: Rigid3, points: FloatArray, seen: FloatArray, focal: float, zoom: float, count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals (2, n) in pixels and derivatives (count, 2, n) by the pose's left perturbation, and the zoom.
-
-    Points behind the camera have residuals of infinity and no derivatives.
-
-    Args:
-        seen: (n, 2) rays by the camera's focal length. zoom: logarithm of the true one over it.
-    """
-    x, y, z = pose.act(points).T
-    front = z > 1e-6
-    inverse = np.where(front, 1.0 / np.where(front, z, 1.0), 0.0)
-    u, v = x * inverse, y * inverse
-    longer = focal * float(np.exp(zoom))
-    projected = longer * np.stack([u, v])
-    residual = projected - focal * seen.T
-    residual[:, ~front | ~np.isfinite(seen).all(axis=1)] = np.inf
-    near, across = longer * inverse, longer * front
-    jacobian = np.zeros((count, 2, len(z)))
-    jacobian[0, 0], jacobian[1, 0], jacobian[2, 0] = across * (-u * v), across * (1.0 + u * u), -across * v
-    jacobian[3, 0], jacobian[5, 0] = near, -near * u
-    jacobian[0, 1], jacobian[1, 1], jacobian[2, 1] = -across * (1.0 + v * v), across * (u * v), across * u
-    jacobian[4, 1], jacobian[5, 1] = near, -near * v
-    jacobian[6:] = projected * front
-    return residual, jacobian
 
 
 def _by_lens(seen: FloatArray, focal: float) -> FloatArray:
