@@ -77,7 +77,7 @@ class _Run:
             the reason.
         map_of: maps that photos are in; why: code and reason of those that are in none.
         entries: maps that this run has made; refused, unplaced: what this round could not place.
-        promotions: the last word on each quarantined map; ever_promoted: maps that any round promoted.
+        promotions: the last word on each quarantined map.
     """
 
     database: Database
@@ -114,13 +114,12 @@ class _Run:
         """New anchors move what was grown, and maps without a place are tried."""
         self.rounds += 1
         replaced = replace_descendants(self.database, self.work, budget_m=self.options.drift_budget_m)
-        if replaced is not None:
-            self.replacements.append(replaced)
+        self.replacements += [replaced] if replaced else []
         self.localiser = Localiser.open(self.database, previous=self.localiser if self.rounds > 1 else None)
         placed, self.unplaced, notes = place_unplaced_maps(
             self.database, self.localiser.areas, self.work, self.options
         )
-        self.entries.update({entry.map_id: entry for entry in placed})
+        self.entries |= {entry.map_id: entry for entry in placed}
         self.notes |= dict.fromkeys(notes)
 
     def localise(self) -> None:
@@ -149,9 +148,8 @@ class _Run:
                 self.why[row] = _split_reason(reason)
                 if self.lost.get(row) != (everywhere, reason):
                     self.lost[row] = everywhere, reason
-                    remember(
-                        self.work, "photos", self._about(row), {"maps": sorted(everywhere), "reason": reason}
-                    )
+                    answer = {"maps": sorted(everywhere), "reason": reason}
+                    remember(self.work, "photos", self._about(row), answer)
 
     def place(self) -> None:
         """Reconstructions and lone photos; what passes is committed."""
@@ -159,8 +157,8 @@ class _Run:
         self.posed = dict(self.localised)
         self.refused.clear()
         for model in new.models():
-            part = keep_photos(model, [int(r) for r in model.rows if int(r) not in self.map_of])
-            if part is not None and any(int(r) in self.localised for r in part.rows):
+            part = keep_photos(model, [row for row in model.rows.tolist() if row not in self.map_of])
+            if part is not None and self.localised.keys() & part.rows.tolist():
                 self._try_model(part, _SPLIT_LINKS)
         left = {row: photo for row, photo in self.localised.items() if row not in self.map_of}
         lone = with_shared_lenses(left, {row: shared_key(new.photos[row], "shared") for row in left})
@@ -175,9 +173,8 @@ class _Run:
 
         A map that goes back to quarantine and is promoted again, round by round, would keep the run going.
         """
-        outside = NewPhotos(
-            given=self.new, rows=self._open_rows(), localised=self.localised, heard=self.heard
-        )
+        rows = self._open_rows()
+        outside = NewPhotos(given=self.new, rows=rows, localised=self.localised, heard=self.heard)
         outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside)
         for outcome in outcomes:
             self.promotions[outcome.map_id] = outcome
@@ -244,36 +241,34 @@ class _Run:
         new, areas = self.new, self.localiser.areas
         maps, budget_m = placed_maps(self.database.snapshot()), self.options.drift_budget_m
         grown = grow_within_budget(model, new.photos, new.features_of, self.posed, areas, maps, budget_m)
-        refused = self._take(grown) if isinstance(grown, GrownMap) else grown
-        if refused is None:
+        if isinstance(grown, GrownMap):
+            self._take(grown)
             return
-        part = keep_photos(model, list(refused.rows)) if refused.reason in AT_SEVERAL_PLACES else None
-        pieces = None if part is None else split(part, links)
-        if pieces is None:
-            self._note(refused)
+        level, parts = split(model, links) if grown.reason in AT_SEVERAL_PLACES else (0.0, [])
+        if not level:
+            self._note(grown, model)
             return
-        level, parts = pieces
-        count, message = len(refused.rows), refused.message
-        _LOG.info("%d photos are at several places: %s; apart at links of %g", count, message, level)
-        for piece in parts:
-            rows = tuple(int(r) for r in piece.rows)
-            if self.posed.keys() & rows:
-                self._try_model(piece, [link for link in links if link > level])
+        _LOG.info("%s: photos are at several places; apart at links of %g", grown.message, level)
+        for part in parts:
+            if self.posed.keys() & part.rows.tolist():
+                self._try_model(part, [link for link in links if link > level])
             else:
-                self._note(replace(refused, rows=rows))
+                self._note(grown, part)
 
-    def _take(self, grown: GrownMap) -> Refused | None:
+    def _take(self, grown: GrownMap) -> None:
         """Commit a grown map in quarantine, unless a scan or a person who retired it are against it."""
         checked, note = checked_by_scan(self.database, grown)
         self.notes |= {note: None} if note else {}
         if isinstance(checked, Refused):
-            return checked
-        feature_map, rows = checked.feature_map, [int(r) for r in checked.model.rows]
+            self._note(checked, grown.model)
+            return
+        feature_map, rows = checked.feature_map, checked.model.rows.tolist()
         every = {m.map_id: m for m in self.database.snapshot().maps(include_retired=True)}
         known = every.get(feature_map.map_id)
         if known is not None and known.status == "retired":
             message = f"map {known.map_id} of these photos was retired: {known.status_reason}"
-            return Refused(reason="RETIRED_MAP", message=message, rows=tuple(rows))
+            self._note(Refused(reason="RETIRED_MAP", message=message), grown.model)
+            return
         used = [self.new.candidate_ids[r] for r in rows if r in self.new.candidate_ids]
         if used:
             mark_used(self.database, used, feature_map.map_id)
@@ -284,11 +279,10 @@ class _Run:
         self.why.update({row: why for row, why in grown.left_out.items() if row not in self.map_of})
         self.entries[feature_map.map_id] = grown_entry(feature_map)
         _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
-        return None
 
-    def _note(self, refused: Refused) -> None:
-        """What became of nothing, and why."""
-        rows = [r for r in refused.rows if r not in self.map_of]
+    def _note(self, refused: Refused, model: Model) -> None:
+        """What photos became no map, and why."""
+        rows = model.rows.tolist()
         self.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
         self.refused.append(refused_entry(refused, photos=tuple(self.new.photos[r].name for r in rows)))
 

@@ -23,9 +23,9 @@ from ingest.fingerprint import digest, options_fingerprint
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.growth_report import GrownEntry, grown_entry, refused_entry
-from ingest.growth.map_images import model_of, observed_features, observed_rows
 from ingest.growth.place.component import GrownMap
 from ingest.growth.place.localised import localise_photos
+from ingest.growth.place.map_images import model_of, observed_features, observed_rows
 from ingest.growth.trust.scan_check import NOT_ASKED, checked_by_scan
 from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, Refused
 from ingest.map_builder import MapIdentity
@@ -139,7 +139,7 @@ def _grown(
         for photo, image in zip(photos, unplaced.images, strict=True)
     ]
     localised, _ = localise_photos(hinted, range(len(hinted)), described_of, areas, options.threads)
-    model = model_of(unplaced, unplaced.points.xyz, unplaced.images, described=False)
+    model = model_of(unplaced, unplaced.images, described=False)
     maps, budget_m = placed_maps(snapshot), options.drift_budget_m
     return grow_within_budget(model, photos, features_of, localised, areas, maps, budget_m, identity)
 

@@ -64,7 +64,7 @@ class LocalisedPhoto:
         covariance: (6, 6), axes of the frame, measured part only (without the maps' placements): small
             rotation of the camera (rad) before displacement of its centre (m), as pose_uncertainty has it.
         feature_rows: (k,) rows of the photo's features that are inliers; pixels: (k, 2) float64 of those.
-        map_ids: the maps of the inliers' points, most inliers first; map_of: (k,) index into them.
+        map_ids: the maps of the inliers' points; map_of: (k,) index into them.
         point_of: (k,) row of that map's points.
         points: (k, 3) those points in the frame, metres.
         point_covariance: (k, 3, 3) of the points, relative to their map's gauge.
@@ -131,18 +131,17 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Refused:
-    """What did not become a map, or an overlap: code of the reason for programs, a message with figures for
-    people, rows of the photos concerned, and every gate that was asked."""
+    """What did not become a map: code of the reason for programs, a message with figures for people, and
+    every gate that was asked."""
 
     reason: str
     message: str
-    rows: tuple[int, ...] = ()
     gates: tuple[Gate, ...] = ()
 
     @classmethod
-    def by(cls, gate: Gate, *before: Gate, rows: tuple[int, ...] = ()) -> "Refused":
+    def by(cls, gate: Gate, *before: Gate) -> "Refused":
         """By a gate, after others that were asked."""
-        return cls(reason=gate.reason, message=gate.message, rows=rows, gates=(*before, gate))
+        return cls(reason=gate.reason, message=gate.message, gates=(*before, gate))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,8 +16,7 @@ from featuredb.store import Database
 from featuredb.store.changes import IMPORTED
 from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.graph.replacing import replace_descendants
-from ingest.growth.map_images import features_and_points
-from ingest.growth.place.overlaps import measure_overlap
+from ingest.growth.place.map_images import features_and_points, measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, own_canaries, run_canaries
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from ingest.growth.values import Edge, GrowthOptions

@@ -209,24 +209,23 @@ def grow_within_budget(
         The map with its drift, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this
         reconstruction and not the others of the run, nor the next run.
     """
-    part, everything = model, tuple(model.rows.tolist())
+    part = model
     beyond: dict[int, tuple[str, str]] = {}
-    refused = Refused(reason="", message="")
     for _ in range(_TRIES):
         try:
             grown = grow_component(part, photos, features_of, localised, areas, identity, budget_m)
         except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
-            _LOG.exception("a reconstruction of %d photos", len(everything))
+            _LOG.exception("a reconstruction of %d photos", len(model.rows))
             text = f"{type(error).__name__}: {error}; the log tells where. Please report it"
-            grown = Refused(reason="FAILED", message=text)
+            return Refused(reason="FAILED", message=text)
         if isinstance(grown, Refused):
-            return replace(grown, rows=everything)
+            return grown
         feature_map, drift, relative = with_drift(grown, maps, budget_m)
         gate = gates.drift(drift, budget_m)
         if gate.passes:
             return replace(grown, feature_map=feature_map, left_out={**beyond, **grown.left_out})
-        refused = Refused.by(gate, *grown.placement.gates, rows=everything)
-        rows = [int(r) for r in grown.model.rows]
+        refused = Refused.by(gate, *grown.placement.gates)
+        rows = grown.model.rows.tolist()
         within = rows_within(feature_map, rows, relative, grown.bending_m, budget_m)
         left = keep_photos(part, within, least=LEAST_PHOTOS) if len(within) < len(rows) else None
         if left is None:
@@ -249,7 +248,7 @@ def with_drift(
             for edge in grown.placement.edges
             if edge.map_id in maps
         ],
-        grown.placement.covariance_relative,
+        grown.placement.covariance,
     )
     covariance = feature_map.placement.covariance
     relative = np.reshape(growth["covariance_relative"], (7, 7))

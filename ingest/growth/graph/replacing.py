@@ -26,7 +26,7 @@ from ingest.growth.graph.map_graph import (
 )
 from ingest.growth.graph.pose_graph import GraphSolution
 from ingest.growth.map_places import growth_of, inflated, map_drift_m, with_growth
-from ingest.growth.place.overlaps import measure_overlap
+from ingest.growth.place.map_images import measure_overlap
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun, check_known
 from ingest.growth.trust.promotion import PARENT_MOVED
 from ingest.growth.values import Edge

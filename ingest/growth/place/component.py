@@ -38,7 +38,7 @@ AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "CONTRADICTS", "NOT_VISIBLE")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GrownMap(Refinement):
-    """A refined reconstruction and its map, ready to be committed (as quarantined, by whoever commits it)."""
+    """A refined reconstruction and its map, ready to be committed in quarantine."""
 
     feature_map: FeatureMap
 
@@ -64,21 +64,23 @@ def grow_component(
             same map.
         max_bound_m: photos that may be further off (95 %) are left out.
     """
-    rows = tuple(int(r) for r in model.rows)
+    rows = model.rows.tolist()
     mine = {r: localised[r] for r in rows if r in localised}
     if not mine:
-        message = f"none of {len(rows)} photos is localised by a map"
-        return Refused(reason="NOT_LOCALISED", message=message, rows=rows)
+        return Refused(reason="NOT_LOCALISED", message=f"none of {len(rows)} photos is localised by a map")
     frame, near = _meeting_place(mine, areas)
     mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
     model, lenses = adopt_lenses(model, photos, near, keypoints)
     camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
     mine = {r: with_lens(photo, model.cameras[camera_of[r]]) for r, photo in mine.items()}
-    correspondences = find_correspondences(model, mine, dict(zip(rows, keypoints, strict=True)))
+    correspondences = find_correspondences(model, mine, keypoints)
     placement = place_by_maps(model, mine, correspondences, photos, near, frame)
-    if placement.reason is not None:
-        return Refused(reason=placement.reason, message=placement.message, rows=rows, gates=placement.gates)
+    if isinstance(placement, Refused):
+        return placement
+    refusal = gates.first_refusal(placement.gates)
+    if refusal is not None:
+        return Refused(reason=refusal.reason, message=refusal.message, gates=placement.gates)
     refined = refine_placed(model, placement, correspondences, mine, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
@@ -110,14 +112,17 @@ def _assembled(
     model, placement = refined.model, refined.placement
     maps = {m.map_id: m for area in areas for m in area.maps}
     parents = [(maps[e.map_id], e.shared_points) for e in placement.edges]
-    to_anchors = placement.covariance_relative + parents_covariance(parents, placement.frame, relative=True)
-    rows = tuple(int(r) for r in model.rows)
+    on_earth, to_anchors = (
+        placement.covariance + parents_covariance(parents, placement.frame, relative=relative)
+        for relative in (False, True)
+    )
+    rows = model.rows.tolist()
     feature_map = build_map(
         model,
         Placement(
             method="map",
             local_from_sfm=Sim3.identity(),  # the model is in metres, in the frame, since its refinement
-            covariance=placement.covariance_relative + placement.on_earth,
+            covariance=on_earth,
             residual_rms_m=placement.residual_rms_m,
         ),
         placement.frame,
@@ -127,16 +132,9 @@ def _assembled(
         replace(_MAPS, height_datum=parents[0][0].height_datum),
     )
     if feature_map is None:
-        return Refused(
-            reason="NO_POINTS",
-            message="no point is placed well enough: the photos' rays are parallel",
-            rows=rows,
-            gates=placement.gates,
-        )
-    growth = {
-        "covariance_relative": to_anchors.ravel().tolist(),
-        "gates": gates.figures(placement.gates),
-    }
+        message = "no point is placed well enough: the photos' rays are parallel"
+        return Refused(reason="NO_POINTS", message=message, gates=placement.gates)
+    growth = {"covariance_relative": to_anchors.ravel().tolist(), "gates": gates.figures(placement.gates)}
     images = tuple(  # they know what their lenses leave open; as they were where nothing is known
         replace(image, covariance=own) if np.isfinite(own).all() else image
         for image, own in zip(feature_map.images, refined.poses, strict=True)
@@ -145,7 +143,7 @@ def _assembled(
         feature_map,
         status="quarantined",
         generation=1 + max(m.generation for m, _ in parents),
-        parents=placement.parents,
+        parents=tuple(m.map_id for m, _ in parents),
         placement=replace(feature_map.placement, evidence={GROWTH: growth}),
         images=images,
         provenance=without_modes(feature_map.provenance),
@@ -165,16 +163,14 @@ def _named(photos: Sequence[Photo]) -> MapIdentity:
     )
 
 
-def split(model: Model, links: Sequence[float]) -> tuple[float, list[Model]] | None:
-    """The parts of a reconstruction at the weakest of the links at which it falls apart, and that link.
+def split(model: Model, links: Sequence[float]) -> tuple[float, list[Model]]:
+    """The weakest of the links at which a reconstruction falls apart, and its parts; 0 where it does not.
 
     Photos that hang on nothing any more are in no part: they are localised by themselves, or wait.
     """
     for level in links:
         parts = connected_parts(model, level)
         if len(parts) > 1:
-            kept = [
-                keep_photos(model, rows, least=LEAST_PHOTOS) for rows in parts if len(rows) >= LEAST_PHOTOS
-            ]
+            kept = [keep_photos(model, rows, least=LEAST_PHOTOS) for rows in parts]
             return level, [part for part in kept if part is not None]
-    return None
+    return 0.0, []

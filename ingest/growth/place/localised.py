@@ -52,7 +52,6 @@ def localise_photos(
 
     Args:
         photos: all new photos. rows: those to be localised.
-        areas: of a reloc.localiser.Localiser; those of another extractor than a photo's are left out.
         threads: photos at a time; the work is done outside of Python's lock, and results are the same.
 
     Returns:
@@ -109,10 +108,7 @@ def localise_photo(
 
 
 def _elsewhere(
-    features: Features,
-    request: LocaliseRequest,
-    first: Localised,
-    areas: Sequence[IndexedArea],
+    features: Features, request: LocaliseRequest, first: Localised, areas: Sequence[IndexedArea]
 ) -> Localised:
     """A photo that was not found within its geotag's reach, looked for beyond it.
 
@@ -146,11 +142,7 @@ def _densified(features: Features, outcome: Localised) -> LocalisedPhoto:
         if len(feature) >= outcome.best.evidence.inliers:
             pose, spread = better, area.point_covariance(point)
             uncertainty = pose_uncertainty(pixels, points, spread, better, QUERY.pose)
-    of_map = area.point_map[point]
-    counts = np.bincount(of_map, minlength=len(area.maps))
-    order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
-    place = np.full(len(area.maps), -1)
-    place[order] = np.arange(len(order))
+    used, map_of = np.unique(area.point_map[point], return_inverse=True)
     return LocalisedPhoto(
         frame=area.frame,
         cam_from_local=pose.cam_from_local,
@@ -158,8 +150,8 @@ def _densified(features: Features, outcome: Localised) -> LocalisedPhoto:
         camera=pose.camera,
         feature_rows=feature,
         pixels=pixels,
-        map_ids=tuple(area.maps[i].map_id for i in order),
-        map_of=place[of_map],
+        map_ids=tuple(area.maps[i].map_id for i in used.tolist()),
+        map_of=map_of.reshape(-1),
         point_of=area.point_row[point].astype(np.int64),
         points=points,
         point_covariance=area.point_covariance(point),
@@ -194,8 +186,7 @@ def _match_each_map(
 def with_lens(photo: LocalisedPhoto, camera: Camera) -> LocalisedPhoto:
     """The photo's pose by its own matches with a lens that is given; as it was where they do not fit it.
 
-    Where the lens was estimated along, focal length and distance hardly differ: two poses of one photo can be
-    compared with the same lens only.
+    Two poses can be compared with the same lens only: focal length and distance hardly differ.
     """
     if camera == photo.camera or (camera.width, camera.height) != (photo.camera.width, photo.camera.height):
         return photo
@@ -244,18 +235,16 @@ def with_shared_lenses(
         by_matches = sorted(rows, key=lambda r: -len(localised[r].pixels))
         lenses = list(dict.fromkeys(localised[r].camera for r in by_matches))[:_MOST_LENSES]
         if len(lenses) > 1:
-            tries = [{r: with_lens(localised[r], lens) for r in rows} for lens in lenses]
+            tries = [[with_lens(localised[r], lens) for r in rows] for lens in lenses]
             fits = [
-                sum(map(_fitting, tried.values(), [lens] * len(rows)))
+                sum(_fitting(photo) for photo in tried if photo.camera == lens)
                 for tried, lens in zip(tries, lenses, strict=True)
             ]
-            found.update(tries[int(np.argmax(fits))])
+            found.update(zip(rows, tries[int(np.argmax(fits))], strict=True))
     return found
 
 
-def _fitting(photo: LocalisedPhoto, lens: Camera) -> int:
-    """Matches of the photo that fit its pose, if it has that lens."""
-    if photo.camera != lens:
-        return 0
-    errors = reprojection_errors(photo.pixels, photo.points, lens, photo.cam_from_local)
-    return int((errors < QUERY.pose.tolerance_px(lens)).sum())
+def _fitting(photo: LocalisedPhoto) -> int:
+    """Matches of the photo that fit its pose."""
+    errors = reprojection_errors(photo.pixels, photo.points, photo.camera, photo.cam_from_local)
+    return int((errors < QUERY.pose.tolerance_px(photo.camera)).sum())

@@ -5,8 +5,8 @@ they see existing points; then gates ask whether to believe it. `tools/growth_po
 of real sets.
 """
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from ingest.growth.place.similarity_fit import (
     agreed_similarity,
     fit_similarity,
 )
-from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto
+from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from reloc.localise.acceptance import agreement
 from reloc.localise.matching import EXPECTED_DEG, visible_points
@@ -42,44 +42,31 @@ _LEAST_SHOWN = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapsPlacement:
-    """A reconstruction placed by existing maps; accepted when `reason` is None.
+    """A reconstruction that existing maps place, to be believed where all gates pass.
 
     Attributes:
-        reason: code of the first gate that refused it, or None; `message` says it for people.
-        frame: local frame in which the similarity places the model.
-        local_from_sfm: None where none could be estimated.
-        covariance_relative: (7, 7) of its left perturbation, relative to the existing maps.
-        on_earth: (7, 7) what the existing maps' own uncertainty on Earth adds.
-        agreeing, disagreeing: rows of the localised photos that agree with the placement, and of those
-            that do not. Photos that no map localises are in neither.
+        frame: local frame in which `fit` places the model.
+        covariance: (7, 7) of the similarity's left perturbation, relative to the existing maps.
+        agreeing, disagreeing: localised photos that agree with the placement, and those that do not, by
+            their place in the model. Photos that no map localises are in neither.
         blind: those that show too little of what existing maps, or the others' points, say they should.
         edges: one for each existing map that holds it, most shared points first: the correction that this
             map alone would apply to the placed one.
-        fit: over the correspondences that agree; None where nothing fits.
-        used: (m,) correspondences that agree with the placement.
-        residual_rms_m: of the agreeing photos' centres, placed minus localised, metres; NaN without any.
+        fit: over the correspondences that agree, `used` (m,).
+        residual_rms_m: of the agreeing photos' centres, placed minus localised, metres.
         gates: every gate with its figure, in the order they were asked.
     """
 
-    reason: str | None
-    message: str
     frame: LocalFrame
-    local_from_sfm: Sim3 | None = None
-    covariance_relative: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
-    on_earth: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
-    agreeing: tuple[int, ...] = ()
-    disagreeing: tuple[int, ...] = ()
-    blind: tuple[int, ...] = ()
-    edges: tuple[Edge, ...] = ()
-    fit: FittedSimilarity | None = None
-    used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
-    residual_rms_m: float = float("nan")
-    gates: tuple[Gate, ...] = ()
-
-    @property
-    def parents(self) -> tuple[str, ...]:
-        """Maps that hold the new one, most shared points first."""
-        return tuple(edge.map_id for edge in self.edges)
+    covariance: FloatArray
+    agreeing: tuple[int, ...]
+    disagreeing: tuple[int, ...]
+    blind: tuple[int, ...]
+    edges: tuple[Edge, ...]
+    fit: FittedSimilarity
+    used: NDArray[np.bool_]
+    residual_rms_m: float
+    gates: tuple[Gate, ...]
 
 
 def place_by_maps(
@@ -89,8 +76,10 @@ def place_by_maps(
     photos: Sequence[Photo],
     areas: Sequence[Area],
     frame: LocalFrame,
-) -> MapsPlacement:
-    """Place a model by the localisations of its photos.
+) -> MapsPlacement | Refused:
+    """Place a model by the localisations of its photos; refused where no map holds it.
+
+    Whether to believe the placement its gates say.
 
     Args:
         model: with the lenses that it keeps.
@@ -100,19 +89,10 @@ def place_by_maps(
     """
     own = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
     found = agreed_similarity(model, own, correspondences)
-    edges: tuple[Edge, ...] = ()
-    if found is not None:
-        fit, agree, used = found
-        edges = edges_of(model, fit, correspondences, used)
-    if found is None or not edges:
-        gate = gates.agreement(0, len(own))
-        return MapsPlacement(
-            reason=gate.reason,
-            message=f"no placement: {gate.message}",
-            frame=frame,
-            disagreeing=_rows(model, own),
-            gates=(gate,),
-        )
+    edges = edges_of(model, found[0], correspondences, found[2]) if found else ()
+    if not found or not edges:
+        return Refused.by(gates.agreement(0, len(own)))
+    fit, agree, used = found
     maps = {m.map_id: m for area in areas for m in area.maps}
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
     sim, held = fit.local_from_sfm, correspondences.take(np.flatnonzero(used))
@@ -122,37 +102,24 @@ def place_by_maps(
     blind = set(np.flatnonzero(with_own < _LEAST_SHOWN).tolist()) - disagree
     blind |= {k for k in agree if existing[k] < gates.LEAST_VISIBLE}
     centers = sim.act(model.centers())
-    # From the placed to the localised centres of the photos that agree, metres.
-    offsets = np.array([own[k].cam_from_local.center - centers[k] for k in sorted(agree)])
-    squared = (offsets**2).sum(axis=1)
+    squared_m2 = [((own[k].cam_from_local.center - centers[k]) ** 2).sum() for k in agree]
     positions = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
-    parents = ", ".join(e.map_id for e in edges)
-    asked = (
-        gates.agreement(len(agree), len(disagree)),
-        gates.geotags(*positions, by=parents),
-        gates.visibility(existing[np.isfinite(existing)]),
-    )
-    refusal = gates.first_refusal(asked)
     return MapsPlacement(
-        reason=refusal.reason if refusal else None,
-        message=refusal.message if refusal else f"placed by {parents}",
         frame=frame,
-        local_from_sfm=sim,
-        covariance_relative=fit.covariance,
-        on_earth=on_earth,
-        agreeing=_rows(model, agree),
-        disagreeing=_rows(model, disagree),
-        blind=_rows(model, blind),
+        covariance=fit.covariance,
+        agreeing=tuple(sorted(agree)),
+        disagreeing=tuple(sorted(disagree)),
+        blind=tuple(sorted(blind)),
         edges=edges,
         fit=fit,
         used=used,
-        residual_rms_m=float(np.sqrt(squared.mean())),
-        gates=asked,
+        residual_rms_m=float(np.sqrt(np.mean(squared_m2))),
+        gates=(
+            gates.agreement(len(agree), len(disagree)),
+            gates.geotags(*positions, by=", ".join(e.map_id for e in edges)),
+            gates.visibility(existing[np.isfinite(existing)]),
+        ),
     )
-
-
-def _rows(model: Model, photos: Collection[int]) -> tuple[int, ...]:
-    return tuple(int(model.rows[k]) for k in sorted(photos))
 
 
 def _against_positions(

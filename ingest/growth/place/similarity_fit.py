@@ -67,7 +67,6 @@ class Correspondences:
         return len(self.photo_of)
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Correspondences":
-        """The correspondences of the given rows."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
     def existing(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -81,13 +80,13 @@ _COLUMNS = Correspondences.__slots__[1:]
 
 
 def find_correspondences(
-    model: Model, localised: Mapping[int, LocalisedPhoto], keypoints: Mapping[int, FloatArray]
+    model: Model, localised: Mapping[int, LocalisedPhoto], keypoints: Sequence[FloatArray]
 ) -> Correspondences:
     """Correspondences of a model's photos, own and carried along its tracks; photos are in one frame.
 
     Args:
         localised: one of the model's photos at least.
-        keypoints: pixels (n, 2) of all features of the model's photos, by row.
+        keypoints: pixels (n, 2) of all features of each photo of the model.
     """
     mine = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
     map_ids = tuple(sorted({m for photo in mine.values() for m in photo.map_ids}))
@@ -118,7 +117,7 @@ def _own(model: Model, k: int, photo: LocalisedPhoto, map_ids: tuple[str, ...]) 
     )
 
 
-def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatArray]) -> Correspondences:
+def _carried(model: Model, own: Correspondences, keypoints: Sequence[FloatArray]) -> Correspondences:
     """Where more than half of a track's matches with one map name one point, its other photos see it too."""
     linked = np.flatnonzero(own.model_point >= 0)
     triple = np.stack([own.model_point[linked], own.map_of[linked], own.point_of[linked]], axis=1)
@@ -136,16 +135,11 @@ def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatAr
         if (int(model.photo_of[o]), int(model.keypoint_of[o]), map_row) not in have
     ]
     seen, source = np.array(found, dtype=np.int64).reshape(-1, 2).T
-    photo_of, feature = model.photo_of[seen], model.keypoint_of[seen]
-    pixels = np.zeros((len(seen), 2))
-    for k in np.unique(photo_of):
-        mine = photo_of == k
-        pixels[mine] = keypoints[int(model.rows[k])][feature[mine]]
     return replace(
         own.take(source),
-        photo_of=photo_of,
-        feature=feature,
-        pixels=pixels,
+        photo_of=model.photo_of[seen],
+        feature=model.keypoint_of[seen],
+        pixels=model.pixels(keypoints)[seen],
         model_point=model.point_of[seen],
         carried=np.ones(len(seen), dtype=np.bool_),
     )
@@ -153,8 +147,7 @@ def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatAr
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FittedSimilarity:
-    """A fitted similarity.
-
+    """
     Attributes:
         covariance: (7, 7) of the similarity's left perturbation.
         errors_px: (m,) distances of all pixels from where the placed model sees their points.
@@ -186,24 +179,21 @@ def agreed_similarity(
     if best is None or not best[1]:
         return None
     tolerance = tolerances_px(model, correspondences)
-    (sim, chosen), fit = best, None
+    sim, chosen = best
+    near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
     for _ in range(5):  # the set of photos settles in two or three rounds
-        near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
-        if fit is not None:
-            near &= fit.errors_px < 2.0 * tolerance
         if near.sum() < 4:
             return None
         fit = fit_similarity(model, sim, correspondences, near)
-        sim = fit.local_from_sfm
-        again = set(agreeing_photos(fit.errors_px, tolerance, correspondences).tolist()) & own.keys()
-        if not again:
+        sim, before = fit.local_from_sfm, chosen
+        chosen = agreeing_photos(fit.errors_px, tolerance, correspondences) & own.keys()
+        if not chosen:
             return None
-        if again == chosen:
+        held = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
+        near = held & (fit.errors_px < 2.0 * tolerance)
+        if chosen == before:
             break
-        chosen = again
-    assert fit is not None
-    used = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
-    return fit, chosen, used & (fit.errors_px < tolerance)
+    return fit, chosen, held & (fit.errors_px < tolerance)
 
 
 def _best_proposal(
@@ -222,7 +212,7 @@ def _best_proposal(
             errors = correspondence_errors(model, sim, scored)
             agree = agreeing_photos(errors, tolerance, scored)
             cost = float((np.minimum(errors / tolerance, 1.0) ** 2).sum())
-            ranked.append((-len(agree), cost, sim, set(agree.tolist())))
+            ranked.append((-len(agree), cost, sim, agree))
     return min(ranked, key=lambda item: item[:2])[2:] if ranked else None
 
 
@@ -267,13 +257,13 @@ def tolerances_px(
 
 def agreeing_photos(
     errors_px: FloatArray, tolerance_px: FloatArray, correspondences: Correspondences
-) -> NDArray[np.int64]:
+) -> set[int]:
     """Model's photos of whose own correspondences half lies within the tolerance."""
     own = ~correspondences.carried
     count = int(correspondences.photo_of.max(initial=-1)) + 1
     total = np.bincount(correspondences.photo_of[own], minlength=count)
     near = np.bincount(correspondences.photo_of[own & (errors_px < tolerance_px)], minlength=count)
-    return np.flatnonzero((total > 0) & (2 * near >= total))
+    return set(np.flatnonzero((total > 0) & (2 * near >= total)).tolist())
 
 
 def fit_similarity(

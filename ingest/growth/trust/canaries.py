@@ -23,7 +23,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store import Database
 from featuredb.store.canaries import TOLERANCE_DEG, Canary, KnownPose, list_canaries, load_canary_image
 from ingest.growth.gates import SIGMAS, Gate
-from ingest.growth.map_images import LEAST_FEATURES, NEAR_M, features_and_points
+from ingest.growth.place.map_images import LEAST_FEATURES, NEAR_M, features_and_points
 from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localise.acceptance import AcceptanceOptions
 from reloc.localise.localise import localise_features

@@ -10,9 +10,14 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.states import OPERATOR
 from ingest.growth.gates import SIGMAS
-from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, NEAR_M, features_and_points
 from ingest.growth.place.localised import in_frame, localise_photos
-from ingest.growth.place.overlaps import localise_image
+from ingest.growth.place.map_images import (
+    LEAST_FEATURES,
+    MOST_IMAGES,
+    NEAR_M,
+    features_and_points,
+    localise_image,
+)
 from ingest.growth.trust.confirmation import OutsidePhoto, Source, Sources
 from ingest.growth.values import DRIFT_BUDGET_M, GrowthPhotos, LocalisedPhoto
 from reloc.localise.candidates import IndexedArea

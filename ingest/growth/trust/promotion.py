@@ -17,7 +17,7 @@ from ingest.fingerprint import digest
 from ingest.growth import gates
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.gates import Gate
-from ingest.growth.map_images import NEAR_M
+from ingest.growth.place.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import Confirmation, Sources, answering_with, confirm
 from ingest.growth.trust.corroboration import NewPhotos, corroborate

@@ -86,8 +86,7 @@ def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Ref
     if gate is None:
         return grown, why
     if not gate.passes:
-        rows = tuple(int(r) for r in grown.model.rows)
-        return Refused.by(gate, *grown.placement.gates, rows=rows), ""
+        return Refused.by(gate, *grown.placement.gates), ""
     told = {**growth_of(feature_map.placement.evidence).get("gates", {}), gate.name: gate.as_json()}
     return replace(grown, feature_map=with_growth(feature_map, gates=told)), ""
 
