@@ -13,8 +13,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.place_bounds import NO_HEIGHT_M
 
-# 95 % of a normal error along the worst axis.
-SIGMAS_95 = 1.96
+SIGMAS_95 = 1.96  # 95 % of a normal error along the worst axis
 # Of the points of oblique photos a few lie far beyond the scene, at the end of nearly parallel rays.
 _SHARE_OF_PLACES = 0.99
 
@@ -32,9 +31,6 @@ def map_drift_m(feature_map: FeatureMap, covariance_relative: FloatArray) -> flo
     """`drift_m` of a map, metres, and no less than at any of its photos' centres.
 
     These are few among thousands of places, and may all be in the hundredth that is left out.
-
-    Args:
-        covariance_relative: (7, 7) relative to the map's anchors, in its frame.
     """
     centers = np.reshape([image.cam_from_local.center for image in feature_map.images], (-1, 3))
     worst = SIGMAS_95 * float(place_sigmas_m(covariance_relative, centers).max(initial=0.0))
@@ -77,9 +73,8 @@ def with_growth(feature_map: FeatureMap, **figures: Any) -> FeatureMap:
 
 def inflated(feature_map: FeatureMap) -> FeatureMap:
     """The map with its placement's covariance `isotropic_inflation`."""
-    placement = feature_map.placement
-    alike = isotropic_inflation(feature_map, placement.covariance)
-    return replace(feature_map, placement=replace(placement, covariance=alike))
+    alike = isotropic_inflation(feature_map, feature_map.placement.covariance)
+    return replace(feature_map, placement=replace(feature_map.placement, covariance=alike))
 
 
 def turns_about(middle: FloatArray) -> FloatArray:

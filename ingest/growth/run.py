@@ -248,7 +248,8 @@ class _Run:
         if not level:
             self._note(grown, model)
             return
-        _LOG.info("%s: photos are at several places; apart at links of %g", grown.message, level)
+        count, message = len(model.rows), grown.message
+        _LOG.info("%d photos are at several places: %s; apart at links of %g", count, message, level)
         for part in parts:
             if self.posed.keys() & part.rows.tolist():
                 self._try_model(part, [link for link in links if link > level])
@@ -284,7 +285,8 @@ class _Run:
         """What photos became no map, and why."""
         rows = model.rows.tolist()
         self.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
-        self.refused.append(refused_entry(refused, photos=tuple(self.new.photos[r].name for r in rows)))
+        names = tuple(self.new.photos[r].name for r in rows)
+        self.refused.append(refused_entry(refused, "refused", photos=names))
 
 
 def _split_reason(reason: str) -> tuple[str, str]:

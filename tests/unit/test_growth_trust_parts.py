@@ -220,7 +220,9 @@ def test_only_points_of_two_sources_answer() -> None:
     assert (part.observations.descriptors[~part.observations.has_descriptor] == 0).all()
     # Where all is seen by two, nothing changes; a trusted owner's points need nobody.
     clean = strip_map("m", 40.0, owners=["anna", "ben"])
-    assert answering_with(clean, np.ones(len(clean.points), dtype=bool)) is clean
+    whole = answering_with(clean, np.ones(len(clean.points), dtype=bool)).observations
+    np.testing.assert_array_equal(whole.descriptors, clean.observations.descriptors)
+    np.testing.assert_array_equal(whole.has_descriptor, clean.observations.has_descriptor)
     trusted = confirm(poisoned, sources_of(poisoned, trusted=("eve",))).points
     assert trusted[fake].mean() > 0.5
     # Whose word does not count yet takes no part.

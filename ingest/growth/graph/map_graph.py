@@ -1,8 +1,4 @@
-"""The maps of a snapshot as a pose graph: who placed whom, how well, and how far that may have drifted.
-
-An edge of the graph is an overlap that growth has measured (`values.Edge`). Once the other map is placed anew
-its digest of place differs, and the edge has to be measured again.
-"""
+"""The maps of a snapshot as a pose graph: who placed whom, how well, and how far that may have drifted."""
 
 import hashlib
 import logging
@@ -15,7 +11,6 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, Placement
-from featuredb.maps.move import covariance_in_frame, in_frame
 from featuredb.store import Snapshot
 from featuredb.store.changes import is_imported
 from featuredb.store.decode import frame_of, placement_of
@@ -23,17 +18,10 @@ from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
-from ingest.growth.graph.pose_graph import WORLD, GraphEdge, GraphSolution, solve_pose_graph
+from ingest.growth.graph.pose_graph import WORLD, GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, map_drift_m, with_growth
 from ingest.growth.place.component import GrownMap, grow_component
-from ingest.growth.values import (
-    LEAST_PHOTOS,
-    Edge,
-    FeaturesOf,
-    LocalisedPhoto,
-    Refused,
-    tied_together,
-)
+from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.links import keep_photos
@@ -72,14 +60,13 @@ class PlacedMap:
         return not self.parents
 
     @property
-    def own_placement(self) -> tuple[FloatArray, Sim3]:
-        """Covariance (7, 7) of an anchor's placement before others moved it, and that move; its frame."""
+    def own_place(self) -> Edge:
+        """An anchor's own placement, before others moved it, as an overlap with the world; its frame."""
         own = growth_of(self.placement.evidence).get(OWN)
-        if own is None:
-            return self.placement.covariance, Sim3.identity()
-        return np.asarray(own["covariance"], dtype=np.float64).reshape(7, 7), Sim3.exp(
-            own["present_from_own"]
-        )
+        covariance, moved = self.placement.covariance, Sim3.identity()
+        if own is not None:
+            covariance, moved = np.reshape(own["covariance"], (7, 7)), Sim3.exp(own["present_from_own"])
+        return Edge(map_id=WORLD, other_from_map=moved.inverse(), covariance=covariance)
 
 
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
@@ -91,11 +78,7 @@ def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
 def _placed(row: Row) -> PlacedMap:
     frame, placement = frame_of(row), placement_of(row)
     return PlacedMap(
-        map_id=row["map_id"],
-        write_id=row["write_id"],
-        status=row["status"],
-        status_reason=row["status_reason"],
-        generation=row["generation"],
+        **{name: row[name] for name in ("map_id", "write_id", "status", "status_reason", "generation")},
         parents=tuple(row["parents"]),
         frame=frame,
         placement=placement,
@@ -122,7 +105,7 @@ def place_key(frame: LocalFrame, placement: Placement) -> str:
 
 
 def holds(maps: Mapping[str, PlacedMap], edge: Edge) -> bool:
-    """Whether the other map is where it was when the overlap was measured."""
+    """Whether the other map is where it was when the overlap was measured; else it is measured again."""
     return edge.map_id in maps and maps[edge.map_id].place == edge.place
 
 
@@ -141,46 +124,23 @@ def solve_maps(
     group_of = dict(zip(names, groups, strict=True))
     wanted = {group_of[m] for m in new}
     members = sorted(m for m in names if group_of[m] in wanted)
-    edges = [
-        in_graph(m, edge, maps[m].frame if m in maps else frame, frame)
-        for m, edge in overlaps
-        if group_of[m] in wanted
-    ]
-    edges += [_placement(m, maps[m], frame) for m in members if m in maps and maps[m].is_anchor]
-    return solve_pose_graph(members, edges)
+    overlaps += [(m, maps[m].own_place) for m in members if m in maps and maps[m].is_anchor]
+    frames = {m: maps[m].frame if m in maps else frame for m in members}
+    return solve_pose_graph(members, [(m, in_graph(e, frames[m], frame)) for m, e in overlaps if m in frames])
 
 
-def _placement(map_id: str, anchor: PlacedMap, frame: LocalFrame) -> GraphEdge:
-    """An anchor's own placement: where others have moved it, their edges say so anew."""
-    covariance, moved = anchor.own_placement
-    return GraphEdge(
-        a=map_id,
-        b=WORLD,
-        b_from_a=in_frame(moved, anchor.frame, frame).inverse(),
-        covariance=covariance_in_frame(covariance, anchor.frame, frame),
-    )
-
-
-def in_graph(map_id: str, edge: Edge, own: LocalFrame, frame: LocalFrame) -> GraphEdge:
+def in_graph(edge: Edge, own: LocalFrame, frame: LocalFrame) -> Edge:
     """A stored edge in the frame of a graph."""
-    return GraphEdge(
-        a=map_id,
-        b=edge.map_id,
-        b_from_a=in_frame(edge.other_from_map, own, frame),
-        covariance=covariance_in_frame(edge.covariance, own, frame),
-        shared=Sim3.from_rigid3(frame.enu_from(own)).adjoint() @ edge.shared,
-    )
+    frame_from_own = Sim3.from_rigid3(frame.enu_from(own))
+    return edge.carried(frame_from_own, frame_from_own)
 
 
 def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
     """Edges of one map to several, all made of the same photos, so that they do not count these twice.
 
-    Taken as independent, they would place the map more surely than one fit to all of them, its bending
-    included, did. What is missing is common to all of them; shared out over n of them, each gets n times as
-    much, so that they have it together.
-
-    Args:
-        together: (7, 7) covariance of the map's placement by all of them at once.
+    Taken as independent, they would place the map more surely than one fit to all of them, `together` (7, 7),
+    did. What is missing is common to all of them; each of n gets n times as much, so that they have it
+    together.
     """
     if not edges:
         return []
@@ -242,14 +202,9 @@ def with_drift(
     """The map with its overlaps by the graph of maps, its drift (m) and covariance (7, 7) to anchors."""
     feature_map = grown.feature_map
     growth = growth_of(feature_map.placement.evidence)
-    edges = no_surer_than(
-        [
-            replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn)
-            for edge in grown.placement.edges
-            if edge.map_id in maps
-        ],
-        grown.placement.covariance,
-    )
+    held = [edge for edge in grown.placement.edges if edge.map_id in maps]
+    held = [replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn) for edge in held]
+    edges = no_surer_than(held, grown.placement.covariance)
     covariance = feature_map.placement.covariance
     relative = np.reshape(growth["covariance_relative"], (7, 7))
     others = {m: placed for m, placed in maps.items() if m != feature_map.map_id}
@@ -264,7 +219,7 @@ def with_drift(
         budget_m=budget_m,
         covariance_relative=relative.ravel().tolist(),
         edges=[edge.as_json() for edge in edges],
-        gates={**growth["gates"], **gates.figures((gates.drift(drift, budget_m),))},
+        gates=growth["gates"] | gates.figures([gates.drift(drift, budget_m)]),
     )
     placed = replace(placed, placement=replace(placed.placement, covariance=covariance))
     return inflated(placed), drift, relative

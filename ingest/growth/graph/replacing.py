@@ -2,9 +2,9 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -75,9 +75,6 @@ class Replacement:
     left_out: tuple[str, ...] = ()
     flagged: tuple[str, ...] = ()
 
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def replace_descendants(database: Database, work: Path, *, budget_m: float) -> Replacement | None:
     """Look for new anchors and anchors placed anew around grown maps, re-place the maps by them; or None.
@@ -94,9 +91,7 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
     frame = maps[min(edges)].frame
     solution = solve_maps(maps, edges, frame)
     told = Replacement(
-        reason=solution.reason,
-        message=solution.message,
-        left_out=tuple(map(str, solution.left_out)),
+        reason=solution.reason, message=solution.message, left_out=tuple(map(" - ".join, solution.left_out))
     )
     if solution.reason is not None:
         return told
@@ -145,28 +140,19 @@ def _measured(
     snapshot: Snapshot, maps: Mapping[str, PlacedMap], wanted: Sequence[tuple[str, str]], work: Path
 ) -> Edges:
     """New overlaps; what was looked for is kept in the work folder."""
-    loaded: dict[str, FeatureMap] = {}
+    load = cache(snapshot.load_map)
     edges: dict[str, list[Edge]] = {}
-    notes: list[str] = []
     for map_id, other_id in wanted:
         about, places = f"{map_id} {other_id}", f"{maps[map_id].place} {maps[other_id].place}"
         said = recall(work, "overlaps", about, places)
         if said is None:
-            for m in (map_id, other_id):
-                loaded[m] = loaded.get(m) or snapshot.load_map(m)
-            found = measure_overlap(loaded[map_id], loaded[other_id])
-            said = {"edge": None}
-            if isinstance(found, Edge):
-                said["edge"] = replace(found, place=maps[other_id].place).as_json()
-                said["note"] = f"{found.photos} images and {found.shared_points} points in common"
-            else:
-                said["note"] = found
+            found = measure_overlap(load(map_id), load(other_id))
+            edge = replace(found, place=maps[other_id].place).as_json() if isinstance(found, Edge) else None
+            said = {"edge": edge}
             remember(work, "overlaps", about, said, places)
-        notes.append(f"{map_id} - {other_id}: {said['note']}")
+            _LOG.info("overlap %s - %s: %s", map_id, other_id, "measured" if edge else found)
         if said["edge"] is not None:
             edges.setdefault(map_id, []).append(Edge.from_json(said["edge"]))
-    if notes:
-        _LOG.info("overlaps: %s", "; ".join(notes))
     return edges
 
 
@@ -180,14 +166,14 @@ def _moved(
 ) -> tuple[list[FeatureMap], list[MovedMap]]:
     """The maps at their new places, and what is said of each."""
     moved: dict[str, FeatureMap] = {}
-    ways: dict[str, float] = {}
+    ways_m: dict[str, float] = {}
     corrections: dict[str, Sim3] = {}
     for map_id, correction in solution.corrections.items():
         before = maps[map_id]
         own = in_frame(correction, frame, before.frame)
         corners = before.corners if len(before.corners) else np.zeros((1, 3))
-        ways[map_id] = float(np.linalg.norm(own.act(corners) - corners, axis=1).max())
-        if before.is_anchor and ways[map_id] < _LEAST_MOVE_M:
+        ways_m[map_id] = float(np.linalg.norm(own.act(corners) - corners, axis=1).max())
+        if before.is_anchor and ways_m[map_id] < _LEAST_MOVE_M:
             own = Sim3.identity()
         else:
             covariance = covariance_in_frame(solution.covariance[map_id], frame, before.frame)
@@ -196,26 +182,23 @@ def _moved(
         corrections[map_id] = own
     places = {m: maps[m].place for m in solution.corrections}
     places |= {m: place_key(there.frame, there.placement) for m, there in moved.items()}
-    contradicting = {(edge.a, edge.b) for edge in solution.left_out}
     new, reports = [], []
     for map_id, feature_map in moved.items():
         before = maps[map_id]
-        edges = [
-            _carried(e, map_id, maps, corrections, places)
-            for e in (*(e for e in before.edges if holds(maps, e)), *new_edges.get(map_id, ()))
-            if (map_id, e.map_id) not in contradicting and e.map_id in corrections
-        ]
+        edges = []
+        for edge in (*(e for e in before.edges if holds(maps, e)), *new_edges.get(map_id, ())):
+            if (map_id, edge.map_id) not in solution.left_out and edge.map_id in corrections:
+                other = in_frame(corrections[edge.map_id], maps[edge.map_id].frame, before.frame)
+                now = edge.carried(other, corrections[map_id])
+                edges.append(replace(now, place=places[edge.map_id]))
         finished, drift = _with_evidence(feature_map, before, edges, solution, frame, budget_m)
         # Active maps stay so; those that were quarantined for their parent's sake are active again.
         again = PARENT_MOVED in before.status_reason and drift <= budget_m
         active = before.status == "active" or again
         new.append(replace(finished, status="active" if active else "quarantined"))
+        told = {"move_m": round(ways_m[map_id], 4), "drift_m": round(drift, 4)}
         drifted = growth_of(before.placement.evidence).get("drift_m")
-        reports.append(
-            MovedMap(
-                map_id=map_id, move_m=round(ways[map_id], 4), drift_before_m=drifted, drift_m=round(drift, 4)
-            )
-        )
+        reports.append(MovedMap(map_id=map_id, drift_before_m=drifted, **told))
     return _with_generations(new, maps), reports
 
 
@@ -243,24 +226,6 @@ def _judged(check: CanaryCheck) -> CanaryCheck:
     return replace(check, regression=f"{check.error_m:.2f} m off, once the maps have moved")
 
 
-def _carried(
-    edge: Edge,
-    map_id: str,
-    maps: Mapping[str, PlacedMap],
-    corrections: Mapping[str, Sim3],
-    places: Mapping[str, str],
-) -> Edge:
-    """An overlap in the coordinates of the new places: Z' = X_other Z X_map^-1."""
-    other = in_frame(corrections[edge.map_id], maps[edge.map_id].frame, maps[map_id].frame)
-    return replace(
-        edge,
-        place=places[edge.map_id],
-        other_from_map=other @ edge.other_from_map @ corrections[map_id].inverse(),
-        covariance=other.carried(edge.covariance),
-        shared=other.adjoint() @ edge.shared,
-    )
-
-
 def _with_evidence(
     feature_map: FeatureMap,
     before: PlacedMap,
@@ -274,9 +239,9 @@ def _with_evidence(
     relative = covariance_in_frame(solution.covariance_relative[map_id], frame, own)
     drift = map_drift_m(feature_map, relative)
     if before.is_anchor:
-        covariance, present_from_own = before.own_placement
-        total = in_frame(solution.corrections[map_id], frame, own) @ present_from_own
-        placed = {"covariance": covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
+        was = before.own_place
+        total = in_frame(solution.corrections[map_id], frame, own) @ was.other_from_map.inverse()
+        placed = {"covariance": was.covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
         return with_growth(feature_map, **{OWN: placed}), drift
     noted = with_growth(
         feature_map,
@@ -285,10 +250,10 @@ def _with_evidence(
         covariance_relative=relative.ravel().tolist(),
         edges=[edge.as_json() for edge in edges],
     )
-    held = tuple(dict.fromkeys(edge.map_id for edge in edges))
-    kept = tuple(m for m in before.parents if m in held)
+    held = [edge.map_id for edge in edges]
     # Only anchors join the parents: a map never becomes its own ancestor.
-    return replace(noted, parents=(*kept, *(m for m in held if m not in kept)) or before.parents), drift
+    parents = tuple(dict.fromkeys([*(m for m in before.parents if m in held), *held])) or before.parents
+    return replace(noted, parents=parents), drift
 
 
 def _with_generations(new: list[FeatureMap], maps: Mapping[str, PlacedMap]) -> list[FeatureMap]:

@@ -7,6 +7,7 @@ localised photo is never enough.
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -36,8 +37,7 @@ def lone_groups(
         overlaps: pairs of rows with verified matches. geometry_of: theirs, in which no pose takes part.
 
     Returns:
-        A model of each group, of its matches alone, with the lenses of the localisations and near their
-        poses; its rows are those of the photos.
+        A model of each group, of its matches alone, with the lenses of the localisations.
     """
     if not localised:
         return [], {}
@@ -49,17 +49,15 @@ def lone_groups(
         pixels = [features_of(r).features.xy[view.inliers[:, k]] for k, r in enumerate((a, b))]
         if poses_fit(photos[a], photos[b], pixels[0].astype(np.float64), pixels[1].astype(np.float64)):
             geometries[a, b] = view
-    reasons = dict.fromkeys(photos, "ALONE: no other photo bears its pose out")
+    alone = photos.keys() - set(chain(*geometries))
     groups: list[Model] = []
-    group_of = dict(zip(photos, tied_together(list(photos), geometries), strict=True))
-    for group in sorted(set(group_of.values())):
-        rows = [r for r in photos if group_of[r] == group]
+    group_of = np.array(tied_together(list(photos), geometries))
+    for group in np.unique(group_of):
+        rows = np.array(list(photos))[group_of == group].tolist()
         if len(rows) >= 2:
             own = {pair: view for pair, view in geometries.items() if pair[0] in rows}
             groups.append(_triangulated(rows, photos, own, features_of))
-            for r in rows:
-                reasons.pop(r)
-    return groups, reasons
+    return groups, dict.fromkeys(alone, "ALONE: no other photo bears its pose out")
 
 
 def poses_fit(a: LocalisedPhoto, b: LocalisedPhoto, pixels_a: FloatArray, pixels_b: FloatArray) -> bool:
@@ -104,20 +102,13 @@ def _triangulated(
     The localisations' poses are the start; then the model is adjusted to its matches alone, in a gauge of its
     own. Whether it still fits the localisations is asked when it is placed, as of any reconstruction.
     """
-    place = {r: k for k, r in enumerate(rows)}
     cameras = list(dict.fromkeys(photos[r].camera for r in rows))
-    sfm = [
-        SfmPhoto(
-            name=str(r), camera_row=cameras.index(photos[r].camera), keypoints=features_of(r).features.xy
-        )
-        for r in rows
-    ]
-    model = triangulate_posed(
-        cameras,
-        sfm,
-        [photos[r].cam_from_local for r in rows],
-        {(place[a], place[b]): view for (a, b), view in geometries.items()},
-    )
+    sfm = []
+    for r in rows:
+        camera_row, xy = cameras.index(photos[r].camera), features_of(r).features.xy
+        sfm.append(SfmPhoto(name=str(r), camera_row=camera_row, keypoints=xy))
+    views = {(rows.index(a), rows.index(b)): view for (a, b), view in geometries.items()}
+    model = triangulate_posed(cameras, sfm, [photos[r].cam_from_local for r in rows], views)
     keypoints = [sfm[int(k)].keypoints.astype(np.float64) for k in model.rows]
     lenses = Lenses(held=range(len(model.cameras)))
     free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses).model

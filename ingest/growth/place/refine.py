@@ -1,8 +1,7 @@
 """Step: a placed reconstruction is adjusted to the existing points, and photos that do not hold are left out.
 
-The lenses of existing maps are adopted before. Photos are left out that contradict the placement before or
-after, that hang on the others by little, and that may be further off than allowed; the others are adjusted
-without them, and say anew how sure they are.
+Those contradict the placement before or after, hang on the others by little, or may be further off than
+allowed; the others are adjusted without them, and say anew how sure they are.
 """
 
 from collections.abc import Mapping, Sequence
@@ -79,7 +78,7 @@ def adopt_lenses(
     Args:
         photos: all, rows as in the model.
         areas: where it may lie; the first one that has a lens for a camera's EXIF key lends it.
-        keypoints: pixels of all features of the model's photos, in the order of its rows.
+        keypoints: pixels of all features of each photo of the model.
     """
     lent: dict[int, Camera] = {}
     focals: dict[int, float] = {}
@@ -115,12 +114,14 @@ def refine_placed(
 
     Args:
         localised: the model's photos that the existing maps localise, by row.
-        keypoints: pixels of all features of the model's photos, in the order of its rows.
+        keypoints: pixels of all features of each photo of the model.
         max_bound_m: photos that may be further off (95 %), against the existing points and with what their
-            lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
+            lens leaves open, are left out.
     """
     rows = model.rows.tolist()
-    placed = in_metres(model, placement.fit.local_from_sfm)
+    sim = placement.fit.local_from_sfm
+    poses = tuple(sim.act_on_pose(pose) for pose in model.cam_from_sfm)
+    placed = replace(model, cam_from_sfm=poses, xyz=sim.act(model.xyz))  # in metres
     left_out = dict.fromkeys(placement.disagreeing, (_CONTRADICTS, _ELSEWHERE))
     left_out |= dict.fromkeys(placement.blind, ("NOT_VISIBLE", _SHOWS_LITTLE))
     weak = weak_photos(model, list(left_out), [k for k in placement.agreeing if k not in left_out])
@@ -209,10 +210,10 @@ def contradicting_photos(
         own = into_local @ (np.nan_to_num(spread[k]) + lenses) @ into_local.T
         square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
         if square > limit:
+            off_m, off_deg = np.linalg.norm(offset[3:]), np.degrees(np.linalg.norm(offset[:3]))
             found[k] = (
-                f"the photo by itself is {float(np.linalg.norm(offset[3:])):.2f} m and "
-                f"{float(np.degrees(np.linalg.norm(offset[:3]))):.2f} degrees from where the others put it, "
-                f"chi-square {square:.0f}, {limit:.0f} is allowed"
+                f"the photo by itself is {off_m:.2f} m and {off_deg:.2f} degrees from where the others put "
+                f"it, chi-square {square:.0f}, {limit:.0f} is allowed"
             )
     return found
 
@@ -242,11 +243,7 @@ def pose_by_lens(photo: LocalisedPhoto, lens: Camera) -> FloatArray:
 
 
 def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> dict[int, str]:
-    """Photos that hang on those that are held by too little, and how little.
-
-    Args:
-        outside: photos that do not count. held: photos that are localised and agree.
-    """
+    """Photos that hang on those that are held by too little, and how little; `outside` do not count."""
     firm = bottleneck_share(model, held, outside)
     return {
         k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
@@ -274,15 +271,6 @@ def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[i
     }
 
 
-def in_metres(model: Model, local_from_sfm: Sim3) -> Model:
-    """The model in the local frame."""
-    return replace(
-        model,
-        cam_from_sfm=tuple(local_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm),
-        xyz=local_from_sfm.act(model.xyz),
-    )
-
-
 def _refined(
     model: Model,
     outside: Sequence[int],
@@ -294,8 +282,11 @@ def _refined(
 
     Observations by features that existing points hold are their points' now.
     """
-    first, number = held.existing()
-    fixed = FixedPoints(xyz=held.points[first], point_of=number, photo_of=held.photo_of, pixels=held.pixels)
+    both = np.stack([held.map_of, held.point_of], axis=1)
+    _, first, number = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    fixed = FixedPoints(
+        xyz=held.points[first], point_of=number.reshape(-1), photo_of=held.photo_of, pixels=held.pixels
+    )
     size = int(max(model.keypoint_of.max(initial=0), held.feature.max(initial=0))) + 1
     taken = np.isin(model.photo_of * size + model.keypoint_of, held.photo_of * size + held.feature)
     free = ~np.isin(model.photo_of, outside) & ~taken
@@ -324,8 +315,6 @@ def _with_existing(
     adjusted: Anchored, fixed: FixedPoints, correspondences: Correspondences, parents: Sequence[str]
 ) -> Model:
     """The adjusted model with the existing points that at least two of its photos see as points of its own.
-
-    A map holds its points itself: a copy of an existing point is where the new photos were held.
 
     Args:
         correspondences: (m,) of the observations of `fixed`.

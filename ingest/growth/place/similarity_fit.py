@@ -1,9 +1,8 @@
 """The similarity that places a reconstruction by existing maps: hypotheses by photo, then a weighted fit.
 
-What holds a new reconstruction are the pixels in which its photos see existing points. A photo's localised
-pose is made of them, and so are pairs of a new and an existing point: to add those as measurements of their
-own would count the same pixels twice. Poses and point pairs therefore propose similarities and judge them;
-the fit itself is over the pixels,
+What holds a new reconstruction are the pixels in which its photos see existing points. Localised poses and
+pairs of a new and an existing point are made of them: they propose similarities and judge them, and the fit
+itself is over the pixels,
 
     pixel_k = project(camera, cam_from_sfm S^-1 point_k) + noise,    S = local_from_sfm,
 
@@ -69,12 +68,6 @@ class Correspondences:
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Correspondences":
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
-    def existing(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """One of each existing point (first row), and the number (m,) of each one's point."""
-        both = np.stack([self.map_of, self.point_of], axis=1)
-        _, first, number = np.unique(both, axis=0, return_index=True, return_inverse=True)
-        return first, number.reshape(-1)
-
 
 _COLUMNS = Correspondences.__slots__[1:]
 
@@ -82,10 +75,10 @@ _COLUMNS = Correspondences.__slots__[1:]
 def find_correspondences(
     model: Model, localised: Mapping[int, LocalisedPhoto], keypoints: Sequence[FloatArray]
 ) -> Correspondences:
-    """Correspondences of a model's photos, own and carried along its tracks; photos are in one frame.
+    """Correspondences of a model's photos, own and carried along its tracks.
 
     Args:
-        localised: one of the model's photos at least.
+        localised: one of the model's photos at least, by row, all in one frame.
         keypoints: pixels (n, 2) of all features of each photo of the model.
     """
     mine = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}

@@ -1,22 +1,21 @@
 """Canaries: photos whose right answer is known are asked before and after a map would be promoted.
 
 A regression is a canary that was answered rightly and no longer is, or a photo of elsewhere that now finds a
-place. Beside those of the database, images of the active maps serve: their observations are features of
-photos, so they can be asked again without any file. Their answer leans on their own map and moves less than
-a stranger's would; what they show is an answer that the new map takes away, makes ambiguous or pulls along,
-and, asked of the new map alone, a new map that shows their place somewhere else.
+place. Beside those of the database, images of the active maps serve, by their observations. Their answer
+leans on their own map; what they show is an answer that the new map takes away, makes ambiguous or pulls
+along, and, asked of the new map alone, a new map that shows their place somewhere else.
 """
 
 import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 
 from featuredb.features.decode import DecodeLimits, decode_gray
-from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.feature_map import FeatureMap, MapImage
@@ -35,7 +34,7 @@ from reloc.wire.query import LocaliseWireRequest
 
 # What a map keeps of its images shows its own points alone: that an image does not show what a new map adds
 # around them says nothing against either.
-_OWN_FEATURES = AcceptanceOptions(min_spread=0.0, min_agreement=0.0)
+_OWN_FEATURES = LocaliseOptions(acceptance=AcceptanceOptions(min_spread=0.0, min_agreement=0.0))
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
 
@@ -100,8 +99,6 @@ class CanaryRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Miss:
-    """How far an answer is from what is known."""
-
     metres: float
     degrees: float
     sigma_m: float
@@ -197,16 +194,15 @@ def own_canaries(
             if described < LEAST_FEATURES:
                 continue
             key = hashlib.sha256(f"{feature_map.map_id} {image.name}".encode()).hexdigest()
-            center = image.cam_from_local.center
             around = False
             for frame, low, high in boxes:
-                there = frame.enu_from(feature_map.frame).act(center)[:2]
+                there = frame.enu_from(feature_map.frame).act(image.cam_from_local.center)[:2]
                 around |= bool(((there >= low) & (there <= high)).all())
             (near if around else far).append((key, feature_map.map_id, image))
-    chosen = sorted(near, key=lambda e: e[0])[:_OWN_NEAR]
-    chosen += sorted(far, key=lambda e: e[0])[: _OWN_NEAR // 2]
-    whole = {map_id: snapshot.load_map(map_id) for map_id in sorted({map_id for _, map_id, _ in chosen})}
-    return [(whole[map_id], image) for _, map_id, image in chosen]
+    near.sort(key=lambda e: e[0])
+    far.sort(key=lambda e: e[0])
+    load = cache(snapshot.load_map)
+    return [(load(map_id), image) for _, map_id, image in near[:_OWN_NEAR] + far[: _OWN_NEAR // 2]]
 
 
 def _check_own(
@@ -219,23 +215,20 @@ def _check_own(
     features, _ = features_and_points(feature_map, image)
     request = LocaliseRequest(camera=feature_map.cameras[image.camera_id])
     asked = ((before, None), (after, None), (after, new_ids))
-    results = [_ask(features, request, localiser, ids) for localiser, ids in asked]
+    results = []
+    for localiser, map_ids in asked:
+        areas = localiser.areas_of(map_ids)
+        areas = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
+        results.append(localise_features(features, request, areas, _OWN_FEATURES).result)
     misses = [_miss_of_image(result.pose, feature_map, image) for result in results]
     verdicts = [_verdict(miss, DRIFT_BUDGET_M, TOLERANCE_DEG) for miss in misses[:2]]
     may_miss_m = SIGMAS * misses[2].sigma_m if misses[2] else 0.0
     alone = _verdict(misses[2], max(DRIFT_BUDGET_M, may_miss_m), TOLERANCE_DEG)
     check = _checked(f"{image.name} of map {feature_map.map_id}", verdicts, misses, results[1])
-    if check.regression or alone != "moved":
-        return replace(check, alone=alone)
-    return replace(check, alone=alone, regression=f"the new map alone has it {misses[2]} from where it is")
-
-
-def _ask(
-    features: Features, request: LocaliseRequest, localiser: Localiser, map_ids: tuple[str, ...] | None
-) -> LocaliseResult:
-    areas = [a for a in localiser.areas_of(map_ids) if a.area.extractor_fingerprint == features.fingerprint]
-    options = LocaliseOptions(acceptance=_OWN_FEATURES)
-    return localise_features(features, request, areas, options).result
+    regression = check.regression
+    if alone == "moved" and not regression:
+        regression = f"the new map alone has it {misses[2]} from where it is"
+    return replace(check, alone=alone, regression=regression)
 
 
 def _checked(
@@ -249,15 +242,9 @@ def _checked(
             regression = "a photo of elsewhere now finds a place"
         elif misses[1] is None:
             regression = f"no longer localised: {result.reason}: {result.detail}"
-    errors = [float("nan") if miss is None else miss.metres for miss in misses[:2]]
-    return CanaryCheck(
-        name=name,
-        before=before,
-        after=after,
-        error_before_m=errors[0],
-        error_m=errors[1],
-        regression=regression,
-    )
+    was_m, is_m = (float("nan") if miss is None else miss.metres for miss in misses[:2])
+    check = CanaryCheck(name=name, before=before, after=after, regression=regression)
+    return replace(check, error_before_m=was_m, error_m=is_m)
 
 
 def _miss_of_known(pose: LocalisedPose | None, expected: KnownPose | None) -> _Miss | None:

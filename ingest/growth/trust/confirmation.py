@@ -34,8 +34,7 @@ class Source:
 
     Attributes:
         owner: who gave it, by identity.
-        proven: it needs nobody's word: it is the operator's, a trusted identity's, or of a map that measured
-            its own place.
+        proven: it needs nobody's word: it is the operator's, a trusted identity's, or an anchor's.
         on_record: its owner's word counts, beside that of another such owner.
     """
 
@@ -54,7 +53,7 @@ class Sources:
 
     Attributes:
         owners: of the database as it is; by default, one to which nobody has contributed.
-        trusted: identities that the operator vouches for: their photos need nobody else, as his own.
+        trusted: identities that the operator vouches for.
     """
 
     owners: Owners = field(default_factory=Owners)
@@ -77,10 +76,7 @@ class Sources:
 
 
 def independent(a: Source, b: Source) -> bool:
-    """Whether two photos that see the same confirm each other.
-
-    They are of two owners, and one of them is proven, or both owners are on record.
-    """
+    """Whether two photos that see the same confirm each other."""
     return a.owner != b.owner and (a.proven or b.proven or (a.on_record and b.on_record))
 
 
@@ -89,7 +85,6 @@ class OutsidePhoto:
     """A photo that is not the map's own, and localised in it alone.
 
     Attributes:
-        name: for people.
         center: (3,) of its camera in the map's frame, metres.
         points: (k,) rows of the map's points that are its inliers.
         contradicts: a sentence, where its place is known and is not where the map has it; else it
@@ -105,17 +100,16 @@ class OutsidePhoto:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Confirmation:
-    """How far a map is confirmed.
+    """How far a map is confirmed: when the gate passes, it is.
 
     Attributes:
-        gate: the map is confirmed when it passes.
         owners: of the photos that confirm each other, or are proven.
         confirmed: image ids of the map.
         earned: those of the map's that make a record for their owner: proven themselves, or confirmed by a
             proven photo, or by photos of two other owners on record.
         points: (n,) which points of the map two independent photos see, its own or from outside, or a proven
-            one of its own. A photo can be true in most of its parts and altered in one: it then fits its
-            neighbours, and the altered part makes points that only its owner has seen.
+            one of its own. The altered part of a photo that is true in the others makes points that only its
+            owner has seen.
     """
 
     gate: Gate
@@ -136,7 +130,7 @@ def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[Outside
     """How far a map is confirmed by those whose word counts.
 
     A photo of the map is confirmed when it is proven, or shares enough of the map's points with a photo that
-    is independent of it, the map's own or one from outside.
+    is independent of it.
     """
     corroborating = [photo for photo in outside if not photo.contradicts]
     against = [photo for photo in outside if photo.contradicts]
@@ -167,9 +161,8 @@ def _earns(
 ) -> bool:
     """Whether a photo makes a record for its owner; one that copies a proven photo does not."""
     mine, same, moved = sources[row], sees_same[row], apart[row]
-    others = [
-        (s, far) for s, yes, far in zip(sources, same, moved, strict=True) if yes and s.owner != mine.owner
-    ]
+    seen = zip(sources, same, moved, strict=True)
+    others = [(s, far) for s, yes, far in seen if yes and s.owner != mine.owner]
     if mine.proven or not all(far for s, far in others if s.proven):
         return mine.proven
     known = {s.owner for s, far in others if s.on_record and far}
@@ -188,10 +181,8 @@ def _pairs(agree: NDArray[np.bool_]) -> float:
 def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[OutsidePhoto]) -> Gate:
     """Whether more pairs confirm the map than one and as many as contradict it.
 
-    A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
-    photo in common count as one, three photos that confirm each other as one and a half.
-
-    Each proven photo contradicts it, and each other owner once, whose photos may all lie.
+    A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Each proven
+    photo contradicts it, and each other owner once, whose photos may all lie.
     """
     theirs = [photo.source for photo in against]
     contradicting = sum(s.proven for s in theirs) + len({s.owner for s in theirs if not s.proven})
@@ -204,10 +195,7 @@ def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[OutsideP
         )
     elif pairs:
         reason = "FEW_PAIRS"
-        message = (
-            f"{confirmed} photos are confirmed by one photo alone; another pair of independent photos is "
-            "needed"
-        )
+        message = f"{confirmed} photos are confirmed by one photo alone; another independent pair is needed"
     else:
         reason, message = "ONE_SOURCE", "no two owners whose word counts see the same of it"
     return Gate(
@@ -222,12 +210,11 @@ def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[OutsideP
 
 def _sees(feature_map: FeatureMap, corroborating: Sequence[OutsidePhoto]) -> sparse.csr_array:
     """Which points each photo sees, (photos, points), 1 or 0: images of the map, then photos from outside."""
-    row = {image.image_id: i for i, image in enumerate(feature_map.images)}
-    seen = feature_map.observations
-    images = [np.array([row[int(i)] for i in seen.image_id], dtype=np.int64)]
-    images += [np.full(len(outside.points), k) for k, outside in enumerate(corroborating, start=len(row))]
+    seen, own = feature_map.observations, len(feature_map.images)
+    images = [feature_map.image_rows(seen.image_id)]
+    images += [np.full(len(outside.points), k) for k, outside in enumerate(corroborating, start=own)]
     points = np.concatenate([seen.point_index, *(outside.points for outside in corroborating)])
-    shape = (len(row) + len(corroborating), max(len(feature_map.points), 1))
+    shape = (own + len(corroborating), max(len(feature_map.points), 1))
     sees = sparse.csr_array((np.ones(len(points), np.int64), (np.concatenate(images), points)), shape=shape)
     sees.sum_duplicates()
     sees.data[:] = 1
@@ -236,28 +223,23 @@ def _sees(feature_map: FeatureMap, corroborating: Sequence[OutsidePhoto]) -> spa
 
 def parallax(feature_map: FeatureMap, corroborating: Sequence[OutsidePhoto]) -> FloatArray:
     """Distances of the cameras from each other over those from what they see, (n, n)."""
-    points = feature_map.points_local()
-    seen = feature_map.observations
-    rows = [seen.point_index[seen.image_id == image.image_id] for image in feature_map.images]
-    rows += [w.points for w in corroborating]
-    centers = np.array(
-        [image.cam_from_local.center for image in feature_map.images] + [w.center for w in corroborating]
-    ).reshape(-1, 3)
+    points, seen = feature_map.points_local(), feature_map.observations
+    photos = [
+        (image.cam_from_local.center, seen.point_index[seen.image_id == image.image_id])
+        for image in feature_map.images
+    ]
+    photos += [(outside.center, outside.points) for outside in corroborating]
+    centers = np.reshape([center for center, _ in photos], (-1, 3))
     reach = np.array(
-        [
-            np.median(np.linalg.norm(points[r] - c, axis=1)) if len(r) else np.inf
-            for r, c in zip(rows, centers, strict=True)
-        ]
+        [np.median(np.linalg.norm(points[r] - c, axis=1)) if len(r) else np.inf for c, r in photos]
     )
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     return np.asarray(apart / np.maximum(np.minimum(reach[:, None], reach[None]), 1e-9), dtype=np.float64)
 
 
 def answering_with(feature_map: FeatureMap, points: NDArray[np.bool_]) -> FeatureMap:
-    """The map with descriptors for the given points only; the same map where all that had some keep them."""
+    """The map with descriptors for the given points only."""
     seen = feature_map.observations
     keep = seen.has_descriptor & points[seen.point_index]
-    if np.array_equal(keep, seen.has_descriptor):
-        return feature_map
     descriptors = np.where(keep[:, None], seen.descriptors, np.uint8(0))
     return replace(feature_map, observations=replace(seen, has_descriptor=keep, descriptors=descriptors))

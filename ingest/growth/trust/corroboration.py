@@ -1,7 +1,8 @@
 """Photos that look at a quarantined map from outside, localised in it alone: of other maps, and new ones."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
@@ -71,9 +72,32 @@ def corroborate(
     indexed, own = IndexedArea.of([feature_map]), set(sources.of_map(feature_map))
     if not len(indexed.area.points):
         return []
-    heard = list(_of_maps(feature_map, others, indexed, own, sources))
-    if new is not None:
-        heard += _of_new(feature_map, write_id, indexed, new, own, sources, threads)
+    names = {image.sha256 for image in feature_map.images}
+    heard: list[OutsidePhoto] = []
+    for other, image, source in _images_around(feature_map, others, own, sources):
+        found = None if image.sha256 in names else localise_image(other, image, [indexed])
+        if found is not None:
+            pose = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
+            known = pose.center, _center_variance(other, image)
+            name = f"{image.name} of map {other.map_id}"
+            heard.append(_heard(feature_map, found, source, name, known))
+    if new is None:
+        return heard
+    photos, asked = new.given.photos, dict[int, Source]()
+    for row in new.that_may_see(feature_map):
+        source = sources.of_owner(photos[row].contributor or OPERATOR)
+        if photos[row].sha256 not in names and source.speaks_to(own):
+            asked[row] = source
+    unheard = [row for row in asked if (write_id, row) not in new.heard]
+    said = localise_photos(photos, unheard, new.given.features_of, [indexed], threads)[0]
+    new.heard.update({(write_id, row): said.get(row) for row in unheard})
+    for row, source in asked.items():
+        found, known_here = new.heard[write_id, row], None
+        if row in new.localised:
+            there = in_frame(new.localised[row], feature_map.frame)
+            known_here = there.cam_from_local.center, _spread(there)
+        if found is not None:
+            heard.append(_heard(feature_map, found, source, photos[row].name, known_here))
     return heard
 
 
@@ -100,50 +124,6 @@ def _heard(
     return OutsidePhoto(name=name, source=source, center=center, points=points, contradicts=contradicts)
 
 
-def _of_maps(
-    feature_map: FeatureMap,
-    others: Sequence[FeatureMap],
-    indexed: IndexedArea,
-    own: set[Source],
-    sources: Sources,
-) -> Iterator[OutsidePhoto]:
-    names = {image.sha256 for image in feature_map.images}
-    for other, image, source in _images_around(feature_map, others, own, sources):
-        found = None if image.sha256 in names else localise_image(other, image, [indexed])
-        if found is not None:
-            pose = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
-            known = pose.center, _center_variance(other, image)
-            yield _heard(feature_map, found, source, f"{image.name} of map {other.map_id}", known)
-
-
-def _of_new(
-    feature_map: FeatureMap,
-    write_id: str,
-    indexed: IndexedArea,
-    new: NewPhotos,
-    own: set[Source],
-    sources: Sources,
-    threads: int,
-) -> Iterator[OutsidePhoto]:
-    names, photos = {image.sha256 for image in feature_map.images}, new.given.photos
-    asked: dict[int, Source] = {}
-    for row in new.that_may_see(feature_map):
-        source = sources.of_owner(photos[row].contributor or OPERATOR)
-        if photos[row].sha256 not in names and source.speaks_to(own):
-            asked[row] = source
-    unheard = [row for row in asked if (write_id, row) not in new.heard]
-    said = localise_photos(photos, unheard, new.given.features_of, [indexed], threads)[0]
-    new.heard.update({(write_id, row): said.get(row) for row in unheard})
-    for row, source in asked.items():
-        found, known = new.heard[write_id, row], None
-        if found is None:
-            continue
-        if row in new.localised:
-            there = in_frame(new.localised[row], feature_map.frame)
-            known = there.cam_from_local.center, _spread(there)
-        yield _heard(feature_map, found, source, photos[row].name, known)
-
-
 def _spread(photo: LocalisedPhoto) -> float:
     """Largest variance of the camera's centre, with that of the maps' placements, square metres."""
     pose = photo.result.pose
@@ -159,30 +139,19 @@ def _center_variance(other: FeatureMap, image: MapImage) -> float:
 
 
 def _images_around(
-    feature_map: FeatureMap,
-    others: Sequence[FeatureMap],
-    own: set[Source],
-    sources: Sources,
+    feature_map: FeatureMap, others: Sequence[FeatureMap], own: set[Source], sources: Sources
 ) -> list[tuple[FeatureMap, MapImage, Source]]:
     """Images of other maps whose owners' word counts, nearest to the map's cameras first."""
     centers = np.array([image.cam_from_local.center for image in feature_map.images])
     reach = NEAR_M + 0.5 * float(np.linalg.norm(np.ptp(centers, axis=0)))
     found: list[tuple[float, str, FeatureMap, MapImage, Source]] = []
     for other in others:
-        if other.map_id == feature_map.map_id:
-            continue
         here_from_other = feature_map.frame.enu_from(other.frame)
         for image, source in zip(other.images, sources.of_map(other), strict=True):
-            if not source.speaks_to(own):
-                continue
             center = here_from_other.act(image.cam_from_local.center)
             distance = float(np.linalg.norm(centers - center, axis=1).min())
-            if distance <= reach:
+            if distance <= reach and source.speaks_to(own):
                 found.append((distance, f"{other.map_id} {image.name}", other, image, source))
-    chosen = []
-    for _, _, other, image, source in sorted(found, key=lambda e: e[:2]):
-        if len(features_and_points(other, image)[1]) >= LEAST_FEATURES:
-            chosen.append((other, image, source))
-        if len(chosen) == MOST_IMAGES:
-            break
-    return chosen
+    nearest = (entry[2:] for entry in sorted(found, key=lambda e: e[:2]))
+    described = (e for e in nearest if len(features_and_points(e[0], e[1])[1]) >= LEAST_FEATURES)
+    return list(islice(described, MOST_IMAGES))
