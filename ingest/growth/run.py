@@ -54,8 +54,9 @@ def grow(
         StoreError
     """
     started, clock = datetime.now(UTC), time.perf_counter()
-    run = _Run(database=database, new=new, work=work, options=options or GrowthOptions())
-    run.recall_lost()
+    extractor = new.features_of(0).features.fingerprint if new.photos else ""  # of all of them
+    options = options or GrowthOptions()
+    run = _Run(database=database, new=new, work=work, options=options, extractor=extractor)
     while True:  # each round but the last promotes a map that no round before it did
         run.start_round()
         run.localise()
@@ -73,8 +74,6 @@ class _Run:
         localiser: of the maps that are active in this round.
         localised: photos that are in no map, as these maps see them; `posed`: the same, lone ones of a camera
             with one lens.
-        lost: write ids of the maps where a photo was looked for in vain (one that was moved is another), and
-            the reason.
         map_of: maps that photos are in; why: code and reason of those that are in none.
         entries: maps that this run has made; refused, unplaced: what this round could not place.
         promotions: the last word on each quarantined map.
@@ -84,12 +83,11 @@ class _Run:
     new: GrowthPhotos
     work: Path
     options: GrowthOptions
+    extractor: str
     rounds: int = 0
-    extractor: str = ""
     localiser: Localiser = field(init=False)
     localised: dict[int, LocalisedPhoto] = field(default_factory=dict)
     posed: dict[int, LocalisedPhoto] = field(default_factory=dict)
-    lost: dict[int, tuple[frozenset[str], str]] = field(default_factory=dict)
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
     map_of: dict[int, str] = field(default_factory=dict)
     why: dict[int, tuple[str, str]] = field(default_factory=dict)
@@ -100,15 +98,6 @@ class _Run:
     ever_promoted: set[str] = field(default_factory=set)
     replacements: list[Replacement] = field(default_factory=list)
     notes: dict[str, None] = field(default_factory=dict)
-
-    def recall_lost(self) -> None:
-        """Which photos earlier runs have looked for in vain."""
-        if self.new.photos:
-            self.extractor = self.new.features_of(0).features.fingerprint  # of all of them
-        for row in range(len(self.new.photos)):
-            known = recall(self.work, "photos", self._about(row))
-            if known is not None:
-                self.lost[row] = frozenset(known["maps"]), known["reason"]
 
     def start_round(self) -> None:
         """New anchors move what was grown, and maps without a place are tried."""
@@ -128,27 +117,25 @@ class _Run:
         served = {m.map_id for indexed in self.localiser.areas for m in indexed.area.maps}
         write_ids = {m.write_id: m.map_id for m in self.database.snapshot().maps() if m.map_id in served}
         rows, everywhere = self._open_rows(), frozenset(write_ids)
-        worth: list[int] = []
+        before = {row: recall(self.work, "photos", self._about(row)) or {} for row in rows}
         asked: dict[frozenset[str], list[int]] = {}
         for row in rows:
-            before = self.lost[row][0] if row in self.lost else frozenset()
-            asked.setdefault(everywhere - before if before <= everywhere else everywhere, []).append(row)
+            maps = frozenset(before[row].get("maps", ()))  # a map that was moved is another one
+            asked.setdefault(everywhere - maps if maps <= everywhere else everywhere, []).append(row)
+        worth = asked.pop(everywhere, [])
+        asked.pop(frozenset(), None)
         for fresh, again in asked.items():
-            if fresh == everywhere:
-                worth += again
-            elif fresh:
-                areas = self.localiser.areas_of(tuple(sorted(write_ids[w] for w in fresh)))
-                worth += localise_photos(new.photos, again, new.features_of, areas, threads)[0]
+            areas = self.localiser.areas_of(tuple(sorted(write_ids[w] for w in fresh)))
+            worth += localise_photos(new.photos, again, new.features_of, areas, threads)[0]
         self.localised, reasons = localise_photos(
             new.photos, sorted(worth), new.features_of, self.localiser.areas, threads
         )
         for row in rows:
             if row not in self.localised:
-                reason = reasons.get(row) or self.lost[row][1]
+                reason = reasons.get(row) or before[row]["reason"]
+                answer = {"maps": sorted(everywhere), "reason": reason}
                 self.why[row] = _split_reason(reason)
-                if self.lost.get(row) != (everywhere, reason):
-                    self.lost[row] = everywhere, reason
-                    answer = {"maps": sorted(everywhere), "reason": reason}
+                if answer != before[row]:
                     remember(self.work, "photos", self._about(row), answer)
 
     def place(self) -> None:

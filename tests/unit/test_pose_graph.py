@@ -43,7 +43,7 @@ def test_a_chain_of_n_edges_has_n_times_the_covariance() -> None:
     for k in range(5):
         np.testing.assert_allclose(found.covariance_relative[f"m{k}"], (k + 1) * _EDGE, rtol=1e-6, atol=1e-15)
         np.testing.assert_allclose(found.covariance[f"m{k}"], (k + 1) * _EDGE + _TIGHT, rtol=1e-4, atol=1e-12)
-    assert found.degrees == 0
+    assert found.message == "chi-square 0.0 with 0 degrees of freedom"
 
 
 def test_an_anchor_at_the_far_end_halves_the_middle() -> None:
@@ -71,8 +71,7 @@ def test_the_drift_of_a_chain_is_spread_over_its_edges() -> None:
     for k in range(1, 4):
         np.testing.assert_allclose(found.corrections[f"m{k}"].log()[4:], [-0.02 * k, 0.0, 0.0], atol=1e-6)
     # (0.08)^2 against the sum of four variances.
-    assert found.chi_square == pytest.approx(0.08**2 / (4 * _SIGMA[4] ** 2), rel=1e-6)
-    assert found.degrees == 7
+    assert found.message == f"chi-square {0.08**2 / (4 * _SIGMA[4] ** 2):.1f} with 7 degrees of freedom"
 
 
 def test_general_similarities_are_recovered() -> None:
@@ -84,7 +83,7 @@ def test_general_similarities_are_recovered() -> None:
     edges = [graph_edge(i, j, truth[j].inverse() @ truth[i], _EDGE) for i, j in pairs]
     nodes = [GraphNode(map_id=m, prior=_TIGHT if m == "a" else None) for m in "abcd"]
     found = solved(nodes, edges)
-    assert found.chi_square < 1e-6
+    assert found.message.startswith("chi-square 0.0 ")
     for m in "bcd":
         np.testing.assert_allclose(found.corrections[m].matrix(), truth[m].matrix(), atol=1e-6)
 
@@ -163,7 +162,6 @@ def test_an_edge_within_its_noise_is_kept() -> None:
     found = solved(*_square(_east(0.03)))
     assert found.reason is None
     assert found.left_out == ()
-    assert found.chi_square > 0
 
 
 def _loop(closing_m: float) -> tuple[list[GraphNode], list[GraphEdge]]:

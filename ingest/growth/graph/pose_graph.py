@@ -56,7 +56,6 @@ class GraphSolution:
             empty where there is a reason.
         covariance: (7, 7) of each new place on Earth.
         covariance_relative: (7, 7) relative to the anchors, as if those were the truth; zero for anchors.
-        chi_square, degrees: of the fit; covariances are widened by their ratio where that is needed.
         left_out: the two maps of each edge that contradicts the rest.
     """
 
@@ -65,8 +64,6 @@ class GraphSolution:
     corrections: Mapping[str, Sim3] = field(default_factory=dict)
     covariance: Mapping[str, FloatArray] = field(default_factory=dict)
     covariance_relative: Mapping[str, FloatArray] = field(default_factory=dict)
-    chi_square: float = 0.0
-    degrees: int = 0
     left_out: tuple[tuple[str, str], ...] = ()
 
 
@@ -201,13 +198,7 @@ def solve_pose_graph(ids: Sequence[str], edges: Sequence[GraphEdge]) -> GraphSol
     if fitted.degrees > 0 and not _likely(fitted.chi_square, fitted.degrees):
         factor = max(1.0, fitted.chi_square / fitted.degrees)
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
-    found = GraphSolution(
-        reason=None,
-        message=figures,
-        chi_square=fitted.chi_square,
-        degrees=fitted.degrees,
-        left_out=tuple(left_out),
-    )
+    found = GraphSolution(reason=None, message=figures, left_out=tuple(left_out))
     if factor > _MOST_VARIANCE_FACTOR:
         blamed = [
             (chi, f"{m} - {edge.map_id}")

@@ -16,14 +16,7 @@ from featuredb.store import Database, Snapshot
 from featuredb.store.canaries import list_canaries
 from featuredb.store.commits import write_time
 from ingest.growth.asked_before import recall, remember
-from ingest.growth.graph.map_graph import (
-    OWN,
-    PlacedMap,
-    holds,
-    place_key,
-    placed_maps,
-    solve_maps,
-)
+from ingest.growth.graph.map_graph import OWN, PlacedMap, holds, place_key, placed_maps, solve_maps
 from ingest.growth.graph.pose_graph import GraphSolution
 from ingest.growth.map_places import growth_of, inflated, map_drift_m, with_growth
 from ingest.growth.place.map_images import measure_overlap

@@ -50,11 +50,7 @@ class PhotoSpread:
 
 
 def photo_covariances(
-    model: Model,
-    keypoints: Sequence[FloatArray],
-    fixed: FixedPoints,
-    kept: NDArray[np.bool_],
-    lenses: Lenses,
+    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints, kept: NDArray[np.bool_], lenses: Lenses
 ) -> PhotoSpread:
     """Of all photos, relative to the existing points.
 

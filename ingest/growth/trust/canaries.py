@@ -16,8 +16,9 @@ from typing import Any, Literal
 import numpy as np
 
 from featuredb.features.decode import DecodeLimits, decode_gray
-from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store import Database
 from featuredb.store.canaries import TOLERANCE_DEG, Canary, KnownPose, list_canaries, load_canary_image
@@ -46,14 +47,13 @@ class CanaryCheck:
     """One canary.
 
     Attributes:
-        before, after: verdict on the answers; `alone`: of the new map alone, "" where it was not asked.
+        before, after: verdict on the answers.
         error_before_m, error_m: of the answers; NaN where there is none.
     """
 
     name: str
     before: Verdict
     after: Verdict
-    alone: Verdict | Literal[""] = ""
     error_before_m: float = float("nan")
     error_m: float = float("nan")
     regression: str = ""
@@ -63,7 +63,6 @@ class CanaryCheck:
             "name": self.name,
             "before": self.before,
             "after": self.after,
-            "alone": self.alone,
             "error_m": None if np.isnan(self.error_m) else round(self.error_m, 4),
             "regression": self.regression,
         }
@@ -136,12 +135,16 @@ def check_known(database: Database, canary: Canary, before: Localiser, after: Lo
     asked = LocaliseWireRequest.model_validate_json(json.dumps(dict(canary.request)))
     request = localise_request(asked, data, gray)
     results = [localiser.localise(gray, request) for localiser in (before, after)]
-    misses = [_miss_of_known(result.pose, canary.pose) for result in results]
-    if canary.pose is None:
+    known = canary.pose
+    if known is None:
         verdicts: list[Verdict] = ["not_found" if r.pose is None else "found" for r in results]
-    else:
-        limits = (canary.pose.tolerance_m, canary.pose.tolerance_deg)
-        verdicts = [_verdict(miss, *limits) for miss in misses]
+        return _checked(canary.name, verdicts, (None, None), results[1])
+    easting, northing, height = known.utm.tolist()
+    frame = LocalFrame.from_utm(easting, northing, height, known.epsg)
+    rotation = matrix_from_quaternion(known.cam_from_utm_xyzw) @ frame.grid_from_enu(np.zeros(3), known.epsg)
+    there = Rigid3(rotation=rotation, translation=np.zeros(3))
+    misses = [_miss(result.pose, frame, there) for result in results]
+    verdicts = [_verdict(miss, known.tolerance_m, known.tolerance_deg) for miss in misses]
     return _checked(canary.name, verdicts, misses, results[1])
 
 
@@ -220,15 +223,14 @@ def _check_own(
         areas = localiser.areas_of(map_ids)
         areas = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
         results.append(localise_features(features, request, areas, _OWN_FEATURES).result)
-    misses = [_miss_of_image(result.pose, feature_map, image) for result in results]
+    misses = [_miss(result.pose, feature_map.frame, image.cam_from_local) for result in results]
     verdicts = [_verdict(miss, DRIFT_BUDGET_M, TOLERANCE_DEG) for miss in misses[:2]]
     may_miss_m = SIGMAS * misses[2].sigma_m if misses[2] else 0.0
     alone = _verdict(misses[2], max(DRIFT_BUDGET_M, may_miss_m), TOLERANCE_DEG)
     check = _checked(f"{image.name} of map {feature_map.map_id}", verdicts, misses, results[1])
-    regression = check.regression
-    if alone == "moved" and not regression:
-        regression = f"the new map alone has it {misses[2]} from where it is"
-    return replace(check, alone=alone, regression=regression)
+    if alone == "moved" and not check.regression:
+        return replace(check, regression=f"the new map alone has it {misses[2]} from where it is")
+    return check
 
 
 def _checked(
@@ -247,26 +249,13 @@ def _checked(
     return replace(check, error_before_m=was_m, error_m=is_m)
 
 
-def _miss_of_known(pose: LocalisedPose | None, expected: KnownPose | None) -> _Miss | None:
-    if pose is None or expected is None:
-        return None
-    where = pose.frame.enu_from_utm(expected.utm, expected.epsg)
-    cam_from_grid = matrix_from_quaternion(expected.cam_from_utm_xyzw)
-    cam_from_local = cam_from_grid @ pose.frame.grid_from_enu(where, expected.epsg)
-    return _miss(pose, where, cam_from_local)
-
-
-def _miss_of_image(pose: LocalisedPose | None, feature_map: FeatureMap, image: MapImage) -> _Miss | None:
+def _miss(pose: LocalisedPose | None, frame: LocalFrame, cam_from_local: Rigid3) -> _Miss | None:
+    """How far an answer is from a known pose in a local frame."""
     if pose is None:
         return None
-    expected = image.cam_from_local @ feature_map.frame.enu_from(pose.frame)
-    return _miss(pose, expected.center, expected.rotation)
-
-
-def _miss(pose: LocalisedPose, center: FloatArray, cam_from_local: FloatArray) -> _Miss:
-    turn = pose.cam_from_local.rotation @ cam_from_local.T
+    expected = cam_from_local @ frame.enu_from(pose.frame)
     return _Miss(
-        metres=float(np.linalg.norm(pose.cam_from_local.center - center)),
-        degrees=float(np.degrees(rotation_angle(turn))),
+        metres=float(np.linalg.norm(pose.cam_from_local.center - expected.center)),
+        degrees=pose.cam_from_local.angle_to_deg(expected),
         sigma_m=float(np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
     )

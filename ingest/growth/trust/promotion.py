@@ -61,11 +61,7 @@ Examine = Callable[[Sequence[MapSummary]], list[ExaminedMap | Promotion]]
 
 
 def promote_confirmed(
-    database: Database,
-    localiser: Localiser,
-    options: GrowthOptions,
-    work: Path,
-    new: NewPhotos | None = None,
+    database: Database, localiser: Localiser, options: GrowthOptions, work: Path, new: NewPhotos | None = None
 ) -> list[Promotion]:
     """Try every quarantined map that growth has made; those that have drifted beyond the budget stay.
 
