@@ -24,7 +24,7 @@ from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, split
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
 from ingest.growth.place.refine import LEAST_LINK
-from ingest.growth.trust.corroboration import NewPhotos
+from ingest.growth.trust.confirmation import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_confirmed
 from ingest.growth.trust.scan_check import checked_by_scan
 from ingest.growth.unplaced import place_unplaced_maps

@@ -57,7 +57,7 @@ def tied_together(nodes: Sequence[Hashable], pairs: Iterable[tuple[Hashable, Has
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocalisedPhoto:
-    """A new photo that the existing maps localise, by itself, without knowing of other new photos.
+    """A new photo that the existing maps localise, by itself.
 
     Attributes:
         frame: local frame of everything metric here.
@@ -159,7 +159,7 @@ class GrowthOptions:
 
     Attributes:
         drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken.
-        trusted: identities that the operator vouches for: their photos need nobody else, as his own.
+        trusted: identities that the operator vouches for.
         threads: photos that are localised at a time.
     """
 

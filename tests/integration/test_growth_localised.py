@@ -17,9 +17,8 @@ from ingest.growth.place.localised import (
     with_lens,
 )
 from ingest.growth.place.refine import pose_by_lens
-from ingest.growth.trust.confirmation import Sources
-from ingest.growth.trust.corroboration import NewPhotos as CorroboratingPhotos
-from ingest.growth.trust.corroboration import corroborate
+from ingest.growth.trust.confirmation import NewPhotos as CorroboratingPhotos
+from ingest.growth.trust.confirmation import Sources, corroborate
 from ingest.growth.values import LocalisedPhoto, no_photos
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import Localised

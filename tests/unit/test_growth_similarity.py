@@ -14,8 +14,8 @@ from ingest.growth.place.similarity_fit import (
     find_correspondences,
     fit_similarity,
     neighbours_factor,
-    tolerances_px,
 )
+from ingest.growth.values import TOLERANCE_PX
 from tests.support.localised_photos import localised_photo
 from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import box_points, random_descriptors, ring
@@ -170,7 +170,7 @@ def test_photos_agree_by_their_own_correspondences() -> None:
     pixels[correspondences.photo_of == 2] += 40.0
     off = replace(correspondences, pixels=pixels)
     errors = correspondence_errors(new.model, TRUTH, off)
-    agree = agreeing_photos(errors, tolerances_px(new.model, off), off)
+    agree = agreeing_photos(errors, TOLERANCE_PX, off)
     assert agree == {0, 1, 3, 4}
 
 

@@ -4,6 +4,7 @@ import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -77,23 +78,19 @@ def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
 
 def _placed(row: Row) -> PlacedMap:
     frame, placement = frame_of(row), placement_of(row)
+    corners = np.zeros((0, 3))
+    if row[BOUNDS[0]] is not None:
+        low_and_high = np.reshape([row[name] for name in BOUNDS], (2, 3))
+        corners = frame.enu_from_utm(list(product(*low_and_high.T)), row["epsg"])
     return PlacedMap(
         **{name: row[name] for name in ("map_id", "write_id", "status", "status_reason", "generation")},
         parents=tuple(row["parents"]),
         frame=frame,
         placement=placement,
         place=place_key(frame, placement),
-        corners=_corners(row, frame),
+        corners=corners,
         edges=tuple(Edge.from_json(edge) for edge in growth_of(placement.evidence).get("edges", ())),
     )
-
-
-def _corners(row: Row, frame: LocalFrame) -> FloatArray:
-    if row[BOUNDS[0]] is None:
-        return np.zeros((0, 3))
-    box = np.array([row[name] for name in BOUNDS], dtype=np.float64).reshape(2, 3)
-    picks = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
-    return frame.enu_from_utm(np.stack([box[picks[:, k], k] for k in range(3)], axis=1), row["epsg"])
 
 
 def place_key(frame: LocalFrame, placement: Placement) -> str:
@@ -209,7 +206,7 @@ def with_drift(
     relative = np.reshape(growth["covariance_relative"], (7, 7))
     others = {m: placed for m, placed in maps.items() if m != feature_map.map_id}
     solution = solve_maps(others, {feature_map.map_id: edges}, feature_map.frame)
-    if solution.reason is None and feature_map.map_id in solution.covariance:
+    if feature_map.map_id in solution.covariance:
         covariance = solution.covariance[feature_map.map_id]
         relative = solution.covariance_relative[feature_map.map_id]
     drift = map_drift_m(feature_map, relative)

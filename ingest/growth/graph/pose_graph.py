@@ -5,8 +5,7 @@ similarities between maps that overlap; anchors are held by their own covariance
 points of map i and Z that carries what map i says to where map j says it, X_i = X_j Z in truth, so an edge's
 residual is log(X_j^-1 X_i Z^-1).
 
-Marginal covariances come from the normal matrix of the whole graph, not from sums along one path. An edge is
-judged by how much of chi-square goes with it (the block form of Baarda's test).
+An edge is judged by how much of chi-square goes with it (the block form of Baarda's test).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -122,10 +121,7 @@ class _Fit:
         return np.concatenate(residuals), csr_array(jacobian)
 
     def judged(self) -> list[tuple[float, int]]:
-        """Of each edge the fall of chi-square without it, and its redundancy.
-
-        The redundancy is the number of its seven directions that others check.
-        """
+        """Of each edge the fall of chi-square without it, and how many of its directions others check."""
         solve, found = _solver(self._jacobian), []
         for k in range(len(self.edges)):
             rows = self._jacobian[7 * k : 7 * k + 7]
@@ -137,11 +133,7 @@ class _Fit:
         return found
 
     def marginals(self, *, relative: bool) -> dict[str, FloatArray]:
-        """Covariance (7, 7) of each map's correction, with what edges have in common.
-
-        Args:
-            relative: as if the anchors were where they are without error; zero for themselves.
-        """
+        """Covariance (7, 7) of each map's correction; `relative`: as if the anchors had no error."""
         free = [i for i, map_id in enumerate(self._ids) if map_id not in self._anchors or not relative]
         found = {map_id: np.zeros((7, 7)) for map_id in self._ids}
         if free:

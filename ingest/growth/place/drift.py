@@ -14,7 +14,7 @@ from scipy import sparse
 from featuredb.adjust.block import Block
 from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import Marks, Terms
+from featuredb.adjust.terms import Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap.adjust import longest_side, residuals_of
@@ -72,7 +72,13 @@ def photo_covariances(
     model = with_observations(model, np.isin(model.point_of, chosen))
     everything = np.ones(len(model.point_of), dtype=np.bool_)
     block, marks = block_and_marks(model, everything, keypoints, fixed, kept)
-    sigma_px = float(np.sqrt(_variance_px2(block, marks)))
+    # Of an observation, with what its neighbours share and what points and poses take up of it.
+    taken, count = 3 * len(block.xyz) + 6 * len(block.names), 2 * (len(block.point_of) + len(marks.xyz))
+    freedom = max(1.0 - taken / count, _LEAST_FREEDOM)
+    residuals, pixels, photo_of = residuals_of(block, marks)
+    shared = design_effect(residuals, pixels, photo_of, longest_side(block.cameras))
+    variance_px2 = float((residuals**2).mean()) * shared / freedom
+    sigma_px = max(float(np.sqrt(variance_px2)), _LEAST_PX)
     terms = Terms(
         keypoint_px=sigma_px,
         dilution=MAPPING.dilution,
@@ -97,8 +103,7 @@ def photo_covariances(
 def _view_turns(block: Block, found: Marginals) -> FloatArray:
     """(k, 3, q) how what each photo sees turns about the block's axes with poses and lenses.
 
-    A principal point that is off turns the photo, and its points stay where they are: only what is left of
-    both turns what comes next.
+    A principal point that is off turns the photo, and its points stay where they are.
     """
     result = np.zeros((len(block.names), 3, len(found.shared)))
     for k, pose in enumerate(block.cam_from_block):
@@ -114,16 +119,6 @@ def _view_turns(block: Block, found: Marginals) -> FloatArray:
             result[k, :, first + cx] = pose.rotation.T @ [0.0, 1.0 / fx, 0.0]
             result[k, :, first + cy] = pose.rotation.T @ [-1.0 / fy, 0.0, 0.0]
     return result
-
-
-def _variance_px2(block: Block, marks: Marks) -> float:
-    """Of an observation, with what its neighbours share and what points and poses take up of it."""
-    count = 2.0 * (len(block.point_of) + len(marks.xyz))
-    taken = 3 * len(block.xyz) + 6 * len(block.names)
-    freedom = max(1.0 - taken / count, _LEAST_FREEDOM)
-    residuals, pixels, photo_of = residuals_of(block, marks)
-    shared = design_effect(residuals, pixels, photo_of, longest_side(block.cameras))
-    return max(float((residuals**2).mean()) * shared / freedom, _LEAST_PX**2)
 
 
 def _pieces(
@@ -144,7 +139,7 @@ def turning_covariance(model: Model, covariance: FloatArray, spread: PhotoSpread
     """(7, 7) to be added to a similarity's covariance (7, 7) to hold the directions of all pieces of a model.
 
     A reconstruction that bends by centimetres at its far end has turned there, and what is tied to that end
-    goes on in the new direction: over many maps the turns are what counts. About the photos' middle.
+    goes on in the new direction. About the photos' middle.
     """
     seen = np.isfinite(spread.turns[:, 0, 0])
     if not seen.any():
@@ -177,9 +172,6 @@ def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray
 
     Added, and not multiplied: near what holds the model the similarity says millimetres, where a photo's own
     position is good to centimetres; a factor that covers this would make metres of it at the far end.
-
-    Args:
-        spread: (k, 6, 6) of `PhotoSpread`.
     """
     seen = np.isfinite(spread[:, 0, 0])
     if not seen.any():

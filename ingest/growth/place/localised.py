@@ -80,7 +80,7 @@ def localise_photo(
     photos are wrong by kilometres.
 
     Args:
-        camera: known intrinsics, of an image that a map holds for example; None: as the photo tells.
+        camera: known intrinsics; None: as the photo tells.
     """
     usable = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
     if not usable or features.fingerprint != QUERY.extractor.fingerprint:
@@ -164,11 +164,8 @@ def _match_each_map(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Guided matches of all features with the points that each map should show, map by map.
 
-    Two maps of one place have the same points twice; each may have its match. Maps with fewer matches
-    within the tolerance than a pose needs are left out: chance alone gives a few.
-
-    Returns:
-        Rows (m,) of the features, and of the area's points.
+    Rows (m,) of the features, and of the area's points. Maps with fewer matches within the tolerance than a
+    pose needs are left out: chance alone gives a few.
     """
     visible = visible_points(area, area.searched_points(), pose.camera, pose.cam_from_local, POSSIBLE_DEG)
     found = np.zeros((2, 0), dtype=np.int64)
@@ -220,12 +217,9 @@ def in_frame(photo: LocalisedPhoto, frame: LocalFrame) -> LocalisedPhoto:
 def with_shared_lenses(
     localised: Mapping[int, LocalisedPhoto], keys: Mapping[int, str]
 ) -> dict[int, LocalisedPhoto]:
-    """The photos by row; those of one camera with the lens under which most of their matches fit.
+    """The photos by row; those of one camera (by its key) with the lens under which most matches fit.
 
-    A photo that this lens does not fit keeps its own (`with_lens`).
-
-    Args:
-        keys: of the cameras, by row (`ingest.photos.photo.shared_key`).
+    A photo that this lens does not fit keeps its own.
     """
     found = dict(localised)
     cameras: dict[str, list[int]] = {}

@@ -1,13 +1,11 @@
 """Step: a reconstruction without a place of its own is placed by the existing maps, or refused.
 
 Photos localise by themselves; the similarity that most of them agree with is fitted to all pixels in which
-they see existing points; then gates ask whether to believe it. `tools/growth_portions.py` prints the figures
-of real sets.
+they see existing points; then gates ask whether to believe it.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +16,11 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.view_cones import in_view, view_cones
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.gates import Gate
+from ingest.growth.map_places import growth_of
 from ingest.growth.place.similarity_fit import (
     Correspondences,
     FittedSimilarity,
@@ -78,8 +76,6 @@ def place_by_maps(
     frame: LocalFrame,
 ) -> MapsPlacement | Refused:
     """Place a model by the localisations of its photos; refused where no map holds it.
-
-    Whether to believe the placement its gates say.
 
     Args:
         model: with the lenses that it keeps.
@@ -171,21 +167,19 @@ def parents_covariance(
 ) -> FloatArray:
     """(7, 7) of the parents' placements in `frame`, weighted by the shared points that each comes with.
 
-    The mean of covariances bounds that of a mean from above however the parents' errors are correlated:
-    parents that came of one anchor err alike.
+    The mean of covariances bounds that of a mean from above however the parents' errors are correlated.
 
     Args:
         relative: to their anchors, nothing for anchors; else on Earth.
     """
-    total = sum(weight for _, weight in parents)
     covariance = np.zeros((7, 7))
-    for feature_map, weight in parents:
-        own: Any = feature_map.placement.covariance
+    for parent, points in parents:
+        own = parent.placement.covariance
         if relative:
-            own = feature_map.placement.evidence.get(GROWTH, {}).get("covariance_relative", np.zeros(49))
-        own = np.asarray(own, dtype=np.float64).reshape(7, 7)
-        covariance += weight / total * covariance_in_frame(own, feature_map.frame, frame)
-    return covariance
+            told = growth_of(parent.placement.evidence).get("covariance_relative", np.zeros(49))
+            own = np.reshape(told, (7, 7))
+        covariance += points * covariance_in_frame(own, parent.frame, frame)
+    return covariance / sum(points for _, points in parents)
 
 
 def _shown_parts(
@@ -193,15 +187,16 @@ def _shown_parts(
 ) -> tuple[FloatArray, FloatArray]:
     """For each photo the share of the image's parts that should show points where it does so.
 
+    Photos that no map localised are asked as well: a camera that looks through a wall, and a copy that was
+    joined at a look-alike, fit what they see and do not show the rest.
+
     Args:
         sim: frame from the model's.
         held: pixels of the model's photos in which existing points are seen, where the placement has them.
 
     Returns:
         Shares (k,) of the points of existing maps, and (k,) of these and of the points of the model itself
-        that several photos bear out; NaN for photos that should show hardly any. Photos that no map localised
-        are asked as well: a camera that looks through a wall, and a copy that was joined at a look-alike, fit
-        what they see and do not show the rest.
+        that several photos bear out; NaN for photos that should show hardly any.
     """
     often = model.track_lengths() >= LEAST_PHOTOS
     cones = view_cones(model.xyz, model.centers(), model.point_of, model.photo_of)

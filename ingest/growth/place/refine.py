@@ -128,7 +128,7 @@ def refine_placed(
     left_out |= {k: ("WEAK_LINK", message) for k, message in weak.items()}
     for _ in range(_ROUNDS):
         good = correspondences.take(placement.used & ~np.isin(correspondences.photo_of, list(left_out)))
-        good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)
+        good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)  # those that hold anything
         adjusted, fixed = _refined(placed, list(left_out), good, lenses, keypoints)
         spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
         fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
@@ -187,9 +187,8 @@ def contradicting_photos(
 
     Asked of the refined model: as it comes, one of a few photos is bent by more than localised poses are
     uncertain. The sigmas are those of the localisation, times the spread and the neighbours factor of the
-    similarity, those of the refined pose, and what the lens that it was localised with makes where the
-    refined one is another. Spread and factor are the larger ones of before and after the refinement: poses
-    from the same existing points share their errors, which the refined model has taken over.
+    similarity (poses from the same existing points share their errors), those of the refined pose, and what
+    the lens that it was localised with makes where the refined one is another.
 
     Args:
         localised: by place in the model.
@@ -294,10 +293,7 @@ def _refined(
 
 
 def _sigma_px(model: Model, correspondences: Correspondences) -> FloatArray:
-    """(m,) largest standard deviation of each existing point across the line of sight, in pixels at 1600.
-
-    Points that are less sure than `TOLERANCE_PX` do not hold a reconstruction.
-    """
+    """(m,) largest standard deviation of each existing point across the line of sight, in pixels at 1600."""
     sigma = np.zeros(len(correspondences))
     for k, pose in enumerate(model.cam_from_sfm):
         rows = np.flatnonzero(correspondences.photo_of == k)

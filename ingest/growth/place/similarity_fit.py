@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.colmap.anchored import KEYPOINT_PX
+from ingest.colmap.anchored import KEYPOINT_PX, pixel_scale
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto
@@ -40,15 +40,13 @@ class Correspondences:
     """Existing points seen by photos of a model, all in one local frame.
 
     Attributes:
-        map_ids: the existing maps, by name; `map_of` indexes into them.
-        photo_of: (m,) index into the model's photos.
-        feature: (m,) row of that photo's features.
-        pixels: (m, 2) float64.
+        map_ids: the existing maps.
+        photo_of: (m,) index into the model's photos. feature: (m,) row of that photo's features.
+        pixels: (m, 2).
         points: (m, 3) metres. covariance: (m, 3, 3) relative to their map's gauge.
-        map_of: (m,), point_of: (m,) row of that map's points.
+        map_of: (m,) index into the maps. point_of: (m,) row of that map's points.
         model_point: (m,) the model's own point that the same feature observes, -1 where it has none.
-        carried: (m,) the photo's own localisation did not find the match; it came along a track of the
-            model, from a photo whose localisation did.
+        carried: (m,) the match came along a track of the model, from a photo whose localisation found it.
     """
 
     map_ids: tuple[str, ...]
@@ -143,10 +141,10 @@ class FittedSimilarity:
     """
     Attributes:
         covariance: (7, 7) of the similarity's left perturbation.
-        errors_px: (m,) distances of all pixels from where the placed model sees their points.
+        errors_px: (m,) `correspondence_errors` of all.
         spread: how many times its claimed sigma the typical residual is.
         neighbours_factor: how many times the variance of what neighbours say exceeds that of independent
-            errors; the larger of that by photo and that by place.
+            errors.
     """
 
     local_from_sfm: Sim3
@@ -171,7 +169,6 @@ def agreed_similarity(
     best = _best_proposal(model, own, correspondences, more)
     if best is None or not best[1]:
         return None
-    tolerance = tolerances_px(model, correspondences)
     sim, chosen = best
     near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
     for _ in range(5):  # the set of photos settles in two or three rounds
@@ -179,14 +176,14 @@ def agreed_similarity(
             return None
         fit = fit_similarity(model, sim, correspondences, near)
         sim, before = fit.local_from_sfm, chosen
-        chosen = agreeing_photos(fit.errors_px, tolerance, correspondences) & own.keys()
+        chosen = agreeing_photos(fit.errors_px, TOLERANCE_PX, correspondences) & own.keys()
         if not chosen:
             return None
         held = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
-        near = held & (fit.errors_px < 2.0 * tolerance)
+        near = held & (fit.errors_px < 2.0 * TOLERANCE_PX)
         if chosen == before:
             break
-    return fit, chosen, held & (fit.errors_px < tolerance)
+    return fit, chosen, held & (fit.errors_px < TOLERANCE_PX)
 
 
 def _best_proposal(
@@ -198,27 +195,25 @@ def _best_proposal(
     if len(rows) > _MOST_SCORED:
         rows = np.sort(np.random.default_rng(0).choice(rows, _MOST_SCORED, replace=False))
     scored = correspondences.take(rows)
-    tolerance = tolerances_px(model, scored, _LOOSE_PX)
     ranked = []
     for sim in sims:
         if sim is not None:
-            errors = correspondence_errors(model, sim, scored)
-            agree = agreeing_photos(errors, tolerance, scored)
-            cost = float((np.minimum(errors / tolerance, 1.0) ** 2).sum())
+            errors_px = correspondence_errors(model, sim, scored)
+            agree = agreeing_photos(errors_px, _LOOSE_PX, scored)
+            cost = float((np.minimum(errors_px / _LOOSE_PX, 1.0) ** 2).sum())
             ranked.append((-len(agree), cost, sim, agree))
     return min(ranked, key=lambda item: item[:2])[2:] if ranked else None
 
 
 def _by_pose(model: Model, correspondences: Correspondences, k: int, photo: LocalisedPhoto) -> Sim3 | None:
     """Scale by the median ratio of the distances of existing and new points of one feature."""
-    rows = np.flatnonzero(
-        (correspondences.photo_of == k) & ~correspondences.carried & (correspondences.model_point >= 0)
-    )
-    if len(rows) < 5:  # a median of fewer is one point's opinion
+    held = ~correspondences.carried & (correspondences.model_point >= 0)
+    mine = correspondences.take(held & (correspondences.photo_of == k))
+    if len(mine) < 5:  # a median of fewer is one point's opinion
         return None
     ours, center = model.cam_from_sfm[k], photo.cam_from_local.center
-    here = np.linalg.norm(correspondences.points[rows] - center, axis=1)
-    there = np.linalg.norm(model.xyz[correspondences.model_point[rows]] - ours.center, axis=1)
+    here = np.linalg.norm(mine.points - center, axis=1)
+    there = np.linalg.norm(model.xyz[mine.model_point] - ours.center, axis=1)
     scale = float(np.median(here / np.maximum(there, 1e-12)))
     if scale <= 0:
         return None
@@ -227,30 +222,17 @@ def _by_pose(model: Model, correspondences: Correspondences, k: int, photo: Loca
 
 
 def correspondence_errors(model: Model, sim: Sim3, correspondences: Correspondences) -> FloatArray:
-    """(m,) distance in pixels from where the placed model sees the existing point; inf if it cannot."""
-    into_sfm = sim.inverse()
-    errors = np.full(len(correspondences), np.inf)
+    """(m,) distance from where the placed model sees the existing point, pixels at 1600; inf if it cannot."""
+    there, errors_px = sim.inverse().act(correspondences.points), np.full(len(correspondences), np.inf)
     for k in np.unique(correspondences.photo_of):
         rows = np.flatnonzero(correspondences.photo_of == k)
-        camera = model.cameras[int(model.camera_of[k])]
-        points = into_sfm.act(correspondences.points[rows])
-        errors[rows] = reprojection_errors(
-            correspondences.pixels[rows], points, camera, model.cam_from_sfm[k]
-        )
-    return errors
+        camera, pixels = model.cameras[int(model.camera_of[k])], correspondences.pixels[rows]
+        errors = reprojection_errors(pixels, there[rows], camera, model.cam_from_sfm[k])
+        errors_px[rows] = errors * 1600.0 / max(camera.width, camera.height)
+    return errors_px
 
 
-def tolerances_px(
-    model: Model, correspondences: Correspondences, at_1600_px: float = TOLERANCE_PX
-) -> FloatArray:
-    """(m,) that many pixels of an image of 1600, at the size of each correspondence's photo."""
-    sides = np.array([max(c.width, c.height) for c in model.cameras], dtype=np.float64)
-    return np.asarray(at_1600_px / 1600.0 * sides[model.camera_of[correspondences.photo_of]])
-
-
-def agreeing_photos(
-    errors_px: FloatArray, tolerance_px: FloatArray, correspondences: Correspondences
-) -> set[int]:
+def agreeing_photos(errors_px: FloatArray, tolerance_px: float, correspondences: Correspondences) -> set[int]:
     """Model's photos of whose own correspondences half lies within the tolerance."""
     own = ~correspondences.carried
     count = int(correspondences.photo_of.max(initial=-1)) + 1
@@ -265,9 +247,8 @@ def fit_similarity(
     """Robust least squares over the pixels of the correspondences in `use` (m,), Gauss-Newton on SIM(3).
 
     Geman-McClure weights at the residuals' robust spread. The covariance is the inverse of the normal
-    equations times the squared spread times how far neighbours err alike: photos share the model's bending,
-    places the existing map's. What nothing holds (the scale, where all photos stand at one place) stays as
-    `start` has it, and has standard deviations of `_OPEN`.
+    equations times the squared spread times how far neighbours err alike. What nothing holds (the scale,
+    where all photos stand at one place) stays as in `start`, and has standard deviations of `_OPEN`.
     """
     chosen = correspondences.take(np.flatnonzero(use))
     sim, covariance, spread, factor = start, np.eye(7), 1.0, 1.0
@@ -313,8 +294,8 @@ def _equations(
     )
     by_point = np.where(np.isfinite(linear.by_point), linear.by_point, 0.0)
     residual = np.where(np.isfinite(linear.residual), linear.residual, 1e6)
-    sigma = KEYPOINT_PX * np.maximum(1.0, tolerances_px(model, correspondences, 1.0))
-    noise = sigma[:, None, None] ** 2 * np.eye(2)
+    sigma_px = KEYPOINT_PX * np.array([pixel_scale(camera) for camera in model.cameras])
+    noise = sigma_px[model.camera_of[correspondences.photo_of], None, None] ** 2 * np.eye(2)
     noise = noise + by_point @ correspondences.covariance @ np.swapaxes(by_point, 1, 2)
     jacobian = by_point @ point_jacobian(correspondences.points)
     return residual, np.asarray(jacobian), np.asarray(np.linalg.inv(noise))
@@ -323,7 +304,8 @@ def _equations(
 def neighbours_factor(score: FloatArray, inverse: FloatArray, correspondences: Correspondences) -> float:
     """Design effect on the similarity: variance of sums of scores over groups, over that of single ones.
 
-    Groups are photos, and places: cells of the existing points, a quarter of their extent wide. At least 1.
+    Groups are photos, which share the model's bending, and places (cells of the existing points, a quarter of
+    their extent wide), which share that of the existing map. At least 1.
 
     Args:
         score: (m, 7) derivative of each correspondence's cost. inverse: (7, 7) of the normal matrix.
@@ -332,8 +314,12 @@ def neighbours_factor(score: FloatArray, inverse: FloatArray, correspondences: C
     if alone <= 0.0:
         return 1.0
     largest = 1.0
-    for group in (correspondences.photo_of, _cells(correspondences)):
-        number = np.unique(group, return_inverse=True)[1].reshape(-1)
+    low, high = np.quantile(correspondences.points, (0.02, 0.98), axis=0)
+    side = max(float((high - low).max()) / 4.0, 1e-6)
+    cells = np.floor((correspondences.points - low) / side).astype(np.int64)
+    places = np.column_stack([cells, correspondences.map_of])
+    for group in (correspondences.photo_of[:, None], places):
+        number = np.unique(group, axis=0, return_inverse=True)[1].reshape(-1)
         count = int(number.max(initial=-1)) + 1
         if count < 2:
             continue
@@ -342,12 +328,3 @@ def neighbours_factor(score: FloatArray, inverse: FloatArray, correspondences: C
         together = float(np.einsum("ga,ab,gb->", sums, inverse, sums)) * count / (count - 1)
         largest = max(largest, together / alone)
     return largest
-
-
-def _cells(correspondences: Correspondences) -> NDArray[np.int64]:
-    """Number of the cell (a quarter of the extent wide) and map of each correspondence's point."""
-    low, high = np.quantile(correspondences.points, (0.02, 0.98), axis=0)
-    side = max(float((high - low).max()) / 4.0, 1e-6)
-    cells = np.floor((correspondences.points - low) / side).astype(np.int64)
-    both = np.concatenate([cells, correspondences.map_of[:, None]], axis=1)
-    return np.unique(both, axis=0, return_inverse=True)[1].reshape(-1)

@@ -1,12 +1,12 @@
-"""Confirmation of a quarantined map: photos of those whose word counts see the same of it.
+"""Confirmation of a quarantined map: photos of those whose word counts, its own and others, see the same.
 
 A map is the claim of those whose photos made it. Its parents vouch for its place, and only where it overlaps
-them; what it adds beyond is believed when photos of another owner show it, too. An owner is an identity that
-the wire has authenticated, and its word counts once more than identities has confirmed it (docs/growth.md).
+them; what it adds beyond is believed when photos of another owner show it, too (docs/growth.md).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,21 @@ from scipy import sparse
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.geometry.sim3 import point_jacobian
+from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
-from ingest.growth.gates import Gate
-from ingest.growth.values import QUERY
+from ingest.growth.gates import SIGMAS, Gate
+from ingest.growth.place.localised import in_frame, localise_photos
+from ingest.growth.place.map_images import (
+    LEAST_FEATURES,
+    MOST_IMAGES,
+    NEAR_M,
+    features_and_points,
+    localise_image,
+)
+from ingest.growth.values import DRIFT_BUDGET_M, QUERY, GrowthPhotos, LocalisedPhoto
+from reloc.localise.candidates import IndexedArea
 
 # Distance of two cameras over their distance from what both see. The same picture given by two people, cut or
 # compressed anew, shows no parallax; poses of one place are good to some thousandths.
@@ -99,6 +109,139 @@ class OutsidePhoto:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NewPhotos:
+    """New photos that may corroborate.
+
+    Attributes:
+        rows: of the given photos that may be asked.
+        localised: those that the active maps localise, by row.
+        heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
+            map is examined again whenever another one changes, and its own photos are the same.
+    """
+
+    given: GrowthPhotos
+    rows: Sequence[int]
+    localised: Mapping[int, LocalisedPhoto]
+    heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
+
+    def that_may_see(self, feature_map: FeatureMap) -> list[int]:
+        """Rows of those that may be asked about a map.
+
+        Of a map that is made of the given photos, those that overlap with one of its own.
+        """
+        names = {image.sha256 for image in feature_map.images}
+        own = {row for row, photo in enumerate(self.given.photos) if photo.sha256 in names}
+        if len(own) < len(names):  # whose matches with these photos nobody has looked at
+            return list(self.rows)
+        pairs = self.given.overlaps
+        beside = {j for i, j in pairs if i in own} | {i for i, j in pairs if j in own}
+        return [row for row in self.rows if row in beside]
+
+
+def corroborate(
+    feature_map: FeatureMap,
+    others: Sequence[FeatureMap],
+    new: NewPhotos | None,
+    sources: Sources,
+    *,
+    write_id: str,
+    threads: int = 1,
+) -> list[OutsidePhoto]:
+    """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
+
+    Args:
+        others: maps around it, active or quarantined.
+        write_id: of the map as it is.
+    """
+    indexed, own = IndexedArea.of([feature_map]), set(sources.of_map(feature_map))
+    if not len(indexed.area.points):
+        return []
+    names = {image.sha256 for image in feature_map.images}
+    heard: list[OutsidePhoto] = []
+    for other, image, source in _images_around(feature_map, others, own, sources):
+        found = None if image.sha256 in names else localise_image(other, image, [indexed])
+        if found is not None:
+            pose = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
+            known = pose.center, _center_variance(other, image)
+            name = f"{image.name} of map {other.map_id}"
+            heard.append(_heard(feature_map, found, source, name, known))
+    if new is None:
+        return heard
+    photos, asked = new.given.photos, dict[int, Source]()
+    for row in new.that_may_see(feature_map):
+        source = sources.of_owner(photos[row].contributor or OPERATOR)
+        if photos[row].sha256 not in names and source.speaks_to(own):
+            asked[row] = source
+    unheard = [row for row in asked if (write_id, row) not in new.heard]
+    said = localise_photos(photos, unheard, new.given.features_of, [indexed], threads)[0]
+    new.heard.update({(write_id, row): said.get(row) for row in unheard})
+    for row, source in asked.items():
+        found, known_here = new.heard[write_id, row], None
+        if row in new.localised:
+            there = in_frame(new.localised[row], feature_map.frame)
+            known_here = there.cam_from_local.center, _spread(there)
+        if found is not None:
+            heard.append(_heard(feature_map, found, source, photos[row].name, known_here))
+    return heard
+
+
+def _heard(
+    feature_map: FeatureMap,
+    found: LocalisedPhoto,
+    source: Source,
+    name: str,
+    known: tuple[FloatArray, float] | None,
+) -> OutsidePhoto:
+    """A photo that the map localises.
+
+    Args:
+        known: its centre (3,) by others, in the map's frame, and the variance of that, square metres.
+    """
+    here = in_frame(found, feature_map.frame)
+    center, contradicts = here.cam_from_local.center, ""
+    if known is not None:
+        apart_m = float(np.linalg.norm(known[0] - center))
+        # What is nearer than a map may drift contradicts nothing.
+        if apart_m > max(DRIFT_BUDGET_M, SIGMAS * float(np.sqrt(_spread(here) + known[1]))):
+            contradicts = f"{name} is {apart_m:.2f} m from where the map has it"
+    points = np.unique(here.point_of)
+    return OutsidePhoto(name=name, source=source, center=center, points=points, contradicts=contradicts)
+
+
+def _spread(photo: LocalisedPhoto) -> float:
+    """Largest variance of the camera's centre, with that of the maps' placements, square metres."""
+    pose = photo.result.pose
+    covariance = photo.covariance if pose is None else pose.covariance
+    return float(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+
+
+def _center_variance(other: FeatureMap, image: MapImage) -> float:
+    """Of a map image's centre on Earth, roughly: its own, and its map's placement."""
+    own = 0.0 if image.covariance is None else float(np.trace(image.covariance[3:, 3:]))
+    jacobian = point_jacobian(image.cam_from_local.center)
+    return own + float(np.linalg.eigvalsh(jacobian @ other.placement.covariance @ jacobian.T)[-1])
+
+
+def _images_around(
+    feature_map: FeatureMap, others: Sequence[FeatureMap], own: set[Source], sources: Sources
+) -> list[tuple[FeatureMap, MapImage, Source]]:
+    """Images of other maps whose owners' word counts, nearest to the map's cameras first."""
+    centers = np.array([image.cam_from_local.center for image in feature_map.images])
+    reach = NEAR_M + 0.5 * float(np.linalg.norm(np.ptp(centers, axis=0)))
+    found: list[tuple[float, str, FeatureMap, MapImage, Source]] = []
+    for other in others:
+        here_from_other = feature_map.frame.enu_from(other.frame)
+        for image, source in zip(other.images, sources.of_map(other), strict=True):
+            center = here_from_other.act(image.cam_from_local.center)
+            distance = float(np.linalg.norm(centers - center, axis=1).min())
+            if distance <= reach and source.speaks_to(own):
+                found.append((distance, f"{other.map_id} {image.name}", other, image, source))
+    nearest = (entry[2:] for entry in sorted(found, key=lambda e: e[:2]))
+    described = (e for e in nearest if len(features_and_points(e[0], e[1])[1]) >= LEAST_FEATURES)
+    return list(islice(described, MOST_IMAGES))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Confirmation:
     """How far a map is confirmed: when the gate passes, it is.
 
@@ -138,9 +281,12 @@ def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[Outside
     own = len(feature_map.images)
     sees = _sees(feature_map, corroborating)
     sees_same = (sees @ sees.T).toarray() >= _LEAST_SHARED_POINTS
-    apart = parallax(feature_map, corroborating) >= _LEAST_PARALLAX
+    apart = _parallax(feature_map, corroborating, sees) >= _LEAST_PARALLAX
     may_confirm = apart & np.array([[independent(a, b) for b in everyone] for a in everyone], dtype=bool)
     agree = sees_same & may_confirm
+    # Pairs that agree, no photo in two of them; by the graph's double cover a triangle counts 1.5.
+    partner = maximum_bipartite_matching(sparse.csr_array(agree.astype(np.int8)), perm_type="column")
+    pairs = int(np.count_nonzero(partner >= 0)) / 2.0
     proven = np.array([s.proven for s in everyone], dtype=bool)
     confirmed: NDArray[np.bool_] = np.asarray(agree.any(axis=1) | proven, dtype=np.bool_)
     others = sparse.csr_array(may_confirm.astype(np.int64)) @ sees  # how many such photos see the point, too
@@ -148,7 +294,7 @@ def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[Outside
     by_proven = np.asarray(sees[np.flatnonzero(proven[:own])].sum(axis=0)).ravel() > 0
     ids = [image.image_id for image in feature_map.images]
     return Confirmation(
-        gate=_gate(int(confirmed[:own].sum()), _pairs(agree), bool(proven[:own].any()), against),
+        gate=_gate(int(confirmed[:own].sum()), pairs, bool(proven[:own].any()), against),
         owners=tuple(dict.fromkeys(s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes)),
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
         earned=tuple(i for k, i in enumerate(ids) if _earns(k, everyone, sees_same, apart)),
@@ -167,15 +313,6 @@ def _earns(
         return mine.proven
     known = {s.owner for s, far in others if s.on_record and far}
     return any(s.proven for s, _ in others) or len(known) > 1
-
-
-def _pairs(agree: NDArray[np.bool_]) -> float:
-    """How many pairs of photos that agree there are, no photo in two of them.
-
-    By the graph's double cover, so that a triangle counts as one and a half.
-    """
-    partner = maximum_bipartite_matching(sparse.csr_array(agree.astype(np.int8)), perm_type="column")
-    return int(np.count_nonzero(partner >= 0)) / 2.0
 
 
 def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[OutsidePhoto]) -> Gate:
@@ -221,18 +358,17 @@ def _sees(feature_map: FeatureMap, corroborating: Sequence[OutsidePhoto]) -> spa
     return sees
 
 
-def parallax(feature_map: FeatureMap, corroborating: Sequence[OutsidePhoto]) -> FloatArray:
+def _parallax(
+    feature_map: FeatureMap, corroborating: Sequence[OutsidePhoto], sees: sparse.csr_array
+) -> FloatArray:
     """Distances of the cameras from each other over those from what they see, (n, n)."""
-    points, seen = feature_map.points_local(), feature_map.observations
-    photos = [
-        (image.cam_from_local.center, seen.point_index[seen.image_id == image.image_id])
-        for image in feature_map.images
-    ]
-    photos += [(outside.center, outside.points) for outside in corroborating]
-    centers = np.reshape([center for center, _ in photos], (-1, 3))
-    reach = np.array(
-        [np.median(np.linalg.norm(points[r] - c, axis=1)) if len(r) else np.inf for c, r in photos]
-    )
+    points = feature_map.points_local()
+    own = [image.cam_from_local.center for image in feature_map.images]
+    centers = np.reshape([*own, *(outside.center for outside in corroborating)], (-1, 3))
+    reach = np.full(len(centers), np.inf)
+    for k, rows in enumerate(np.split(sees.indices, sees.indptr[1:-1])):
+        if len(rows):
+            reach[k] = np.median(np.linalg.norm(points[rows] - centers[k], axis=1))
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     return np.asarray(apart / np.maximum(np.minimum(reach[:, None], reach[None]), 1e-9), dtype=np.float64)
 

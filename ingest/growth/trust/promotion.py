@@ -20,8 +20,14 @@ from ingest.growth.asked_before import recall, remember
 from ingest.growth.gates import Gate
 from ingest.growth.place.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import Confirmation, Sources, answering_with, confirm
-from ingest.growth.trust.corroboration import NewPhotos, corroborate
+from ingest.growth.trust.confirmation import (
+    Confirmation,
+    NewPhotos,
+    Sources,
+    answering_with,
+    confirm,
+    corroborate,
+)
 from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
 
