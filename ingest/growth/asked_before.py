@@ -15,11 +15,7 @@ _VERSION = "5"
 
 
 def recall(work: Path, kind: str, about: str, question: str = "") -> dict[str, Any] | None:
-    """The answer to what was last asked about something, if it was this question; else None.
-
-    Args:
-        kind: of the things that are asked about; each has a folder. about: one of them.
-    """
+    """The answer to what was last asked about one thing of a kind, if it was this question; else None."""
     file, key = _file_and_key(work, kind, about, question)
     value = read_json(file) if file.is_file() else {}
     answer: dict[str, Any] | None = value.get("answer") if value.get("question") == key else None

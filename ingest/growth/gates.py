@@ -103,11 +103,7 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gat
 
 
 def visibility(shown: FloatArray) -> Gate:
-    """Share of the photos that do not show what the existing maps say they should.
-
-    Args:
-        shown: (n,) for each photo that should see parts of existing maps: share of these in which it does.
-    """
+    """Share of the photos that show less of existing maps than they should, by what each does show (n,)."""
     blind, most = int((shown < LEAST_VISIBLE).sum()), round(1.0 - AGREEING_SHARE, 2)
     share = blind / len(shown) if len(shown) else 0.0
     return Gate(

@@ -24,10 +24,7 @@ _WORDS: dict[PhotoOutcome, str] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoFate:
-    """What became of a photo, and why it waits or is refused.
-
-    The name of a contributed one is its id; its owner is an identity.
-    """
+    """What became of a photo (a contributed one by its id), and why it waits or is refused."""
 
     name: str
     owner: str
@@ -66,8 +63,7 @@ class GrowthReport:
     """One run.
 
     Attributes:
-        rounds: of localising, growing and promoting; more than one where photos saw a map that was just
-            promoted.
+        rounds: of localising, growing and promoting.
         promotions: of every quarantined map that was examined, in the last round that did.
         replacements: what new anchors did.
     """

@@ -20,8 +20,7 @@ from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.graph.replacing import Replacement, replace_descendants
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate, grown_entry, refused_entry
-from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, split
-from ingest.growth.place.groups import lone_groups
+from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, lone_groups, split
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
 from ingest.growth.place.refine import LEAST_LINK
 from ingest.growth.trust.confirmation import NewPhotos
@@ -218,12 +217,9 @@ class _Run:
         return [row for row in range(len(self.new.photos)) if row not in self.map_of]
 
     def _try_model(self, model: Model, links: Sequence[float]) -> None:
-        """Place one reconstruction; where it reaches beyond the drift budget, the part of it that does not.
+        """Place one reconstruction, or the part of it that is within the drift budget.
 
-        Where its photos are at several places, its parts: look-alikes join what does not belong together.
-
-        Args:
-            links: at which it may be split, weakest first.
+        Where its photos are at several places, its parts, split at `links`, weakest first.
         """
         new, areas = self.new, self.localiser.areas
         maps, budget_m = placed_maps(self.database.snapshot()), self.options.drift_budget_m

@@ -13,8 +13,7 @@ from ingest.colmap.anchored import with_observations
 from ingest.colmap.bridge import Model
 from ingest.growth.graph.map_graph import grow_within_budget
 from ingest.growth.map_places import drift_m, places_of
-from ingest.growth.place.component import GrownMap, grow_component
-from ingest.growth.place.groups import lone_groups
+from ingest.growth.place.component import GrownMap, grow_component, lone_groups
 from ingest.growth.place.localised import localise_photos
 from ingest.growth.values import LocalisedPhoto, Refused
 from reloc.localise.candidates import IndexedArea

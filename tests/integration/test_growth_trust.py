@@ -391,4 +391,4 @@ def test_what_is_retired_cannot_be_promoted(tmp_path: Path) -> None:
 
 
 def test_a_run_of_canaries_says_what_regressed() -> None:
-    assert "0 canaries answered as before" in CanaryRun(checks=(), note="none").message
+    assert "0 canaries answered as before" in CanaryRun(checks=(), note="none").gate.message

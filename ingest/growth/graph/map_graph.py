@@ -136,8 +136,7 @@ def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
     """Edges of one map to several, all made of the same photos, so that they do not count these twice.
 
     Taken as independent, they would place the map more surely than one fit to all of them, `together` (7, 7),
-    did. What is missing is common to all of them; each of n gets n times as much, so that they have it
-    together.
+    did. Each of n gets n times what is missing, so that they have it together.
     """
     if not edges:
         return []
@@ -160,11 +159,9 @@ def grow_within_budget(
     budget_m: float,
     identity: MapIdentity | None = None,
 ) -> GrownMap | Refused:
-    """`grow_component` of a reconstruction, or of the part of it that is within the budget.
+    """`grow_component` of a reconstruction, or of the part of it that is within the budget; with its drift.
 
-    Returns:
-        The map with its drift, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this
-        reconstruction and not the others of the run, nor the next run.
+    What no step foresaw is a refusal, too (FAILED): it costs this reconstruction and not the others.
     """
     part = model
     beyond: dict[int, tuple[str, str]] = {}

@@ -87,7 +87,7 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
     moved, reports = _moved(snapshot, maps, edges, solution, frame, budget_m)
     canaries = ask_persons_canaries(database, {m.map_id: m for m in moved})
     if canaries.regressions:
-        return replace(told, reason="CANARY", message=f"nothing is moved: {canaries.message}")
+        return replace(told, reason="CANARY", message=f"nothing is moved: {canaries.gate.message}")
     ids = [m.map_id for m in moved]
     results = database.commit_maps(
         moved, replaces=ids, based_on={map_id: maps[map_id].write_id for map_id in ids}
@@ -190,9 +190,8 @@ def _moved(
 def ask_persons_canaries(database: Database, new: Mapping[str, FeatureMap]) -> CanaryRun:
     """The known queries that a person vouches for, before and after maps move.
 
-    Images of the maps move along, and so do remembered answers. Where someone knows the truth, an answer that
-    is wrong afterwards must at least have come much nearer: before, the new anchor answered already, and may
-    have been as wrong.
+    An answer that is wrong afterwards must at least have come much nearer: before, the new anchor answered
+    already, and may have been as wrong.
     """
     known = [canary for canary in list_canaries(database) if canary.origin == "person"]
     if not known:

@@ -92,8 +92,14 @@ def localise_photo(
     outcome = localise_features(few, request, usable, QUERY)
     by_prior = outcome.best is not None
     if not by_prior and photo.gps is not None:
-        again = _elsewhere(few, request, outcome, usable)
-        outcome = again if again.best is not None else outcome
+        # Where something was found there that cannot be believed (a pose that contradicts the geotag, two
+        # poses), all places compete once more; and what was found in vain near the geotag stays a rival.
+        all_places = outcome.result.reason in ("CONTRADICTS_PRIOR", "AMBIGUOUS")
+        beyond = None if all_places else photo.gps
+        again = localise_features(few, replace(request, prior=None, beyond=beyond), usable, QUERY)
+        rival = QUERY.acceptance.rival_share * again.result.inliers
+        if again.best is not None and (all_places or outcome.result.inliers < rival):
+            outcome = again
     if outcome.best is None:
         return f"{outcome.result.reason}: {outcome.result.detail}"
     found = _densified(features, outcome)
@@ -105,20 +111,6 @@ def localise_photo(
                 f"map should show there, {_SHOWN_AGAINST_GEOTAG:.0%} needed"
             )
     return found
-
-
-def _elsewhere(
-    features: Features, request: LocaliseRequest, first: Localised, areas: Sequence[IndexedArea]
-) -> Localised:
-    """A photo that was not found within its geotag's reach, looked for beyond it.
-
-    Where something was found there that cannot be believed (a pose that contradicts the geotag, two poses),
-    all places compete once more; and what was found in vain near the geotag stays a rival.
-    """
-    tried = None if first.result.reason in ("CONTRADICTS_PRIOR", "AMBIGUOUS") else request.prior
-    found = localise_features(features, replace(request, prior=None, beyond=tried), areas, QUERY)
-    rival = QUERY.acceptance.rival_share * found.result.inliers
-    return first if tried is not None and first.result.inliers >= rival else found
 
 
 def share_shown(photo: LocalisedPhoto, area: Area) -> float:

@@ -29,11 +29,7 @@ _LEAST_POINTS = 2 * LEAST_SHARED_POINTS  # behind an overlap; fewer leave scale 
 
 
 def observed_rows(any_map: AnyMap, image: MapImage, *, described: bool) -> NDArray[np.int64]:
-    """Rows (n,) of a map's observations of one image: with descriptors first, largest of them first.
-
-    Args:
-        described: only those with descriptors.
-    """
+    """Rows (n,) of a map's observations of one image, those with descriptors first, or alone; large first."""
     seen = any_map.observations
     rows = np.flatnonzero(seen.image_id == image.image_id)
     rows = rows[np.lexsort((-seen.scale[rows], ~seen.has_descriptor[rows]))]
@@ -62,10 +58,7 @@ def features_and_points(feature_map: FeatureMap, image: MapImage) -> tuple[Featu
 
 
 def model_of(any_map: AnyMap, images: Sequence[MapImage], *, described: bool) -> Model:
-    """Images of a map with the points that they see, as a reconstruction in the map's frame.
-
-    Keypoints of an image are its `observed_rows`.
-    """
+    """Images of a map as a reconstruction in its frame; keypoints of an image are its `observed_rows`."""
     rows = [observed_rows(any_map, image, described=described) for image in images]
     counts = [len(r) for r in rows]
     photo_of = np.repeat(np.arange(len(images), dtype=np.int64), counts)

@@ -91,20 +91,19 @@ def _joined(*parts: Correspondences) -> Correspondences:
 
 
 def _own(model: Model, k: int, photo: LocalisedPhoto, map_ids: tuple[str, ...]) -> Correspondences:
-    number = np.array([map_ids.index(m) for m in photo.map_ids], dtype=np.int64)
-    seen = model.photo_of == k
+    seen, count = model.photo_of == k, len(photo.feature_rows)
     points = dict(zip(model.keypoint_of[seen].tolist(), model.point_of[seen].tolist(), strict=True))
     return Correspondences(
         map_ids=map_ids,
-        photo_of=np.full(len(photo.feature_rows), k, dtype=np.int64),
+        photo_of=np.full(count, k),
         feature=photo.feature_rows,
         pixels=photo.pixels,
         points=photo.points,
         covariance=photo.point_covariance,
-        map_of=number[photo.map_of],
+        map_of=np.array([map_ids.index(m) for m in photo.map_ids], dtype=np.int64)[photo.map_of],
         point_of=photo.point_of,
         model_point=np.array([points.get(f, -1) for f in photo.feature_rows.tolist()], dtype=np.int64),
-        carried=np.zeros(len(photo.feature_rows), dtype=np.bool_),
+        carried=np.zeros(count, dtype=np.bool_),
     )
 
 

@@ -80,19 +80,17 @@ class CanaryRun:
         return tuple(check for check in self.checks if check.regression)
 
     @property
-    def message(self) -> str:
-        if not self.regressions:
-            return f"{len(self.checks)} canaries answered as before ({self.note})"
-        first = self.regressions[0]
-        count = f"{len(self.regressions)} of {len(self.checks)} canaries regress"
-        return f"{count}: {first.name}: {first.regression}"
-
-    @property
     def gate(self) -> Gate:
         """Whether no known answer got worse."""
-        count = len(self.regressions)
+        count, message = (
+            len(self.regressions),
+            f"{len(self.checks)} canaries answered as before ({self.note})",
+        )
+        if count:
+            first = self.regressions[0]
+            message = f"{count} of {len(self.checks)} canaries regress: {first.name}: {first.regression}"
         return Gate(
-            name="canaries", reason="CANARY", figure=count, limit=0, passes=not count, message=self.message
+            name="canaries", reason="CANARY", figure=count, limit=0, passes=not count, message=message
         )
 
 

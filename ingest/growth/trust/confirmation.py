@@ -14,11 +14,11 @@ from scipy import sparse
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import SIGMAS, Gate
+from ingest.growth.map_places import centers_of, place_sigmas_m
 from ingest.growth.place.localised import in_frame, localise_photos
 from ingest.growth.place.map_images import (
     LEAST_FEATURES,
@@ -218,15 +218,14 @@ def _spread(photo: LocalisedPhoto) -> float:
 def _center_variance(other: FeatureMap, image: MapImage) -> float:
     """Of a map image's centre on Earth, roughly: its own, and its map's placement."""
     own = 0.0 if image.covariance is None else float(np.trace(image.covariance[3:, 3:]))
-    jacobian = point_jacobian(image.cam_from_local.center)
-    return own + float(np.linalg.eigvalsh(jacobian @ other.placement.covariance @ jacobian.T)[-1])
+    return own + float(place_sigmas_m(other.placement.covariance, image.cam_from_local.center[None])[0]) ** 2
 
 
 def _images_around(
     feature_map: FeatureMap, others: Sequence[FeatureMap], own: set[Source], sources: Sources
 ) -> list[tuple[FeatureMap, MapImage, Source]]:
     """Images of other maps whose owners' word counts, nearest to the map's cameras first."""
-    centers = np.array([image.cam_from_local.center for image in feature_map.images])
+    centers = centers_of(feature_map)
     reach = NEAR_M + 0.5 * float(np.linalg.norm(np.ptp(centers, axis=0)))
     found: list[tuple[float, str, FeatureMap, MapImage, Source]] = []
     for other in others:
@@ -261,13 +260,6 @@ class Confirmation:
     earned: tuple[int, ...]
     points: NDArray[np.bool_]
 
-    @property
-    def message(self) -> str:
-        """Why it is not confirmed, or how it was; for people."""
-        if not self.gate.passes:
-            return self.gate.message
-        return f"{len(self.confirmed)} photos confirmed by {len(self.owners)} owners"
-
 
 def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[OutsidePhoto] = ()) -> Confirmation:
     """How far a map is confirmed by those whose word counts.
@@ -293,9 +285,11 @@ def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[Outside
     by_two = np.asarray(sees.multiply(others).sum(axis=0)).ravel() > 0
     by_proven = np.asarray(sees[np.flatnonzero(proven[:own])].sum(axis=0)).ravel() > 0
     ids = [image.image_id for image in feature_map.images]
+    owners = tuple(dict.fromkeys(s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes))
+    by = f"{int(confirmed[:own].sum())} photos", f"{len(owners)} owners"
     return Confirmation(
-        gate=_gate(int(confirmed[:own].sum()), pairs, bool(proven[:own].any()), against),
-        owners=tuple(dict.fromkeys(s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes)),
+        gate=_gate(by, pairs, bool(proven[:own].any()), against),
+        owners=owners,
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
         earned=tuple(i for k, i in enumerate(ids) if _earns(k, everyone, sees_same, apart)),
         points=(by_two | by_proven)[: len(feature_map.points)],
@@ -315,16 +309,23 @@ def _earns(
     return any(s.proven for s, _ in others) or len(known) > 1
 
 
-def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[OutsidePhoto]) -> Gate:
+def _gate(confirmed: tuple[str, str], pairs: float, proven: bool, against: Sequence[OutsidePhoto]) -> Gate:
     """Whether more pairs confirm the map than one and as many as contradict it.
 
     A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Each proven
     photo contradicts it, and each other owner once, whose photos may all lie.
+
+    Args:
+        confirmed: how many photos, and by how many owners, in words.
     """
     theirs = [photo.source for photo in against]
     contradicting = sum(s.proven for s in theirs) + len({s.owner for s in theirs if not s.proven})
     needed = contradicting + (0.0 if proven else 1.0)
-    if against and (proven or pairs > 1.0):
+    passes = pairs > needed or (proven and not against)
+    photos, owners = confirmed
+    if passes:
+        reason, message = "", f"{photos} confirmed by {owners}"
+    elif against and (proven or pairs > 1.0):
         reason = "CONTRADICTED"
         message = (
             f"{len(against)} photos from outside contradict it and count as {contradicting}, {pairs:g} pairs "
@@ -332,16 +333,11 @@ def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[OutsideP
         )
     elif pairs:
         reason = "FEW_PAIRS"
-        message = f"{confirmed} photos are confirmed by one photo alone; another independent pair is needed"
+        message = f"{photos} are confirmed by one photo alone; another independent pair is needed"
     else:
         reason, message = "ONE_SOURCE", "no two owners whose word counts see the same of it"
     return Gate(
-        name="confirmation",
-        reason=reason,
-        figure=pairs,
-        limit=needed,
-        passes=pairs > needed or (proven and not against),
-        message=message,
+        name="confirmation", reason=reason, figure=pairs, limit=needed, passes=passes, message=message
     )
 
 
@@ -363,8 +359,7 @@ def _parallax(
 ) -> FloatArray:
     """Distances of the cameras from each other over those from what they see, (n, n)."""
     points = feature_map.points_local()
-    own = [image.cam_from_local.center for image in feature_map.images]
-    centers = np.reshape([*own, *(outside.center for outside in corroborating)], (-1, 3))
+    centers = np.reshape([*centers_of(feature_map), *(outside.center for outside in corroborating)], (-1, 3))
     reach = np.full(len(centers), np.inf)
     for k, rows in enumerate(np.split(sees.indices, sees.indptr[1:-1])):
         if len(rows):

@@ -41,8 +41,7 @@ class ExaminedMap:
     """A map that others confirm, as `summary` has it in the database.
 
     Attributes:
-        feature_map: with descriptors where they confirm it: a photo that is altered in one part brings that
-            part in otherwise.
+        feature_map: with descriptors only where they confirm it.
         earned: candidate ids of its photos that make a record for their owners.
     """
 
@@ -61,9 +60,6 @@ class Promotion:
     reason_code: str = ""
     reason: str
     gates: Mapping[str, Any] = field(default_factory=dict)
-
-
-Examine = Callable[[Sequence[MapSummary]], list[ExaminedMap | Promotion]]
 
 
 def promote_confirmed(
@@ -122,9 +118,7 @@ def _sources(database: Database, options: GrowthOptions) -> Sources:
 def _examined(
     waiting: Sequence[MapSummary], snapshot: Snapshot, sources: Sources, new: NewPhotos | None, threads: int
 ) -> list[ExaminedMap | Promotion]:
-    """All of them, with the records that they make for each other: else what two newcomers show beside what
-    an anchor shows would lose its descriptors, which do not come back.
-    """
+    """All of them, with the records that they make for each other: lost descriptors do not come back."""
     while True:
         found = [_examine(summary, snapshot, sources, new, threads) for summary in waiting]
         earned = [c for one in found if isinstance(one, ExaminedMap) for c in one.earned]
@@ -224,7 +218,10 @@ def _others(me: MapSummary, snapshot: Snapshot) -> list[FeatureMap]:
 
 
 def _promote(
-    database: Database, before: Localiser, ready: Sequence[ExaminedMap], examine: Examine
+    database: Database,
+    before: Localiser,
+    ready: Sequence[ExaminedMap],
+    examine: Callable[[Sequence[MapSummary]], list[ExaminedMap | Promotion]],
 ) -> list[Promotion]:
     """Ask the canaries: of all of them together, and one by one where that shows a regression.
 
@@ -275,8 +272,8 @@ def _decide(
 
     if not run.gate.passes:
         return outcomes(run.gate.reason, run.gate.message)
-    confirmed = "; ".join(dict.fromkeys(found.confirmation.message for found in ready))
-    reason = f"{confirmed}; {run.message}"
+    confirmed = "; ".join(dict.fromkeys(found.confirmation.gate.message for found in ready))
+    reason = f"{confirmed}; {run.gate.message}"
     active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
     for found in ready:
         mark_confirmed(database, found.earned, found.feature_map.map_id)

@@ -22,7 +22,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.tables import LIDAR
 from ingest.growth.gates import SIGMAS, Gate, sigmas_limit
-from ingest.growth.map_places import growth_of, with_growth
+from ingest.growth.map_places import growth_of, place_sigmas_m, with_growth
 from ingest.growth.place.component import GrownMap
 from ingest.growth.values import LEAST_PHOTOS, MAD, Refused
 from ingest.register.structure.surface_fit import MIN_REACH_M, Surface, nearest_planes, reach_of, surface_near
@@ -96,9 +96,7 @@ def cloud_gate(cloud: PointCloud, points: FloatArray, covariance: FloatArray) ->
     reach = reach_of(surface)
     near = np.isfinite(nearest_planes(surface, over, reach)[0])
     middle = over.mean(axis=0)
-    jacobian = point_jacobian(middle)
-    claim = jacobian @ covariance @ jacobian.T + np.eye(3) * _SCAN_SIGMA_M**2
-    claimed_m = SIGMAS * float(np.sqrt(np.linalg.eigvalsh(claim)[-1]))
+    claimed_m = SIGMAS * float(np.hypot(place_sigmas_m(covariance, middle[None])[0], _SCAN_SIGMA_M))
     if near.mean() < _LEAST_NEAR:
         if claimed_m > reach:
             return None
@@ -166,11 +164,7 @@ class _Laid:
         return move
 
     def chi_square(self, move: Rigid3, covariance: FloatArray, sigma_m: float) -> float:
-        """Of the motion against nothing: what the placement (7, 7), the scan and the fit leave open.
-
-        Flat ground leaves shifts and the heading open, in which the fit slides; they count as far as roofs
-        and walls hold them.
-        """
+        """Of the motion against what the placement (7, 7), the scan and the fit leave open."""
         at_middle = np.concatenate([np.eye(7)[1:4], point_jacobian(self.middle)])  # turn and shift there
         information, _ = self.normal_equations(move, SIGMAS * sigma_m, sigma_m)
         allowed = at_middle @ covariance @ at_middle.T + np.linalg.inv(information + _OPEN)
