@@ -5,6 +5,7 @@ of them was placed by matches with existing points. Matches between two of them 
 geometry, estimated without any pose, fits the two poses, two independent statements agree.
 """
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
@@ -80,28 +81,26 @@ def grow_component(
         model: a connected reconstruction; its rows are rows of `photos`.
         localised: new photos that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
-        identity: of the map; None: it is named by the photos that were tried, so that the same ones give the
-            same map.
+        identity: of the map; None: it is named by the photos that were tried.
         max_bound_m: photos that may be further off (95 %) are left out.
     """
     rows = model.rows.tolist()
-    mine = {r: localised[r] for r in rows if r in localised}
-    if not mine:
+    own = {k: localised[r] for k, r in enumerate(rows) if r in localised}
+    if not own:
         return Refused(reason="NOT_LOCALISED", message=f"none of {len(rows)} photos is localised by a map")
-    frame, near = _meeting_place(mine, areas)
-    mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
+    frame, near = _meeting_place(own, areas)
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
     model, lenses = adopt_lenses(model, photos, near, keypoints)
-    camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
-    mine = {r: with_lens(photo, model.cameras[camera_of[r]]) for r, photo in mine.items()}
-    correspondences = find_correspondences(model, mine, keypoints)
-    placement = place_by_maps(model, mine, correspondences, photos, near, frame)
+    cameras = [model.cameras[c] for c in model.camera_of.tolist()]
+    own = {k: with_lens(in_frame(photo, frame), cameras[k]) for k, photo in own.items()}
+    correspondences = find_correspondences(model, own, keypoints)
+    placement = place_by_maps(model, own, correspondences, photos, near, frame)
     if isinstance(placement, Refused):
         return placement
     refusal = gates.first_refusal(placement.gates)
     if refusal is not None:
         return Refused(reason=refusal.reason, message=refusal.message, gates=placement.gates)
-    refined = refine_placed(model, placement, correspondences, mine, keypoints, lenses, max_bound_m)
+    refined = refine_placed(model, placement, correspondences, own, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
     named = identity or _named([photos[r] for r in rows])
@@ -112,10 +111,10 @@ def _meeting_place(
     localised: Mapping[int, LocalisedPhoto], areas: Sequence[IndexedArea]
 ) -> tuple[LocalFrame, list[Area]]:
     """The frame of the area with most inliers; this area and then others whose heights have its datum."""
-    inliers: dict[LocalFrame, int] = {}
+    inliers: Counter[LocalFrame] = Counter()
     for photo in localised.values():
-        inliers[photo.frame] = inliers.get(photo.frame, 0) + len(photo.pixels)
-    frame = max(inliers, key=lambda f: inliers[f])
+        inliers[photo.frame] += len(photo.pixels)
+    frame = inliers.most_common(1)[0][0]
     datum = next(a.area for a in areas if a.area.frame == frame).maps[0].height_datum
     near = [a.area for a in areas if a.area.maps[0].height_datum == datum]
     return frame, sorted(near, key=lambda area: area.frame != frame)

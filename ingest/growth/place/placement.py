@@ -69,7 +69,7 @@ class MapsPlacement:
 
 def place_by_maps(
     model: Model,
-    localised: Mapping[int, LocalisedPhoto],
+    own: Mapping[int, LocalisedPhoto],
     correspondences: Correspondences,
     photos: Sequence[Photo],
     areas: Sequence[Area],
@@ -79,11 +79,10 @@ def place_by_maps(
 
     Args:
         model: with the lenses that it keeps.
-        localised: of the model's photos, by row of the photos, in `frame`; so are the correspondences.
+        own: the model's localised photos, by place among them, in `frame`; so are the correspondences.
         photos: all new photos, for their positions.
         areas: that hold the existing maps.
     """
-    own = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
     found = agreed_similarity(model, own, correspondences)
     edges = edges_of(model, found[0], correspondences, found[2]) if found else ()
     if not found or not edges:

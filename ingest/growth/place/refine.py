@@ -113,7 +113,7 @@ def refine_placed(
     """Refine an accepted placement with the existing points held fixed.
 
     Args:
-        localised: the model's photos that the existing maps localise, by row.
+        localised: the model's photos that the existing maps localise, by place among them.
         keypoints: pixels of all features of each photo of the model.
         max_bound_m: photos that may be further off (95 %), against the existing points and with what their
             lens leaves open, are left out.
@@ -132,7 +132,7 @@ def refine_placed(
         adjusted, fixed = _refined(placed, list(left_out), good, lenses, keypoints)
         spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
         fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
-        inside = {k: localised[rows[k]] for k in placement.agreeing if k not in left_out}
+        inside = {k: localised[k] for k in placement.agreeing if k not in left_out}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
         left_out |= {k: (_CONTRADICTS, message) for k, message in against.items()}
         loose = loose_photos(adjusted.model, spread.poses, max_bound_m)
@@ -153,9 +153,8 @@ def refine_placed(
     whole = _with_existing(adjusted, fixed, good, [e.map_id for e in edges])
     for k in sorted(set(range(len(rows))) - set(left_out) - set(whole.photo_of.tolist())):
         left_out[k] = _LOOSE, "the photo shows nothing that another photo of the map shows as well"
-    agreeing = tuple(k for k in placement.agreeing if k not in left_out)
-    disagreeing = tuple(k for k, (reason, _) in sorted(left_out.items()) if reason == _CONTRADICTS)
-    gate = gates.agreement(len(agreeing), len(disagreeing))
+    disagreeing = sum(reason == _CONTRADICTS for reason, _ in left_out.values())
+    gate = gates.agreement(len(set(placement.agreeing) - set(left_out)), disagreeing)
     if not gate.passes:
         message = f"once refined, {gate.message}"
         return Refused(reason=gate.reason, message=message, gates=placement.gates)
@@ -167,9 +166,7 @@ def refine_placed(
     kept = [k for k in range(len(rows)) if k not in left_out]
     return Refinement(
         model=select_photos(whole, [rows[k] for k in kept]),
-        placement=replace(
-            placement, edges=edges, agreeing=agreeing, disagreeing=disagreeing, covariance=covariance
-        ),
+        placement=replace(placement, edges=edges, covariance=covariance),
         poses=spread.poses[kept],
         bending_m=float(np.sqrt(bending_m2)),
         shared_turn=shared_turn(adjusted.model, spread),

@@ -76,12 +76,11 @@ def find_correspondences(
     """Correspondences of a model's photos, own and carried along its tracks.
 
     Args:
-        localised: one of the model's photos at least, by row, all in one frame.
+        localised: one of the model's photos at least, by place among them, all in one frame.
         keypoints: pixels (n, 2) of all features of each photo of the model.
     """
-    mine = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
-    map_ids = tuple(sorted({m for photo in mine.values() for m in photo.map_ids}))
-    own = _joined(*(_own(model, k, photo, map_ids) for k, photo in mine.items()))
+    map_ids = tuple(sorted({m for photo in localised.values() for m in photo.map_ids}))
+    own = _joined(*(_own(model, k, photo, map_ids) for k, photo in localised.items()))
     return _joined(own, _carried(model, own, keypoints))
 
 

@@ -82,10 +82,8 @@ class CanaryRun:
     @property
     def gate(self) -> Gate:
         """Whether no known answer got worse."""
-        count, message = (
-            len(self.regressions),
-            f"{len(self.checks)} canaries answered as before ({self.note})",
-        )
+        count = len(self.regressions)
+        message = f"{len(self.checks)} canaries answered as before ({self.note})"
         if count:
             first = self.regressions[0]
             message = f"{count} of {len(self.checks)} canaries regress: {first.name}: {first.regression}"
