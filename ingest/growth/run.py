@@ -1,8 +1,8 @@
 """The story of growth on a database: new photos in, quarantined maps, confirmation, canaries, promoted maps.
 
 Rounds: photos are localised by the active maps, reconstructions placed by them and committed in quarantine,
-quarantined maps confirmed and promoted; then again, while something new was promoted that photos may see.
-Every step is a commit of its own and can be repeated: a run that was killed is finished by the next.
+quarantined maps confirmed and promoted; then again, while something new was promoted. Every step is a commit
+of its own and can be repeated: a run that was killed is finished by the next.
 """
 
 import logging

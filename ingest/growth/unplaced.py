@@ -143,7 +143,7 @@ def left_over(
     """What was not taken along, where it is a map still: a map without a place, under an id of its own.
 
     Args:
-        by: what placed the others. code, why: reason for which these photos were not placed with them.
+        by: what placed the others. code, why: of the reason why these were not placed.
     """
     taken = {image.name for image in placed.images}
     left = [image for image in unplaced.images if image.name not in taken]

@@ -61,8 +61,8 @@ class LocalisedPhoto:
 
     Attributes:
         frame: local frame of everything metric here.
-        covariance: (6, 6), axes of the frame, measured part only (without the maps' placements): small
-            rotation of the camera (rad) before displacement of its centre (m), as pose_uncertainty has it.
+        covariance: (6, 6) as pose_uncertainty has it, axes of the frame, without the maps' placements: small
+            rotation of the camera (rad) before displacement of its centre (m).
         feature_rows: (k,) rows of the photo's features that are inliers; pixels: (k, 2) float64 of those.
         map_ids: the maps of the inliers' points; map_of: (k,) index into them.
         point_of: (k,) row of that map's points.

@@ -47,12 +47,11 @@ GraphEdge = tuple[str, Edge]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraphSolution:
-    """New places of all maps that hang on an anchor.
+    """New places of all maps that hang on an anchor; none where there is a reason.
 
     Attributes:
         reason: None, NO_ANCHOR or CONTRADICTION; `message` says it for people.
-        corrections: new_from_present of each map that a chain of edges ties to an anchor, graph's frame;
-            empty where there is a reason.
+        corrections: new_from_present of each map that a chain of edges ties to an anchor, graph's frame.
         covariance: (7, 7) of each new place on Earth.
         covariance_relative: (7, 7) relative to the anchors, as if those were the truth; zero for anchors.
         left_out: the two maps of each edge that contradicts the rest.

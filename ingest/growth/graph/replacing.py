@@ -54,7 +54,7 @@ class Replacement:
         reason: None, the pose graph's, or CANARY; where there is one, nothing was committed.
         version: of the database since, or -1. moved: all maps that were committed anew.
         left_out: overlaps that contradict the rest.
-        flagged: maps that are quarantined now, because they hang on a moved one by no overlap that holds.
+        flagged: maps that are quarantined now: they hang on a moved one by no overlap that holds.
     """
 
     reason: str | None

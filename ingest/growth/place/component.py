@@ -75,8 +75,6 @@ def grow_component(
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
 
-    Photos whose own localisation contradicts the placement are left out of the map.
-
     Args:
         model: a connected reconstruction; its rows are rows of `photos`.
         localised: new photos that the maps localise, by row; others than the model's are ignored.
@@ -266,10 +264,9 @@ def _triangulated(
     geometries: Mapping[Pair, TwoView],
     features_of: FeaturesOf,
 ) -> Model:
-    """A model of the group from its verified matches; rows are those of the photos.
+    """A model of the group, from the localisations' poses adjusted to its verified matches alone.
 
-    The localisations' poses are the start; then the model is adjusted to its matches alone, in a gauge of its
-    own. Whether it still fits the localisations is asked when it is placed, as of any reconstruction.
+    Whether it still fits the localisations is asked when it is placed, as of any reconstruction.
     """
     cameras = list(dict.fromkeys(photos[r].camera for r in rows))
     sfm = []

@@ -1,9 +1,8 @@
 """Canaries: photos whose right answer is known are asked before and after a map would be promoted.
 
 A regression is a canary that was answered rightly and no longer is, or a photo of elsewhere that now finds a
-place. Beside those of the database, images of the active maps serve, by their observations. Their answer
-leans on their own map; what they show is an answer that the new map takes away, makes ambiguous or pulls
-along, and, asked of the new map alone, a new map that shows their place somewhere else.
+place. Beside those of the database, images of the active maps serve, by their observations: for answers that
+the new map takes away, makes ambiguous or pulls along, or has somewhere else.
 """
 
 import hashlib
@@ -108,8 +107,7 @@ def run_canaries(
     """Ask all known queries and images of the maps, before and after.
 
     Args:
-        before: the active maps. after: the same with the new ones.
-        new_maps: which are asked alone, too.
+        before: the active maps. after: the same with the new ones, which are asked alone, too.
 
     Raises:
         StoreError, CanaryNotFoundError: a canary's image cannot be read.

@@ -97,8 +97,7 @@ class OutsidePhoto:
     Attributes:
         center: (3,) of its camera in the map's frame, metres.
         points: (k,) rows of the map's points that are its inliers.
-        contradicts: a sentence, where its place is known and is not where the map has it; else it
-            corroborates the map.
+        contradicts: a sentence, where its place is known and is not where the map has it.
     """
 
     name: str
@@ -125,10 +124,7 @@ class NewPhotos:
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
 
     def that_may_see(self, feature_map: FeatureMap) -> list[int]:
-        """Rows of those that may be asked about a map.
-
-        Of a map that is made of the given photos, those that overlap with one of its own.
-        """
+        """Rows of those that may be asked about a map; if it is made of given photos, those beside these."""
         names = {image.sha256 for image in feature_map.images}
         own = {row for row, photo in enumerate(self.given.photos) if photo.sha256 in names}
         if len(own) < len(names):  # whose matches with these photos nobody has looked at
@@ -150,8 +146,7 @@ def corroborate(
     """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 
     Args:
-        others: maps around it, active or quarantined.
-        write_id: of the map as it is.
+        others: maps around it, active or quarantined. write_id: of the map as it is.
     """
     indexed, own = IndexedArea.of([feature_map]), set(sources.of_map(feature_map))
     if not len(indexed.area.points):
@@ -192,11 +187,7 @@ def _heard(
     name: str,
     known: tuple[FloatArray, float] | None,
 ) -> OutsidePhoto:
-    """A photo that the map localises.
-
-    Args:
-        known: its centre (3,) by others, in the map's frame, and the variance of that, square metres.
-    """
+    """A photo that the map localises; `known`: its centre (3,) by others and its variance, map's frame, m."""
     here = in_frame(found, feature_map.frame)
     center, contradicts = here.cam_from_local.center, ""
     if known is not None:
@@ -250,8 +241,7 @@ class Confirmation:
         earned: those of the map's that make a record for their owner: proven themselves, or confirmed by a
             proven photo, or by photos of two other owners on record.
         points: (n,) which points of the map two independent photos see, its own or from outside, or a proven
-            one of its own. The altered part of a photo that is true in the others makes points that only its
-            owner has seen.
+            one of its own: the altered part of a photo makes points that only its owner has seen.
     """
 
     gate: Gate
@@ -262,11 +252,7 @@ class Confirmation:
 
 
 def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[OutsidePhoto] = ()) -> Confirmation:
-    """How far a map is confirmed by those whose word counts.
-
-    A photo of the map is confirmed when it is proven, or shares enough of the map's points with a photo that
-    is independent of it.
-    """
+    """How far a map is confirmed: by its photos that are proven, or share points with independent ones."""
     corroborating = [photo for photo in outside if not photo.contradicts]
     against = [photo for photo in outside if photo.contradicts]
     everyone = [*sources.of_map(feature_map), *(photo.source for photo in corroborating)]

@@ -69,7 +69,7 @@ def promote_confirmed(
 
     Args:
         localiser: of the active maps of the newest snapshot.
-        work: work folder, where it is kept what was found out: without anything new nothing is asked again.
+        work: work folder: without anything new nothing is asked again.
         new: photos that may corroborate a map, beside the images of other maps.
 
     Raises:

@@ -1,7 +1,7 @@
 """Whether a grown map lies where the scans in store have the ground and the roofs.
 
-A map that was placed by other maps says how far off it may be. A scan is right to decimetres: where it
-covers the map, the rigid motion that brings the map's points onto its surface must be no larger than that.
+A grown map says how far off it may be: where a scan covers it, the rigid motion that brings the map's points
+onto the scan's surface must be no larger than that.
 """
 
 import logging
@@ -48,8 +48,6 @@ _LEAST_GAIN = 0.1
 
 def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Refused, str]:
     """The map with the gate's figure in its evidence, or the refusal of a scan.
-
-    Where the extra `lidar` is missing, the map is refused: the scan might refuse it.
 
     Returns:
         The second is why a scan that is there could not be compared, "" otherwise.
