@@ -83,14 +83,12 @@ def adopt_lenses(
     lent: dict[int, Camera] = {}
     focals: dict[int, float] = {}
     for c, camera in enumerate(model.cameras):
-        rows = model.rows[model.camera_of == c].tolist()
-        keys = {photos[r].camera_key for r in rows}
+        of_camera = [photos[r] for r in model.rows[model.camera_of == c].tolist()]
+        keys, told = {photo.camera_key for photo in of_camera}, {photo.focal_px for photo in of_camera}
         key = keys.pop() if len(keys) == 1 else ""
-        known = (area.camera_for_key(key) for area in areas) if key else iter(())
-        lens = next((camera for camera in known if camera is not None), None)
+        lens = next((own for area in areas if key and (own := area.camera_for_key(key))), None)
         if lens is not None and (lens.width, lens.height) == (camera.width, camera.height):
             lent[c] = lens
-        told = {photos[r].focal_px for r in rows}
         focal_px = told.pop() if len(told) == 1 else None  # none where EXIF tells several
         if focal_px is not None:
             focals[c] = focal_px

@@ -272,9 +272,8 @@ def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[Outside
     by_proven = np.asarray(sees[np.flatnonzero(proven[:own])].sum(axis=0)).ravel() > 0
     ids = [image.image_id for image in feature_map.images]
     owners = tuple(dict.fromkeys(s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes))
-    by = f"{int(confirmed[:own].sum())} photos", f"{len(owners)} owners"
     return Confirmation(
-        gate=_gate(by, pairs, bool(proven[:own].any()), against),
+        gate=_gate(int(confirmed[:own].sum()), len(owners), pairs, bool(proven[:own].any()), against),
         owners=owners,
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
         earned=tuple(i for k, i in enumerate(ids) if _earns(k, everyone, sees_same, apart)),
@@ -295,22 +294,18 @@ def _earns(
     return any(s.proven for s, _ in others) or len(known) > 1
 
 
-def _gate(confirmed: tuple[str, str], pairs: float, proven: bool, against: Sequence[OutsidePhoto]) -> Gate:
+def _gate(confirmed: int, owners: int, pairs: float, proven: bool, against: Sequence[OutsidePhoto]) -> Gate:
     """Whether more pairs confirm the map than one and as many as contradict it.
 
     A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Each proven
     photo contradicts it, and each other owner once, whose photos may all lie.
-
-    Args:
-        confirmed: how many photos, and by how many owners, in words.
     """
     theirs = [photo.source for photo in against]
     contradicting = sum(s.proven for s in theirs) + len({s.owner for s in theirs if not s.proven})
     needed = contradicting + (0.0 if proven else 1.0)
     passes = pairs > needed or (proven and not against)
-    photos, owners = confirmed
     if passes:
-        reason, message = "", f"{photos} confirmed by {owners}"
+        reason, message = "", f"{confirmed} photos confirmed by {owners} owners"
     elif against and (proven or pairs > 1.0):
         reason = "CONTRADICTED"
         message = (
@@ -319,7 +314,7 @@ def _gate(confirmed: tuple[str, str], pairs: float, proven: bool, against: Seque
         )
     elif pairs:
         reason = "FEW_PAIRS"
-        message = f"{photos} are confirmed by one photo alone; another independent pair is needed"
+        message = f"{confirmed} photos are confirmed by one photo alone; another independent pair is needed"
     else:
         reason, message = "ONE_SOURCE", "no two owners whose word counts see the same of it"
     return Gate(

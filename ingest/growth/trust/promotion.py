@@ -17,7 +17,6 @@ from featuredb.store.changes import is_imported
 from ingest.fingerprint import digest
 from ingest.growth import gates
 from ingest.growth.asked_before import recall, remember
-from ingest.growth.gates import Gate
 from ingest.growth.place.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import (
@@ -196,7 +195,7 @@ def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Prom
     return Promotion(map_id=summary.map_id, reason_code=code, reason=text)
 
 
-def _stays(map_id: str, gate: Gate) -> Promotion:
+def _stays(map_id: str, gate: gates.Gate) -> Promotion:
     told = gates.figures([gate])
     return Promotion(map_id=map_id, reason_code=gate.reason, reason=gate.message, gates=told)
 
