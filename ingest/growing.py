@@ -7,11 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from featuredb.atomic import atomic_file
 from featuredb.errors import CandidateNotFoundError, FeatureDbError
-from featuredb.maps.feature_map import GeoPrior
 from featuredb.store import Database
 from featuredb.store.candidates.photos import list_candidates, load_images, refuse
 from featuredb.store.candidates.states import Candidate
@@ -33,81 +31,63 @@ _FOLDER = "candidates"
 _HEX = re.compile(r"[0-9a-f]{32}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CandidatePhotos:
-    """What waits.
-
-    Attributes:
-        photos: usable ones, oldest first; `Photo.name` is the candidate's id with an ending.
-        candidate_ids: of them, in the same order.
-        unusable: reason code and sentence of the others, by candidate id: broken files, copies of others.
-    """
-
-    photos: tuple[Photo, ...]
-    candidate_ids: tuple[str, ...]
-    unusable: dict[str, tuple[str, str]]
-
-
-def waiting_photos(database: Database, work: Path, progress: Progress = no_progress) -> CandidatePhotos:
+def waiting_photos(
+    database: Database, work: Path, progress: Progress = no_progress
+) -> tuple[list[Photo], dict[str, tuple[str, str]]]:
     """The photos that wait for growth, written into the work folder where they are not there yet.
+
+    Returns:
+        Usable ones, oldest first, the stem of each name its candidate's id; reason code and sentence of the
+        others, by candidate id: broken files, copies of others.
 
     Raises:
         StoreError: the database cannot be read.
     """
     candidates = list_candidates(database)
-    wanted = [c for c in candidates if c.state == "waiting"]
+    waiting = {f"{c.candidate_id}.img": c for c in candidates if c.state == "waiting"}
     folder = work / _FOLDER
-    files = _write_files(database, folder, wanted)
-    _remove_withdrawn(folder, candidates)
-    if not files:
-        return CandidatePhotos(photos=(), candidate_ids=(), unusable={})
-    scanned = scan_folder(folder, ScanOptions(), progress, work / "scan" / f"{_FOLDER}.json")
-    by_name = {photo.name: photo for photo in scanned.photos}
-    live = {files[c.candidate_id] for c in wanted if c.candidate_id in files}
-    photos, ids = [], []
-    unusable: dict[str, tuple[str, str]] = {}
-    for candidate in wanted:
-        name = files.get(candidate.candidate_id)
-        photo = None if name is None else by_name.get(name)
-        if photo is None:
-            continue
-        if photo.status == "ok" or (photo.duplicate_of and photo.duplicate_of not in live):
-            photos.append(_with_query(photo, candidate))
-            ids.append(candidate.candidate_id)
-        else:
-            unusable[candidate.candidate_id] = (photo.reason_code.upper(), photo.reason)
-    return CandidatePhotos(photos=tuple(photos), candidate_ids=tuple(ids), unusable=unusable)
-
-
-def _write_files(database: Database, folder: Path, wanted: Sequence[Candidate]) -> dict[str, str]:
-    """Names of the files of candidates, by id; those that are withdrawn meanwhile have none."""
-    names = {c.candidate_id: f"{c.candidate_id}.img" for c in wanted}
     folder.mkdir(parents=True, exist_ok=True)
-    for candidate_id, name in list(names.items()):
-        target = folder / name
-        if target.is_file():
-            continue
-        try:
-            data = next(load_images(database, [candidate_id]))[1]
-        except CandidateNotFoundError:
-            del names[candidate_id]
-            continue
-        with atomic_file(target) as temporary:
-            temporary.write_bytes(data)
-    return names
-
-
-def _remove_withdrawn(folder: Path, candidates: Sequence[Candidate]) -> None:
-    """Withdrawn photos leave the work folder, too."""
+    for name, candidate in waiting.items():
+        _write_file(database, folder / name, candidate.candidate_id)
     kept = {c.candidate_id for c in candidates if c.state != "withdrawn"}
     for file in folder.glob("*.img"):
         if _HEX.fullmatch(file.stem) and file.stem not in kept:
             file.unlink(missing_ok=True)
+    if not waiting:
+        return [], {}
+    scanned = scan_folder(folder, ScanOptions(), progress, work / "scan" / f"{_FOLDER}.json")
+    by_name = {photo.name: photo for photo in scanned.photos if photo.name in waiting}
+    photos: list[Photo] = []
+    unusable: dict[str, tuple[str, str]] = {}
+    for name, candidate in waiting.items():
+        photo = by_name.get(name)
+        if photo is None:  # withdrawn meanwhile
+            continue
+        if photo.status == "ok" or (photo.duplicate_of and photo.duplicate_of not in by_name):
+            photos.append(_with_query(photo, candidate))
+        else:
+            unusable[candidate.candidate_id] = (photo.reason_code.upper(), photo.reason)
+    return photos, unusable
+
+
+def _write_file(database: Database, target: Path, candidate_id: str) -> None:
+    """A candidate's bytes, where they are not there yet; nothing for one that is withdrawn meanwhile."""
+    if target.is_file():
+        return
+    try:
+        data = next(load_images(database, [candidate_id]))[1]
+    except CandidateNotFoundError:
+        return
+    with atomic_file(target) as temporary:
+        temporary.write_bytes(data)
 
 
 def _with_query(photo: Photo, candidate: Candidate) -> Photo:
     """The photo with what its query said: position, whom to name, licence; and who gave it."""
-    prior = _prior(candidate.request.get("prior"))
+    try:
+        prior = geo_prior(PriorRequest.model_validate(candidate.request.get("prior")))
+    except ValueError:  # it has none, or a broken one
+        prior = None
     return replace(
         photo,
         status="ok",
@@ -118,14 +98,6 @@ def _with_query(photo: Photo, candidate: Candidate) -> Photo:
         licence=candidate.licence,
         contributor=candidate.owner,
     )
-
-
-def _prior(asked: Any) -> GeoPrior | None:
-    """The position of a wire request, as it was stored; None where it has none or a broken one."""
-    try:
-        return geo_prior(PriorRequest.model_validate(asked))
-    except ValueError:
-        return None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,16 +138,16 @@ def grow_candidates(
     now = now or datetime.now(UTC)
     work = options.work or default_root(database.url)
     remove_leftovers(work)
-    waiting = waiting_photos(database, work, progress)
-    photos = waiting.photos[:_MOST_PHOTOS]
+    waiting, unusable = waiting_photos(database, work, progress)
+    photos = waiting[:_MOST_PHOTOS]
     if options.workers == 1:
-        new, unreadable = _prepared(waiting, work, options, InProcessExecutor(), progress)
+        new, unreadable = _prepared(photos, work, options, InProcessExecutor(), progress)
     else:
         with PoolExecutor(options.workers) as pool:
-            new, unreadable = _prepared(waiting, work, options, pool, progress)
+            new, unreadable = _prepared(photos, work, options, pool, progress)
     report = grow(database, new, work, replace(options.growth, threads=options.workers))
-    refused = _refuse(database, {**waiting.unusable, **unreadable}, report, now, options)
-    left = len(waiting.photos) - len(photos)
+    refused = _refuse(database, {**unusable, **unreadable}, report, now, options)
+    left = len(waiting) - len(photos)
     notes = (*report.notes, *((f"{left} photos wait for the next run",) if left else ()))
     kept = tuple(p for p in report.photos if p.name not in refused)
     return replace(report, photos=(*kept, *refused.values()), notes=notes)
@@ -198,22 +170,15 @@ def reconstructed_photos(done: Reconstructed, candidate_ids: Mapping[int, str] |
 
 
 def _prepared(
-    waiting: CandidatePhotos,
-    work: Path,
-    options: GrowingOptions,
-    executor: Executor,
-    progress: Progress,
+    photos: Sequence[Photo], work: Path, options: GrowingOptions, executor: Executor, progress: Progress
 ) -> tuple[GrowthPhotos, dict[str, tuple[str, str]]]:
     """Features, matches and reconstructions of the waiting photos; and those that cannot be read."""
-    photos = waiting.photos[:_MOST_PHOTOS]
     if not photos:
         return no_photos(), {}
     done = reconstruct_photos(photos, Workspace(root=work), options.making, executor, progress=progress)
-    ids = dict(zip((p.name for p in photos), waiting.candidate_ids, strict=False))
-    rows = {row: ids[photo.name] for row, photo in enumerate(done.usable)}
-    return reconstructed_photos(done, rows), {
-        ids[name]: ("UNREADABLE", reason) for name, reason in done.unreadable.items()
-    }
+    rows = {row: Path(photo.name).stem for row, photo in enumerate(done.usable)}
+    unreadable = {Path(name).stem: ("UNREADABLE", reason) for name, reason in done.unreadable.items()}
+    return reconstructed_photos(done, rows), unreadable
 
 
 def _refuse(
@@ -224,11 +189,9 @@ def _refuse(
     options: GrowingOptions,
 ) -> dict[str, PhotoFate]:
     """Refuse for good what can never be used: broken files, copies, photos of retired maps, the forgotten."""
-    reasons = dict(unusable)
-    reasons.update(
-        {p.name: (p.reason_code, p.reason) for p in report.photos if p.reason_code == "RETIRED_MAP"}
-    )
-    candidates: dict[str, Candidate] = {c.candidate_id: c for c in list_candidates(database, state="waiting")}
+    retired = {p.name: (p.reason_code, p.reason) for p in report.photos if p.reason_code == "RETIRED_MAP"}
+    reasons = unusable | retired
+    candidates = {c.candidate_id: c for c in list_candidates(database, state="waiting")}
     for photo in report.photos:
         candidate = candidates.get(photo.name)
         if photo.outcome != "waiting" or candidate is None:

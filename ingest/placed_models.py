@@ -91,7 +91,10 @@ def place_models(
                 loose += rows
                 continue
             model = select_photos(whole, rows)
-            groups = [] if survey is not None else _elsewhere(model, done.usable, options)
+            groups = []
+            if survey is None:  # groups of photos whose GPS contradicts a placement that is accepted
+                _, with_gps, placed = placed_by_gps(model, [done.usable[r] for r in model.rows])
+                groups = tagged_elsewhere(model, with_gps, placed) if placed.reason is None else []
             gone = {int(model.rows[k]) for group in groups for k in group.photos}
             kept = keep_photos(model, set(rows) - gone) if groups else model
             if kept is not None:
@@ -100,11 +103,11 @@ def place_models(
             elsewhere += [(model, group) for group in groups]
         if loose:
             reason = _WEAKLY_TIED.format(least=options.min_tie)
-            yield _left_out(select_photos(whole, loose), done.usable, options, "WEAKLY_TIED", reason)
+            yield _left_out(select_photos(whole, loose), done.usable, "WEAKLY_TIED", reason)
     for model, group in elsewhere:
         part = select_photos(model, model.rows[list(group.photos)].tolist())
         reason = _ELSEWHERE.format(offset_m=group.offset_m)
-        component = _left_out(part, done.usable, options, "ELSEWHERE", reason)
+        component = _left_out(part, done.usable, "ELSEWHERE", reason)
         if len(part.rows) >= options.sfm.min_model_photos:
             features = done.features.of(part.rows)
             component = _without_place(component, features, identity(next(number)), options)
@@ -127,15 +130,7 @@ def placed_by_gps(
     return frame, tuple(with_gps.tolist()), placed
 
 
-def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[TaggedElsewhere]:
-    """Groups of photos whose GPS contradicts a placement that is accepted."""
-    _, with_gps, placed = placed_by_gps(model, [photos[r] for r in model.rows])
-    return tagged_elsewhere(model, with_gps, placed) if placed.reason is None else []
-
-
-def _by_gps(
-    model: Model, photos: Sequence[Photo], options: MapMakingOptions
-) -> tuple[Component, LocalFrame | None]:
+def _by_gps(model: Model, photos: Sequence[Photo]) -> tuple[Component, LocalFrame | None]:
     """A model as GPS places it or refuses to, without a map yet; and the frame.
 
     Args:
@@ -155,11 +150,9 @@ def _by_gps(
     return component, frame
 
 
-def _left_out(
-    model: Model, photos: Sequence[Photo], options: MapMakingOptions, code: str, reason: str
-) -> Component:
+def _left_out(model: Model, photos: Sequence[Photo], code: str, reason: str) -> Component:
     """Photos that are in no map."""
-    return replace(_by_gps(model, photos, options)[0], reason_code=code, reason=reason)
+    return replace(_by_gps(model, photos)[0], reason_code=code, reason=reason)
 
 
 def _component(
@@ -179,32 +172,25 @@ def _component(
         photos: all usable ones.
         features: of the model's.
     """
-    component, frame = _by_gps(model, photos, options)
+    component, frame = _by_gps(model, photos)
     chosen, with_gps, placed = component.photos, component.with_gps, component.placement
     if survey is not None:
         return _by_control(component, frame, features, identity, options, survey)
-    if (
-        placed.reason is not None
-        or frame is None
-        or placed.local_from_sfm is None
-        or placed.covariance is None
-    ):
+    sim, covariance = placed.local_from_sfm, placed.covariance
+    if placed.reason is not None or frame is None or sim is None or covariance is None:
         return _without_place(component, features, identity, options)
     placement = Placement(
         method="gps",
-        local_from_sfm=placed.local_from_sfm,
-        covariance=placed.covariance,
+        local_from_sfm=sim,
+        covariance=covariance,
         residual_rms_m=placed.residual_rms_m,
         evidence=placement_evidence(placed, [chosen[i] for i in with_gps]),
     )
     hints = [chosen[i].gps_is_hint for i, inner in zip(with_gps, placed.inliers, strict=True) if inner]
     feature_map = build_map(model, placement, frame, chosen, features, identity, options.maps)
     if feature_map is None:
-        return replace(
-            component,
-            reason_code="NO_POINTS",
-            reason="no point is placed well enough: the photos' rays are parallel",
-        )
+        reason = "no point is placed well enough: the photos' rays are parallel"
+        return replace(component, reason_code="NO_POINTS", reason=reason)
     camera_of = _whose_cameras(model, chosen)
     held_back = (
         placed.provisional

@@ -21,8 +21,7 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.vocabulary import Vocabulary
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import MapSummary, Snapshot
-from ingest.growth.map_images import features_and_points
-from ingest.growth.place.overlaps import measure_overlap
+from ingest.growth.place.map_images import features_and_points, measure_overlap
 from ingest.growth.values import LEAST_PHOTOS, Edge
 from ingest.positions.variance_components import NOISE_SPREAD
 from ingest.workspace import read_array, write_arrays

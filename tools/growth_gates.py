@@ -131,10 +131,10 @@ class _Note:
         return promote_confirmed
 
     def _model(self, step: str, model: Any, placement: Any, gates: dict[str, bool]) -> None:
-        if placement.local_from_sfm is None:
+        if isinstance(placement, Refused):  # nothing fits
             return
         names = [self._photos[int(row)].name for row in model.rows]
-        centers = placement.local_from_sfm.act(model.centers())
+        centers = placement.fit.local_from_sfm.act(model.centers())
         self._write(step, names, self._frame.enu_from(placement.frame).act(centers), gates)
 
     def _map(self, step: str, feature_map: FeatureMap, gates: dict[str, bool]) -> None:

@@ -3,7 +3,7 @@
 Everything here is linear in the number of pairs but for a logarithm.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,12 +92,12 @@ def find_clusters(
 def _cluster(graph: "Graph", rows: NDArray[np.int64], options: ClusterOptions) -> PhotoCluster:
     cores = graph.cut(rows, options.max_block_photos)
     if len(cores) == 1:
-        return PhotoCluster(blocks=(PhotoBlock(own=_plain(rows)),))
-    return PhotoCluster(
-        blocks=tuple(
-            PhotoBlock(own=_plain(core), shared=_plain(graph.seam(core, rows, options))) for core in cores
-        )
-    )
+        return PhotoCluster(blocks=(PhotoBlock(own=tuple(rows.tolist())),))
+    blocks = []
+    for core in cores:
+        seam = graph.seam(core, rows, options)
+        blocks.append(PhotoBlock(own=tuple(core.tolist()), shared=tuple(seam.tolist())))
+    return PhotoCluster(blocks=tuple(blocks))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -181,7 +181,3 @@ def _distances(lengths: csr_matrix, source: int) -> FloatArray:
     """Shortest ways (n,) from one row to all."""
     ways = dijkstra(lengths, directed=False, indices=np.array([source], dtype=np.int32))
     return np.asarray(ways, dtype=np.float64).ravel()
-
-
-def _plain(rows: Sequence[int] | NDArray[np.int64]) -> tuple[int, ...]:
-    return tuple(int(row) for row in rows)

@@ -41,27 +41,16 @@ class Joint:
         first, second: which models.
         first_from_second: the similarity.
         points: pairs of points that fit it; the joint's strength.
-        photos: shared photos whose poses agree.
     """
 
     first: int
     second: int
     first_from_second: Sim3
     points: int
-    photos: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JoinedModel:
-    """Models that are one.
-
-    Attributes:
-        members: which models, largest first.
-        first_from: similarity of each member into the frame of the first.
-    """
-
-    members: tuple[int, ...]
-    first_from: tuple[Sim3, ...]
+JoinedModel = dict[int, Sim3]
+"""Models that are one, largest first: of each member the similarity into the frame of the first."""
 
 
 def join(models: Sequence[Model]) -> list[JoinedModel]:
@@ -94,7 +83,7 @@ def find_joint(models: Sequence[Model], first: int, second: int, shared: NDArray
     if not good:
         _LOG.info("models %d and %d: %d of %d shared photos agree", first, second, agreeing, len(shared))
         return None
-    return Joint(first=first, second=second, first_from_second=sim, points=inliers, photos=agreeing)
+    return Joint(first=first, second=second, first_from_second=sim, points=inliers)
 
 
 def common_points(a: Model, b: Model) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
@@ -195,11 +184,9 @@ def _groups(tree: Sequence[Joint], models: Sequence[Model]) -> list[JoinedModel]
     while left:
         root = left[0]
         ways = {k: way for k in left if (way := _way(tree, root, k)) is not None}
-        groups.append(
-            JoinedModel(members=tuple(ways), first_from=tuple(_along(way, root) for way in ways.values()))
-        )
+        groups.append({k: _along(way, root) for k, way in ways.items()})
         left = [k for k in left if k not in ways]
-    return sorted(groups, key=lambda g: -sum(len(models[k].rows) for k in g.members))
+    return sorted(groups, key=lambda g: -sum(len(models[k].rows) for k in g))
 
 
 def hangs_together(model: Model, parts: Sequence[Sequence[int]]) -> bool:

@@ -4,7 +4,7 @@ import logging
 import shutil
 import tempfile
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -132,14 +132,14 @@ def reconstruct_clusters(
         views: all photos; clusters name their rows.
         matches: files of the verified pairs.
     """
-    tasks_of = _Tasks(cameras, views, matches)
-    whole = [tasks_of.make(c.rows, options) for c in clusters]
+    task_of = _task_maker(cameras, views, matches)
+    whole = [task_of(c.rows, options) for c in clusters]
     rough = replace(options, adjust=replace(options.adjust, whole_lens=False))
     block_tasks: list[list[_BlockTask]] = []
     for cluster, task in zip(clusters, whole, strict=True):
         # Of several blocks the lens is for the whole cluster to tell.
         alone = len(cluster.blocks) == 1
-        sfms = [task] if alone else [tasks_of.make(b.rows, rough) for b in cluster.blocks]
+        sfms = [task] if alone else [task_of(b.rows, rough) for b in cluster.blocks]
         block_tasks.append([_BlockTask(sfm=s, folder=workspace.models(s.key())) for s in sfms])
 
     todo = [t for tasks in block_tasks for t in tasks if not t.folder.is_dir()]
@@ -155,11 +155,8 @@ def reconstruct_clusters(
     waiting = [j for j in joins if not j.folder.is_dir()]
     joined = executor.map("join", _reconstructed, waiting, progress)
     failed |= {t.folder: o.reason for t, o in zip(waiting, joined, strict=True) if isinstance(o, Lost)}
-    return _collected(clusters, block_tasks, joins, failed, options, reused=_count(block_tasks) - len(todo))
-
-
-def _count(tasks: Sequence[Sequence[object]]) -> int:
-    return sum(len(t) for t in tasks)
+    reused = sum(map(len, block_tasks)) - len(todo)
+    return _collected(clusters, block_tasks, joins, failed, options, reused)
 
 
 def _collected(
@@ -183,40 +180,32 @@ def _collected(
             lost |= dict.fromkeys(cluster.rows, failed[folder])
         else:
             results.append(ModelFiles(folder=folder, rows=cluster.rows, min_photos=options.min_model_photos))
-    return Reconstruction(clusters=tuple(results), reused=reused, blocks=_count(block_tasks), lost=lost)
+    return Reconstruction(
+        clusters=tuple(results), reused=reused, blocks=sum(map(len, block_tasks)), lost=lost
+    )
 
 
-class _Tasks:
-    """Makes the task of some photos, with their cameras and pairs numbered anew."""
+def _task_maker(
+    cameras: Sequence[tuple[Camera, bool]], views: Sequence[SfmView], matches: Mapping[Pair, Path]
+) -> Callable[[Sequence[int], SfmOptions], SfmTask]:
+    """Makes the task of the photos of some rows, which rise, with their cameras and pairs numbered anew."""
+    of_photo: dict[int, list[tuple[int, Path]]] = {}
+    for (i, j), file in sorted(matches.items()):
+        of_photo.setdefault(i, []).append((j, file))
 
-    def __init__(
-        self,
-        cameras: Sequence[tuple[Camera, bool]],
-        views: Sequence[SfmView],
-        matches: Mapping[Pair, Path],
-    ) -> None:
-        self._cameras, self._views = cameras, views
-        self._of_photo: dict[int, list[tuple[int, Path]]] = {}
-        for (i, j), file in sorted(matches.items()):
-            self._of_photo.setdefault(i, []).append((j, file))
-
-    def make(self, rows: Sequence[int], options: SfmOptions) -> SfmTask:
-        """Structure from motion of the photos of these rows, which rise."""
-        used = sorted({self._views[row].camera_row for row in rows})
+    def make(rows: Sequence[int], options: SfmOptions) -> SfmTask:
+        used = sorted({views[row].camera_row for row in rows})
         place = {row: k for k, row in enumerate(rows)}
         return SfmTask(
-            cameras=tuple(self._cameras[c] for c in used),
-            views=tuple(
-                replace(self._views[row], camera_row=used.index(self._views[row].camera_row)) for row in rows
-            ),
+            cameras=tuple(cameras[c] for c in used),
+            views=tuple(replace(views[row], camera_row=used.index(views[row].camera_row)) for row in rows),
             matches=tuple(
-                (place[i], place[j], file)
-                for i in rows
-                for j, file in self._of_photo.get(i, ())
-                if j in place
+                (place[i], place[j], file) for i in rows for j, file in of_photo.get(i, ()) if j in place
             ),
             options=options,
         )
+
+    return make
 
 
 def _join_task(
@@ -294,15 +283,13 @@ def _join(task: _JoinTask) -> None:
                 loss_scale_px(task.sfm),
                 adjust_options(task.sfm.options),
             )
-            if len(group.members) > 1 and (
+            if len(group) > 1 and (
                 len(kept) < _MOSTLY * len(poses)
-                or not hangs_together(read_model(folder), [models[m].rows.tolist() for m in group.members])
+                or not hangs_together(read_model(folder), [models[m].rows.tolist() for m in group])
             ):
                 _LOG.info("%s: the joint of %d photos does not hold; apart again", task, len(poses))
                 shutil.rmtree(folder, ignore_errors=True)
-                groups.extendleft(
-                    JoinedModel(members=(m,), first_from=(Sim3.identity(),)) for m in reversed(group.members)
-                )
+                groups.extendleft({m: Sim3.identity()} for m in reversed(group))
                 continue
             taken |= {int(row) for row in kept}
 
@@ -322,7 +309,7 @@ def _poses(group: JoinedModel, models: Sequence[Model], own: Sequence[frozenset[
     """Pose of every photo of the group: of the block whose own it is, where that has registered it."""
     poses: dict[int, Rigid3] = {}
     for mine in (True, False):
-        for member, sim in zip(group.members, group.first_from, strict=True):
+        for member, sim in group.items():
             for row, pose in zip(models[member].rows.tolist(), models[member].cam_from_sfm, strict=True):
                 if row not in poses and (row in own[member]) == mine:
                     poses[row] = sim.act_on_pose(pose)
@@ -333,7 +320,7 @@ def _cameras(group: JoinedModel, models: Sequence[Model], sfm: SfmTask) -> list[
     """Cameras of the cluster, each as the member with most of its photos has it."""
     cameras = [camera for camera, _ in sfm.cameras]
     most = [0] * len(cameras)
-    for member in group.members:
+    for member in group:
         model = models[member]
         counts = np.bincount(model.camera_of, minlength=len(model.cameras))
         for row, index in zip(model.rows.tolist(), model.camera_of.tolist(), strict=True):

@@ -15,25 +15,19 @@ _VERSION = "5"
 
 
 def recall(work: Path, kind: str, about: str, question: str = "") -> dict[str, Any] | None:
-    """The answer to what was last asked about something, if it was this question; else None.
-
-    Args:
-        kind: of the things that are asked about; each has a folder. about: one of them.
-    """
-    file = _file(work, kind, about)
+    """The answer to what was last asked about one thing of a kind, if it was this question; else None."""
+    file, key = _file_and_key(work, kind, about, question)
     value = read_json(file) if file.is_file() else {}
-    answer: dict[str, Any] | None = value.get("answer") if value.get("question") == _key(question) else None
+    answer: dict[str, Any] | None = value.get("answer") if value.get("question") == key else None
     return answer
 
 
 def remember(work: Path, kind: str, about: str, answer: dict[str, Any], question: str = "") -> None:
     """Note the answer, in place of that to an earlier question about the same."""
-    write_json(_file(work, kind, about), {"question": _key(question), "answer": answer})
+    file, key = _file_and_key(work, kind, about, question)
+    write_json(file, {"question": key, "answer": answer})
 
 
-def _key(question: str) -> str:
-    return digest(_VERSION, options_fingerprint(QUERY), question)
-
-
-def _file(work: Path, kind: str, about: str) -> Path:
-    return work / "asked" / kind / f"{digest(about)[:24]}.json"
+def _file_and_key(work: Path, kind: str, about: str, question: str) -> tuple[Path, str]:
+    file = work / "asked" / kind / f"{digest(about)[:24]}.json"
+    return file, digest(_VERSION, options_fingerprint(QUERY), question)

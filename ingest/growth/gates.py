@@ -29,10 +29,7 @@ LEAST_VISIBLE = AcceptanceOptions().min_agreement
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gate:
-    """One question and its answer.
-
-    `reason` is the code of a refusal by it; `message` is for people, with figure and limit.
-    """
+    """One question and its answer; `reason` is the code of a refusal by it, `message` is for people."""
 
     name: str
     reason: str
@@ -62,7 +59,7 @@ def sigmas_limit(degrees: int) -> float:
 
 
 def agreement(agreeing: int, disagreeing: int) -> Gate:
-    """Photos whose own localisation agrees with the placement: one alone proves nothing, and most must."""
+    """Photos whose own localisation agrees with the placement: most must."""
     total = agreeing + disagreeing
     found = agreeing / total if total else 0.0
     return Gate(
@@ -78,9 +75,6 @@ def agreement(agreeing: int, disagreeing: int) -> Gate:
 
 def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gate:
     """How often so many of the photos' positions contradict their place by accident.
-
-    A tenth of a community's positions are wrong by kilometres, so some may contradict; more than accident
-    explains may not.
 
     Args:
         offsets_m: (n, 2) placed centre minus position, east and north.
@@ -109,11 +103,7 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gat
 
 
 def visibility(shown: FloatArray) -> Gate:
-    """Share of the photos that do not show what the existing maps say they should.
-
-    Args:
-        shown: (n,) for each photo that should see parts of existing maps: share of these in which it does.
-    """
+    """Share of the photos that show less of existing maps than they should, by what each does show (n,)."""
     blind, most = int((shown < LEAST_VISIBLE).sum()), round(1.0 - AGREEING_SHARE, 2)
     share = blind / len(shown) if len(shown) else 0.0
     return Gate(

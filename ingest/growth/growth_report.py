@@ -14,20 +14,17 @@ from ingest.growth.trust.promotion import Promotion
 from ingest.growth.values import Refused
 
 PhotoOutcome = Literal["promoted", "quarantined", "waiting", "refused"]
-_WORDS: tuple[tuple[PhotoOutcome, str], ...] = (
-    ("promoted", "in active maps"),
-    ("quarantined", "in quarantined maps"),
-    ("waiting", "waiting"),
-    ("refused", "refused"),
-)
+_WORDS: dict[PhotoOutcome, str] = {
+    "promoted": "in active maps",
+    "quarantined": "in quarantined maps",
+    "waiting": "waiting",
+    "refused": "refused",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoFate:
-    """What became of a photo, and why it waits or is refused.
-
-    The name of a contributed one is its id; its owner is an identity.
-    """
+    """What became of a photo (a contributed one by its id), and why it waits or is refused."""
 
     name: str
     owner: str
@@ -48,11 +45,11 @@ class GrownEntry:
         drift_m, budget_m: 95 % bound on its drift against its anchors, and what is allowed.
     """
 
-    map_id: str
+    map_id: str = ""
     status: str
-    reason_code: str
-    reason: str
-    photos: tuple[str, ...]
+    reason_code: str = ""
+    reason: str = ""
+    photos: tuple[str, ...] = ()
     points: int = 0
     parents: tuple[str, ...] = ()
     generation: int = 0
@@ -66,8 +63,7 @@ class GrowthReport:
     """One run.
 
     Attributes:
-        rounds: of localising, growing and promoting; more than one where photos saw a map that was just
-            promoted.
+        rounds: of localising, growing and promoting.
         promotions: of every quarantined map that was examined, in the last round that did.
         replacements: what new anchors did.
     """
@@ -92,22 +88,11 @@ class GrowthReport:
         return tuple(p.map_id for p in self.promotions if p.promoted)
 
     def as_json(self) -> dict[str, Any]:
-        return {
-            "database": self.database,
-            "started": self.started.isoformat(),
-            "seconds": round(self.seconds, 3),
-            "rounds": self.rounds,
-            "version": self.version,
-            "photos": [asdict(photo) for photo in self.photos],
-            "maps": [asdict(entry) for entry in self.maps],
-            "promotions": [asdict(promotion) for promotion in self.promotions],
-            "replacements": [r.as_json() for r in self.replacements],
-            "notes": list(self.notes),
-        }
+        return {**asdict(self), "started": self.started.isoformat(), "seconds": round(self.seconds, 3)}
 
     def as_text(self) -> str:
         """For the terminal."""
-        counts = ", ".join(f"{self.count(outcome)} {word}" for outcome, word in _WORDS)
+        counts = ", ".join(f"{self.count(outcome)} {word}" for outcome, word in _WORDS.items())
         lines = [f"{len(self.photos)} photos: {counts}; {self.rounds} rounds, {self.seconds:.1f} s"]
         reasons = Counter(p.reason_code for p in self.photos if p.reason_code)
         lines += [f"  {code}: {count} photos" for code, count in reasons.most_common()]
@@ -125,29 +110,22 @@ class GrowthReport:
 def _entry_line(entry: GrownEntry) -> str:
     if entry.status == "unplaced":
         return f"map {entry.map_id}: has no place still: {entry.reason_code}: {entry.reason}"
-    drift = ""
-    if entry.drift_m is not None and entry.budget_m is not None:
-        drift = f", {entry.drift_m:.2f} of {entry.budget_m:.2f} m"
-    steps = ""
+    line = f"map {entry.map_id or '-'}: {entry.status}, {len(entry.photos)} photos, {entry.points} points"
     if entry.generation:
-        steps = f", {entry.generation} step{'s' if entry.generation != 1 else ''} from an anchor"
-    code = f"{entry.reason_code}: " if entry.reason_code else ""
-    return (
-        f"map {entry.map_id or '-'}: {entry.status}, {len(entry.photos)} photos, {entry.points} points{steps}"
-        f"{drift}: {code}{entry.reason}"
-    )
+        line += f", {entry.generation} step{'s' if entry.generation != 1 else ''} from an anchor"
+    if entry.drift_m is not None and entry.budget_m is not None:
+        line += f", {entry.drift_m:.2f} of {entry.budget_m:.2f} m"
+    return f"{line}: {entry.reason_code}: {entry.reason}" if entry.reason_code else f"{line}: {entry.reason}"
 
 
 def _replacement_lines(replacements: Sequence[Replacement]) -> list[str]:
     lines = []
     for found in replacements:
-        code = f"{found.reason}: " if found.reason else ""
-        lines.append(f"new anchors: {code}{found.message}")
+        lines.append(f"new anchors: {found.reason + ': ' if found.reason else ''}{found.message}")
         for moved in found.moved:
+            line = f"  map {moved.map_id} moved by {moved.move_m:.2f} m, drift {moved.drift_m:.2f} m"
             before = "" if moved.drift_before_m is None else f" (before {moved.drift_before_m:.2f} m)"
-            lines.append(
-                f"  map {moved.map_id} moved by {moved.move_m:.2f} m, drift {moved.drift_m:.2f} m{before}"
-            )
+            lines.append(line + before)
         lines += [f"  left out: overlap {edge}" for edge in found.left_out]
         if found.flagged:
             lines.append(f"  quarantined, because nothing holds them any more: {', '.join(found.flagged)}")
@@ -160,8 +138,6 @@ def grown_entry(feature_map: FeatureMap) -> GrownEntry:
     return GrownEntry(
         map_id=feature_map.map_id,
         status="quarantined",
-        reason_code="",
-        reason="",
         photos=tuple(image.name for image in feature_map.images),
         points=len(feature_map.points),
         parents=feature_map.parents,
@@ -172,20 +148,7 @@ def grown_entry(feature_map: FeatureMap) -> GrownEntry:
     )
 
 
-def refused_entry(
-    refused: Refused,
-    status: str = "refused",
-    *,
-    map_id: str = "",
-    photos: tuple[str, ...] = (),
-    points: int = 0,
-) -> GrownEntry:
-    return GrownEntry(
-        map_id=map_id,
-        status=status,
-        reason_code=refused.reason,
-        reason=refused.message,
-        photos=photos,
-        points=points,
-        gates=figures(refused.gates),
-    )
+def refused_entry(refused: Refused, status: str, **of: Any) -> GrownEntry:
+    """Of what a gate refuses, with other fields of an entry."""
+    told = figures(refused.gates)
+    return GrownEntry(status=status, reason_code=refused.reason, reason=refused.message, gates=told, **of)

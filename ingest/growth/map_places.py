@@ -13,8 +13,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.place_bounds import NO_HEIGHT_M
 
-# 95 % of a normal error along the worst axis.
-SIGMAS_95 = 1.96
+SIGMAS_95 = 1.96  # 95 % of a normal error along the worst axis
 # Of the points of oblique photos a few lie far beyond the scene, at the end of nearly parallel rays.
 _SHARE_OF_PLACES = 0.99
 
@@ -32,13 +31,14 @@ def map_drift_m(feature_map: FeatureMap, covariance_relative: FloatArray) -> flo
     """`drift_m` of a map, metres, and no less than at any of its photos' centres.
 
     These are few among thousands of places, and may all be in the hundredth that is left out.
-
-    Args:
-        covariance_relative: (7, 7) relative to the map's anchors, in its frame.
     """
-    centers = np.reshape([image.cam_from_local.center for image in feature_map.images], (-1, 3))
-    worst = SIGMAS_95 * float(place_sigmas_m(covariance_relative, centers).max(initial=0.0))
-    return max(worst, drift_m(covariance_relative, places_of(feature_map)))
+    at_photos_m = place_sigmas_m(covariance_relative, centers_of(feature_map)).max(initial=0.0)
+    return max(SIGMAS_95 * float(at_photos_m), drift_m(covariance_relative, places_of(feature_map)))
+
+
+def centers_of(feature_map: FeatureMap) -> FloatArray:
+    """(n, 3) centres of a map's photos, in its frame."""
+    return np.reshape([image.cam_from_local.center for image in feature_map.images], (-1, 3))
 
 
 def place_sigmas_m(covariance: FloatArray, places: FloatArray) -> FloatArray:
@@ -54,13 +54,9 @@ def at_most_places(values: FloatArray) -> float:
 
 
 def places_of(feature_map: FeatureMap) -> FloatArray:
-    """(n, 3) where a map answers for what it says, in its frame: its points, a sample of them, and images.
-
-    Points and not the corners of their box: there is nothing in most of these.
-    """
+    """(n, 3) where a map answers for what it says, in its frame: a sample of its points, and its photos."""
     points = feature_map.points_local()
-    centers = [image.cam_from_local.center for image in feature_map.images]
-    return np.concatenate([points[:: max(1, len(points) // 2000)], np.reshape(centers, (-1, 3))])
+    return np.concatenate([points[:: max(1, len(points) // 2000)], centers_of(feature_map)])
 
 
 def growth_of(evidence: Mapping[str, Any]) -> dict[str, Any]:
@@ -77,9 +73,8 @@ def with_growth(feature_map: FeatureMap, **figures: Any) -> FeatureMap:
 
 def inflated(feature_map: FeatureMap) -> FeatureMap:
     """The map with its placement's covariance `isotropic_inflation`."""
-    placement = feature_map.placement
-    alike = isotropic_inflation(feature_map, placement.covariance)
-    return replace(feature_map, placement=replace(placement, covariance=alike))
+    alike = isotropic_inflation(feature_map, feature_map.placement.covariance)
+    return replace(feature_map, placement=replace(feature_map.placement, covariance=alike))
 
 
 def turns_about(middle: FloatArray) -> FloatArray:
@@ -94,18 +89,17 @@ def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> Floa
     the worst direction there. A height that nobody knows is no such direction. The covariance is of the
     placement's left perturbation, in the map's frame.
     """
-    middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
-    jacobian = point_jacobian(middle)
+    middle = centers_of(feature_map).mean(axis=0)
     unknown_m2 = float(covariance[6, 6])
     if unknown_m2 > NO_HEIGHT_M**2:
-        about_middle = np.vstack([np.eye(4, 7), jacobian])
+        about_middle = np.vstack([np.eye(4, 7), point_jacobian(middle)])
         covariance = about_middle @ covariance @ about_middle.T
         covariance[6], covariance[:, 6] = 0.0, 0.0
         covariance[6, 6] = covariance[4:6, 4:6].diagonal().max()
         back = np.linalg.inv(about_middle)
         alike = isotropic_inflation(feature_map, back @ covariance @ back.T)
         return alike + np.diag([0.0] * 6 + [unknown_m2])
-    shift_m2 = float(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1])
+    shift_m2 = float(place_sigmas_m(covariance, middle[None])[0]) ** 2
     turn = float(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])
     about = turns_about(middle)
     grow = np.concatenate([[1.0, 0.0, 0.0, 0.0], -middle])[:, None]

@@ -1,8 +1,8 @@
 """The story of growth on a database: new photos in, quarantined maps, confirmation, canaries, promoted maps.
 
 Rounds: photos are localised by the active maps, reconstructions placed by them and committed in quarantine,
-quarantined maps confirmed and promoted; then again, while something new was promoted that photos may see.
-Every step is a commit of its own and can be repeated: a run that was killed is finished by the next.
+quarantined maps confirmed and promoted; then again, while something new was promoted. Every step is a commit
+of its own and can be repeated: a run that was killed is finished by the next.
 """
 
 import logging
@@ -20,11 +20,10 @@ from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.graph.replacing import Replacement, replace_descendants
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate, grown_entry, refused_entry
-from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, split
-from ingest.growth.place.groups import lone_groups
+from ingest.growth.place.component import AT_SEVERAL_PLACES, GrownMap, lone_groups, split
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
 from ingest.growth.place.refine import LEAST_LINK
-from ingest.growth.trust.corroboration import NewPhotos
+from ingest.growth.trust.confirmation import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_confirmed
 from ingest.growth.trust.scan_check import checked_by_scan
 from ingest.growth.unplaced import place_unplaced_maps
@@ -54,8 +53,9 @@ def grow(
         StoreError
     """
     started, clock = datetime.now(UTC), time.perf_counter()
-    run = _Run(database=database, new=new, work=work, options=options or GrowthOptions())
-    run.recall_lost()
+    extractor = new.features_of(0).features.fingerprint if new.photos else ""  # of all of them
+    options = options or GrowthOptions()
+    run = _Run(database=database, new=new, work=work, options=options, extractor=extractor)
     while True:  # each round but the last promotes a map that no round before it did
         run.start_round()
         run.localise()
@@ -73,23 +73,20 @@ class _Run:
         localiser: of the maps that are active in this round.
         localised: photos that are in no map, as these maps see them; `posed`: the same, lone ones of a camera
             with one lens.
-        lost: write ids of the maps where a photo was looked for in vain (one that was moved is another), and
-            the reason.
         map_of: maps that photos are in; why: code and reason of those that are in none.
         entries: maps that this run has made; refused, unplaced: what this round could not place.
-        promotions: the last word on each quarantined map; ever_promoted: maps that any round promoted.
+        promotions: the last word on each quarantined map.
     """
 
     database: Database
     new: GrowthPhotos
     work: Path
     options: GrowthOptions
+    extractor: str
     rounds: int = 0
-    extractor: str = ""
     localiser: Localiser = field(init=False)
     localised: dict[int, LocalisedPhoto] = field(default_factory=dict)
     posed: dict[int, LocalisedPhoto] = field(default_factory=dict)
-    lost: dict[int, tuple[frozenset[str], str]] = field(default_factory=dict)
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
     map_of: dict[int, str] = field(default_factory=dict)
     why: dict[int, tuple[str, str]] = field(default_factory=dict)
@@ -101,26 +98,16 @@ class _Run:
     replacements: list[Replacement] = field(default_factory=list)
     notes: dict[str, None] = field(default_factory=dict)
 
-    def recall_lost(self) -> None:
-        """Which photos earlier runs have looked for in vain."""
-        if self.new.photos:
-            self.extractor = self.new.features_of(0).features.fingerprint  # of all of them
-        for row in range(len(self.new.photos)):
-            known = recall(self.work, "photos", self._about(row))
-            if known is not None:
-                self.lost[row] = frozenset(known["maps"]), known["reason"]
-
     def start_round(self) -> None:
         """New anchors move what was grown, and maps without a place are tried."""
         self.rounds += 1
         replaced = replace_descendants(self.database, self.work, budget_m=self.options.drift_budget_m)
-        if replaced is not None:
-            self.replacements.append(replaced)
+        self.replacements += [replaced] if replaced else []
         self.localiser = Localiser.open(self.database, previous=self.localiser if self.rounds > 1 else None)
         placed, self.unplaced, notes = place_unplaced_maps(
             self.database, self.localiser.areas, self.work, self.options
         )
-        self.entries.update({entry.map_id: entry for entry in placed})
+        self.entries |= {entry.map_id: entry for entry in placed}
         self.notes |= dict.fromkeys(notes)
 
     def localise(self) -> None:
@@ -129,29 +116,26 @@ class _Run:
         served = {m.map_id for indexed in self.localiser.areas for m in indexed.area.maps}
         write_ids = {m.write_id: m.map_id for m in self.database.snapshot().maps() if m.map_id in served}
         rows, everywhere = self._open_rows(), frozenset(write_ids)
-        worth: list[int] = []
+        before = {row: recall(self.work, "photos", self._about(row)) or {} for row in rows}
         asked: dict[frozenset[str], list[int]] = {}
         for row in rows:
-            before = self.lost[row][0] if row in self.lost else frozenset()
-            asked.setdefault(everywhere - before if before <= everywhere else everywhere, []).append(row)
+            maps = frozenset(before[row].get("maps", ()))  # a map that was moved is another one
+            asked.setdefault(everywhere - maps if maps <= everywhere else everywhere, []).append(row)
+        worth = asked.pop(everywhere, [])
+        asked.pop(frozenset(), None)
         for fresh, again in asked.items():
-            if fresh == everywhere:
-                worth += again
-            elif fresh:
-                areas = self.localiser.areas_of(tuple(sorted(write_ids[w] for w in fresh)))
-                worth += localise_photos(new.photos, again, new.features_of, areas, threads)[0]
+            areas = self.localiser.areas_of(tuple(sorted(write_ids[w] for w in fresh)))
+            worth += localise_photos(new.photos, again, new.features_of, areas, threads)[0]
         self.localised, reasons = localise_photos(
             new.photos, sorted(worth), new.features_of, self.localiser.areas, threads
         )
         for row in rows:
             if row not in self.localised:
-                reason = reasons.get(row) or self.lost[row][1]
+                reason = reasons.get(row) or before[row]["reason"]
+                answer = {"maps": sorted(everywhere), "reason": reason}
                 self.why[row] = _split_reason(reason)
-                if self.lost.get(row) != (everywhere, reason):
-                    self.lost[row] = everywhere, reason
-                    remember(
-                        self.work, "photos", self._about(row), {"maps": sorted(everywhere), "reason": reason}
-                    )
+                if answer != before[row]:
+                    remember(self.work, "photos", self._about(row), answer)
 
     def place(self) -> None:
         """Reconstructions and lone photos; what passes is committed."""
@@ -159,8 +143,8 @@ class _Run:
         self.posed = dict(self.localised)
         self.refused.clear()
         for model in new.models():
-            part = keep_photos(model, [int(r) for r in model.rows if int(r) not in self.map_of])
-            if part is not None and any(int(r) in self.localised for r in part.rows):
+            part = keep_photos(model, [row for row in model.rows.tolist() if row not in self.map_of])
+            if part is not None and self.localised.keys() & part.rows.tolist():
                 self._try_model(part, _SPLIT_LINKS)
         left = {row: photo for row, photo in self.localised.items() if row not in self.map_of}
         lone = with_shared_lenses(left, {row: shared_key(new.photos[row], "shared") for row in left})
@@ -175,9 +159,8 @@ class _Run:
 
         A map that goes back to quarantine and is promoted again, round by round, would keep the run going.
         """
-        outside = NewPhotos(
-            given=self.new, rows=self._open_rows(), localised=self.localised, heard=self.heard
-        )
+        rows = self._open_rows()
+        outside = NewPhotos(given=self.new, rows=rows, localised=self.localised, heard=self.heard)
         outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside)
         for outcome in outcomes:
             self.promotions[outcome.map_id] = outcome
@@ -234,46 +217,42 @@ class _Run:
         return [row for row in range(len(self.new.photos)) if row not in self.map_of]
 
     def _try_model(self, model: Model, links: Sequence[float]) -> None:
-        """Place one reconstruction; where it reaches beyond the drift budget, the part of it that does not.
+        """Place one reconstruction, or the part of it that is within the drift budget.
 
-        Where its photos are at several places, its parts: look-alikes join what does not belong together.
-
-        Args:
-            links: at which it may be split, weakest first.
+        Where its photos are at several places, its parts, split at `links`, weakest first.
         """
         new, areas = self.new, self.localiser.areas
         maps, budget_m = placed_maps(self.database.snapshot()), self.options.drift_budget_m
         grown = grow_within_budget(model, new.photos, new.features_of, self.posed, areas, maps, budget_m)
-        refused = self._take(grown) if isinstance(grown, GrownMap) else grown
-        if refused is None:
+        if isinstance(grown, GrownMap):
+            self._take(grown)
             return
-        part = keep_photos(model, list(refused.rows)) if refused.reason in AT_SEVERAL_PLACES else None
-        pieces = None if part is None else split(part, links)
-        if pieces is None:
-            self._note(refused)
+        level, parts = split(model, links) if grown.reason in AT_SEVERAL_PLACES else (0.0, [])
+        if not level:
+            self._note(grown, model)
             return
-        level, parts = pieces
-        count, message = len(refused.rows), refused.message
+        count, message = len(model.rows), grown.message
         _LOG.info("%d photos are at several places: %s; apart at links of %g", count, message, level)
-        for piece in parts:
-            rows = tuple(int(r) for r in piece.rows)
-            if self.posed.keys() & rows:
-                self._try_model(piece, [link for link in links if link > level])
+        for part in parts:
+            if self.posed.keys() & part.rows.tolist():
+                self._try_model(part, [link for link in links if link > level])
             else:
-                self._note(replace(refused, rows=rows))
+                self._note(grown, part)
 
-    def _take(self, grown: GrownMap) -> Refused | None:
+    def _take(self, grown: GrownMap) -> None:
         """Commit a grown map in quarantine, unless a scan or a person who retired it are against it."""
         checked, note = checked_by_scan(self.database, grown)
         self.notes |= {note: None} if note else {}
         if isinstance(checked, Refused):
-            return checked
-        feature_map, rows = checked.feature_map, [int(r) for r in checked.model.rows]
+            self._note(checked, grown.model)
+            return
+        feature_map, rows = checked.feature_map, checked.model.rows.tolist()
         every = {m.map_id: m for m in self.database.snapshot().maps(include_retired=True)}
         known = every.get(feature_map.map_id)
         if known is not None and known.status == "retired":
             message = f"map {known.map_id} of these photos was retired: {known.status_reason}"
-            return Refused(reason="RETIRED_MAP", message=message, rows=tuple(rows))
+            self._note(Refused(reason="RETIRED_MAP", message=message), grown.model)
+            return
         used = [self.new.candidate_ids[r] for r in rows if r in self.new.candidate_ids]
         if used:
             mark_used(self.database, used, feature_map.map_id)
@@ -284,13 +263,13 @@ class _Run:
         self.why.update({row: why for row, why in grown.left_out.items() if row not in self.map_of})
         self.entries[feature_map.map_id] = grown_entry(feature_map)
         _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
-        return None
 
-    def _note(self, refused: Refused) -> None:
-        """What became of nothing, and why."""
-        rows = [r for r in refused.rows if r not in self.map_of]
+    def _note(self, refused: Refused, model: Model) -> None:
+        """What photos became no map, and why."""
+        rows = model.rows.tolist()
         self.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
-        self.refused.append(refused_entry(refused, photos=tuple(self.new.photos[r].name for r in rows)))
+        names = tuple(self.new.photos[r].name for r in rows)
+        self.refused.append(refused_entry(refused, "refused", photos=names))
 
 
 def _split_reason(reason: str) -> tuple[str, str]:

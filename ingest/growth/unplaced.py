@@ -1,8 +1,7 @@
-"""Maps without a place are placed by the maps that show the same, behind the gates of growth.
+"""Maps without a place are placed by the maps that show the same, as reconstructions of new photos are.
 
-Such a map is a reconstruction like any other: its images are localised by what the map keeps of them, the
-similarity that they agree upon is refined with the existing points held fixed, and gates ask whether to
-believe it. It keeps its id, and what could not be taken along stays a map without a place.
+Their images are localised by what the map keeps of them. A map keeps its id, and what could not be taken
+along stays a map without a place.
 """
 
 import logging
@@ -23,9 +22,9 @@ from ingest.fingerprint import digest, options_fingerprint
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.growth_report import GrownEntry, grown_entry, refused_entry
-from ingest.growth.map_images import model_of, observed_features, observed_rows
 from ingest.growth.place.component import GrownMap
 from ingest.growth.place.localised import localise_photos
+from ingest.growth.place.map_images import model_of, observed_features, observed_rows
 from ingest.growth.trust.scan_check import NOT_ASKED, checked_by_scan
 from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, Refused
 from ingest.map_builder import MapIdentity
@@ -65,10 +64,9 @@ def place_unplaced_maps(
         if isinstance(outcome, FeatureMap):
             placed.append(grown_entry(outcome))
             continue
-        entry = refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points)
-        unplaced.append(entry)
-        if entry.reason_code not in ("CONFLICT", NOT_ASKED):
-            remember(work, "maps", summary.map_id, asdict(entry), asked)
+        unplaced.append(refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points))
+        if outcome.reason not in ("CONFLICT", NOT_ASKED):
+            remember(work, "maps", summary.map_id, asdict(unplaced[-1]), asked)
     return placed, unplaced, notes
 
 
@@ -114,13 +112,8 @@ def _grown(
     """The map where the others put it, by what it keeps of its photos."""
     rows = [observed_rows(unplaced, image, described=False) for image in unplaced.images]
     photos = [_photo(unplaced, image) for image in unplaced.images]
-    identity = MapIdentity(
-        map_id=unplaced.map_id,
-        name=unplaced.name,
-        source=unplaced.source,
-        licence=unplaced.licence,
-        provenance=unplaced.provenance,
-    )
+    named = ("map_id", "name", "source", "licence", "provenance")
+    identity = MapIdentity(**{name: getattr(unplaced, name) for name in named})
 
     def features_of(row: int) -> PhotoFeatures:
         features = observed_features(unplaced, unplaced.images[row], rows[row])
@@ -139,7 +132,7 @@ def _grown(
         for photo, image in zip(photos, unplaced.images, strict=True)
     ]
     localised, _ = localise_photos(hinted, range(len(hinted)), described_of, areas, options.threads)
-    model = model_of(unplaced, unplaced.points.xyz, unplaced.images, described=False)
+    model = model_of(unplaced, unplaced.images, described=False)
     maps, budget_m = placed_maps(snapshot), options.drift_budget_m
     return grow_within_budget(model, photos, features_of, localised, areas, maps, budget_m, identity)
 
@@ -150,7 +143,7 @@ def left_over(
     """What was not taken along, where it is a map still: a map without a place, under an id of its own.
 
     Args:
-        by: what placed the others. code, why: reason for which these photos were not placed with them.
+        by: what placed the others. code, why: of the reason why these were not placed.
     """
     taken = {image.name for image in placed.images}
     left = [image for image in unplaced.images if image.name not in taken]
@@ -160,32 +153,19 @@ def left_over(
     if not len(rest.points):
         return []
     key = digest(unplaced.map_id, *sorted(image.sha256 or image.name for image in left))[:12]
-    return [
-        replace(
-            rest,
-            map_id=f"{unplaced.map_id}-{key}",
-            name=f"{unplaced.name}, the rest",
-            no_place=NoPlace(
-                reason_code=code,
-                reason=f"left out when map {unplaced.map_id} was placed by {by}: {why}",
-                ways=unplaced.no_place.ways,
-            ),
-        )
-    ]
+    reason = f"left out when map {unplaced.map_id} was placed by {by}: {why}"
+    no_place = NoPlace(reason_code=code, reason=reason, ways=unplaced.no_place.ways)
+    name = f"{unplaced.name}, the rest"
+    return [replace(rest, map_id=f"{unplaced.map_id}-{key}", name=name, no_place=no_place)]
 
 
 def _photo(unplaced: UnplacedMap, image: MapImage) -> Photo:
     camera = unplaced.cameras[image.camera_id]
     keys = unplaced.camera_keys
     return Photo(
-        name=image.name,
         path=Path(image.name),
-        sha256=image.sha256,
         width=camera.width,
         height=camera.height,
         camera_key=keys[image.camera_id] if keys else "",
-        capture_time=image.capture_time,
-        gps=image.gps,
-        owner=image.owner,
-        licence=image.licence,
+        **{n: getattr(image, n) for n in ("name", "sha256", "capture_time", "gps", "owner", "licence")},
     )

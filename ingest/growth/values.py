@@ -1,7 +1,7 @@
 """The values that pass between the steps of growth: new photos, localised ones, overlaps, refusals."""
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -49,22 +49,22 @@ TOLERANCE_PX = 2.0 * 1600.0 * QUERY.pose.tolerance_rel
 def tied_together(nodes: Sequence[Hashable], pairs: Iterable[tuple[Hashable, Hashable]]) -> list[int]:
     """For each node the number of its group: of those that a chain of pairs ties together."""
     row = {node: k for k, node in enumerate(nodes)}
-    ends = np.array([(row[a], row[b]) for a, b in pairs], dtype=np.int64).reshape(-1, 2).T
-    graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(len(nodes), len(nodes)))
+    a, b = np.array([(row[a], row[b]) for a, b in pairs], dtype=np.int64).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(nodes), len(nodes)))
     labels: list[int] = connected_components(graph, directed=False)[1].tolist()
     return labels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocalisedPhoto:
-    """A new photo that the existing maps localise, by itself, without knowing of other new photos.
+    """A new photo that the existing maps localise, by itself.
 
     Attributes:
         frame: local frame of everything metric here.
-        covariance: (6, 6), axes of the frame, measured part only (without the maps' placements): small
-            rotation of the camera (rad) before displacement of its centre (m), as pose_uncertainty has it.
+        covariance: (6, 6) as pose_uncertainty has it, axes of the frame, without the maps' placements: small
+            rotation of the camera (rad) before displacement of its centre (m).
         feature_rows: (k,) rows of the photo's features that are inliers; pixels: (k, 2) float64 of those.
-        map_ids: the maps of the inliers' points, most inliers first; map_of: (k,) index into them.
+        map_ids: the maps of the inliers' points; map_of: (k,) index into them.
         point_of: (k,) row of that map's points.
         points: (k, 3) those points in the frame, metres.
         point_covariance: (k, 3, 3) of the points, relative to their map's gauge.
@@ -100,10 +100,19 @@ class Edge:
     map_id: str
     other_from_map: Sim3
     covariance: FloatArray
-    shared_points: int
-    photos: int
+    shared_points: int = 0
+    photos: int = 0
     place: str = ""
     shared: FloatArray = field(default_factory=lambda: np.zeros((7, 3)))
+
+    def carried(self, other: Sim3, own: Sim3) -> "Edge":
+        """The same overlap where the other map's coordinates, and this one's, are moved so."""
+        return replace(
+            self,
+            other_from_map=other @ self.other_from_map @ own.inverse(),
+            covariance=other.carried(self.covariance),
+            shared=other.adjoint() @ self.shared,
+        )
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -122,27 +131,26 @@ class Edge:
             map_id=str(value["map_id"]),
             place=str(value.get("place", "")),
             other_from_map=Sim3.exp(value.get("parent_from_new") or np.zeros(7)),
-            covariance=np.asarray(value["covariance"], dtype=np.float64).reshape(7, 7),
+            covariance=np.reshape(value["covariance"], (7, 7)),
             shared_points=int(value.get("shared_points", 0)),
             photos=int(value.get("photos", 0)),
-            shared=np.asarray(value.get("shared") or np.zeros(21), dtype=np.float64).reshape(7, 3),
+            shared=np.reshape(value.get("shared") or np.zeros(21), (7, 3)),
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Refused:
-    """What did not become a map, or an overlap: code of the reason for programs, a message with figures for
-    people, rows of the photos concerned, and every gate that was asked."""
+    """What did not become a map: code of the reason for programs, a message with figures for people, and
+    every gate that was asked."""
 
     reason: str
     message: str
-    rows: tuple[int, ...] = ()
     gates: tuple[Gate, ...] = ()
 
     @classmethod
-    def by(cls, gate: Gate, *before: Gate, rows: tuple[int, ...] = ()) -> "Refused":
+    def by(cls, gate: Gate, *before: Gate) -> "Refused":
         """By a gate, after others that were asked."""
-        return cls(reason=gate.reason, message=gate.message, rows=rows, gates=(*before, gate))
+        return cls(reason=gate.reason, message=gate.message, gates=(*before, gate))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,9 +158,8 @@ class GrowthOptions:
     """How a database grows.
 
     Attributes:
-        drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken;
-            its photos wait for an anchor.
-        trusted: identities that the operator vouches for: their photos need nobody else, as his own.
+        drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken.
+        trusted: identities that the operator vouches for.
         threads: photos that are localised at a time.
     """
 
@@ -181,8 +188,5 @@ class GrowthPhotos:
 
 def no_photos() -> GrowthPhotos:
     """Nothing new: old quarantined maps are examined, and new anchors looked for."""
-
-    def none(rows: object) -> Any:
-        raise IndexError(f"there is no photo {rows}")
-
-    return GrowthPhotos(photos=(), features_of=none, models=lambda: (), overlaps=(), geometry_of=none)
+    of_none: Any = {}.__getitem__
+    return GrowthPhotos(photos=(), features_of=of_none, models=tuple, overlaps=(), geometry_of=of_none)

@@ -95,7 +95,7 @@ def test_a_wrong_joint_is_undone_and_the_blocks_stay_apart(
     def at_random(models: Sequence[Model]) -> list[JoinedModel]:
         rng = np.random.default_rng(1)
         turned = [Sim3.exp(np.append(rng.normal(0, 1, 4), rng.normal(0, 5, 3))) for _ in models]
-        return [JoinedModel(members=tuple(range(len(models))), first_from=tuple(turned))]
+        return [dict(enumerate(turned))]
 
     monkeypatch.setattr(reconstruct, "join", at_random)
     for done in ("features", "matches", "models"):

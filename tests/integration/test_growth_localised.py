@@ -10,16 +10,15 @@ import ingest.growth.place.localised as localised_module
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapObservations
-from ingest.growth.place.contradictions import pose_by_lens
 from ingest.growth.place.localised import (
     localise_photo,
     localise_photos,
     share_shown,
     with_lens,
 )
-from ingest.growth.trust.confirmation import Sources
-from ingest.growth.trust.corroboration import NewPhotos as CorroboratingPhotos
-from ingest.growth.trust.corroboration import corroborate
+from ingest.growth.place.refine import pose_by_lens
+from ingest.growth.trust.confirmation import NewPhotos as CorroboratingPhotos
+from ingest.growth.trust.confirmation import Sources, corroborate
 from ingest.growth.values import LocalisedPhoto, no_photos
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import Localised

@@ -16,8 +16,7 @@ from featuredb.store import Database
 from featuredb.store.changes import IMPORTED
 from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.graph.replacing import replace_descendants
-from ingest.growth.map_images import features_and_points
-from ingest.growth.place.overlaps import measure_overlap
+from ingest.growth.place.map_images import features_and_points, measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, own_canaries, run_canaries
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from ingest.growth.values import Edge, GrowthOptions
@@ -392,4 +391,4 @@ def test_what_is_retired_cannot_be_promoted(tmp_path: Path) -> None:
 
 
 def test_a_run_of_canaries_says_what_regressed() -> None:
-    assert "0 canaries answered as before" in CanaryRun(checks=(), note="none").message
+    assert "0 canaries answered as before" in CanaryRun(checks=(), note="none").gate.message

@@ -1,12 +1,17 @@
 """A small made-up world: a box of points that a map has, more beyond it, and cameras that walk east."""
 
+from typing import Any
+
 import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from ingest.growth.place.component import GrownMap
+from ingest.growth.place.placement import MapsPlacement
+from ingest.growth.place.similarity_fit import FittedSimilarity
 from tests.support.new_photos import FINGERPRINT, NewPhotos
 from tests.support.scenes import (
     EASTING,
@@ -67,3 +72,33 @@ def centers_error(grown: GrownMap, new: NewPhotos) -> FloatArray:
     truth = np.array([new.poses[int(r)].center for r in grown.model.rows])
     to_frame = grown.feature_map.frame.enu_from(FRAME)
     return np.linalg.norm(grown.model.centers() - to_frame.act(truth), axis=1)
+
+
+def grown_map(feature_map: FeatureMap, model: Any, *, bending_m: float = 0.0, left_out: Any = ()) -> GrownMap:
+    """A grown map of a model, without gates, overlaps or anything that its refinement knows."""
+    return GrownMap(
+        feature_map=feature_map,
+        placement=MapsPlacement(
+            frame=feature_map.frame,
+            covariance=np.zeros((7, 7)),
+            agreeing=(),
+            disagreeing=(),
+            blind=(),
+            edges=(),
+            fit=FittedSimilarity(
+                local_from_sfm=Sim3.identity(),
+                covariance=np.zeros((7, 7)),
+                errors_px=np.zeros(0),
+                spread=1.0,
+                neighbours_factor=1.0,
+            ),
+            used=np.zeros(0, dtype=np.bool_),
+            residual_rms_m=0.0,
+            gates=(),
+        ),
+        model=model,
+        left_out=dict(left_out),
+        poses=np.zeros((0, 6, 6)),
+        bending_m=bending_m,
+        shared_turn=np.zeros((7, 3)),
+    )

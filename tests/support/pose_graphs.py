@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.growth.graph.pose_graph import WORLD, GraphEdge, GraphSolution, solve_pose_graph
+from ingest.growth.values import Edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -17,10 +18,15 @@ class GraphNode:
     present_from_own: Sim3 = field(default_factory=Sim3.identity)
 
 
+def graph_edge(a: str, b: str, b_from_a: Sim3, covariance: FloatArray, **more: FloatArray) -> GraphEdge:
+    """The overlap of map a with map b, as a graph has it."""
+    return a, Edge(map_id=b, other_from_map=b_from_a, covariance=covariance, **more)
+
+
 def solved(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> GraphSolution:
     """The graph of these maps and overlaps."""
     placements = [
-        GraphEdge(a=n.map_id, b=WORLD, b_from_a=n.present_from_own.inverse(), covariance=n.prior)
+        graph_edge(n.map_id, WORLD, n.present_from_own.inverse(), n.prior)
         for n in nodes
         if n.prior is not None
     ]

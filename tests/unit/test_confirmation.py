@@ -50,7 +50,7 @@ def test_two_owners_on_record_confirm_each_other() -> None:
     assert found.gate.passes
     assert set(found.owners) == {"anna", "ben"}
     assert len(found.confirmed) == 8
-    assert "8 photos confirmed by 2 owners" in found.message
+    assert "8 photos confirmed by 2 owners" in found.gate.message
 
 
 def test_one_owner_does_not_confirm_himself() -> None:
@@ -154,7 +154,7 @@ def test_one_photo_confirms_nothing_alone() -> None:
     found = _confirm(one)
     assert len(found.confirmed) == 20
     assert _reason(found) == "FEW_PAIRS"
-    assert "confirmed by one photo alone" in found.message
+    assert "confirmed by one photo alone" in found.gate.message
     assert _reason(_confirm(_owned(["eve", "anna"], cameras=2))) == "FEW_PAIRS"
     assert _confirm(_owned(["eve", "eve"] + 18 * ["anna"], cameras=20)).gate.passes
     assert _confirm(_owned(["eve", "anna", "ben"], cameras=3)).gate.passes
@@ -189,7 +189,7 @@ def test_photos_from_outside_that_contradict_count_against_pairs() -> None:
     assert _confirm(feature_map, against=proven * 2).gate.passes
     found = _confirm(feature_map, against=proven * 3)
     assert _reason(found) == "CONTRADICTED"
-    assert "a is 5.0 m off" in found.message
+    assert "a is 5.0 m off" in found.gate.message
     # One owner on record may lie with all photos, and counts once; three owners count.
     lies = [(Source(owner=name, on_record=True), "b") for name in ("carl", "eve", "dan")]
     assert _confirm(feature_map, against=lies[:1] * 9).gate.passes

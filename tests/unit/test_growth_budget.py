@@ -14,7 +14,7 @@ from ingest.growth.graph import map_graph
 from ingest.growth.graph.map_graph import rows_within, with_drift
 from ingest.growth.map_places import drift_m, places_of, turns_about, with_growth
 from ingest.growth.place.component import GrownMap
-from ingest.growth.place.placement import MapsPlacement
+from tests.support.growth_box import grown_map
 from tests.support.scenes import box_points, looking_at, random_descriptors, ring, scene_map
 
 RNG = np.random.default_rng(4)
@@ -65,15 +65,8 @@ def test_photos_far_from_what_they_show_keep_the_budget_like_its_points() -> Non
     far = [looking_at(np.array([x, 0.0, 40.0]), np.array([0.0, 0.0, 3.0])) for x in (-400.0, 400.0)]
     plain = scene_map(points=points, descriptors=random_descriptors(RNG, 2000), poses=[*ring(4), *far])
     turn = turns_about(np.zeros(3)) @ turns_about(np.zeros(3)).T * 1e-3**2
-    grown = GrownMap(
-        feature_map=with_growth(plain, covariance_relative=turn.ravel().tolist(), gates={}),
-        placement=MapsPlacement(reason=None, message="", frame=plain.frame),
-        model=SimpleNamespace(),  # type: ignore[arg-type]
-        left_out={},
-        poses=np.zeros((0, 6, 6)),
-        bending_m=0.0,
-        shared_turn=np.zeros((7, 3)),
-    )
+    told = with_growth(plain, covariance_relative=turn.ravel().tolist(), gates={})
+    grown = grown_map(told, SimpleNamespace())
     assert drift_m(turn, places_of(plain)) < 0.11
     feature_map, drift, relative = with_drift(grown, {}, BUDGET_M)
     assert drift == pytest.approx(1.96e-3 * np.hypot(400.0, 40.0), rel=1e-6)
@@ -84,26 +77,18 @@ def test_photos_far_from_what_they_show_keep_the_budget_like_its_points() -> Non
 def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     """One is beyond the budget, one hangs on it alone, one was left out before for a reason of its own."""
 
-    placement = MapsPlacement(reason=None, message="", frame=bent([None]).frame)
+    feature_map = bent([None])
 
     def grown(part: Any, *_: object) -> GrownMap:
         left_out = {3: ("WEAK_LINK", "little")} if 3 in part.rows else {}
-        return GrownMap(
-            feature_map=part,
-            placement=placement,
-            model=part,
-            left_out=left_out,
-            poses=np.zeros((0, 6, 6)),
-            bending_m=BENDING_M,
-            shared_turn=np.zeros((7, 3)),
-        )
+        return grown_map(feature_map, part, bending_m=BENDING_M, left_out=left_out)
 
     def cut(part: Any, rows: list[int], least: int) -> Any:
         return SimpleNamespace(rows=np.array([0, 1, 2]))  # 4 hangs on nothing that is left
 
     whole = SimpleNamespace(rows=np.arange(6))
     monkeypatch.setattr(
-        map_graph, "with_drift", lambda found, *_: (found.model, 0.1 * len(found.model.rows), None)
+        map_graph, "with_drift", lambda found, *_: (feature_map, 0.1 * len(found.model.rows), None)
     )
     monkeypatch.setattr(map_graph, "rows_within", lambda *_: [0, 1, 2, 4])
     monkeypatch.setattr(map_graph, "keep_photos", cut)

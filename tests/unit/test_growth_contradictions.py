@@ -11,7 +11,7 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
-from ingest.growth.place.contradictions import contradicting_photos
+from ingest.growth.place.refine import contradicting_photos
 from ingest.growth.place.similarity_fit import FittedSimilarity
 from ingest.growth.values import LocalisedPhoto
 from tests.support.localised_photos import localised_photo

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.growth.place.groups import intersections, poses_fit
+from ingest.growth.place.component import intersections, poses_fit
 from tests.support.localised_photos import localised_photo
 from tests.support.scenes import CAMERA, box_points, ring
 

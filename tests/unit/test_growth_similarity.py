@@ -14,8 +14,8 @@ from ingest.growth.place.similarity_fit import (
     find_correspondences,
     fit_similarity,
     neighbours_factor,
-    tolerances_px,
 )
+from ingest.growth.values import TOLERANCE_PX
 from tests.support.localised_photos import localised_photo
 from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import box_points, random_descriptors, ring
@@ -170,8 +170,8 @@ def test_photos_agree_by_their_own_correspondences() -> None:
     pixels[correspondences.photo_of == 2] += 40.0
     off = replace(correspondences, pixels=pixels)
     errors = correspondence_errors(new.model, TRUTH, off)
-    agree = agreeing_photos(errors, tolerances_px(new.model, off), off)
-    assert agree.tolist() == [0, 1, 3, 4]
+    agree = agreeing_photos(errors, TOLERANCE_PX, off)
+    assert agree == {0, 1, 3, 4}
 
 
 def test_points_behind_a_camera_never_agree() -> None:
@@ -195,7 +195,7 @@ def test_anchors_are_carried_along_tracks() -> None:
         points=points[world_rows],
         point_covariance=np.tile(np.eye(3) * 1e-4, (20, 1, 1)),
     )
-    correspondences = find_correspondences(new.model, {0: photo}, new.keypoints())
+    correspondences = find_correspondences(new.model, {0: photo}, list(new.keypoints().values()))
     assert (~correspondences.carried).sum() == 20
     seen_by_others = sum(int(np.isin(w, world_rows).sum()) for w in new.world_of[1:])
     assert correspondences.carried.sum() == seen_by_others

@@ -21,8 +21,8 @@ from ingest.growth.graph.map_graph import (
 )
 from ingest.growth.graph.replacing import MovedMap, Replacement, overlaps_to_measure
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
-from ingest.growth.map_images import model_of
 from ingest.growth.map_places import drift_m, growth_of, places_of
+from ingest.growth.place.map_images import model_of
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.confirmation import OutsidePhoto, Source, answering_with, confirm
 from ingest.growth.trust.promotion import Promotion
@@ -166,7 +166,7 @@ def test_which_overlaps_are_measured_anew() -> None:
 
 def _model() -> Model:
     feature_map = strip_map("m", 40.0)
-    return model_of(feature_map, feature_map.points_local(), feature_map.images, described=True)
+    return model_of(feature_map, feature_map.images, described=True)
 
 
 def test_a_model_is_cut_to_the_photos_that_hang_together() -> None:
@@ -220,7 +220,9 @@ def test_only_points_of_two_sources_answer() -> None:
     assert (part.observations.descriptors[~part.observations.has_descriptor] == 0).all()
     # Where all is seen by two, nothing changes; a trusted owner's points need nobody.
     clean = strip_map("m", 40.0, owners=["anna", "ben"])
-    assert answering_with(clean, np.ones(len(clean.points), dtype=bool)) is clean
+    whole = answering_with(clean, np.ones(len(clean.points), dtype=bool)).observations
+    np.testing.assert_array_equal(whole.descriptors, clean.observations.descriptors)
+    np.testing.assert_array_equal(whole.has_descriptor, clean.observations.has_descriptor)
     trusted = confirm(poisoned, sources_of(poisoned, trusted=("eve",))).points
     assert trusted[fake].mean() > 0.5
     # Whose word does not count yet takes no part.

@@ -48,16 +48,13 @@ def test_parts_are_tied_by_less_than_their_photos_are() -> None:
 
 def test_a_reconstruction_of_two_places_is_taken_apart_at_its_weakest_joint() -> None:
     model = two_places()
-    found = split(model, (0.10, 0.15, 0.25))
-    assert found is not None
-    level, parts = found
+    level, parts = split(model, (0.10, 0.15, 0.25))
     assert level == 0.15
     assert [part.rows.tolist() for part in parts] == [[3, 4, 5, 6], [0, 1, 2]]
     # Points that only the joint had two views of are gone.
     assert len(parts[1].xyz) == 100
     # One place is left as it is, and so are links that nobody names.
-    assert split(parts[0], (0.10, 0.15, 0.25)) is None
-    assert split(model, ()) is None
+    assert split(parts[0], (0.10, 0.15, 0.25)) == (0.0, [])
+    assert split(model, ()) == (0.0, [])
     # Photos that hang on nothing are in no part.
-    level, parts = split(model, (0.60,)) or (0.0, [model])
-    assert (level, parts) == (0.60, [])
+    assert split(model, (0.60,)) == (0.60, [])

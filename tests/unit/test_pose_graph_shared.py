@@ -11,9 +11,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.growth.graph.map_graph import in_graph
-from ingest.growth.graph.pose_graph import GraphEdge, GraphSolution
+from ingest.growth.graph.pose_graph import GraphSolution
 from ingest.growth.values import Edge
-from tests.support.pose_graphs import GraphNode, solved
+from tests.support.pose_graphs import GraphNode, graph_edge, solved
 
 MAPS, STEP_M = 12, 30.0
 OWN = np.diag(np.array([1e-5, 5e-5, 5e-5, 5e-5, 0.005, 0.005, 0.005]) ** 2)
@@ -35,11 +35,11 @@ def chain(errors: FloatArray, said: bool, far_anchor: bool = False) -> GraphSolu
     for k, (parent, child) in enumerate(itertools.pairwise(names)):
         common = shared(k)
         edges.append(
-            GraphEdge(
-                a=child,
-                b=parent,
-                b_from_a=Sim3.exp(errors[k]),
-                covariance=OWN + common @ common.T,
+            graph_edge(
+                child,
+                parent,
+                Sim3.exp(errors[k]),
+                OWN + common @ common.T,
                 shared=common if said else np.zeros((7, 3)),
             )
         )
@@ -117,5 +117,5 @@ def test_it_is_stored_with_the_overlap_and_turns_with_its_frame() -> None:
     here = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0)
     there = LocalFrame(latitude_deg=48.3, longitude_deg=9.5, height_m=100.0)
     own = replace(edge, covariance=edge.shared @ edge.shared.T)
-    moved = in_graph("m1", own, here, there)
+    moved = in_graph(own, here, there)
     np.testing.assert_allclose(moved.shared @ moved.shared.T, moved.covariance, rtol=1e-6, atol=1e-9)

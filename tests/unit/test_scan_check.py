@@ -13,13 +13,13 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.render.cloud import PointCloud
 from ingest.growth.gates import Gate
-from ingest.growth.map_images import model_of
 from ingest.growth.map_places import growth_of
 from ingest.growth.place.component import GrownMap
-from ingest.growth.place.placement import MapsPlacement
+from ingest.growth.place.map_images import model_of
 from ingest.growth.trust import scan_check
 from ingest.growth.trust.scan_check import checked_by_scan, cloud_gate
 from ingest.growth.values import Refused
+from tests.support.growth_box import grown_map
 from tests.support.scanned_map import ground_points, plain_cloud, scan, scanned_map
 
 
@@ -93,16 +93,7 @@ def test_where_there_is_no_scan_nothing_is_said(cloud: PointCloud) -> None:
 def test_without_the_extra_a_map_with_a_scan_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     world = scanned_map(placed_by=Sim3.identity())
     known = replace(world.feature_map, height_datum=world.cloud.height_datum)
-    placement = MapsPlacement(reason=None, message="", frame=known.frame)
-    grown = GrownMap(
-        feature_map=known,
-        placement=placement,
-        model=model_of(known, known.points_local(), known.images, described=False),
-        poses=np.zeros((0, 6, 6)),
-        bending_m=0.0,
-        shared_turn=np.zeros((7, 3)),
-        left_out={},
-    )
+    grown = grown_map(known, model_of(known, known.images, described=False))
     database: Any = SimpleNamespace(has=lambda _: True)
     monkeypatch.setattr(scan_check, "load_cloud", lambda *_: world.cloud)
     checked, why = checked_by_scan(database, grown)

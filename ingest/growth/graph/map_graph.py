@@ -1,13 +1,10 @@
-"""The maps of a snapshot as a pose graph: who placed whom, how well, and how far that may have drifted.
-
-An edge of the graph is an overlap that growth has measured (`values.Edge`). Once the other map is placed anew
-its digest of place differs, and the edge has to be measured again.
-"""
+"""The maps of a snapshot as a pose graph: who placed whom, how well, and how far that may have drifted."""
 
 import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -15,7 +12,6 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, Placement
-from featuredb.maps.move import covariance_in_frame, in_frame
 from featuredb.store import Snapshot
 from featuredb.store.changes import is_imported
 from featuredb.store.decode import frame_of, placement_of
@@ -23,17 +19,10 @@ from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
-from ingest.growth.graph.pose_graph import WORLD, GraphEdge, GraphSolution, solve_pose_graph
+from ingest.growth.graph.pose_graph import WORLD, GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, map_drift_m, with_growth
 from ingest.growth.place.component import GrownMap, grow_component
-from ingest.growth.values import (
-    LEAST_PHOTOS,
-    Edge,
-    FeaturesOf,
-    LocalisedPhoto,
-    Refused,
-    tied_together,
-)
+from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.links import keep_photos
@@ -72,14 +61,13 @@ class PlacedMap:
         return not self.parents
 
     @property
-    def own_placement(self) -> tuple[FloatArray, Sim3]:
-        """Covariance (7, 7) of an anchor's placement before others moved it, and that move; its frame."""
+    def own_place(self) -> Edge:
+        """An anchor's own placement, before others moved it, as an overlap with the world; its frame."""
         own = growth_of(self.placement.evidence).get(OWN)
-        if own is None:
-            return self.placement.covariance, Sim3.identity()
-        return np.asarray(own["covariance"], dtype=np.float64).reshape(7, 7), Sim3.exp(
-            own["present_from_own"]
-        )
+        covariance, moved = self.placement.covariance, Sim3.identity()
+        if own is not None:
+            covariance, moved = np.reshape(own["covariance"], (7, 7)), Sim3.exp(own["present_from_own"])
+        return Edge(map_id=WORLD, other_from_map=moved.inverse(), covariance=covariance)
 
 
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
@@ -90,27 +78,19 @@ def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
 
 def _placed(row: Row) -> PlacedMap:
     frame, placement = frame_of(row), placement_of(row)
+    corners = np.zeros((0, 3))
+    if row[BOUNDS[0]] is not None:
+        low_and_high = np.reshape([row[name] for name in BOUNDS], (2, 3))
+        corners = frame.enu_from_utm(list(product(*low_and_high.T)), row["epsg"])
     return PlacedMap(
-        map_id=row["map_id"],
-        write_id=row["write_id"],
-        status=row["status"],
-        status_reason=row["status_reason"],
-        generation=row["generation"],
+        **{name: row[name] for name in ("map_id", "write_id", "status", "status_reason", "generation")},
         parents=tuple(row["parents"]),
         frame=frame,
         placement=placement,
         place=place_key(frame, placement),
-        corners=_corners(row, frame),
+        corners=corners,
         edges=tuple(Edge.from_json(edge) for edge in growth_of(placement.evidence).get("edges", ())),
     )
-
-
-def _corners(row: Row, frame: LocalFrame) -> FloatArray:
-    if row[BOUNDS[0]] is None:
-        return np.zeros((0, 3))
-    box = np.array([row[name] for name in BOUNDS], dtype=np.float64).reshape(2, 3)
-    picks = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
-    return frame.enu_from_utm(np.stack([box[picks[:, k], k] for k in range(3)], axis=1), row["epsg"])
 
 
 def place_key(frame: LocalFrame, placement: Placement) -> str:
@@ -122,7 +102,7 @@ def place_key(frame: LocalFrame, placement: Placement) -> str:
 
 
 def holds(maps: Mapping[str, PlacedMap], edge: Edge) -> bool:
-    """Whether the other map is where it was when the overlap was measured."""
+    """Whether the other map is where it was when the overlap was measured; else it is measured again."""
     return edge.map_id in maps and maps[edge.map_id].place == edge.place
 
 
@@ -141,46 +121,22 @@ def solve_maps(
     group_of = dict(zip(names, groups, strict=True))
     wanted = {group_of[m] for m in new}
     members = sorted(m for m in names if group_of[m] in wanted)
-    edges = [
-        in_graph(m, edge, maps[m].frame if m in maps else frame, frame)
-        for m, edge in overlaps
-        if group_of[m] in wanted
-    ]
-    edges += [_placement(m, maps[m], frame) for m in members if m in maps and maps[m].is_anchor]
-    return solve_pose_graph(members, edges)
+    overlaps += [(m, maps[m].own_place) for m in members if m in maps and maps[m].is_anchor]
+    frames = {m: maps[m].frame if m in maps else frame for m in members}
+    return solve_pose_graph(members, [(m, in_graph(e, frames[m], frame)) for m, e in overlaps if m in frames])
 
 
-def _placement(map_id: str, anchor: PlacedMap, frame: LocalFrame) -> GraphEdge:
-    """An anchor's own placement: where others have moved it, their edges say so anew."""
-    covariance, moved = anchor.own_placement
-    return GraphEdge(
-        a=map_id,
-        b=WORLD,
-        b_from_a=in_frame(moved, anchor.frame, frame).inverse(),
-        covariance=covariance_in_frame(covariance, anchor.frame, frame),
-    )
-
-
-def in_graph(map_id: str, edge: Edge, own: LocalFrame, frame: LocalFrame) -> GraphEdge:
+def in_graph(edge: Edge, own: LocalFrame, frame: LocalFrame) -> Edge:
     """A stored edge in the frame of a graph."""
-    return GraphEdge(
-        a=map_id,
-        b=edge.map_id,
-        b_from_a=in_frame(edge.other_from_map, own, frame),
-        covariance=covariance_in_frame(edge.covariance, own, frame),
-        shared=Sim3.from_rigid3(frame.enu_from(own)).adjoint() @ edge.shared,
-    )
+    frame_from_own = Sim3.from_rigid3(frame.enu_from(own))
+    return edge.carried(frame_from_own, frame_from_own)
 
 
 def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
     """Edges of one map to several, all made of the same photos, so that they do not count these twice.
 
-    Taken as independent, they would place the map more surely than one fit to all of them, its bending
-    included, did. What is missing is common to all of them; shared out over n of them, each gets n times as
-    much, so that they have it together.
-
-    Args:
-        together: (7, 7) covariance of the map's placement by all of them at once.
+    Taken as independent, they would place the map more surely than one fit to all of them, `together` (7, 7),
+    did. Each of n gets n times what is missing, so that they have it together.
     """
     if not edges:
         return []
@@ -203,30 +159,27 @@ def grow_within_budget(
     budget_m: float,
     identity: MapIdentity | None = None,
 ) -> GrownMap | Refused:
-    """`grow_component` of a reconstruction, or of the part of it that is within the budget.
+    """`grow_component` of a reconstruction, or of the part of it that is within the budget; with its drift.
 
-    Returns:
-        The map with its drift, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this
-        reconstruction and not the others of the run, nor the next run.
+    What no step foresaw is a refusal, too (FAILED): it costs this reconstruction and not the others.
     """
-    part, everything = model, tuple(model.rows.tolist())
+    part = model
     beyond: dict[int, tuple[str, str]] = {}
-    refused = Refused(reason="", message="")
     for _ in range(_TRIES):
         try:
             grown = grow_component(part, photos, features_of, localised, areas, identity, budget_m)
         except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
-            _LOG.exception("a reconstruction of %d photos", len(everything))
+            _LOG.exception("a reconstruction of %d photos", len(model.rows))
             text = f"{type(error).__name__}: {error}; the log tells where. Please report it"
-            grown = Refused(reason="FAILED", message=text)
+            return Refused(reason="FAILED", message=text)
         if isinstance(grown, Refused):
-            return replace(grown, rows=everything)
+            return grown
         feature_map, drift, relative = with_drift(grown, maps, budget_m)
         gate = gates.drift(drift, budget_m)
         if gate.passes:
             return replace(grown, feature_map=feature_map, left_out={**beyond, **grown.left_out})
-        refused = Refused.by(gate, *grown.placement.gates, rows=everything)
-        rows = [int(r) for r in grown.model.rows]
+        refused = Refused.by(gate, *grown.placement.gates)
+        rows = grown.model.rows.tolist()
         within = rows_within(feature_map, rows, relative, grown.bending_m, budget_m)
         left = keep_photos(part, within, least=LEAST_PHOTOS) if len(within) < len(rows) else None
         if left is None:
@@ -243,19 +196,14 @@ def with_drift(
     """The map with its overlaps by the graph of maps, its drift (m) and covariance (7, 7) to anchors."""
     feature_map = grown.feature_map
     growth = growth_of(feature_map.placement.evidence)
-    edges = no_surer_than(
-        [
-            replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn)
-            for edge in grown.placement.edges
-            if edge.map_id in maps
-        ],
-        grown.placement.covariance_relative,
-    )
+    held = [edge for edge in grown.placement.edges if edge.map_id in maps]
+    held = [replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn) for edge in held]
+    edges = no_surer_than(held, grown.placement.covariance)
     covariance = feature_map.placement.covariance
     relative = np.reshape(growth["covariance_relative"], (7, 7))
     others = {m: placed for m, placed in maps.items() if m != feature_map.map_id}
     solution = solve_maps(others, {feature_map.map_id: edges}, feature_map.frame)
-    if solution.reason is None and feature_map.map_id in solution.covariance:
+    if feature_map.map_id in solution.covariance:
         covariance = solution.covariance[feature_map.map_id]
         relative = solution.covariance_relative[feature_map.map_id]
     drift = map_drift_m(feature_map, relative)
@@ -265,7 +213,7 @@ def with_drift(
         budget_m=budget_m,
         covariance_relative=relative.ravel().tolist(),
         edges=[edge.as_json() for edge in edges],
-        gates={**growth["gates"], **gates.figures((gates.drift(drift, budget_m),))},
+        gates=growth["gates"] | gates.figures([gates.drift(drift, budget_m)]),
     )
     placed = replace(placed, placement=replace(placed.placement, covariance=covariance))
     return inflated(placed), drift, relative

@@ -5,8 +5,7 @@ similarities between maps that overlap; anchors are held by their own covariance
 points of map i and Z that carries what map i says to where map j says it, X_i = X_j Z in truth, so an edge's
 residual is log(X_j^-1 X_i Z^-1).
 
-Marginal covariances come from the normal matrix of the whole graph, not from sums along one path. An edge is
-judged by how much of chi-square goes with it (the block form of Baarda's test).
+An edge is judged by how much of chi-square goes with it (the block form of Baarda's test).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.sparse import bsr_array, csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.stats import chi2
 
@@ -23,7 +22,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3
 from ingest.growth.gates import SIGMAS
-from ingest.growth.values import tied_together
+from ingest.growth.values import Edge, tied_together
 
 WORLD = ""  # what anchors are measured against, and stays
 _CHANCE = float(chi2.sf(SIGMAS**2, 1))  # of a worse chi-square, below which something contradicts
@@ -42,38 +41,20 @@ _ROUNDS, _HALVINGS = 50, 8  # of Gauss and Newton, and of a step
 _NOTHING = 1e-6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GraphEdge:
-    """A measured overlap of two maps at their present places, or an anchor's own placement, if b is `WORLD`.
-
-    Attributes:
-        b_from_a: carries what map a says to where map b says it; graph's frame.
-        covariance: (7, 7) of its left perturbation.
-        shared: (7, 3) the part that all edges have in common, for one sigma of three errors.
-    """
-
-    a: str
-    b: str
-    b_from_a: Sim3
-    covariance: FloatArray
-    shared: FloatArray = field(default_factory=lambda: np.zeros((7, 3)))
-
-    def __str__(self) -> str:
-        return f"{self.a} - {self.b}"
+GraphEdge = tuple[str, Edge]
+"""A map and its overlap with another one, or with `WORLD`: its own placement; all in the graph's frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraphSolution:
-    """New places of all maps that hang on an anchor.
+    """New places of all maps that hang on an anchor; none where there is a reason.
 
     Attributes:
         reason: None, NO_ANCHOR or CONTRADICTION; `message` says it for people.
-        corrections: new_from_present of each map that a chain of edges ties to an anchor, graph's frame;
-            empty where there is a reason.
+        corrections: new_from_present of each map that a chain of edges ties to an anchor, graph's frame.
         covariance: (7, 7) of each new place on Earth.
         covariance_relative: (7, 7) relative to the anchors, as if those were the truth; zero for anchors.
-        chi_square, degrees: of the fit; covariances are widened by their ratio where that is needed.
-        left_out: edges that contradict the rest.
+        left_out: the two maps of each edge that contradicts the rest.
     """
 
     reason: str | None
@@ -81,9 +62,7 @@ class GraphSolution:
     corrections: Mapping[str, Sim3] = field(default_factory=dict)
     covariance: Mapping[str, FloatArray] = field(default_factory=dict)
     covariance_relative: Mapping[str, FloatArray] = field(default_factory=dict)
-    chi_square: float = 0.0
-    degrees: int = 0
-    left_out: tuple[GraphEdge, ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()
 
 
 class _Fit:
@@ -91,11 +70,11 @@ class _Fit:
 
     def __init__(self, ids: Sequence[str], edges: Sequence[GraphEdge]) -> None:
         self._ids, rows = ids, {map_id: i for i, map_id in enumerate(ids)}
-        self.edges = [e for e in edges if e.a in rows]
-        self._ends = [(rows[e.a], rows.get(e.b)) for e in self.edges]
-        self._anchors = {e.a for e in self.edges if e.b == WORLD}
+        self.edges = [(m, edge) for m, edge in edges if m in rows]
+        self._ends = [(rows[m], rows.get(edge.map_id)) for m, edge in self.edges]
+        self._anchors = {m for m, edge in self.edges if edge.map_id == WORLD}
         # W with W C W^T = I.
-        self._white = [np.linalg.inv(np.linalg.cholesky(e.covariance + _FLOOR)) for e in self.edges]
+        self._white = [np.linalg.inv(np.linalg.cholesky(e.covariance + _FLOOR)) for _, e in self.edges]
         places = self._solved()
         self._residuals, self._jacobian = self._linearised(places)
         self.corrections = dict(zip(rows, places, strict=True))
@@ -127,23 +106,21 @@ class _Fit:
         Those at a residual of nothing lead nowhere where an overlap is turned by a right angle: the fit stops
         short, and of two overlaps that hold a map alike the right one was left out.
         """
-        residuals: list[FloatArray] = []
-        blocks: list[tuple[int, int, FloatArray]] = []
-        for k, (edge, (a, b), white) in enumerate(zip(self.edges, self._ends, self._white, strict=True)):
+        residuals, blocks, columns, starts = [], [], [], [0]
+        for (_, edge), (a, b), white in zip(self.edges, self._ends, self._white, strict=True):
             b_inverse = Sim3.identity() if b is None else places[b].inverse()
-            miss = (b_inverse @ places[a] @ edge.b_from_a.inverse()).log()
+            miss = (b_inverse @ places[a] @ edge.other_from_map.inverse()).log()
             along = white @ np.linalg.solve(left_jacobian(miss), b_inverse.adjoint())
             residuals.append(white @ miss)
-            blocks.append((k, a, along))
-            if b is not None:
-                blocks.append((k, b, -along))
-        return np.concatenate(residuals), _assemble(blocks, len(residuals), len(places))
+            blocks += [along] if b is None else [along, -along]
+            columns += [a] if b is None else [a, b]
+            starts.append(len(columns))
+        shape = (7 * len(self.edges), 7 * len(places))
+        jacobian = bsr_array((np.array(blocks), columns, starts), shape=shape)
+        return np.concatenate(residuals), csr_array(jacobian)
 
     def judged(self) -> list[tuple[float, int]]:
-        """Of each edge the fall of chi-square without it, and its redundancy.
-
-        The redundancy is the number of its seven directions that others check.
-        """
+        """Of each edge the fall of chi-square without it, and how many of its directions others check."""
         solve, found = _solver(self._jacobian), []
         for k in range(len(self.edges)):
             rows = self._jacobian[7 * k : 7 * k + 7]
@@ -155,11 +132,7 @@ class _Fit:
         return found
 
     def marginals(self, *, relative: bool) -> dict[str, FloatArray]:
-        """Covariance (7, 7) of each map's correction, with what edges have in common.
-
-        Args:
-            relative: as if the anchors were where they are without error; zero for themselves.
-        """
+        """Covariance (7, 7) of each map's correction; `relative`: as if the anchors had no error."""
         free = [i for i, map_id in enumerate(self._ids) if map_id not in self._anchors or not relative]
         found = {map_id: np.zeros((7, 7)) for map_id in self._ids}
         if free:
@@ -178,7 +151,7 @@ class _Fit:
         units = (np.eye(size, 7, -first) for first in range(0, size, 7))
         own = np.array([solve(unit)[7 * i : 7 * i + 7] for i, unit in enumerate(units)])
         together, apart = np.zeros((size // 7, 7, 3)), np.zeros((size // 7, 7, 7))
-        for k, (edge, white) in enumerate(zip(self.edges, self._white, strict=True)):
+        for k, ((_, edge), white) in enumerate(zip(self.edges, self._white, strict=True)):
             if edge.shared.any():
                 rows = jacobian[7 * k : 7 * k + 7]
                 moved = solve(rows.T @ (white @ edge.shared)).reshape(-1, 7, 3)
@@ -193,20 +166,15 @@ def solve_pose_graph(ids: Sequence[str], edges: Sequence[GraphEdge]) -> GraphSol
     """The most likely places of all maps; edges that contradict the rest are named and left out.
 
     Args:
-        ids: of the maps. edges: overlaps, and the anchors' own placements.
+        ids: of the maps. edges: overlaps between them, and the anchors' own placements.
 
     Raises:
-        InvalidValueError: map ids repeat, an edge names an unknown map, or its covariance is not finite.
+        InvalidValueError: the covariance of an edge is not finite.
     """
-    if len(set(ids)) != len(ids):
-        raise InvalidValueError(f"pose graph: map ids repeat: {ids}")
-    if unknown := {m for e in edges for m in (e.a, e.b)} - {*ids, WORLD}:
-        raise InvalidValueError(f"pose graph: edges name unknown maps {sorted(unknown)}")
-    if broken := [str(e) for e in edges if not np.isfinite(e.covariance).all()]:
+    if broken := [f"{m} - {e.map_id}" for m, e in edges if not np.isfinite(e.covariance).all()]:
         raise InvalidValueError(f"pose graph: covariances that are not finite: {broken}")
-    left_out: list[GraphEdge] = []
-    remaining = list(edges)
-    reached = _anchored(ids, remaining)
+    left_out: list[tuple[str, str]] = []
+    remaining, reached = list(edges), _anchored(ids, edges)
     if not reached:
         return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
     while True:
@@ -215,21 +183,20 @@ def solve_pose_graph(ids: Sequence[str], edges: Sequence[GraphEdge]) -> GraphSol
         worst = _contradicting(fitted, judged)
         if worst is None or _anchored(ids, [e for e in remaining if e is not worst]) != reached:
             break
-        left_out.append(worst)
+        left_out.append((worst[0], worst[1].map_id))
         remaining.remove(worst)
-    return replace(_solution(fitted, judged), left_out=tuple(left_out))
-
-
-def _solution(fitted: _Fit, judged: Sequence[tuple[float, int]]) -> GraphSolution:
     factor = 1.0
     if fitted.degrees > 0 and not _likely(fitted.chi_square, fitted.degrees):
         factor = max(1.0, fitted.chi_square / fitted.degrees)
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
-    found = GraphSolution(reason=None, message=figures, chi_square=fitted.chi_square, degrees=fitted.degrees)
+    found = GraphSolution(reason=None, message=figures, left_out=tuple(left_out))
     if factor > _MOST_VARIANCE_FACTOR:
-        overlaps = [(e, *of) for e, of in zip(fitted.edges, judged, strict=True) if e.b != WORLD]
-        worst = [(chi, str(edge)) for edge, chi, free in overlaps if free]
-        named = "; ".join(f"{edge} by {chi:.1f}" for chi, edge in sorted(worst, reverse=True))
+        blamed = [
+            (chi, f"{m} - {edge.map_id}")
+            for (m, edge), (chi, free) in zip(fitted.edges, judged, strict=True)
+            if edge.map_id != WORLD and free
+        ]
+        named = "; ".join(f"{pair} by {chi:.1f}" for chi, pair in sorted(blamed, reverse=True))
         text = f"the overlaps contradict each other and no single one stands out ({figures}): {named}"
         return replace(found, reason="CONTRADICTION", message=text)
     return replace(
@@ -247,7 +214,7 @@ def _likely(chi_square: float, degrees: int) -> bool:
 def _contradicting(fitted: _Fit, judged: Sequence[tuple[float, int]]) -> GraphEdge | None:
     """The edge that alone explains why the graph does not fit, if there is one."""
     chi_square, degrees = fitted.chi_square, fitted.degrees
-    overlaps = [k for k, edge in enumerate(fitted.edges) if edge.b != WORLD]
+    overlaps = [k for k, (_, edge) in enumerate(fitted.edges) if edge.map_id != WORLD]
     if degrees == 0 or not overlaps or _likely(chi_square, degrees):
         return None
     row = max(overlaps, key=lambda k: judged[k][0])
@@ -264,46 +231,29 @@ def _contradicting(fitted: _Fit, judged: Sequence[tuple[float, int]]) -> GraphEd
 
 def _anchored(ids: Sequence[str], edges: Sequence[GraphEdge]) -> list[str]:
     """Maps with a chain of edges to an anchor's placement."""
-    world, *labels = tied_together([WORLD, *ids], [(e.a, e.b) for e in edges])
+    world, *labels = tied_together([WORLD, *ids], [(m, edge.map_id) for m, edge in edges])
     return [map_id for map_id, label in zip(ids, labels, strict=True) if label == world]
 
 
 def _solver(jacobian: csr_array) -> Callable[[FloatArray], FloatArray]:
     """What solves the normal equations for columns of right-hand sides."""
-    normal = csc_array(jacobian.T @ jacobian)
-    scale = 1.0 / np.sqrt(normal.diagonal())
-    turned = coo_array(normal)
-    turned.data = turned.data * scale[turned.row] * scale[turned.col]
-    solver = splu(csc_array(turned))
-    return lambda right: np.asarray(scale[:, None] * solver.solve(scale[:, None] * right))
-
-
-def _assemble(blocks: Sequence[tuple[int, int, FloatArray]], rows: int, columns: int) -> csr_array:
-    """A sparse matrix of (7, 7) blocks."""
-    inner = np.arange(7)
-    row = np.concatenate([np.repeat(7 * r + inner, 7) for r, _, _ in blocks])
-    column = np.concatenate([np.tile(7 * c + inner, 7) for _, c, _ in blocks])
-    value = np.concatenate([block.ravel() for _, _, block in blocks])
-    return csr_array(coo_array((value, (row, column)), shape=(7 * rows, 7 * columns)))
-
-
-def small_adjoint(tangent: FloatArray) -> FloatArray:
-    """(7, 7) matrix of the Lie bracket with (sigma, omega, nu), the derivative of Sim3.adjoint."""
-    sigma, omega, nu = float(tangent[0]), tangent[1:4], tangent[4:]
-    ad = np.zeros((7, 7))
-    ad[1:4, 1:4] = skew(omega)
-    ad[4:, 0] = -nu
-    ad[4:, 1:4] = skew(nu)
-    ad[4:, 4:] = sigma * np.eye(3) + skew(omega)
-    return ad
+    normal = jacobian.T @ jacobian
+    scale = diags_array(1.0 / np.sqrt(normal.diagonal()))
+    solver = splu(csc_array(scale @ normal @ scale))
+    return lambda right: np.asarray(scale @ solver.solve(scale @ right))
 
 
 def left_jacobian(tangent: FloatArray) -> FloatArray:
     """J (7, 7) with exp(x + dx) = exp(J dx) exp(x) to first order.
 
-    The integral of exp(t ad) over t in [0, 1]: the corner of one matrix exponential (Van Loan 1978).
+    The integral over t in [0, 1] of exp(t ad), with ad the derivative of Sim3.adjoint: the corner of one
+    matrix exponential (Van Loan 1978).
     """
+    sigma, omega, nu = float(tangent[0]), tangent[1:4], tangent[4:]
     both = np.zeros((14, 14))
-    both[:7, :7] = small_adjoint(tangent)
+    both[1:4, 1:4] = skew(omega)
+    both[4:7, 0] = -nu
+    both[4:7, 1:4] = skew(nu)
+    both[4:7, 4:7] = sigma * np.eye(3) + skew(omega)
     both[:7, 7:] = np.eye(7)
     return np.asarray(expm(both)[:7, 7:], dtype=np.float64)

@@ -2,9 +2,9 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,18 +16,11 @@ from featuredb.store import Database, Snapshot
 from featuredb.store.canaries import list_canaries
 from featuredb.store.commits import write_time
 from ingest.growth.asked_before import recall, remember
-from ingest.growth.graph.map_graph import (
-    OWN,
-    PlacedMap,
-    holds,
-    place_key,
-    placed_maps,
-    solve_maps,
-)
+from ingest.growth.graph.map_graph import OWN, PlacedMap, holds, place_key, placed_maps, solve_maps
 from ingest.growth.graph.pose_graph import GraphSolution
 from ingest.growth.map_places import growth_of, inflated, map_drift_m, with_growth
-from ingest.growth.place.overlaps import measure_overlap
-from ingest.growth.trust.canaries import CanaryCheck, CanaryRun, check_known
+from ingest.growth.place.map_images import measure_overlap
+from ingest.growth.trust.canaries import CanaryRun, check_known
 from ingest.growth.trust.promotion import PARENT_MOVED
 from ingest.growth.values import Edge
 from reloc.localiser import Localiser
@@ -36,9 +29,6 @@ _LOG = logging.getLogger(__name__)
 _LEAST_MOVE_M = 0.01  # anchors that would move by less stay where they are
 _GAP_M = 5.0  # boxes of a grown map and a new anchor that come this close are looked at for an overlap
 _SAME_M = 1e-6  # an answer that moves by less was not touched
-
-Edges = Mapping[str, Sequence[Edge]]
-"""New overlaps, by the map whose evidence will have them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,11 +51,10 @@ class Replacement:
     """What became of the grown maps around new anchors.
 
     Attributes:
-        reason: None, the pose graph's, or CANARY; `message` for people. Nothing was committed where there
-            is one.
+        reason: None, the pose graph's, or CANARY; where there is one, nothing was committed.
         version: of the database since, or -1. moved: all maps that were committed anew.
         left_out: overlaps that contradict the rest.
-        flagged: maps that are quarantined now, because they hang on a moved one by no overlap that holds.
+        flagged: maps that are quarantined now: they hang on a moved one by no overlap that holds.
     """
 
     reason: str | None
@@ -74,9 +63,6 @@ class Replacement:
     moved: tuple[MovedMap, ...] = ()
     left_out: tuple[str, ...] = ()
     flagged: tuple[str, ...] = ()
-
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def replace_descendants(database: Database, work: Path, *, budget_m: float) -> Replacement | None:
@@ -94,16 +80,14 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
     frame = maps[min(edges)].frame
     solution = solve_maps(maps, edges, frame)
     told = Replacement(
-        reason=solution.reason,
-        message=solution.message,
-        left_out=tuple(map(str, solution.left_out)),
+        reason=solution.reason, message=solution.message, left_out=tuple(map(" - ".join, solution.left_out))
     )
     if solution.reason is not None:
         return told
     moved, reports = _moved(snapshot, maps, edges, solution, frame, budget_m)
     canaries = ask_persons_canaries(database, {m.map_id: m for m in moved})
     if canaries.regressions:
-        return replace(told, reason="CANARY", message=f"nothing is moved: {canaries.message}")
+        return replace(told, reason="CANARY", message=f"nothing is moved: {canaries.gate.message}")
     ids = [m.map_id for m in moved]
     results = database.commit_maps(
         moved, replaces=ids, based_on={map_id: maps[map_id].write_id for map_id in ids}
@@ -128,66 +112,53 @@ def overlaps_to_measure(maps: Mapping[str, PlacedMap]) -> list[tuple[str, str]]:
         pairs |= {(me.map_id, m) for m, place in places.items() if m in maps and maps[m].place != place}
         for anchor in anchors:
             later = write_time(anchor.write_id) > write_time(me.write_id)
-            if anchor.map_id not in places and later and _touch(me, anchor):
+            if anchor.map_id in places or not later or not len(me.corners) or not len(anchor.corners):
+                continue
+            box, other = me.corners[:, :2], me.frame.enu_from(anchor.frame).act(anchor.corners)[:, :2]
+            apart = (other.min(axis=0) - box.max(axis=0), box.min(axis=0) - other.max(axis=0))
+            if np.max(apart) <= _GAP_M:
                 pairs.add((me.map_id, anchor.map_id))
     return sorted(pairs)
 
 
-def _touch(a: PlacedMap, b: PlacedMap) -> bool:
-    if not len(a.corners) or not len(b.corners):
-        return False
-    other = a.frame.enu_from(b.frame).act(b.corners)
-    low, high = a.corners.min(axis=0)[:2] - _GAP_M, a.corners.max(axis=0)[:2] + _GAP_M
-    return bool((other.min(axis=0)[:2] <= high).all() and (low <= other.max(axis=0)[:2]).all())
-
-
 def _measured(
     snapshot: Snapshot, maps: Mapping[str, PlacedMap], wanted: Sequence[tuple[str, str]], work: Path
-) -> Edges:
-    """New overlaps; what was looked for is kept in the work folder."""
-    loaded: dict[str, FeatureMap] = {}
+) -> dict[str, list[Edge]]:
+    """New overlaps by the map that has them; what was looked for is kept in the work folder."""
+    load = cache(snapshot.load_map)
     edges: dict[str, list[Edge]] = {}
-    notes: list[str] = []
     for map_id, other_id in wanted:
         about, places = f"{map_id} {other_id}", f"{maps[map_id].place} {maps[other_id].place}"
         said = recall(work, "overlaps", about, places)
         if said is None:
-            for m in (map_id, other_id):
-                loaded[m] = loaded.get(m) or snapshot.load_map(m)
-            found = measure_overlap(loaded[map_id], loaded[other_id])
-            said = {"edge": None}
-            if isinstance(found, Edge):
-                said["edge"] = replace(found, place=maps[other_id].place).as_json()
-                said["note"] = f"{found.photos} images and {found.shared_points} points in common"
-            else:
-                said["note"] = found
+            found = measure_overlap(load(map_id), load(other_id))
+            edge = replace(found, place=maps[other_id].place).as_json() if isinstance(found, Edge) else None
+            said = {"edge": edge}
             remember(work, "overlaps", about, said, places)
-        notes.append(f"{map_id} - {other_id}: {said['note']}")
+            _LOG.info("overlap %s - %s: %s", map_id, other_id, "measured" if edge else found)
         if said["edge"] is not None:
             edges.setdefault(map_id, []).append(Edge.from_json(said["edge"]))
-    if notes:
-        _LOG.info("overlaps: %s", "; ".join(notes))
     return edges
 
 
 def _moved(
     snapshot: Snapshot,
     maps: Mapping[str, PlacedMap],
-    new_edges: Edges,
+    new_edges: Mapping[str, Sequence[Edge]],
     solution: GraphSolution,
     frame: LocalFrame,
     budget_m: float,
 ) -> tuple[list[FeatureMap], list[MovedMap]]:
     """The maps at their new places, and what is said of each."""
     moved: dict[str, FeatureMap] = {}
-    ways: dict[str, float] = {}
+    ways_m: dict[str, float] = {}
     corrections: dict[str, Sim3] = {}
     for map_id, correction in solution.corrections.items():
         before = maps[map_id]
         own = in_frame(correction, frame, before.frame)
         corners = before.corners if len(before.corners) else np.zeros((1, 3))
-        ways[map_id] = float(np.linalg.norm(own.act(corners) - corners, axis=1).max())
-        if before.is_anchor and ways[map_id] < _LEAST_MOVE_M:
+        ways_m[map_id] = float(np.linalg.norm(own.act(corners) - corners, axis=1).max())
+        if before.is_anchor and ways_m[map_id] < _LEAST_MOVE_M:
             own = Sim3.identity()
         else:
             covariance = covariance_in_frame(solution.covariance[map_id], frame, before.frame)
@@ -196,69 +167,45 @@ def _moved(
         corrections[map_id] = own
     places = {m: maps[m].place for m in solution.corrections}
     places |= {m: place_key(there.frame, there.placement) for m, there in moved.items()}
-    contradicting = {(edge.a, edge.b) for edge in solution.left_out}
     new, reports = [], []
     for map_id, feature_map in moved.items():
         before = maps[map_id]
-        edges = [
-            _carried(e, map_id, maps, corrections, places)
-            for e in (*(e for e in before.edges if holds(maps, e)), *new_edges.get(map_id, ()))
-            if (map_id, e.map_id) not in contradicting and e.map_id in corrections
-        ]
+        edges = []
+        for edge in (*(e for e in before.edges if holds(maps, e)), *new_edges.get(map_id, ())):
+            if (map_id, edge.map_id) not in solution.left_out and edge.map_id in corrections:
+                other = in_frame(corrections[edge.map_id], maps[edge.map_id].frame, before.frame)
+                now = edge.carried(other, corrections[map_id])
+                edges.append(replace(now, place=places[edge.map_id]))
         finished, drift = _with_evidence(feature_map, before, edges, solution, frame, budget_m)
         # Active maps stay so; those that were quarantined for their parent's sake are active again.
         again = PARENT_MOVED in before.status_reason and drift <= budget_m
         active = before.status == "active" or again
         new.append(replace(finished, status="active" if active else "quarantined"))
+        told = {"move_m": round(ways_m[map_id], 4), "drift_m": round(drift, 4)}
         drifted = growth_of(before.placement.evidence).get("drift_m")
-        reports.append(
-            MovedMap(
-                map_id=map_id, move_m=round(ways[map_id], 4), drift_before_m=drifted, drift_m=round(drift, 4)
-            )
-        )
+        reports.append(MovedMap(map_id=map_id, drift_before_m=drifted, **told))
     return _with_generations(new, maps), reports
 
 
 def ask_persons_canaries(database: Database, new: Mapping[str, FeatureMap]) -> CanaryRun:
     """The known queries that a person vouches for, before and after maps move.
 
-    Images of the maps move along, and so do remembered answers. Where someone knows the truth, an answer that
-    is wrong afterwards must at least have come much nearer: before, the new anchor answered already, and may
-    have been as wrong.
+    An answer that is wrong afterwards must at least have come much nearer: before, the new anchor answered
+    already, and may have been as wrong.
     """
     known = [canary for canary in list_canaries(database) if canary.origin == "person"]
     if not known:
         return CanaryRun(checks=(), note="no known queries")
     before = Localiser.open(database)
     after = Localiser.open(database, previous=before, instead=new)
-    checks = tuple(_judged(check_known(database, canary, before, after)) for canary in known)
-    return CanaryRun(checks=checks, note=f"{len(known)} known queries")
-
-
-def _judged(check: CanaryCheck) -> CanaryCheck:
-    untouched = abs(check.error_m - check.error_before_m) < _SAME_M
-    nearer = check.before == "moved" and check.error_m <= 0.5 * check.error_before_m
-    if check.regression or check.after not in ("moved", "found") or untouched or nearer:
-        return check
-    return replace(check, regression=f"{check.error_m:.2f} m off, once the maps have moved")
-
-
-def _carried(
-    edge: Edge,
-    map_id: str,
-    maps: Mapping[str, PlacedMap],
-    corrections: Mapping[str, Sim3],
-    places: Mapping[str, str],
-) -> Edge:
-    """An overlap in the coordinates of the new places: Z' = X_other Z X_map^-1."""
-    other = in_frame(corrections[edge.map_id], maps[edge.map_id].frame, maps[map_id].frame)
-    return replace(
-        edge,
-        place=places[edge.map_id],
-        other_from_map=other @ edge.other_from_map @ corrections[map_id].inverse(),
-        covariance=other.carried(edge.covariance),
-        shared=other.adjoint() @ edge.shared,
-    )
+    checks = []
+    for check in (check_known(database, canary, before, after) for canary in known):
+        untouched = abs(check.error_m - check.error_before_m) < _SAME_M
+        nearer = check.before == "moved" and check.error_m <= 0.5 * check.error_before_m
+        if not (check.regression or untouched or nearer) and check.after in ("moved", "found"):
+            check = replace(check, regression=f"{check.error_m:.2f} m off, once the maps have moved")
+        checks.append(check)
+    return CanaryRun(checks=tuple(checks), note="known queries")
 
 
 def _with_evidence(
@@ -274,9 +221,9 @@ def _with_evidence(
     relative = covariance_in_frame(solution.covariance_relative[map_id], frame, own)
     drift = map_drift_m(feature_map, relative)
     if before.is_anchor:
-        covariance, present_from_own = before.own_placement
-        total = in_frame(solution.corrections[map_id], frame, own) @ present_from_own
-        placed = {"covariance": covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
+        was = before.own_place
+        total = in_frame(solution.corrections[map_id], frame, own) @ was.other_from_map.inverse()
+        placed = {"covariance": was.covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
         return with_growth(feature_map, **{OWN: placed}), drift
     noted = with_growth(
         feature_map,
@@ -285,10 +232,10 @@ def _with_evidence(
         covariance_relative=relative.ravel().tolist(),
         edges=[edge.as_json() for edge in edges],
     )
-    held = tuple(dict.fromkeys(edge.map_id for edge in edges))
-    kept = tuple(m for m in before.parents if m in held)
+    held = [edge.map_id for edge in edges]
     # Only anchors join the parents: a map never becomes its own ancestor.
-    return replace(noted, parents=(*kept, *(m for m in held if m not in kept)) or before.parents), drift
+    parents = tuple(dict.fromkeys([*(m for m in before.parents if m in held), *held])) or before.parents
+    return replace(noted, parents=parents), drift
 
 
 def _with_generations(new: list[FeatureMap], maps: Mapping[str, PlacedMap]) -> list[FeatureMap]:

@@ -14,7 +14,7 @@ from scipy import sparse
 from featuredb.adjust.block import Block
 from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import Marks, Terms
+from featuredb.adjust.terms import Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap.adjust import longest_side, residuals_of
@@ -35,14 +35,13 @@ _MOST_POINTS = 20_000  # free points that take part; fewer know less, so the bou
 class PhotoSpread:
     """How far the photos of a model may be off, relative to the existing points.
 
+    NaN for photos that see nothing, and for all where no existing point is kept.
+
     Attributes:
-        poses: (k, 6, 6) of the left perturbation of each cam_from_local; NaN for photos that see nothing, and
-            for all where no existing point is kept.
-        turns: (k, 3, 3) radians squared, about the local axes: how the piece of the model around each photo
-            may be turned: the mean rotation of the photo and those that share most points with it. What comes
-            next is tied to such a piece. NaN as before.
-        lens_turns: (k, 3, 3) the part of `turns` that the lenses bring and that other maps have as well: all
-            but what a lens may differ by from the one that a map has lent.
+        poses: (k, 6, 6) of the left perturbation of each cam_from_local.
+        turns: (k, 3, 3) radians squared, about the local axes: of the mean rotation of each photo and those
+            that share most points with it. What comes next is tied to such a piece of the model.
+        lens_turns: (k, 3, 3) the part of `turns` that the lenses bring and that other maps have as well.
     """
 
     poses: FloatArray
@@ -51,36 +50,35 @@ class PhotoSpread:
 
 
 def photo_covariances(
-    model: Model,
-    keypoints: Sequence[FloatArray],
-    fixed: FixedPoints,
-    kept: NDArray[np.bool_],
-    lenses: Lenses,
+    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints, kept: NDArray[np.bool_], lenses: Lenses
 ) -> PhotoSpread:
     """Of all photos, relative to the existing points.
 
     Observations count as their neighbours share, and for lenses as photos disagree about them
     (`featuredb.adjust.lens_agreement`). By how much a lens differs from the one that a map has lent is this
-    reconstruction's alone: it may have changed since. All else that the lenses bring other maps of the same
-    cameras have as well.
+    reconstruction's alone: it may have changed since.
 
     Args:
         model: refined, in metres. keypoints: of its photos.
         fixed: existing points, those observations of `kept` (m,).
-        lenses: what is known of the model's cameras without the photos, as the adjustment had it.
+        lenses: as the adjustment had them.
     """
-    count = len(model.rows)
-    spread = PhotoSpread(
-        poses=np.full((count, 6, 6), np.nan),
-        turns=np.full((count, 3, 3), np.nan),
-        lens_turns=np.full((count, 3, 3), np.nan),
-    )
+    unknown = np.full((len(model.rows), 6, 6), np.nan)
+    spread = PhotoSpread(poses=unknown, turns=unknown[:, :3, :3].copy(), lens_turns=unknown[:, :3, :3].copy())
     if not kept.any():
         return spread
-    model = _thinned(model)
+    points = len(model.xyz)
+    chosen = np.linspace(0, points - 1, min(points, _MOST_POINTS)).astype(np.int64)
+    model = with_observations(model, np.isin(model.point_of, chosen))
     everything = np.ones(len(model.point_of), dtype=np.bool_)
     block, marks = block_and_marks(model, everything, keypoints, fixed, kept)
-    sigma_px = float(np.sqrt(_variance_px2(block, marks)))
+    # Of an observation, with what its neighbours share and what points and poses take up of it.
+    taken, count = 3 * len(block.xyz) + 6 * len(block.names), 2 * (len(block.point_of) + len(marks.xyz))
+    freedom = max(1.0 - taken / count, _LEAST_FREEDOM)
+    residuals, pixels, photo_of = residuals_of(block, marks)
+    shared = design_effect(residuals, pixels, photo_of, longest_side(block.cameras))
+    variance_px2 = float((residuals**2).mean()) * shared / freedom
+    sigma_px = max(float(np.sqrt(variance_px2)), _LEAST_PX)
     terms = Terms(
         keypoint_px=sigma_px,
         dilution=MAPPING.dilution,
@@ -105,8 +103,7 @@ def photo_covariances(
 def _view_turns(block: Block, found: Marginals) -> FloatArray:
     """(k, 3, q) how what each photo sees turns about the block's axes with poses and lenses.
 
-    A principal point that is off turns the photo, and its points stay where they are: only what is left of
-    both turns what comes next.
+    A principal point that is off turns the photo, and its points stay where they are.
     """
     result = np.zeros((len(block.names), 3, len(found.shared)))
     for k, pose in enumerate(block.cam_from_block):
@@ -124,25 +121,6 @@ def _view_turns(block: Block, found: Marginals) -> FloatArray:
     return result
 
 
-def _variance_px2(block: Block, marks: Marks) -> float:
-    """Of an observation, with what its neighbours share and what points and poses take up of it."""
-    count = 2.0 * (len(block.point_of) + len(marks.xyz))
-    taken = 3 * len(block.xyz) + 6 * len(block.names)
-    freedom = max(1.0 - taken / count, _LEAST_FREEDOM)
-    residuals, pixels, photo_of = residuals_of(block, marks)
-    shared = design_effect(residuals, pixels, photo_of, longest_side(block.cameras))
-    return max(float((residuals**2).mean()) * shared / freedom, _LEAST_PX**2)
-
-
-def _thinned(model: Model) -> Model:
-    """The model with at most so many points, evenly chosen."""
-    if len(model.xyz) <= _MOST_POINTS:
-        return model
-    chosen = np.zeros(len(model.xyz), dtype=np.bool_)
-    chosen[np.linspace(0, len(model.xyz) - 1, _MOST_POINTS).astype(np.int64)] = True
-    return with_observations(model, chosen[model.point_of])
-
-
 def _pieces(
     model: Model, fixed: FixedPoints, kept: NDArray[np.bool_], seen: NDArray[np.int64]
 ) -> dict[int, NDArray[np.int64]]:
@@ -158,13 +136,10 @@ def _pieces(
 
 
 def turning_covariance(model: Model, covariance: FloatArray, spread: PhotoSpread) -> FloatArray:
-    """(7, 7) to be added to a similarity's covariance to hold the directions of all pieces of a model.
+    """(7, 7) to be added to a similarity's covariance (7, 7) to hold the directions of all pieces of a model.
 
     A reconstruction that bends by centimetres at its far end has turned there, and what is tied to that end
-    goes on in the new direction: over many maps the turns are what counts. About the photos' middle.
-
-    Args:
-        covariance: (7, 7) of the similarity's left perturbation, in the local frame.
+    goes on in the new direction. About the photos' middle.
     """
     seen = np.isfinite(spread.turns[:, 0, 0])
     if not seen.any():
@@ -193,15 +168,10 @@ def shared_turn(model: Model, spread: PhotoSpread) -> FloatArray:
 
 
 def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray) -> float:
-    """What must be added to a similarity's covariance to hold the positions of all photos, square metres.
+    """What must be added to a similarity's covariance (7, 7) to hold the positions of all photos, m^2.
 
     Added, and not multiplied: near what holds the model the similarity says millimetres, where a photo's own
     position is good to centimetres; a factor that covers this would make metres of it at the far end.
-
-    Args:
-        model: refined, in metres.
-        covariance: (7, 7) of the similarity's left perturbation, in the local frame.
-        spread: (k, 6, 6) of `PhotoSpread`; NaN for photos that see nothing any more and say nothing.
     """
     seen = np.isfinite(spread[:, 0, 0])
     if not seen.any():

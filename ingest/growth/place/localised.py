@@ -52,7 +52,6 @@ def localise_photos(
 
     Args:
         photos: all new photos. rows: those to be localised.
-        areas: of a reloc.localiser.Localiser; those of another extractor than a photo's are left out.
         threads: photos at a time; the work is done outside of Python's lock, and results are the same.
 
     Returns:
@@ -81,7 +80,7 @@ def localise_photo(
     photos are wrong by kilometres.
 
     Args:
-        camera: known intrinsics, of an image that a map holds for example; None: as the photo tells.
+        camera: known intrinsics; None: as the photo tells.
     """
     usable = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
     if not usable or features.fingerprint != QUERY.extractor.fingerprint:
@@ -93,8 +92,14 @@ def localise_photo(
     outcome = localise_features(few, request, usable, QUERY)
     by_prior = outcome.best is not None
     if not by_prior and photo.gps is not None:
-        again = _elsewhere(few, request, outcome, usable)
-        outcome = again if again.best is not None else outcome
+        # Where something was found there that cannot be believed (a pose that contradicts the geotag, two
+        # poses), all places compete once more; and what was found in vain near the geotag stays a rival.
+        all_places = outcome.result.reason in ("CONTRADICTS_PRIOR", "AMBIGUOUS")
+        beyond = None if all_places else photo.gps
+        again = localise_features(few, replace(request, prior=None, beyond=beyond), usable, QUERY)
+        rival = QUERY.acceptance.rival_share * again.result.inliers
+        if again.best is not None and (all_places or outcome.result.inliers < rival):
+            outcome = again
     if outcome.best is None:
         return f"{outcome.result.reason}: {outcome.result.detail}"
     found = _densified(features, outcome)
@@ -106,23 +111,6 @@ def localise_photo(
                 f"map should show there, {_SHOWN_AGAINST_GEOTAG:.0%} needed"
             )
     return found
-
-
-def _elsewhere(
-    features: Features,
-    request: LocaliseRequest,
-    first: Localised,
-    areas: Sequence[IndexedArea],
-) -> Localised:
-    """A photo that was not found within its geotag's reach, looked for beyond it.
-
-    Where something was found there that cannot be believed (a pose that contradicts the geotag, two poses),
-    all places compete once more; and what was found in vain near the geotag stays a rival.
-    """
-    tried = None if first.result.reason in ("CONTRADICTS_PRIOR", "AMBIGUOUS") else request.prior
-    found = localise_features(features, replace(request, prior=None, beyond=tried), areas, QUERY)
-    rival = QUERY.acceptance.rival_share * found.result.inliers
-    return first if tried is not None and first.result.inliers >= rival else found
 
 
 def share_shown(photo: LocalisedPhoto, area: Area) -> float:
@@ -146,11 +134,7 @@ def _densified(features: Features, outcome: Localised) -> LocalisedPhoto:
         if len(feature) >= outcome.best.evidence.inliers:
             pose, spread = better, area.point_covariance(point)
             uncertainty = pose_uncertainty(pixels, points, spread, better, QUERY.pose)
-    of_map = area.point_map[point]
-    counts = np.bincount(of_map, minlength=len(area.maps))
-    order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
-    place = np.full(len(area.maps), -1)
-    place[order] = np.arange(len(order))
+    used, map_of = np.unique(area.point_map[point], return_inverse=True)
     return LocalisedPhoto(
         frame=area.frame,
         cam_from_local=pose.cam_from_local,
@@ -158,8 +142,8 @@ def _densified(features: Features, outcome: Localised) -> LocalisedPhoto:
         camera=pose.camera,
         feature_rows=feature,
         pixels=pixels,
-        map_ids=tuple(area.maps[i].map_id for i in order),
-        map_of=place[of_map],
+        map_ids=tuple(area.maps[i].map_id for i in used.tolist()),
+        map_of=map_of.reshape(-1),
         point_of=area.point_row[point].astype(np.int64),
         points=points,
         point_covariance=area.point_covariance(point),
@@ -172,11 +156,8 @@ def _match_each_map(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Guided matches of all features with the points that each map should show, map by map.
 
-    Two maps of one place have the same points twice; each may have its match. Maps with fewer matches
-    within the tolerance than a pose needs are left out: chance alone gives a few.
-
-    Returns:
-        Rows (m,) of the features, and of the area's points.
+    Rows (m,) of the features, and of the area's points. Maps with fewer matches within the tolerance than a
+    pose needs are left out: chance alone gives a few.
     """
     visible = visible_points(area, area.searched_points(), pose.camera, pose.cam_from_local, POSSIBLE_DEG)
     found = np.zeros((2, 0), dtype=np.int64)
@@ -194,8 +175,7 @@ def _match_each_map(
 def with_lens(photo: LocalisedPhoto, camera: Camera) -> LocalisedPhoto:
     """The photo's pose by its own matches with a lens that is given; as it was where they do not fit it.
 
-    Where the lens was estimated along, focal length and distance hardly differ: two poses of one photo can be
-    compared with the same lens only.
+    Two poses can be compared with the same lens only: focal length and distance hardly differ.
     """
     if camera == photo.camera or (camera.width, camera.height) != (photo.camera.width, photo.camera.height):
         return photo
@@ -229,12 +209,9 @@ def in_frame(photo: LocalisedPhoto, frame: LocalFrame) -> LocalisedPhoto:
 def with_shared_lenses(
     localised: Mapping[int, LocalisedPhoto], keys: Mapping[int, str]
 ) -> dict[int, LocalisedPhoto]:
-    """The photos by row; those of one camera with the lens under which most of their matches fit.
+    """The photos by row; those of one camera (by its key) with the lens under which most matches fit.
 
-    A photo that this lens does not fit keeps its own (`with_lens`).
-
-    Args:
-        keys: of the cameras, by row (`ingest.photos.photo.shared_key`).
+    A photo that this lens does not fit keeps its own.
     """
     found = dict(localised)
     cameras: dict[str, list[int]] = {}
@@ -244,18 +221,16 @@ def with_shared_lenses(
         by_matches = sorted(rows, key=lambda r: -len(localised[r].pixels))
         lenses = list(dict.fromkeys(localised[r].camera for r in by_matches))[:_MOST_LENSES]
         if len(lenses) > 1:
-            tries = [{r: with_lens(localised[r], lens) for r in rows} for lens in lenses]
+            tries = [[with_lens(localised[r], lens) for r in rows] for lens in lenses]
             fits = [
-                sum(map(_fitting, tried.values(), [lens] * len(rows)))
+                sum(_fitting(photo) for photo in tried if photo.camera == lens)
                 for tried, lens in zip(tries, lenses, strict=True)
             ]
-            found.update(tries[int(np.argmax(fits))])
+            found.update(zip(rows, tries[int(np.argmax(fits))], strict=True))
     return found
 
 
-def _fitting(photo: LocalisedPhoto, lens: Camera) -> int:
-    """Matches of the photo that fit its pose, if it has that lens."""
-    if photo.camera != lens:
-        return 0
-    errors = reprojection_errors(photo.pixels, photo.points, lens, photo.cam_from_local)
-    return int((errors < QUERY.pose.tolerance_px(lens)).sum())
+def _fitting(photo: LocalisedPhoto) -> int:
+    """Matches of the photo that fit its pose."""
+    errors = reprojection_errors(photo.pixels, photo.points, photo.camera, photo.cam_from_local)
+    return int((errors < QUERY.pose.tolerance_px(photo.camera)).sum())

@@ -1,13 +1,11 @@
 """Step: a reconstruction without a place of its own is placed by the existing maps, or refused.
 
 Photos localise by themselves; the similarity that most of them agree with is fitted to all pixels in which
-they see existing points; then gates ask whether to believe it. `tools/growth_portions.py` prints the figures
-of real sets.
+they see existing points; then gates ask whether to believe it.
 """
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +16,18 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.view_cones import in_view, view_cones
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.gates import Gate
+from ingest.growth.map_places import growth_of
 from ingest.growth.place.similarity_fit import (
     Correspondences,
     FittedSimilarity,
     agreed_similarity,
     fit_similarity,
 )
-from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto
+from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from reloc.localise.acceptance import agreement
 from reloc.localise.matching import EXPECTED_DEG, visible_points
@@ -42,77 +40,54 @@ _LEAST_SHOWN = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapsPlacement:
-    """A reconstruction placed by existing maps; accepted when `reason` is None.
+    """A reconstruction that existing maps place, to be believed where all gates pass.
 
     Attributes:
-        reason: code of the first gate that refused it, or None; `message` says it for people.
-        frame: local frame in which the similarity places the model.
-        local_from_sfm: None where none could be estimated.
-        covariance_relative: (7, 7) of its left perturbation, relative to the existing maps.
-        on_earth: (7, 7) what the existing maps' own uncertainty on Earth adds.
-        agreeing, disagreeing: rows of the localised photos that agree with the placement, and of those
-            that do not. Photos that no map localises are in neither.
+        frame: local frame in which `fit` places the model.
+        covariance: (7, 7) of the similarity's left perturbation, relative to the existing maps.
+        agreeing, disagreeing: localised photos that agree with the placement, and those that do not, by
+            their place in the model. Photos that no map localises are in neither.
         blind: those that show too little of what existing maps, or the others' points, say they should.
         edges: one for each existing map that holds it, most shared points first: the correction that this
             map alone would apply to the placed one.
-        fit: over the correspondences that agree; None where nothing fits.
-        used: (m,) correspondences that agree with the placement.
-        residual_rms_m: of the agreeing photos' centres, placed minus localised, metres; NaN without any.
+        fit: over the correspondences that agree, `used` (m,).
+        residual_rms_m: of the agreeing photos' centres, placed minus localised, metres.
         gates: every gate with its figure, in the order they were asked.
     """
 
-    reason: str | None
-    message: str
     frame: LocalFrame
-    local_from_sfm: Sim3 | None = None
-    covariance_relative: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
-    on_earth: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
-    agreeing: tuple[int, ...] = ()
-    disagreeing: tuple[int, ...] = ()
-    blind: tuple[int, ...] = ()
-    edges: tuple[Edge, ...] = ()
-    fit: FittedSimilarity | None = None
-    used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
-    residual_rms_m: float = float("nan")
-    gates: tuple[Gate, ...] = ()
-
-    @property
-    def parents(self) -> tuple[str, ...]:
-        """Maps that hold the new one, most shared points first."""
-        return tuple(edge.map_id for edge in self.edges)
+    covariance: FloatArray
+    agreeing: tuple[int, ...]
+    disagreeing: tuple[int, ...]
+    blind: tuple[int, ...]
+    edges: tuple[Edge, ...]
+    fit: FittedSimilarity
+    used: NDArray[np.bool_]
+    residual_rms_m: float
+    gates: tuple[Gate, ...]
 
 
 def place_by_maps(
     model: Model,
-    localised: Mapping[int, LocalisedPhoto],
+    own: Mapping[int, LocalisedPhoto],
     correspondences: Correspondences,
     photos: Sequence[Photo],
     areas: Sequence[Area],
     frame: LocalFrame,
-) -> MapsPlacement:
-    """Place a model by the localisations of its photos.
+) -> MapsPlacement | Refused:
+    """Place a model by the localisations of its photos; refused where no map holds it.
 
     Args:
         model: with the lenses that it keeps.
-        localised: of the model's photos, by row of the photos, in `frame`; so are the correspondences.
+        own: the model's localised photos, by place among them, in `frame`; so are the correspondences.
         photos: all new photos, for their positions.
         areas: that hold the existing maps.
     """
-    own = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
     found = agreed_similarity(model, own, correspondences)
-    edges: tuple[Edge, ...] = ()
-    if found is not None:
-        fit, agree, used = found
-        edges = edges_of(model, fit, correspondences, used)
-    if found is None or not edges:
-        gate = gates.agreement(0, len(own))
-        return MapsPlacement(
-            reason=gate.reason,
-            message=f"no placement: {gate.message}",
-            frame=frame,
-            disagreeing=_rows(model, own),
-            gates=(gate,),
-        )
+    edges = edges_of(model, found[0], correspondences, found[2]) if found else ()
+    if not found or not edges:
+        return Refused.by(gates.agreement(0, len(own)))
+    fit, agree, used = found
     maps = {m.map_id: m for area in areas for m in area.maps}
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
     sim, held = fit.local_from_sfm, correspondences.take(np.flatnonzero(used))
@@ -122,37 +97,24 @@ def place_by_maps(
     blind = set(np.flatnonzero(with_own < _LEAST_SHOWN).tolist()) - disagree
     blind |= {k for k in agree if existing[k] < gates.LEAST_VISIBLE}
     centers = sim.act(model.centers())
-    # From the placed to the localised centres of the photos that agree, metres.
-    offsets = np.array([own[k].cam_from_local.center - centers[k] for k in sorted(agree)])
-    squared = (offsets**2).sum(axis=1)
+    squared_m2 = [((own[k].cam_from_local.center - centers[k]) ** 2).sum() for k in agree]
     positions = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
-    parents = ", ".join(e.map_id for e in edges)
-    asked = (
-        gates.agreement(len(agree), len(disagree)),
-        gates.geotags(*positions, by=parents),
-        gates.visibility(existing[np.isfinite(existing)]),
-    )
-    refusal = gates.first_refusal(asked)
     return MapsPlacement(
-        reason=refusal.reason if refusal else None,
-        message=refusal.message if refusal else f"placed by {parents}",
         frame=frame,
-        local_from_sfm=sim,
-        covariance_relative=fit.covariance,
-        on_earth=on_earth,
-        agreeing=_rows(model, agree),
-        disagreeing=_rows(model, disagree),
-        blind=_rows(model, blind),
+        covariance=fit.covariance,
+        agreeing=tuple(sorted(agree)),
+        disagreeing=tuple(sorted(disagree)),
+        blind=tuple(sorted(blind)),
         edges=edges,
         fit=fit,
         used=used,
-        residual_rms_m=float(np.sqrt(squared.mean())),
-        gates=asked,
+        residual_rms_m=float(np.sqrt(np.mean(squared_m2))),
+        gates=(
+            gates.agreement(len(agree), len(disagree)),
+            gates.geotags(*positions, by=", ".join(e.map_id for e in edges)),
+            gates.visibility(existing[np.isfinite(existing)]),
+        ),
     )
-
-
-def _rows(model: Model, photos: Collection[int]) -> tuple[int, ...]:
-    return tuple(int(model.rows[k]) for k in sorted(photos))
 
 
 def _against_positions(
@@ -204,21 +166,19 @@ def parents_covariance(
 ) -> FloatArray:
     """(7, 7) of the parents' placements in `frame`, weighted by the shared points that each comes with.
 
-    The mean of covariances bounds that of a mean from above however the parents' errors are correlated:
-    parents that came of one anchor err alike.
+    The mean of covariances bounds that of a mean from above however the parents' errors are correlated.
 
     Args:
         relative: to their anchors, nothing for anchors; else on Earth.
     """
-    total = sum(weight for _, weight in parents)
     covariance = np.zeros((7, 7))
-    for feature_map, weight in parents:
-        own: Any = feature_map.placement.covariance
+    for parent, points in parents:
+        own = parent.placement.covariance
         if relative:
-            own = feature_map.placement.evidence.get(GROWTH, {}).get("covariance_relative", np.zeros(49))
-        own = np.asarray(own, dtype=np.float64).reshape(7, 7)
-        covariance += weight / total * covariance_in_frame(own, feature_map.frame, frame)
-    return covariance
+            told = growth_of(parent.placement.evidence).get("covariance_relative", np.zeros(49))
+            own = np.reshape(told, (7, 7))
+        covariance += points * covariance_in_frame(own, parent.frame, frame)
+    return covariance / sum(points for _, points in parents)
 
 
 def _shown_parts(
@@ -226,15 +186,16 @@ def _shown_parts(
 ) -> tuple[FloatArray, FloatArray]:
     """For each photo the share of the image's parts that should show points where it does so.
 
+    Photos that no map localised are asked as well: a camera that looks through a wall, and a copy that was
+    joined at a look-alike, fit what they see and do not show the rest.
+
     Args:
         sim: frame from the model's.
         held: pixels of the model's photos in which existing points are seen, where the placement has them.
 
     Returns:
         Shares (k,) of the points of existing maps, and (k,) of these and of the points of the model itself
-        that several photos bear out; NaN for photos that should show hardly any. Photos that no map localised
-        are asked as well: a camera that looks through a wall, and a copy that was joined at a look-alike, fit
-        what they see and do not show the rest.
+        that several photos bear out; NaN for photos that should show hardly any.
     """
     often = model.track_lengths() >= LEAST_PHOTOS
     cones = view_cones(model.xyz, model.centers(), model.point_of, model.photo_of)

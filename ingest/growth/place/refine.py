@@ -1,24 +1,25 @@
 """Step: a placed reconstruction is adjusted to the existing points, and photos that do not hold are left out.
 
-The lenses of existing maps are adopted before. Photos are left out that contradict the placement before or
-after, that hang on the others by little, and that may be further off than allowed; the others are adjusted
-without them, and say anew how sure they are.
+Those contradict the placement before or after, hang on the others by little, or may be further off than
+allowed; the others are adjusted without them, and say anew how sure they are.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from ingest.colmap.anchored import Anchored, FixedPoints, Lenses, adjust_anchored, pixel_scale
 from ingest.colmap.bridge import Model, with_observations
+from ingest.colmap.precision import linearise
 from ingest.growth import gates
 from ingest.growth.map_places import SIGMAS_95
-from ingest.growth.place.contradictions import contradicting_photos
 from ingest.growth.place.drift import (
     bending_variance_m2,
     center_covariances,
@@ -27,7 +28,7 @@ from ingest.growth.place.drift import (
     turning_covariance,
 )
 from ingest.growth.place.placement import MapsPlacement, edges_of
-from ingest.growth.place.similarity_fit import Correspondences, fit_similarity
+from ingest.growth.place.similarity_fit import Correspondences, FittedSimilarity, fit_similarity
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from ingest.sfm.links import bottleneck_share, select_photos
@@ -41,6 +42,10 @@ _ELSEWHERE = "the photo by itself sees existing points elsewhere than the others
 # 0.14. Those wait, and are localised by themselves once their neighbours are in an active map.
 LEAST_LINK = 0.25
 _ROUNDS = 4  # of leaving photos out; the others are adjusted without them
+# What the focal length of a localisation may be off, one sigma. A photo at the rim of a map sees it in a
+# corner, and turns a lens that is 0.5 % off into half a metre and half a degree, where its pixels say 0.1 m.
+# `brighton`'s lens is off by 1.3 %.
+_FOCAL_REL = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,8 +53,8 @@ class Refinement:
     """A refined reconstruction.
 
     Attributes:
-        model: of the photos that are kept, in metres, in the placement's frame; existing points that at least
-            two of them see are its own.
+        model: of the photos that are kept, in metres, in the placement's frame; existing points that two of
+            them see are its own.
         placement: with the gates asked here and the covariances of the refined model.
         poses: (k, 6, 6) of `PhotoSpread`, of the photos that are kept.
         bending_m: what the photos' positions lack beyond the similarity, one sigma along the worst axis.
@@ -73,19 +78,17 @@ def adopt_lenses(
     Args:
         photos: all, rows as in the model.
         areas: where it may lie; the first one that has a lens for a camera's EXIF key lends it.
-        keypoints: pixels of all features of the model's photos, in the order of its rows.
+        keypoints: pixels of all features of each photo of the model.
     """
     lent: dict[int, Camera] = {}
     focals: dict[int, float] = {}
     for c, camera in enumerate(model.cameras):
-        rows = model.rows[model.camera_of == c].tolist()
-        keys = {photos[r].camera_key for r in rows}
+        of_camera = [photos[r] for r in model.rows[model.camera_of == c].tolist()]
+        keys, told = {photo.camera_key for photo in of_camera}, {photo.focal_px for photo in of_camera}
         key = keys.pop() if len(keys) == 1 else ""
-        known = (area.camera_for_key(key) for area in areas) if key else iter(())
-        lens = next((camera for camera in known if camera is not None), None)
+        lens = next((own for area in areas if key and (own := area.camera_for_key(key))), None)
         if lens is not None and (lens.width, lens.height) == (camera.width, camera.height):
             lent[c] = lens
-        told = {photos[r].focal_px for r in rows}
         focal_px = told.pop() if len(told) == 1 else None  # none where EXIF tells several
         if focal_px is not None:
             focals[c] = focal_px
@@ -108,41 +111,32 @@ def refine_placed(
     """Refine an accepted placement with the existing points held fixed.
 
     Args:
-        localised: the model's photos that the existing maps localise, by row.
-        keypoints: pixels of all features of the model's photos, in the order of its rows.
+        localised: the model's photos that the existing maps localise, by place among them.
+        keypoints: pixels of all features of each photo of the model.
         max_bound_m: photos that may be further off (95 %), against the existing points and with what their
-            lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
+            lens leaves open, are left out.
     """
-    assert placement.local_from_sfm is not None
-    assert placement.fit is not None
-    rows = tuple(int(r) for r in model.rows)
-    placed = in_metres(model, placement.local_from_sfm)
-    outside = [rows.index(r) for r in (*placement.disagreeing, *placement.blind)]
-    holding = [rows.index(r) for r in placement.agreeing if r not in placement.blind]
-    weak = weak_photos(model, outside, holding)
+    rows = model.rows.tolist()
+    sim = placement.fit.local_from_sfm
+    poses = tuple(sim.act_on_pose(pose) for pose in model.cam_from_sfm)
+    placed = replace(model, cam_from_sfm=poses, xyz=sim.act(model.xyz))  # in metres
     left_out = dict.fromkeys(placement.disagreeing, (_CONTRADICTS, _ELSEWHERE))
     left_out |= dict.fromkeys(placement.blind, ("NOT_VISIBLE", _SHOWS_LITTLE))
-    left_out |= {rows[k]: ("WEAK_LINK", message) for k, message in weak.items()}
-    outside += sorted(weak)
+    weak = weak_photos(model, list(left_out), [k for k in placement.agreeing if k not in left_out])
+    left_out |= {k: ("WEAK_LINK", message) for k, message in weak.items()}
     for _ in range(_ROUNDS):
-        good = correspondences.take(
-            np.flatnonzero(placement.used & ~np.isin(correspondences.photo_of, outside))
-        )
-        good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)
-        adjusted, fixed = _refined(placed, outside, good, lenses, keypoints)
+        good = correspondences.take(placement.used & ~np.isin(correspondences.photo_of, list(left_out)))
+        good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)  # those that hold anything
+        adjusted, fixed = _refined(placed, list(left_out), good, lenses, keypoints)
         spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
         fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
-        inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
+        inside = {k: localised[k] for k in placement.agreeing if k not in left_out}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
-        loose = {
-            k: message
-            for k, message in loose_photos(adjusted.model, spread.poses, max_bound_m).items()
-            if k not in outside and k not in against
-        }
-        left_out |= {rows[k]: (_CONTRADICTS, message) for k, message in against.items()}
-        left_out |= {rows[k]: (_LOOSE, message) for k, message in loose.items()}
-        outside += sorted({**against, **loose})
-        if not (against or loose) or len(outside) > len(rows) - 2:
+        left_out |= {k: (_CONTRADICTS, message) for k, message in against.items()}
+        loose = loose_photos(adjusted.model, spread.poses, max_bound_m)
+        loose = {k: message for k, message in loose.items() if k not in left_out}
+        left_out |= {k: (_LOOSE, message) for k, message in loose.items()}
+        if not (against or loose) or len(left_out) > len(rows) - 2:
             break
     for reason, named, what in (
         (_LOOSE, loose, "hardly a photo is held well enough"),
@@ -150,48 +144,100 @@ def refine_placed(
     ):
         if named:
             message = f"{what}: {next(iter(named.values()))}"
-            return Refused(reason=reason, message=message, rows=rows, gates=placement.gates)
+            return Refused(reason=reason, message=message, gates=placement.gates)
     edges = edges_of(adjusted.model, fit, good, adjusted.fixed_kept)
-    if {e.map_id for e in edges} != set(placement.parents):  # a parent that hardly held: as it was
-        edges = placement.edges
+    if {e.map_id for e in edges} != {e.map_id for e in placement.edges}:
+        edges = placement.edges  # a parent that hardly held: as it was
     whole = _with_existing(adjusted, fixed, good, [e.map_id for e in edges])
-    for k in sorted(set(range(len(rows))) - set(outside) - set(whole.photo_of.tolist())):
-        left_out[rows[k]] = _LOOSE, "the photo shows nothing that another photo of the map shows as well"
-        outside.append(k)
-    contradict = {r for r, (reason, _) in left_out.items() if reason == _CONTRADICTS}
-    agreeing = tuple(r for r in placement.agreeing if rows.index(r) not in outside)
-    disagreeing = tuple(sorted({*placement.disagreeing, *contradict}))
-    gate = gates.agreement(len(agreeing), len(disagreeing))
+    for k in sorted(set(range(len(rows))) - set(left_out) - set(whole.photo_of.tolist())):
+        left_out[k] = _LOOSE, "the photo shows nothing that another photo of the map shows as well"
+    disagreeing = sum(reason == _CONTRADICTS for reason, _ in left_out.values())
+    gate = gates.agreement(len(set(placement.agreeing) - set(left_out)), disagreeing)
     if not gate.passes:
         message = f"once refined, {gate.message}"
-        return Refused(reason=gate.reason, message=message, rows=rows, gates=placement.gates)
+        return Refused(reason=gate.reason, message=message, gates=placement.gates)
     # Until now the reconstruction was bent as it came, and its residuals said more of that than of where it
     # lies.
     turning = turning_covariance(adjusted.model, fit.covariance, spread)
     bending_m2 = bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
-    kept = [k for k in range(len(rows)) if k not in outside]
+    covariance = fit.covariance + turning + np.diag([0.0] * 4 + [bending_m2] * 3)
+    kept = [k for k in range(len(rows)) if k not in left_out]
     return Refinement(
         model=select_photos(whole, [rows[k] for k in kept]),
-        placement=replace(
-            placement,
-            edges=edges,
-            agreeing=agreeing,
-            disagreeing=disagreeing,
-            covariance_relative=fit.covariance + turning + np.diag([0.0] * 4 + [bending_m2] * 3),
-        ),
+        placement=replace(placement, edges=edges, covariance=covariance),
         poses=spread.poses[kept],
         bending_m=float(np.sqrt(bending_m2)),
         shared_turn=shared_turn(adjusted.model, spread),
-        left_out=left_out,
+        left_out={rows[k]: why for k, why in left_out.items()},
     )
 
 
-def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> dict[int, str]:
-    """Photos that hang on those that are held by too little, and how little.
+def contradicting_photos(
+    model: Model,
+    localised: Mapping[int, LocalisedPhoto],
+    spread: FloatArray,
+    fits: Sequence[FittedSimilarity],
+) -> dict[int, str]:
+    """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.
+
+    Asked of the refined model: as it comes, one of a few photos is bent by more than localised poses are
+    uncertain. The sigmas are those of the localisation, times the spread and the neighbours factor of the
+    similarity (poses from the same existing points share their errors), those of the refined pose, and what
+    the lens that it was localised with makes where the refined one is another.
 
     Args:
-        outside: photos that do not count. held: photos that are localised and agree.
+        localised: by place in the model.
+        spread: (k, 6, 6) of `PhotoSpread`; unknown ones (NaN) add nothing.
+        fits: of the model to the existing points, as it came and refined.
     """
+    limit = gates.sigmas_limit(6)
+    dilution = max(max(fit.spread, 1.0) ** 2 * fit.neighbours_factor for fit in fits)
+    found: dict[int, str] = {}
+    for k, photo in sorted(localised.items()):
+        pose, own_pose = model.cam_from_sfm[k], photo.cam_from_local
+        turn = so3_log(own_pose.rotation.T @ pose.rotation)
+        offset = np.concatenate([turn, own_pose.center - pose.center])
+        into_local = block_diag(pose.rotation.T, pose.rotation.T)
+        longer = photo.camera.with_focal((1.0 + _FOCAL_REL) * photo.camera.focal_px)
+        refined = model.cameras[int(model.camera_of[k])]
+        lenses = sum(np.outer(by, by) for by in (pose_by_lens(photo, lens) for lens in (longer, refined)))
+        own = into_local @ (np.nan_to_num(spread[k]) + lenses) @ into_local.T
+        square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
+        if square > limit:
+            off_m, off_deg = np.linalg.norm(offset[3:]), np.degrees(np.linalg.norm(offset[:3]))
+            found[k] = (
+                f"the photo by itself is {off_m:.2f} m and {off_deg:.2f} degrees from where the others put "
+                f"it, chi-square {square:.0f}, {limit:.0f} is allowed"
+            )
+    return found
+
+
+def pose_by_lens(photo: LocalisedPhoto, lens: Camera) -> FloatArray:
+    """(6,) how far a localised pose is off (left perturbation), if the photo's lens is another one.
+
+    The change of pose that moves the pixels of its points most alike.
+    """
+    seen = photo.cam_from_local.act(photo.points)
+    moved_px = lens.project(seen) - photo.camera.project(seen)
+    count = len(photo.pixels)
+    if count < 4:
+        return np.zeros(6)
+    linear = linearise(
+        [photo.camera],
+        np.zeros(1, dtype=np.int64),
+        [photo.cam_from_local],
+        photo.points,
+        np.arange(count),
+        np.zeros(count, dtype=np.int64),
+        photo.pixels,
+    )
+    good = np.isfinite(linear.by_pose).all(axis=(1, 2)) & np.isfinite(moved_px).all(axis=1)
+    by_pose = linear.by_pose[good].reshape(-1, 6)
+    return np.asarray(np.linalg.lstsq(by_pose, moved_px[good].reshape(-1), rcond=None)[0])
+
+
+def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> dict[int, str]:
+    """Photos that hang on those that are held by too little, and how little; `outside` do not count."""
     firm = bottleneck_share(model, held, outside)
     return {
         k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
@@ -219,15 +265,6 @@ def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[i
     }
 
 
-def in_metres(model: Model, local_from_sfm: Sim3) -> Model:
-    """The model in the local frame."""
-    return replace(
-        model,
-        cam_from_sfm=tuple(local_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm),
-        xyz=local_from_sfm.act(model.xyz),
-    )
-
-
 def _refined(
     model: Model,
     outside: Sequence[int],
@@ -239,8 +276,11 @@ def _refined(
 
     Observations by features that existing points hold are their points' now.
     """
-    first, number = held.existing()
-    fixed = FixedPoints(xyz=held.points[first], point_of=number, photo_of=held.photo_of, pixels=held.pixels)
+    both = np.stack([held.map_of, held.point_of], axis=1)
+    _, first, number = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    fixed = FixedPoints(
+        xyz=held.points[first], point_of=number.reshape(-1), photo_of=held.photo_of, pixels=held.pixels
+    )
     size = int(max(model.keypoint_of.max(initial=0), held.feature.max(initial=0))) + 1
     taken = np.isin(model.photo_of * size + model.keypoint_of, held.photo_of * size + held.feature)
     free = ~np.isin(model.photo_of, outside) & ~taken
@@ -248,10 +288,7 @@ def _refined(
 
 
 def _sigma_px(model: Model, correspondences: Correspondences) -> FloatArray:
-    """(m,) largest standard deviation of each existing point across the line of sight, in pixels at 1600.
-
-    Points that are less sure than `TOLERANCE_PX` do not hold a reconstruction.
-    """
+    """(m,) largest standard deviation of each existing point across the line of sight, in pixels at 1600."""
     sigma = np.zeros(len(correspondences))
     for k, pose in enumerate(model.cam_from_sfm):
         rows = np.flatnonzero(correspondences.photo_of == k)
@@ -269,8 +306,6 @@ def _with_existing(
     adjusted: Anchored, fixed: FixedPoints, correspondences: Correspondences, parents: Sequence[str]
 ) -> Model:
     """The adjusted model with the existing points that at least two of its photos see as points of its own.
-
-    A map holds its points itself: a copy of an existing point is where the new photos were held.
 
     Args:
         correspondences: (m,) of the observations of `fixed`.

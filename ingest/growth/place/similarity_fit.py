@@ -1,9 +1,8 @@
 """The similarity that places a reconstruction by existing maps: hypotheses by photo, then a weighted fit.
 
-What holds a new reconstruction are the pixels in which its photos see existing points. A photo's localised
-pose is made of them, and so are pairs of a new and an existing point: to add those as measurements of their
-own would count the same pixels twice. Poses and point pairs therefore propose similarities and judge them;
-the fit itself is over the pixels,
+What holds a new reconstruction are the pixels in which its photos see existing points. Localised poses and
+pairs of a new and an existing point are made of them: they propose similarities and judge them, and the fit
+itself is over the pixels,
 
     pixel_k = project(camera, cam_from_sfm S^-1 point_k) + noise,    S = local_from_sfm,
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.colmap.anchored import KEYPOINT_PX
+from ingest.colmap.anchored import KEYPOINT_PX, pixel_scale
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto
@@ -41,15 +40,13 @@ class Correspondences:
     """Existing points seen by photos of a model, all in one local frame.
 
     Attributes:
-        map_ids: the existing maps, by name; `map_of` indexes into them.
-        photo_of: (m,) index into the model's photos.
-        feature: (m,) row of that photo's features.
-        pixels: (m, 2) float64.
+        map_ids: the existing maps.
+        photo_of: (m,) index into the model's photos. feature: (m,) row of that photo's features.
+        pixels: (m, 2).
         points: (m, 3) metres. covariance: (m, 3, 3) relative to their map's gauge.
-        map_of: (m,), point_of: (m,) row of that map's points.
+        map_of: (m,) index into the maps. point_of: (m,) row of that map's points.
         model_point: (m,) the model's own point that the same feature observes, -1 where it has none.
-        carried: (m,) the photo's own localisation did not find the match; it came along a track of the
-            model, from a photo whose localisation did.
+        carried: (m,) the match came along a track of the model, from a photo whose localisation found it.
     """
 
     map_ids: tuple[str, ...]
@@ -67,31 +64,23 @@ class Correspondences:
         return len(self.photo_of)
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Correspondences":
-        """The correspondences of the given rows."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
-
-    def existing(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """One of each existing point (first row), and the number (m,) of each one's point."""
-        both = np.stack([self.map_of, self.point_of], axis=1)
-        _, first, number = np.unique(both, axis=0, return_index=True, return_inverse=True)
-        return first, number.reshape(-1)
 
 
 _COLUMNS = Correspondences.__slots__[1:]
 
 
 def find_correspondences(
-    model: Model, localised: Mapping[int, LocalisedPhoto], keypoints: Mapping[int, FloatArray]
+    model: Model, localised: Mapping[int, LocalisedPhoto], keypoints: Sequence[FloatArray]
 ) -> Correspondences:
-    """Correspondences of a model's photos, own and carried along its tracks; photos are in one frame.
+    """Correspondences of a model's photos, own and carried along its tracks.
 
     Args:
-        localised: one of the model's photos at least.
-        keypoints: pixels (n, 2) of all features of the model's photos, by row.
+        localised: one of the model's photos at least, by place among them, all in one frame.
+        keypoints: pixels (n, 2) of all features of each photo of the model.
     """
-    mine = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
-    map_ids = tuple(sorted({m for photo in mine.values() for m in photo.map_ids}))
-    own = _joined(*(_own(model, k, photo, map_ids) for k, photo in mine.items()))
+    map_ids = tuple(sorted({m for photo in localised.values() for m in photo.map_ids}))
+    own = _joined(*(_own(model, k, photo, map_ids) for k, photo in localised.items()))
     return _joined(own, _carried(model, own, keypoints))
 
 
@@ -101,24 +90,23 @@ def _joined(*parts: Correspondences) -> Correspondences:
 
 
 def _own(model: Model, k: int, photo: LocalisedPhoto, map_ids: tuple[str, ...]) -> Correspondences:
-    number = np.array([map_ids.index(m) for m in photo.map_ids], dtype=np.int64)
-    seen = model.photo_of == k
+    seen, count = model.photo_of == k, len(photo.feature_rows)
     points = dict(zip(model.keypoint_of[seen].tolist(), model.point_of[seen].tolist(), strict=True))
     return Correspondences(
         map_ids=map_ids,
-        photo_of=np.full(len(photo.feature_rows), k, dtype=np.int64),
+        photo_of=np.full(count, k),
         feature=photo.feature_rows,
         pixels=photo.pixels,
         points=photo.points,
         covariance=photo.point_covariance,
-        map_of=number[photo.map_of],
+        map_of=np.array([map_ids.index(m) for m in photo.map_ids], dtype=np.int64)[photo.map_of],
         point_of=photo.point_of,
         model_point=np.array([points.get(f, -1) for f in photo.feature_rows.tolist()], dtype=np.int64),
-        carried=np.zeros(len(photo.feature_rows), dtype=np.bool_),
+        carried=np.zeros(count, dtype=np.bool_),
     )
 
 
-def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatArray]) -> Correspondences:
+def _carried(model: Model, own: Correspondences, keypoints: Sequence[FloatArray]) -> Correspondences:
     """Where more than half of a track's matches with one map name one point, its other photos see it too."""
     linked = np.flatnonzero(own.model_point >= 0)
     triple = np.stack([own.model_point[linked], own.map_of[linked], own.point_of[linked]], axis=1)
@@ -136,16 +124,11 @@ def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatAr
         if (int(model.photo_of[o]), int(model.keypoint_of[o]), map_row) not in have
     ]
     seen, source = np.array(found, dtype=np.int64).reshape(-1, 2).T
-    photo_of, feature = model.photo_of[seen], model.keypoint_of[seen]
-    pixels = np.zeros((len(seen), 2))
-    for k in np.unique(photo_of):
-        mine = photo_of == k
-        pixels[mine] = keypoints[int(model.rows[k])][feature[mine]]
     return replace(
         own.take(source),
-        photo_of=photo_of,
-        feature=feature,
-        pixels=pixels,
+        photo_of=model.photo_of[seen],
+        feature=model.keypoint_of[seen],
+        pixels=model.pixels(keypoints)[seen],
         model_point=model.point_of[seen],
         carried=np.ones(len(seen), dtype=np.bool_),
     )
@@ -153,14 +136,13 @@ def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatAr
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FittedSimilarity:
-    """A fitted similarity.
-
+    """
     Attributes:
         covariance: (7, 7) of the similarity's left perturbation.
-        errors_px: (m,) distances of all pixels from where the placed model sees their points.
+        errors_px: (m,) `correspondence_errors` of all.
         spread: how many times its claimed sigma the typical residual is.
         neighbours_factor: how many times the variance of what neighbours say exceeds that of independent
-            errors; the larger of that by photo and that by place.
+            errors.
     """
 
     local_from_sfm: Sim3
@@ -185,25 +167,21 @@ def agreed_similarity(
     best = _best_proposal(model, own, correspondences, more)
     if best is None or not best[1]:
         return None
-    tolerance = tolerances_px(model, correspondences)
-    (sim, chosen), fit = best, None
+    sim, chosen = best
+    near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
     for _ in range(5):  # the set of photos settles in two or three rounds
-        near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
-        if fit is not None:
-            near &= fit.errors_px < 2.0 * tolerance
         if near.sum() < 4:
             return None
         fit = fit_similarity(model, sim, correspondences, near)
-        sim = fit.local_from_sfm
-        again = set(agreeing_photos(fit.errors_px, tolerance, correspondences).tolist()) & own.keys()
-        if not again:
+        sim, before = fit.local_from_sfm, chosen
+        chosen = agreeing_photos(fit.errors_px, TOLERANCE_PX, correspondences) & own.keys()
+        if not chosen:
             return None
-        if again == chosen:
+        held = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
+        near = held & (fit.errors_px < 2.0 * TOLERANCE_PX)
+        if chosen == before:
             break
-        chosen = again
-    assert fit is not None
-    used = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
-    return fit, chosen, used & (fit.errors_px < tolerance)
+    return fit, chosen, held & (fit.errors_px < TOLERANCE_PX)
 
 
 def _best_proposal(
@@ -215,27 +193,25 @@ def _best_proposal(
     if len(rows) > _MOST_SCORED:
         rows = np.sort(np.random.default_rng(0).choice(rows, _MOST_SCORED, replace=False))
     scored = correspondences.take(rows)
-    tolerance = tolerances_px(model, scored, _LOOSE_PX)
     ranked = []
     for sim in sims:
         if sim is not None:
-            errors = correspondence_errors(model, sim, scored)
-            agree = agreeing_photos(errors, tolerance, scored)
-            cost = float((np.minimum(errors / tolerance, 1.0) ** 2).sum())
-            ranked.append((-len(agree), cost, sim, set(agree.tolist())))
+            errors_px = correspondence_errors(model, sim, scored)
+            agree = agreeing_photos(errors_px, _LOOSE_PX, scored)
+            cost = float((np.minimum(errors_px / _LOOSE_PX, 1.0) ** 2).sum())
+            ranked.append((-len(agree), cost, sim, agree))
     return min(ranked, key=lambda item: item[:2])[2:] if ranked else None
 
 
 def _by_pose(model: Model, correspondences: Correspondences, k: int, photo: LocalisedPhoto) -> Sim3 | None:
     """Scale by the median ratio of the distances of existing and new points of one feature."""
-    rows = np.flatnonzero(
-        (correspondences.photo_of == k) & ~correspondences.carried & (correspondences.model_point >= 0)
-    )
-    if len(rows) < 5:  # a median of fewer is one point's opinion
+    held = ~correspondences.carried & (correspondences.model_point >= 0)
+    mine = correspondences.take(held & (correspondences.photo_of == k))
+    if len(mine) < 5:  # a median of fewer is one point's opinion
         return None
     ours, center = model.cam_from_sfm[k], photo.cam_from_local.center
-    here = np.linalg.norm(correspondences.points[rows] - center, axis=1)
-    there = np.linalg.norm(model.xyz[correspondences.model_point[rows]] - ours.center, axis=1)
+    here = np.linalg.norm(mine.points - center, axis=1)
+    there = np.linalg.norm(model.xyz[mine.model_point] - ours.center, axis=1)
     scale = float(np.median(here / np.maximum(there, 1e-12)))
     if scale <= 0:
         return None
@@ -244,36 +220,23 @@ def _by_pose(model: Model, correspondences: Correspondences, k: int, photo: Loca
 
 
 def correspondence_errors(model: Model, sim: Sim3, correspondences: Correspondences) -> FloatArray:
-    """(m,) distance in pixels from where the placed model sees the existing point; inf if it cannot."""
-    into_sfm = sim.inverse()
-    errors = np.full(len(correspondences), np.inf)
+    """(m,) distance from where the placed model sees the existing point, pixels at 1600; inf if it cannot."""
+    there, errors_px = sim.inverse().act(correspondences.points), np.full(len(correspondences), np.inf)
     for k in np.unique(correspondences.photo_of):
         rows = np.flatnonzero(correspondences.photo_of == k)
-        camera = model.cameras[int(model.camera_of[k])]
-        points = into_sfm.act(correspondences.points[rows])
-        errors[rows] = reprojection_errors(
-            correspondences.pixels[rows], points, camera, model.cam_from_sfm[k]
-        )
-    return errors
+        camera, pixels = model.cameras[int(model.camera_of[k])], correspondences.pixels[rows]
+        errors = reprojection_errors(pixels, there[rows], camera, model.cam_from_sfm[k])
+        errors_px[rows] = errors * 1600.0 / max(camera.width, camera.height)
+    return errors_px
 
 
-def tolerances_px(
-    model: Model, correspondences: Correspondences, at_1600_px: float = TOLERANCE_PX
-) -> FloatArray:
-    """(m,) that many pixels of an image of 1600, at the size of each correspondence's photo."""
-    sides = np.array([max(c.width, c.height) for c in model.cameras], dtype=np.float64)
-    return np.asarray(at_1600_px / 1600.0 * sides[model.camera_of[correspondences.photo_of]])
-
-
-def agreeing_photos(
-    errors_px: FloatArray, tolerance_px: FloatArray, correspondences: Correspondences
-) -> NDArray[np.int64]:
+def agreeing_photos(errors_px: FloatArray, tolerance_px: float, correspondences: Correspondences) -> set[int]:
     """Model's photos of whose own correspondences half lies within the tolerance."""
     own = ~correspondences.carried
     count = int(correspondences.photo_of.max(initial=-1)) + 1
     total = np.bincount(correspondences.photo_of[own], minlength=count)
     near = np.bincount(correspondences.photo_of[own & (errors_px < tolerance_px)], minlength=count)
-    return np.flatnonzero((total > 0) & (2 * near >= total))
+    return set(np.flatnonzero((total > 0) & (2 * near >= total)).tolist())
 
 
 def fit_similarity(
@@ -282,9 +245,8 @@ def fit_similarity(
     """Robust least squares over the pixels of the correspondences in `use` (m,), Gauss-Newton on SIM(3).
 
     Geman-McClure weights at the residuals' robust spread. The covariance is the inverse of the normal
-    equations times the squared spread times how far neighbours err alike: photos share the model's bending,
-    places the existing map's. What nothing holds (the scale, where all photos stand at one place) stays as
-    `start` has it, and has standard deviations of `_OPEN`.
+    equations times the squared spread times how far neighbours err alike. What nothing holds (the scale,
+    where all photos stand at one place) stays as in `start`, and has standard deviations of `_OPEN`.
     """
     chosen = correspondences.take(np.flatnonzero(use))
     sim, covariance, spread, factor = start, np.eye(7), 1.0, 1.0
@@ -330,8 +292,8 @@ def _equations(
     )
     by_point = np.where(np.isfinite(linear.by_point), linear.by_point, 0.0)
     residual = np.where(np.isfinite(linear.residual), linear.residual, 1e6)
-    sigma = KEYPOINT_PX * np.maximum(1.0, tolerances_px(model, correspondences, 1.0))
-    noise = sigma[:, None, None] ** 2 * np.eye(2)
+    sigma_px = KEYPOINT_PX * np.array([pixel_scale(camera) for camera in model.cameras])
+    noise = sigma_px[model.camera_of[correspondences.photo_of], None, None] ** 2 * np.eye(2)
     noise = noise + by_point @ correspondences.covariance @ np.swapaxes(by_point, 1, 2)
     jacobian = by_point @ point_jacobian(correspondences.points)
     return residual, np.asarray(jacobian), np.asarray(np.linalg.inv(noise))
@@ -340,7 +302,8 @@ def _equations(
 def neighbours_factor(score: FloatArray, inverse: FloatArray, correspondences: Correspondences) -> float:
     """Design effect on the similarity: variance of sums of scores over groups, over that of single ones.
 
-    Groups are photos, and places: cells of the existing points, a quarter of their extent wide. At least 1.
+    Groups are photos, which share the model's bending, and places (cells of the existing points, a quarter of
+    their extent wide), which share that of the existing map. At least 1.
 
     Args:
         score: (m, 7) derivative of each correspondence's cost. inverse: (7, 7) of the normal matrix.
@@ -349,8 +312,12 @@ def neighbours_factor(score: FloatArray, inverse: FloatArray, correspondences: C
     if alone <= 0.0:
         return 1.0
     largest = 1.0
-    for group in (correspondences.photo_of, _cells(correspondences)):
-        number = np.unique(group, return_inverse=True)[1].reshape(-1)
+    low, high = np.quantile(correspondences.points, (0.02, 0.98), axis=0)
+    side = max(float((high - low).max()) / 4.0, 1e-6)
+    cells = np.floor((correspondences.points - low) / side).astype(np.int64)
+    places = np.column_stack([cells, correspondences.map_of])
+    for group in (correspondences.photo_of[:, None], places):
+        number = np.unique(group, axis=0, return_inverse=True)[1].reshape(-1)
         count = int(number.max(initial=-1)) + 1
         if count < 2:
             continue
@@ -359,12 +326,3 @@ def neighbours_factor(score: FloatArray, inverse: FloatArray, correspondences: C
         together = float(np.einsum("ga,ab,gb->", sums, inverse, sums)) * count / (count - 1)
         largest = max(largest, together / alone)
     return largest
-
-
-def _cells(correspondences: Correspondences) -> NDArray[np.int64]:
-    """Number of the cell (a quarter of the extent wide) and map of each correspondence's point."""
-    low, high = np.quantile(correspondences.points, (0.02, 0.98), axis=0)
-    side = max(float((high - low).max()) / 4.0, 1e-6)
-    cells = np.floor((correspondences.points - low) / side).astype(np.int64)
-    both = np.concatenate([cells, correspondences.map_of[:, None]], axis=1)
-    return np.unique(both, axis=0, return_inverse=True)[1].reshape(-1)

@@ -1,29 +1,28 @@
 """Canaries: photos whose right answer is known are asked before and after a map would be promoted.
 
 A regression is a canary that was answered rightly and no longer is, or a photo of elsewhere that now finds a
-place. Beside those of the database, images of the active maps serve: their observations are features of
-photos, so they can be asked again without any file. Their answer leans on their own map and moves less than
-a stranger's would; what they show is an answer that the new map takes away, makes ambiguous or pulls along,
-and, asked of the new map alone, a new map that shows their place somewhere else.
+place. Beside those of the database, images of the active maps serve, by their observations: for answers that
+the new map takes away, makes ambiguous or pulls along, or has somewhere else.
 """
 
 import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 
 from featuredb.features.decode import decode_gray, probe
-from featuredb.features.features import Features
-from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store import Database
 from featuredb.store.canaries import TOLERANCE_DEG, Canary, KnownPose, list_canaries, load_canary_image
 from ingest.growth.gates import SIGMAS, Gate
-from ingest.growth.map_images import LEAST_FEATURES, NEAR_M, features_and_points
+from ingest.growth.place.map_images import LEAST_FEATURES, NEAR_M, features_and_points
 from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localise.acceptance import AcceptanceOptions
 from reloc.localise.localise import localise_features
@@ -35,7 +34,7 @@ from reloc.wire.query import LocaliseWireRequest
 
 # What a map keeps of its images shows its own points alone: that an image does not show what a new map adds
 # around them says nothing against either.
-_OWN_FEATURES = AcceptanceOptions(min_spread=0.0, min_agreement=0.0)
+_OWN_FEATURES = LocaliseOptions(acceptance=AcceptanceOptions(min_spread=0.0, min_agreement=0.0))
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
 
@@ -47,14 +46,13 @@ class CanaryCheck:
     """One canary.
 
     Attributes:
-        before, after: verdict on the answers; `alone`: of the new map alone, "" where it was not asked.
+        before, after: verdict on the answers.
         error_before_m, error_m: of the answers; NaN where there is none.
     """
 
     name: str
     before: Verdict
     after: Verdict
-    alone: Verdict | Literal[""] = ""
     error_before_m: float = float("nan")
     error_m: float = float("nan")
     regression: str = ""
@@ -64,7 +62,6 @@ class CanaryCheck:
             "name": self.name,
             "before": self.before,
             "after": self.after,
-            "alone": self.alone,
             "error_m": None if np.isnan(self.error_m) else round(self.error_m, 4),
             "regression": self.regression,
         }
@@ -82,26 +79,20 @@ class CanaryRun:
         return tuple(check for check in self.checks if check.regression)
 
     @property
-    def message(self) -> str:
-        if not self.regressions:
-            return f"{len(self.checks)} canaries answered as before ({self.note})"
-        first = self.regressions[0]
-        count = f"{len(self.regressions)} of {len(self.checks)} canaries regress"
-        return f"{count}: {first.name}: {first.regression}"
-
-    @property
     def gate(self) -> Gate:
         """Whether no known answer got worse."""
         count = len(self.regressions)
+        message = f"{len(self.checks)} canaries answered as before ({self.note})"
+        if count:
+            first = self.regressions[0]
+            message = f"{count} of {len(self.checks)} canaries regress: {first.name}: {first.regression}"
         return Gate(
-            name="canaries", reason="CANARY", figure=count, limit=0, passes=not count, message=self.message
+            name="canaries", reason="CANARY", figure=count, limit=0, passes=not count, message=message
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Miss:
-    """How far an answer is from what is known."""
-
     metres: float
     degrees: float
     sigma_m: float
@@ -116,8 +107,7 @@ def run_canaries(
     """Ask all known queries and images of the maps, before and after.
 
     Args:
-        before: the active maps. after: the same with the new ones.
-        new_maps: which are asked alone, too.
+        before: the active maps. after: the same with the new ones, which are asked alone, too.
 
     Raises:
         StoreError, CanaryNotFoundError: a canary's image cannot be read.
@@ -139,12 +129,16 @@ def check_known(database: Database, canary: Canary, before: Localiser, after: Lo
     asked = LocaliseWireRequest.model_validate_json(json.dumps(dict(canary.request)))
     request = localise_request(asked, data, header)
     results = [localiser.localise(gray, request) for localiser in (before, after)]
-    misses = [_miss_of_known(result.pose, canary.pose) for result in results]
-    if canary.pose is None:
+    known = canary.pose
+    if known is None:
         verdicts: list[Verdict] = ["not_found" if r.pose is None else "found" for r in results]
-    else:
-        limits = (canary.pose.tolerance_m, canary.pose.tolerance_deg)
-        verdicts = [_verdict(miss, *limits) for miss in misses]
+        return _checked(canary.name, verdicts, (None, None), results[1])
+    easting, northing, height = known.utm.tolist()
+    frame = LocalFrame.from_utm(easting, northing, height, known.epsg)
+    rotation = matrix_from_quaternion(known.cam_from_utm_xyzw) @ frame.grid_from_enu(np.zeros(3), known.epsg)
+    there = Rigid3(rotation=rotation, translation=np.zeros(3))
+    misses = [_miss(result.pose, frame, there) for result in results]
+    verdicts = [_verdict(miss, known.tolerance_m, known.tolerance_deg) for miss in misses]
     return _checked(canary.name, verdicts, misses, results[1])
 
 
@@ -197,16 +191,15 @@ def own_canaries(
             if described < LEAST_FEATURES:
                 continue
             key = hashlib.sha256(f"{feature_map.map_id} {image.name}".encode()).hexdigest()
-            center = image.cam_from_local.center
             around = False
             for frame, low, high in boxes:
-                there = frame.enu_from(feature_map.frame).act(center)[:2]
+                there = frame.enu_from(feature_map.frame).act(image.cam_from_local.center)[:2]
                 around |= bool(((there >= low) & (there <= high)).all())
             (near if around else far).append((key, feature_map.map_id, image))
-    chosen = sorted(near, key=lambda e: e[0])[:_OWN_NEAR]
-    chosen += sorted(far, key=lambda e: e[0])[: _OWN_NEAR // 2]
-    whole = {map_id: snapshot.load_map(map_id) for map_id in sorted({map_id for _, map_id, _ in chosen})}
-    return [(whole[map_id], image) for _, map_id, image in chosen]
+    near.sort(key=lambda e: e[0])
+    far.sort(key=lambda e: e[0])
+    load = cache(snapshot.load_map)
+    return [(load(map_id), image) for _, map_id, image in near[:_OWN_NEAR] + far[: _OWN_NEAR // 2]]
 
 
 def _check_own(
@@ -219,23 +212,19 @@ def _check_own(
     features, _ = features_and_points(feature_map, image)
     request = LocaliseRequest(camera=feature_map.cameras[image.camera_id])
     asked = ((before, None), (after, None), (after, new_ids))
-    results = [_ask(features, request, localiser, ids) for localiser, ids in asked]
-    misses = [_miss_of_image(result.pose, feature_map, image) for result in results]
+    results = []
+    for localiser, map_ids in asked:
+        areas = localiser.areas_of(map_ids)
+        areas = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
+        results.append(localise_features(features, request, areas, _OWN_FEATURES).result)
+    misses = [_miss(result.pose, feature_map.frame, image.cam_from_local) for result in results]
     verdicts = [_verdict(miss, DRIFT_BUDGET_M, TOLERANCE_DEG) for miss in misses[:2]]
     may_miss_m = SIGMAS * misses[2].sigma_m if misses[2] else 0.0
     alone = _verdict(misses[2], max(DRIFT_BUDGET_M, may_miss_m), TOLERANCE_DEG)
     check = _checked(f"{image.name} of map {feature_map.map_id}", verdicts, misses, results[1])
-    if check.regression or alone != "moved":
-        return replace(check, alone=alone)
-    return replace(check, alone=alone, regression=f"the new map alone has it {misses[2]} from where it is")
-
-
-def _ask(
-    features: Features, request: LocaliseRequest, localiser: Localiser, map_ids: tuple[str, ...] | None
-) -> LocaliseResult:
-    areas = [a for a in localiser.areas_of(map_ids) if a.area.extractor_fingerprint == features.fingerprint]
-    options = LocaliseOptions(acceptance=_OWN_FEATURES)
-    return localise_features(features, request, areas, options).result
+    if alone == "moved" and not check.regression:
+        return replace(check, regression=f"the new map alone has it {misses[2]} from where it is")
+    return check
 
 
 def _checked(
@@ -249,37 +238,18 @@ def _checked(
             regression = "a photo of elsewhere now finds a place"
         elif misses[1] is None:
             regression = f"no longer localised: {result.reason}: {result.detail}"
-    errors = [float("nan") if miss is None else miss.metres for miss in misses[:2]]
-    return CanaryCheck(
-        name=name,
-        before=before,
-        after=after,
-        error_before_m=errors[0],
-        error_m=errors[1],
-        regression=regression,
-    )
+    was_m, is_m = (float("nan") if miss is None else miss.metres for miss in misses[:2])
+    check = CanaryCheck(name=name, before=before, after=after, regression=regression)
+    return replace(check, error_before_m=was_m, error_m=is_m)
 
 
-def _miss_of_known(pose: LocalisedPose | None, expected: KnownPose | None) -> _Miss | None:
-    if pose is None or expected is None:
-        return None
-    where = pose.frame.enu_from_utm(expected.utm, expected.epsg)
-    cam_from_grid = matrix_from_quaternion(expected.cam_from_utm_xyzw)
-    cam_from_local = cam_from_grid @ pose.frame.grid_from_enu(where, expected.epsg)
-    return _miss(pose, where, cam_from_local)
-
-
-def _miss_of_image(pose: LocalisedPose | None, feature_map: FeatureMap, image: MapImage) -> _Miss | None:
+def _miss(pose: LocalisedPose | None, frame: LocalFrame, cam_from_local: Rigid3) -> _Miss | None:
+    """How far an answer is from a known pose in a local frame."""
     if pose is None:
         return None
-    expected = image.cam_from_local @ feature_map.frame.enu_from(pose.frame)
-    return _miss(pose, expected.center, expected.rotation)
-
-
-def _miss(pose: LocalisedPose, center: FloatArray, cam_from_local: FloatArray) -> _Miss:
-    turn = pose.cam_from_local.rotation @ cam_from_local.T
+    expected = cam_from_local @ frame.enu_from(pose.frame)
     return _Miss(
-        metres=float(np.linalg.norm(pose.cam_from_local.center - center)),
-        degrees=float(np.degrees(rotation_angle(turn))),
+        metres=float(np.linalg.norm(pose.cam_from_local.center - expected.center)),
+        degrees=pose.cam_from_local.angle_to_deg(expected),
         sigma_m=float(np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
     )

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +12,21 @@ from featuredb.store import Database, MapSummary, Snapshot
 from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.owners import read_owners
 from featuredb.store.candidates.photos import mark_confirmed
+from featuredb.store.candidates.states import ANONYMOUS
 from featuredb.store.changes import is_imported
 from ingest.fingerprint import digest
 from ingest.growth import gates
 from ingest.growth.asked_before import recall, remember
-from ingest.growth.gates import Gate
-from ingest.growth.map_images import NEAR_M
+from ingest.growth.place.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import Confirmation, Sources, answering_with, confirm
-from ingest.growth.trust.corroboration import NewPhotos, corroborate
+from ingest.growth.trust.confirmation import (
+    Confirmation,
+    NewPhotos,
+    Sources,
+    answering_with,
+    confirm,
+    corroborate,
+)
 from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
 
@@ -34,8 +40,7 @@ class ExaminedMap:
     """A map that others confirm, as `summary` has it in the database.
 
     Attributes:
-        feature_map: with descriptors where they confirm it: a photo that is altered in one part brings that
-            part in otherwise.
+        feature_map: with descriptors only where they confirm it.
         earned: candidate ids of its photos that make a record for their owners.
     """
 
@@ -50,34 +55,28 @@ class Promotion:
     """What became of one quarantined map, and why it stays one or was promoted; figures of gates by name."""
 
     map_id: str
-    promoted: bool
-    reason_code: str
+    promoted: bool = False
+    reason_code: str = ""
     reason: str
     gates: Mapping[str, Any] = field(default_factory=dict)
 
 
 def promote_confirmed(
-    database: Database,
-    localiser: Localiser,
-    options: GrowthOptions,
-    work: Path,
-    new: NewPhotos | None = None,
+    database: Database, localiser: Localiser, options: GrowthOptions, work: Path, new: NewPhotos | None = None
 ) -> list[Promotion]:
     """Try every quarantined map that growth has made; those that have drifted beyond the budget stay.
 
     Args:
         localiser: of the active maps of the newest snapshot.
-        work: work folder, where it is kept what was found out: without anything new nothing is asked again.
+        work: work folder: without anything new nothing is asked again.
         new: photos that may corroborate a map, beside the images of other maps.
 
     Raises:
         StoreError
     """
     snapshot = database.snapshot()
-    sources = Sources(owners=read_owners(database, snapshot), trusted=options.trusted)
-    asked = _question(database, snapshot, sources, new)
+    asked = _question(database, options, new)
     open_maps: list[MapSummary] = []
-    ready: list[ExaminedMap] = []
     outcomes: list[Promotion] = []
     for summary in snapshot.maps():
         if summary.status != "quarantined" or summary.method != "map":
@@ -89,53 +88,51 @@ def promote_confirmed(
             open_maps.append(summary)
         else:
             outcomes.append(stays)
-    for one in _examined(open_maps, snapshot, sources, new, options.threads):
-        if isinstance(one, ExaminedMap):
-            ready.append(one)
-        else:
-            outcomes.append(one)
+
+    def examine(waiting: Sequence[MapSummary]) -> list[ExaminedMap | Promotion]:
+        return _examined(waiting, snapshot, _sources(database, options), new, options.threads)
+
+    examined = examine(open_maps) if open_maps else []
+    stay = [one for one in examined if isinstance(one, Promotion)]
+    _remember(work, stay, asked)
+    ready = [one for one in examined if isinstance(one, ExaminedMap)]
+    if not ready:
+        return outcomes + stay
+    decided = _promote(database, localiser, ready, examine)
+    _remember(work, decided, _question(database, options, new))
+    return outcomes + stay + decided
+
+
+def _remember(work: Path, outcomes: Sequence[Promotion], asked: str) -> None:
+    for one in outcomes:
+        if not one.promoted and one.reason_code != "CONFLICT":
             remember(work, "maps", one.map_id, asdict(one), asked)
 
-    def by_itself(was: ExaminedMap) -> ExaminedMap | Promotion:
-        as_is = replace(sources, owners=read_owners(database, database.snapshot()))
-        return _examined([was.summary], snapshot, as_is, new, options.threads)[0]
 
-    if ready:
-        decided = _promote(database, localiser, ready, by_itself)
-        now = database.snapshot()
-        after = _question(database, now, replace(sources, owners=read_owners(database, now)), new)
-        for outcome in decided:
-            if not outcome.promoted and outcome.reason_code != "CONFLICT":
-                remember(work, "maps", outcome.map_id, asdict(outcome), after)
-        outcomes += decided
-    return outcomes
+def _sources(database: Database, options: GrowthOptions) -> Sources:
+    """Whose word counts now."""
+    return Sources(owners=read_owners(database, database.snapshot()), trusted=options.trusted)
 
 
 def _examined(
     waiting: Sequence[MapSummary], snapshot: Snapshot, sources: Sources, new: NewPhotos | None, threads: int
 ) -> list[ExaminedMap | Promotion]:
-    """All of them, with the records that they make for each other: else what two newcomers show beside what
-    an anchor shows would lose its descriptors, which do not come back.
-    """
+    """All of them, with the records that they make for each other: lost descriptors do not come back."""
     while True:
         found = [_examine(summary, snapshot, sources, new, threads) for summary in waiting]
-        more = sources.with_records(
-            sources.owners.of_image(one.feature_map, image)
-            for one in found
-            if isinstance(one, ExaminedMap)
-            for image in one.feature_map.images
-            if image.image_id in one.confirmation.earned
-        )
+        earned = [c for one in found if isinstance(one, ExaminedMap) for c in one.earned]
+        more = sources.with_records(sources.owners.givers.get(c, ANONYMOUS) for c in earned)
         if more == sources:
             return found
         sources = more
 
 
-def _question(database: Database, snapshot: Snapshot, sources: Sources, new: NewPhotos | None) -> str:
+def _question(database: Database, options: GrowthOptions, new: NewPhotos | None) -> str:
     """Digest of all that an examination depends on: live maps, canaries, photos, whose word counts."""
-    maps = sorted(f"{m.write_id} {m.status}" for m in snapshot.maps())
+    maps = sorted(f"{m.write_id} {m.status}" for m in database.snapshot().maps())
     canaries = [f"{c.name} {c.created_at.isoformat()}" for c in list_canaries(database)]
     photos = [] if new is None else [new.given.photos[row].sha256 for row in new.rows]
+    sources = _sources(database, options)
     records = [f"{owner} is on record" for owner in sources.owners.on_record]
     trusted = [f"{owner} is trusted" for owner in sources.trusted]
     return digest(*maps, "|", *canaries, "|", *sorted([*photos, *records, *trusted]))
@@ -151,7 +148,7 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
     snapshot = database.snapshot()
     summary = snapshot.get(map_id)
     if summary.status == "active":
-        return Promotion(map_id=map_id, promoted=True, reason_code="", reason="it was active already")
+        return Promotion(map_id=map_id, promoted=True, reason="it was active already")
     if summary.status == "retired":
         raise StoreError(f"map {map_id} is retired ({summary.status_reason}); commit it again")
     gate = _tried(database, Localiser.open(database), [snapshot.load_map(map_id)]).gate
@@ -160,7 +157,7 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
     text = f"{reason} (by hand; {gate.message})"
     mark_confirmed(database, read_owners(database, snapshot).made_of.get(map_id, ()), map_id)
     database.set_status([map_id], "active", text, based_on={map_id: summary.write_id})
-    return Promotion(map_id=map_id, promoted=True, reason_code="", reason=text, gates=gates.figures([gate]))
+    return Promotion(map_id=map_id, promoted=True, reason=text, gates=gates.figures([gate]))
 
 
 def _examine(
@@ -195,18 +192,12 @@ def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Prom
         code, text = "NO_PARENT", f"no active map holds it: {', '.join(summary.parents)} is not active"
     elif gate.passes:
         return None
-    return Promotion(map_id=summary.map_id, promoted=False, reason_code=code, reason=text)
+    return Promotion(map_id=summary.map_id, reason_code=code, reason=text)
 
 
-def _stays(map_id: str, gate: Gate) -> Promotion:
-    """By a gate."""
-    return Promotion(
-        map_id=map_id,
-        promoted=False,
-        reason_code=gate.reason,
-        reason=gate.message,
-        gates=gates.figures([gate]),
-    )
+def _stays(map_id: str, gate: gates.Gate) -> Promotion:
+    told = gates.figures([gate])
+    return Promotion(map_id=map_id, reason_code=gate.reason, reason=gate.message, gates=told)
 
 
 def _others(me: MapSummary, snapshot: Snapshot) -> list[FeatureMap]:
@@ -225,21 +216,11 @@ def _others(me: MapSummary, snapshot: Snapshot) -> list[FeatureMap]:
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
 
-def _committed(database: Database, found: ExaminedMap) -> str:
-    """The map with the descriptors that it will answer with, still in quarantine; its write id."""
-    described = int(found.feature_map.observations.has_descriptor.sum())
-    write_id = found.summary.write_id
-    if described == found.summary.descriptors:
-        return write_id
-    map_id = found.summary.map_id
-    return database.commit_map(found.feature_map, replaces=map_id, based_on=write_id, moves=False).write_id
-
-
 def _promote(
     database: Database,
     before: Localiser,
     ready: Sequence[ExaminedMap],
-    by_itself: Callable[[ExaminedMap], ExaminedMap | Promotion],
+    examine: Callable[[Sequence[MapSummary]], list[ExaminedMap | Promotion]],
 ) -> list[Promotion]:
     """Ask the canaries: of all of them together, and one by one where that shows a regression.
 
@@ -249,20 +230,28 @@ def _promote(
     if not together.regressions or len(ready) == 1:
         return _decide(database, before, ready, together)
     outcomes: dict[str, Promotion] = {}
-    waiting, asked = list(ready), 0
+    waiting, asked = [found.summary for found in ready], 0
     while asked < len(waiting):  # a promoted map has made records for those that were asked before it
-        map_id = waiting[asked].feature_map.map_id
-        found = by_itself(waiting[asked])
-        if not isinstance(found, ExaminedMap):
-            outcomes[map_id] = found
+        (found,) = examine([waiting[asked]])
+        if isinstance(found, Promotion):
+            outcomes[found.map_id] = found
             asked += 1
             continue
         run = _tried(database, before, [found.feature_map])
-        (outcomes[map_id],) = _decide(database, before, [found], run)
+        (decided,) = _decide(database, before, [found], run)
+        outcomes[decided.map_id] = decided
         del waiting[asked]
-        if outcomes[map_id].promoted:
+        if decided.promoted:
             before, asked = Localiser.open(database, previous=before), 0
     return list(outcomes.values())
+
+
+def _committed(database: Database, found: ExaminedMap) -> str:
+    """The map with the descriptors that it will answer with, still in quarantine; its write id."""
+    was, answering = found.summary, found.feature_map
+    if int(answering.observations.has_descriptor.sum()) == was.descriptors:
+        return was.write_id
+    return database.commit_map(answering, replaces=was.map_id, based_on=was.write_id, moves=False).write_id
 
 
 def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) -> CanaryRun:
@@ -277,21 +266,13 @@ def _decide(
     asked = {found.feature_map.map_id: (found.confirmation.gate, run.gate) for found in ready}
 
     def outcomes(code: str, reason: str, *, promoted: bool = False) -> list[Promotion]:
-        return [
-            Promotion(
-                map_id=map_id,
-                promoted=promoted,
-                reason_code=code,
-                reason=reason,
-                gates=gates.figures(of),
-            )
-            for map_id, of in asked.items()
-        ]
+        told: dict[str, Any] = {"promoted": promoted, "reason_code": code, "reason": reason}
+        return [Promotion(map_id=map_id, gates=gates.figures(of), **told) for map_id, of in asked.items()]
 
     if not run.gate.passes:
         return outcomes(run.gate.reason, run.gate.message)
-    confirmed = "; ".join(dict.fromkeys(found.confirmation.message for found in ready))
-    reason = f"{confirmed}; {run.message}"
+    confirmed = "; ".join(dict.fromkeys(found.confirmation.gate.message for found in ready))
+    reason = f"{confirmed}; {run.gate.message}"
     active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
     for found in ready:
         mark_confirmed(database, found.earned, found.feature_map.map_id)

@@ -1,7 +1,7 @@
 """Whether a grown map lies where the scans in store have the ground and the roofs.
 
-A map that was placed by other maps says how far off it may be. A scan is right to decimetres: where it
-covers the map, the rigid motion that brings the map's points onto its surface must be no larger than that.
+A grown map says how far off it may be: where a scan covers it, the rigid motion that brings the map's points
+onto the scan's surface must be no larger than that.
 """
 
 import logging
@@ -22,16 +22,10 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.tables import LIDAR
 from ingest.growth.gates import SIGMAS, Gate, sigmas_limit
-from ingest.growth.map_places import growth_of, with_growth
+from ingest.growth.map_places import growth_of, place_sigmas_m, with_growth
 from ingest.growth.place.component import GrownMap
 from ingest.growth.values import LEAST_PHOTOS, MAD, Refused
-from ingest.register.structure.surface_fit import (
-    MIN_REACH_M,
-    Surface,
-    nearest_planes,
-    reach_of,
-    surface_near,
-)
+from ingest.register.structure.surface_fit import MIN_REACH_M, Surface, nearest_planes, reach_of, surface_near
 
 NOT_ASKED = "SCAN_NOT_ASKED"  # reason of a gate that another installation may pass
 
@@ -56,8 +50,7 @@ def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Ref
     """The map with the gate's figure in its evidence, or the refusal of a scan.
 
     Returns:
-        The second is why a scan that is there could not be compared, "" otherwise. Where the extra `lidar` is
-        missing, the map is refused: the scan might refuse it.
+        The second is why a scan that is there could not be compared, "" otherwise.
 
     Raises:
         StoreError: the scans cannot be read.
@@ -76,8 +69,7 @@ def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Ref
             gate = cloud_gate(cloud, points, feature_map.placement.covariance)
     except MissingExtraError as error:
         text = f"a scan is there that could not be asked; it waits until it can be ({error})"
-        limit = sigmas_limit(6)
-        gate = Gate(name="scan", reason=NOT_ASKED, figure=np.inf, limit=limit, passes=False, message=text)
+        gate = replace(_gate(np.inf, ""), reason=NOT_ASKED, message=text)
     except ScanError as error:  # heights of several datums
         why = str(error)
     if why:
@@ -86,8 +78,7 @@ def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Ref
     if gate is None:
         return grown, why
     if not gate.passes:
-        rows = tuple(int(r) for r in grown.model.rows)
-        return Refused.by(gate, *grown.placement.gates, rows=rows), ""
+        return Refused.by(gate, *grown.placement.gates), ""
     told = {**growth_of(feature_map.placement.evidence).get("gates", {}), gate.name: gate.as_json()}
     return replace(grown, feature_map=with_growth(feature_map, gates=told)), ""
 
@@ -103,25 +94,20 @@ def cloud_gate(cloud: PointCloud, points: FloatArray, covariance: FloatArray) ->
     reach = reach_of(surface)
     near = np.isfinite(nearest_planes(surface, over, reach)[0])
     middle = over.mean(axis=0)
-    jacobian = point_jacobian(middle)
-    claim = jacobian @ covariance @ jacobian.T + np.eye(3) * _SCAN_SIGMA_M**2
-    claimed_m = SIGMAS * float(np.sqrt(np.linalg.eigvalsh(claim)[-1]))
+    claimed_m = SIGMAS * float(np.hypot(place_sigmas_m(covariance, middle[None])[0], _SCAN_SIGMA_M))
     if near.mean() < _LEAST_NEAR:
         if claimed_m > reach:
             return None
         return _gate(np.inf, f"{near.mean():.0%} of its points lie within {reach:.1f} m of the scan")
     laid = _Laid(surface=surface, points=over, middle=middle)
-    here = laid.fitted(Rigid3.identity(), (_NARROW,))
-    there = laid.fitted(Rigid3.identity(), _WIDE_TO_NARROW)
+    here, there = laid.fitted((_NARROW,)), laid.fitted(_WIDE_TO_NARROW)
     sigma = laid.sigma_m(there)
     gain = 1.0 - laid.cost(there, sigma) / max(laid.cost(here, sigma), 1e-9)
     best = there if gain > _LEAST_GAIN else here
+    shift_m = float(np.linalg.norm(best.act(middle) - middle))
+    text = f"it would have to move by {shift_m:.2f} m to lie on the scan"
     chi2 = laid.chi_square(best, covariance, sigma)
-    shift = float(np.linalg.norm(best.act(middle) - middle))
-    return _gate(
-        chi2,
-        f"it would have to move by {shift:.2f} m to lie on the scan; its placement allows {claimed_m:.2f} m",
-    )
+    return _gate(chi2, f"{text}; its placement allows {claimed_m:.2f} m")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,8 +148,9 @@ class _Laid:
         weight = self.weights(places[good]) / sigma_m**2
         return np.asarray(rows.T @ (weight[:, None] * rows)), np.asarray(rows.T @ (weight * distance[good]))
 
-    def fitted(self, move: Rigid3, cuts: Sequence[float]) -> Rigid3:
-        """Point to plane from a start. Each cut (metres; 0: three sigma) says what counts, in turn."""
+    def fitted(self, cuts: Sequence[float]) -> Rigid3:
+        """Point to plane from where the points are; each cut (metres; 0: three sigma) in turn."""
+        move = Rigid3.identity()
         for cut in cuts:
             for _ in range(_ROUNDS):
                 sigma = self.sigma_m(move)
@@ -175,11 +162,7 @@ class _Laid:
         return move
 
     def chi_square(self, move: Rigid3, covariance: FloatArray, sigma_m: float) -> float:
-        """Of the motion against nothing: what the placement (7, 7), the scan and the fit leave open.
-
-        Flat ground leaves shifts and the heading open, in which the fit slides; they count as far as roofs
-        and walls hold them.
-        """
+        """Of the motion against what the placement (7, 7), the scan and the fit leave open."""
         at_middle = np.concatenate([np.eye(7)[1:4], point_jacobian(self.middle)])  # turn and shift there
         information, _ = self.normal_equations(move, SIGMAS * sigma_m, sigma_m)
         allowed = at_middle @ covariance @ at_middle.T + np.linalg.inv(information + _OPEN)
@@ -215,12 +198,10 @@ def _points(feature_map: FeatureMap) -> FloatArray:
 
 def _over_scan(surface: Surface, points: FloatArray) -> NDArray[np.bool_]:
     """Points with scan around them in plan: elsewhere there is a hole, and its rim says nothing."""
-    cell = max(MIN_REACH_M, 2.0 * surface.spacing_m)
-    filled = _cells(surface.points + surface.middle, cell)
-    return np.isin(_cells(points, cell), filled)
+    cell_m = max(MIN_REACH_M, 2.0 * surface.spacing_m)
 
+    def cells(xyz: FloatArray) -> NDArray[np.int64]:
+        rows = np.floor(xyz[:, :2] / cell_m).astype(np.int64)
+        return np.asarray(rows[:, 0] * (1 << 32) + rows[:, 1])
 
-def _cells(points: FloatArray, size_m: float) -> NDArray[np.int64]:
-    """Number of the cell in plan (n,) of each point."""
-    rows = np.floor(points[:, :2] / size_m).astype(np.int64)
-    return np.asarray(rows[:, 0] * (1 << 32) + rows[:, 1])
+    return np.isin(cells(points), cells(surface.points + surface.middle))

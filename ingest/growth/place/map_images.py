@@ -1,24 +1,80 @@
-"""How two existing maps lie to each other where they overlap, measured by images of one in the other.
+"""Images of maps, asked like new photos by what their maps keep of them: observations with descriptors.
 
-What a map keeps of its images, observations with descriptors, is localised against the other map as if they
-were new photos; the similarity then comes from the pixels in which both maps' points are seen.
+How two existing maps lie to each other where they overlap is measured so: images of one are localised in the
+other, and the similarity then comes from the pixels in which both maps' points are seen.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from featuredb.features.features import Features
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
-from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, features_and_points, model_of
+from featuredb.maps.unplaced_map import AnyMap
+from ingest.colmap.bridge import Model
 from ingest.growth.place.localised import in_frame, localise_photo
 from ingest.growth.place.similarity_fit import agreed_similarity, find_correspondences
 from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
 
+# Observations with descriptors that an image needs to be asked, of which a third are inliers in a good one.
+LEAST_FEATURES = 2 * LEAST_SHARED_POINTS
+NEAR_M = 50.0  # images of maps around another one are asked whose camera is so far from it at most
+MOST_IMAGES = 24  # that are asked of a map or around one, nearest first; more only sharpen what they say
 _LEAST_POINTS = 2 * LEAST_SHARED_POINTS  # behind an overlap; fewer leave scale and tilt open
+
+
+def observed_rows(any_map: AnyMap, image: MapImage, *, described: bool) -> NDArray[np.int64]:
+    """Rows (n,) of a map's observations of one image, those with descriptors first, or alone; large first."""
+    seen = any_map.observations
+    rows = np.flatnonzero(seen.image_id == image.image_id)
+    rows = rows[np.lexsort((-seen.scale[rows], ~seen.has_descriptor[rows]))]
+    return rows[seen.has_descriptor[rows]] if described else rows
+
+
+def observed_features(any_map: AnyMap, image: MapImage, rows: NDArray[np.int64]) -> Features:
+    """Rows (n,) of a map's observations, all of one image, as features of that photo, best first."""
+    seen, camera = any_map.observations, any_map.cameras[image.camera_id]
+    return Features(
+        xy=seen.xy[rows],
+        scale=seen.scale[rows],
+        angle=seen.angle[rows],
+        response=np.linspace(1.0, 0.5, len(rows), dtype=np.float32),
+        descriptors=seen.descriptors[rows],
+        width=camera.width,
+        height=camera.height,
+        fingerprint=any_map.extractor_fingerprint,
+    )
+
+
+def features_and_points(feature_map: FeatureMap, image: MapImage) -> tuple[Features, NDArray[np.int64]]:
+    """What a map keeps of one of its photos, and the row of its points (n,) that each feature observes."""
+    rows = observed_rows(feature_map, image, described=True)
+    return observed_features(feature_map, image, rows), feature_map.observations.point_index[rows]
+
+
+def model_of(any_map: AnyMap, images: Sequence[MapImage], *, described: bool) -> Model:
+    """Images of a map as a reconstruction in its frame; keypoints of an image are its `observed_rows`."""
+    rows = [observed_rows(any_map, image, described=described) for image in images]
+    counts = [len(r) for r in rows]
+    photo_of = np.repeat(np.arange(len(images), dtype=np.int64), counts)
+    points = any_map.observations.point_index[np.concatenate(rows)]
+    used, point_of = np.unique(points, return_inverse=True)
+    order = np.lexsort((photo_of, point_of))
+    return Model(
+        cameras=any_map.cameras,
+        rows=np.arange(len(images), dtype=np.int64),
+        camera_of=np.array([image.camera_id for image in images], dtype=np.int64),
+        cam_from_sfm=tuple(image.cam_from_local for image in images),
+        xyz=any_map.points_local()[used],
+        point_of=point_of.reshape(-1)[order].astype(np.int64),
+        photo_of=photo_of[order],
+        keypoint_of=np.concatenate([np.arange(n, dtype=np.int64) for n in counts])[order],
+    )
 
 
 def measure_overlap(
@@ -35,17 +91,12 @@ def measure_overlap(
         return "heights of different datums"
     images = _images_near(feature_map, other) if images is None else images
     indexed = IndexedArea.of([other])
-    localised: dict[int, LocalisedPhoto] = {}
-    for row, image in enumerate(images):
-        photo = localise_image(feature_map, image, [indexed])
-        if photo is not None:
-            localised[row] = in_frame(photo, feature_map.frame)
+    asked = [localise_image(feature_map, image, [indexed]) for image in images]
+    localised = {row: in_frame(photo, feature_map.frame) for row, photo in enumerate(asked) if photo}
     if len(localised) < LEAST_PHOTOS:
         return f"{len(localised)} of {len(images)} images are found, {LEAST_PHOTOS} are needed"
-    model = model_of(feature_map, feature_map.points_local(), images, described=True)
-    keypoints = {
-        r: features_and_points(feature_map, image)[0].xy.astype(float) for r, image in enumerate(images)
-    }
+    model = model_of(feature_map, images, described=True)
+    keypoints = [features_and_points(feature_map, image)[0].xy.astype(float) for image in images]
     correspondences = find_correspondences(model, localised, keypoints)
     found = agreed_similarity(model, localised, correspondences, [Sim3.identity()])
     if found is None:
