@@ -26,15 +26,8 @@ from ingest.register.anchor.frames import (
 from ingest.register.anchor.placing import PlaceRound, place_in_rounds
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.block import block_of_map
-from ingest.register.structure.map_move import (
-    MapMove,
-    MapResidual,
-    map_move,
-    map_residuals,
-)
-from ingest.register.structure.projection import (
-    project_structure,
-)
+from ingest.register.structure.map_move import MapMove, MapResidual, map_move, map_residuals
+from ingest.register.structure.projection import project_structure
 
 # How far the map may move in the plane and turn, in standard deviations of its placement. Six, because
 # receivers understate their errors. Heights are not judged: those of GPS have an unknown datum and differ
@@ -47,6 +40,7 @@ _MAX_SCALE_CHANGE = 0.1  # relative; GPS and scan both measure metres
 # Median distance of the map's points from the scan after, as a share of the distance from which they are
 # seen: 0.02 is 1 m from 50 m, what trees and a day's change leave.
 _MAX_RESIDUAL_SHARE = 0.02
+_GOOD_M = 0.05  # and that much is no objection
 
 AnchorReason = Literal[
     "NO_SCAN",  # no frame of the map sees the scan
@@ -92,7 +86,7 @@ class AnchorResult:
 
     reason: AnchorReason | None
     message: str
-    feature_map: FeatureMap | None
+    feature_map: FeatureMap | None = None
     agreement: FrameAgreement | None = None
     used: tuple[int, ...] = ()
     rounds: tuple[PlaceRound, ...] = ()
@@ -140,7 +134,6 @@ def place_map(
     found = AnchorResult(
         reason="STRUCTURE",
         message=words,
-        feature_map=None,
         agreement=agreement,
         used=agreement.agreeing,
         rounds=tuple(rounds),
@@ -177,7 +170,6 @@ def _nothing_registered(tried: TriedFrames) -> AnchorResult:
             reason="NO_SCAN",
             message="no frame of the map sees enough of the scan from where the map is placed now; "
             "is it the scan of this place? A rough pose (--pose) or picks (--picks) can start elsewhere",
-            feature_map=None,
         )
     reasons = "; ".join(
         f"{f.image.name}: {f.registration.reason}: {f.registration.message}" for f in tried.tried
@@ -185,7 +177,6 @@ def _nothing_registered(tried: TriedFrames) -> AnchorResult:
     return AnchorResult(
         reason="NO_FRAME",
         message=f"none of {len(tried.tried)} frames was registered to the scan: {reasons}",
-        feature_map=None,
     )
 
 
@@ -230,7 +221,6 @@ def _too_little(
         return AnchorResult(
             reason="STRUCTURE",
             message=f"the map's points do not fit the scan through any registered frame: {words}",
-            feature_map=None,
         )
     if not agreement.agreeing or (len(agreement.agreeing) < needed and len(lone) >= 2):
         apart = "; ".join(
@@ -241,7 +231,6 @@ def _too_little(
             reason="FRAMES_DISAGREE",
             message=f"the frames send the map to different places ({apart}); look at them in anchor.html and "
             "confirm the right one (--confirm)",
-            feature_map=None,
         )
     if len(agreement.agreeing) < needed:
         others = "".join(f"; {name}: {why}" for name, why in refusals.items())
@@ -250,7 +239,6 @@ def _too_little(
             message=f"{len(agreement.agreeing)} frame places the map, {names[agreement.agreeing[0]]}{others}"
             f"; {needed} that agree are needed without a person; look at it in anchor.html and confirm it "
             "(--confirm), or accept one frame (--frames 1)",
-            feature_map=None,
         )
     return None
 
@@ -262,8 +250,9 @@ def _judged(
     before, after = map_residuals(old, new, cloud)
     move = map_move(old, new)
     distance = float(np.median(block_of_map(new).distances()))
-    apart = found.agreement.apart_m if found.agreement else {}
-    allowed = found.agreement.allowed_m if found.agreement else {}
+    most_m = max(_MAX_RESIDUAL_SHARE * distance, _GOOD_M)
+    assert found.agreement is not None
+    allowed = found.agreement.allowed_m
     checks: dict[str, Any] = {
         "before": before.as_figures(),
         "after": after.as_figures(),
@@ -271,27 +260,27 @@ def _judged(
         "viewing_distance_m": distance,
         "frames_apart_m": [
             {"frames": list(pair), "apart_m": metres, "allowed_m": allowed[pair]}
-            for pair, metres in apart.items()
+            for pair, metres in found.agreement.apart_m.items()
         ],
     }
     found = replace(found, before=before, after=after, checks=checks, message="")
-    if not len(after.distance_m) or after.median_m > max(_MAX_RESIDUAL_SHARE * distance, 0.05):
+    if not len(after.distance_m) or after.median_m > most_m:
         return replace(
             found,
             reason="NOT_BETTER",
             message=f"the map's points would lie {after.median_m:.2f} m (median) from the scan, "
-            f"{max(_MAX_RESIDUAL_SHARE * distance, 0.05):.2f} m allowed",
+            f"{most_m:.2f} m allowed",
         )
-    if after.median_m > max(before.median_m, 0.05):
+    if after.median_m > max(before.median_m, _GOOD_M):
         return replace(
             found,
             reason="NOT_BETTER",
             message=f"the map's points lie {before.median_m:.2f} m (median) from the scan now and would lie "
             f"{after.median_m:.2f} m from it",
         )
-    words = None if supervised else _contradiction(move)
-    if words is not None:
-        return replace(found, reason="CONTRADICTS_PLACEMENT", message=words)
+    contradiction = None if supervised else _contradiction(move)
+    if contradiction is not None:
+        return replace(found, reason="CONTRADICTS_PLACEMENT", message=contradiction)
     evidence = new.placement.evidence | {
         "anchor": checks
         | {

@@ -73,11 +73,7 @@ _CONTROLS = (
 def write_anchor_report(
     folder: Path, report: AnchorReport, old: FeatureMap, cloud: PointCloud, read_rgb: PhotoRgb, command: str
 ) -> Path:
-    """Write `anchor.json` and `anchor.html` into the folder; returns the path of the page.
-
-    Args:
-        old, read_rgb, command: see `anchor_page`.
-    """
+    """Write `anchor.json` and `anchor.html` (see `anchor_page`) into the folder; the path of the page."""
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / REPORT_JSON, report_json(report))
     with atomic_file(folder / REPORT_HTML) as temporary:

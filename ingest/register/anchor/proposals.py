@@ -1,7 +1,7 @@
 """Which frames of a map are worth registering first."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +47,6 @@ class FrameScore:
     points: int
     spread: float
 
-    def as_figures(self) -> dict[str, float]:
-        """JSON-able."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameProposal:
@@ -62,9 +58,7 @@ class FrameProposal:
 
 
 def propose_frames(
-    feature_map: FeatureMap,
-    cloud: PointCloud,
-    priors: Mapping[int, FramePrior],
+    feature_map: FeatureMap, cloud: PointCloud, priors: Mapping[int, FramePrior]
 ) -> list[FrameProposal]:
     """All frames that see enough of the scan, the most promising first.
 

@@ -15,8 +15,7 @@ from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.control.adjust import Adjusted, Task, Weights, adjust
 from ingest.register.control.fit import ControlFit
-from ingest.register.control.marks import Control
-from ingest.register.control.rays import mark_residuals
+from ingest.register.control.marks import Control, mark_residuals
 
 _SETTLED = 0.01  # relative change of the sigma, whose own uncertainty is tens of per cent
 _SIGNIFICANCE = 0.01  # chance of naming a good observation as wrong, over the whole file

@@ -27,12 +27,7 @@ _KNOWN_HEADING_DEG = 30.0  # with a heading so sure a photo is not upside down
 
 
 def agreement_elsewhere(
-    views: FrameViews,
-    prior: FramePrior,
-    pose: Rigid3,
-    source: RenderSource,
-    max_places: int,
-    enough: float,
+    views: FrameViews, prior: FramePrior, pose: Rigid3, source: RenderSource, max_places: int, enough: float
 ) -> tuple[int, float]:
     """The strongest agreement at wrong places: how many were searched, and the largest evidence (0 for none).
 
@@ -72,7 +67,7 @@ def _priors_beside(views: FrameViews, prior: FramePrior, pose: Rigid3) -> Iterat
 
 
 def _sees(views: FrameViews, prior: FramePrior) -> bool:
-    look = first_look(views.cloud, views.camera, prior)
+    look = first_look(views.cloud, views.camera, prior.cam_from_local)
     return look is not None and look.cover >= _MIN_COVER * views.look.cover
 
 

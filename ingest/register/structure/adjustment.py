@@ -142,10 +142,7 @@ def adjust_to_scan(
 
 
 def placed_map(
-    feature_map: FeatureMap,
-    structure: StructurePlacement,
-    cloud: PointCloud,
-    adjustment: LidarAdjustment,
+    feature_map: FeatureMap, structure: StructurePlacement, cloud: PointCloud, adjustment: LidarAdjustment
 ) -> FeatureMap:
     """The map at its new place: same ids, descriptors and local frame; the scan's height datum.
 

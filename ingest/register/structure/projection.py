@@ -17,12 +17,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.structure.pairs import Registered, structure_pairs
-from ingest.register.structure.similarity import (
-    Pairs,
-    SimilarityFit,
-    ransac_similarity,
-    refine_similarity,
-)
+from ingest.register.structure.similarity import Pairs, SimilarityFit, ransac_similarity, refine_similarity
 
 StructureReason = Literal["NO_FRAMES", "TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
 

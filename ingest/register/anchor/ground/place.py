@@ -19,9 +19,8 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.anchor.ground.fit import SolidFit, fitted
 from ingest.register.anchor.ground.parts import parts
-from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, shape_of
+from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit, fitted, shape_of
 from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
 from ingest.register.anchor.ground.street_plan import StreetPlan, street_plan
 from ingest.register.anchor.together.evidence import JointEvidence

@@ -182,11 +182,7 @@ def _by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -
 
 
 def first_place(
-    database: Database,
-    unplaced: UnplacedMap,
-    files: StartFiles,
-    scan_ids: Sequence[str],
-    photos: PhotoFiles,
+    database: Database, unplaced: UnplacedMap, files: StartFiles, scan_ids: Sequence[str], photos: PhotoFiles
 ) -> FirstPlace:
     """Put a map without a place where a person's photo says, or where it is found near, on the scans.
 
@@ -279,11 +275,7 @@ def _cloud_near(database: Database, near: Circle, scan_ids: tuple[str, ...]) -> 
 
 
 def _found_near(
-    database: Database,
-    unplaced: UnplacedMap,
-    near: Circle,
-    scan_ids: tuple[str, ...],
-    photos: PhotoFiles,
+    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...], photos: PhotoFiles
 ) -> tuple[FeatureMap, str, bool]:
     """The map where the scans near a place show the same, a line on it, and whether it was only its look."""
     cloud, reach = _cloud_near(database, near, scan_ids), near.radius_m

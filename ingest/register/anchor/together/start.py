@@ -52,10 +52,7 @@ class Starts:
 
 
 def starts_from_above(
-    feature_map: FeatureMap,
-    picture: OrthoPicture,
-    cloud: PointCloud,
-    source: RenderSource,
+    feature_map: FeatureMap, picture: OrthoPicture, cloud: PointCloud, source: RenderSource
 ) -> Starts:
     """The best places within what the placement leaves open; none where that is too much.
 

@@ -16,15 +16,13 @@ from featuredb.geometry.camera import Camera
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
 from ingest.register.frame.dense.pictures import oriented_gradients
-from ingest.register.frame.dense.score_maps import TemplateOptions, cut_templates, peaks, search_around
+from ingest.register.frame.dense.score_maps import cut_templates, peaks, search_around
 from ingest.register.frame.dense.search import register_dense, searched_near
 from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
-from ingest.register.frame.options import DenseFitOptions
 from ingest.register.frame.prior_fit import fitted_under_prior
-from ingest.register.frame.sources import source_image
 from ingest.register.frame.verdict import DECISIVE_LOG_NFA
-from ingest.register.frame.views import FrameViews
+from ingest.register.frame.views import DenseFitOptions, FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import refine_pose
@@ -51,9 +49,7 @@ def near_places(
     Args:
         photo_gray: (h, w) uint8 of `camera`'s size. rendering: made with that camera, shrunk.
     """
-    channels = oriented_gradients(source_image(rendering, source), rendering.valid)
-    pieces = TemplateOptions(size_px=piece_px, spacing_px=piece_px // 2, max_count=_MAX_PIECES)
-    templates = cut_templates(channels, rendering, pieces)
+    templates = cut_templates(rendering, source, piece_px, _MAX_PIECES)
     size = (rendering.camera.width, rendering.camera.height)
     small = np.asarray(cv2.resize(photo_gray, size, interpolation=cv2.INTER_AREA))
     photo = oriented_gradients(small, None)

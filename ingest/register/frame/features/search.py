@@ -11,12 +11,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.consistency import consistent_matches
 from ingest.register.frame.features.matching import FrameMatches, Pool, joined, pooled_matches
-from ingest.register.frame.views import (
-    FrameViews,
-    fan_headings_deg,
-    star_poses,
-    turned_about_vertical,
-)
+from ingest.register.frame.views import FrameViews, fan_headings_deg, star_poses, turned_about_vertical
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.acceptance import independent_inliers, log_nfa
 from reloc.localise.lens_prior import LensPriors
