@@ -144,7 +144,7 @@ def _judged(
     known = np.isfinite(sigmas)
     residuals = np.where(known, positions - fit.local_from_sfm.act(centers), np.nan)
     stated = np.array([stated_sigma(sigmas[:, k]) for k in range(3)])
-    white, drift = (np.array([of[0], of[0], of[1]]) for of in (fit.noise.white, fit.noise.drift))
+    white, drift = (of[[0, 0, 1]] for of in (fit.white_m, fit.drift_m))
     bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0))
     if by > 1.0:  # what each is off by shows among them, but not what all share: a datum of heights, a map
         shared = np.hypot(np.minimum(bias, white) / np.sqrt(by - 1.0), _MANY_SHARE * stated)
@@ -165,8 +165,8 @@ def _judged(
     axes = [any(told[:2]), told[2]]
     figures = figures | {
         "inliers": int(inliers.sum()),
-        "noise_m": _where(axes, fit.noise.white),
-        "drift_m": _where(axes, fit.noise.drift),
+        "noise_m": _where(axes, fit.white_m.tolist()),
+        "drift_m": _where(axes, fit.drift_m.tolist()),
         "lag_s": fit.lag_s,
         "bias_sigma_m": _where(told, bias.tolist()),
         "scale_sigma": float(np.sqrt(covariance[0, 0])),

@@ -142,7 +142,7 @@ class ScanGround:
         pixels = _corners(gray)
         rendering = render(self._cloud, camera, pose, RenderOptions(attributes=False, threads=1))
         hits = surface_at(rendering, self._cloud, pixels)
-        pixels, points = pixels[hits.valid], hits.points[hits.valid]
+        pixels, points = pixels[hits.rows], hits.points
         if len(points) < options.min_matches:
             return Unmatched(
                 reason="TOO_FEW_POINTS",

@@ -41,6 +41,9 @@ _MAX_SCALE_CHANGE = 0.1  # relative; GPS and scan both measure metres
 # seen: 0.02 is 1 m from 50 m, what trees and a day's change leave.
 _MAX_RESIDUAL_SHARE = 0.02
 _GOOD_M = 0.05  # and that much is no objection
+# So many frames must agree before a map is moved without a person's word. One frame's verdict is good; two
+# that were found independently and agree are hardly both wrong. Who asks for one frame does not ask for two.
+_MIN_AGREEING = 2
 
 AnchorReason = Literal[
     "NO_SCAN",  # no frame of the map sees the scan
@@ -51,22 +54,6 @@ AnchorReason = Literal[
     "CONTRADICTS_PLACEMENT",  # the map would go where its placement says it cannot be
     "NOT_BETTER",  # the map's points are no closer to the scan than before
 ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnchorOptions:
-    """How a map is anchored.
-
-    Attributes:
-        frames: so many accepted ones are wanted; three spread ones show most of a map's bend.
-        max_tries: frames tried until the first one is registered, at most; a wrong scan costs all of them.
-        min_agreeing: so many frames must agree before a map is moved without a person's word. One frame's
-            verdict is good; two that were found independently and agree are hardly both wrong.
-    """
-
-    frames: int = 3
-    max_tries: int = 6
-    min_agreeing: int = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,7 +88,7 @@ def place_map(
     cloud: PointCloud,
     tried: TriedFrames,
     read_gray: PhotoReader,
-    options: AnchorOptions,
+    wanted: int,
     *,
     confirmed: bool = False,
     supervised: bool = False,
@@ -110,6 +97,7 @@ def place_map(
     """Place the map by the frames that were registered, if they agree and all gates are passed.
 
     Args:
+        wanted: frames that were asked for.
         confirmed: a person has looked at these frames: one is enough.
         supervised: a person has said where the photos are: the map's placement may be wrong by any distance.
     """
@@ -119,7 +107,7 @@ def place_map(
     clock = StageClock()
     lone, refusals = _alone(feature_map, frames, cloud)
     agreement = frames_that_agree(lone)
-    needed = 1 if confirmed else options.min_agreeing
+    needed = 1 if confirmed else min(_MIN_AGREEING, wanted)
     refusal = _too_little(frames, lone, refusals, agreement, needed)
     if refusal is not None:
         return replace(refusal, agreement=agreement if lone else None)

@@ -23,6 +23,9 @@ from ingest.register.frame_registration import FramePrior, FrameRegistration
 _LOG = logging.getLogger(__name__)
 
 
+FRAMES = 3  # accepted ones that are wanted; three spread ones show most of a map's bend
+# Frames tried until the first is registered, at most: more than are wanted. A wrong scan costs all of them.
+_LEAST_TRIES, _SPARE_TRIES = 6, 3
 # Frames tried at most once one is registered. Where one of three registers, as low films over a scan without
 # colours, 18 leave fewer than two registered once in 150 maps.
 _MORE_TRIES = 18
@@ -92,7 +95,6 @@ def try_frames(
     cloud: PointCloud,
     read_gray: PhotoReader,
     wanted: int,
-    max_tries: int,
     *,
     starts: Mapping[int, FramePrior] | None = None,
     readable: Sequence[int] | None = None,
@@ -108,7 +110,7 @@ def try_frames(
     Args:
         cloud: the scan around the map, in the map's local frame.
         read_gray: grey pixels (h, w) of an image of the map.
-        wanted: accepted frames. max_tries: until the first one is accepted.
+        wanted: accepted frames.
         starts: priors by a person, by image id; these frames are tried first.
         readable: ids of images whose photos are there; None for all.
         together: ask all photos together. Not where the map was put where it looks most like the scan: the
@@ -131,7 +133,7 @@ def try_frames(
     order += [p for p in ranking if p.image.image_id not in starts]
     tried: list[TriedFrame] = []
     vouched: list[TriedFrame] = []
-    least = max(max_tries, len(starts))
+    least = max(_LEAST_TRIES, wanted + _SPARE_TRIES, len(starts))
     ask = together and not starts
     if ask and cloud.rgb is None:
         ask, vouched = False, _tried_together(feature_map, cloud, ranking, read_gray, wanted)

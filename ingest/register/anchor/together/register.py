@@ -24,7 +24,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.anchor.start.ortho import picture_of_map
 from ingest.register.anchor.together.evidence import JointEvidence, evidence_of
-from ingest.register.anchor.together.start import Starts, starts_from_above
+from ingest.register.anchor.together.start import starts_from_above
 from ingest.register.frame.dense.fit import MAX_SIDE_PX, near_places
 from ingest.register.frame.register import fit_vouched_for
 from ingest.register.frame.sources import searched_sources
@@ -81,8 +81,8 @@ def register_together(
         return None
     sources = [source for source in searched_sources(cloud) if source != "shaded"]  # which shows no ground
     for source in sources:
-        starts = starts_from_above(feature_map, picture, cloud, source)
-        found = _placed(feature_map, starts, asked, grays, cloud, source, len(sources))
+        there, wrong = starts_from_above(feature_map, picture, cloud, source)
+        found = _placed(feature_map, there, wrong, asked, grays, cloud, source, len(sources))
         if found is not None:
             return _registered(feature_map, *found, asked, grays, cloud, source, wanted)
     return None
@@ -90,7 +90,8 @@ def register_together(
 
 def _placed(
     feature_map: FeatureMap,
-    starts: Starts,
+    there: Sequence[Sim3],
+    elsewhere: Sequence[Sim3],
     images: Sequence[MapImage],
     grays: Mapping[int, NDArray[np.uint8]],
     cloud: PointCloud,
@@ -99,18 +100,18 @@ def _placed(
 ) -> tuple[Sim3, dict[str, Any]] | None:
     """The fitted place that wrong places do not explain, and its evidence as figures."""
     cameras = feature_map.cameras
-    one = [evidence_of(start, images[:1], cameras, grays, cloud, source).places for start in starts.there]
+    one = [evidence_of(start, images[:1], cameras, grays, cloud, source).places for start in there]
     images = images[: max(_LEAST_PHOTOS, _ENOUGH_PLACES // max([1, *one]))]
 
     def evidence(similarity: Sim3) -> JointEvidence:
         return evidence_of(similarity, images, cameras, grays, cloud, source)
 
-    asked = [(start, evidence(start)) for start in starts.there]
+    asked = [(start, evidence(start)) for start in there]
     if not asked:
         return None
     # All as they are found: fitted to its pieces a wrong place agrees more, too.
     start, found = max(asked, key=lambda one: one[1].agreeing)
-    wrong = [one for other, one in asked if other is not start] + [evidence(one) for one in starts.wrong]
+    wrong = [one for other, one in asked if other is not start] + [evidence(one) for one in elsewhere]
     log_nfa = found.log_nfa(wrong, sources * len(asked))
     _LOG.info("together by %s: %s, 10^-%.1f, elsewhere %s", source, found, log_nfa, wrong)
     if log_nfa < _LOG_RATE or found.agreeing < _LEAST_SHARE * found.places:
