@@ -54,7 +54,7 @@ def work_folder(database: Database, work: Path | None, name: str, points: int) -
         ConflictError: another process works on the same job.
         ScanError: the folder cannot be made, or the disk is too small.
     """
-    parent = work or _default_parent(database)
+    parent = work or (Path(database.url) / "_work" if "://" not in database.url else user_cache() / "lidar")
     path = parent / name
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -78,12 +78,6 @@ def work_folder(database: Database, work: Path | None, name: str, points: int) -
         os.close(lock)
 
 
-def _default_parent(database: Database) -> Path:
-    if "://" not in database.url:
-        return Path(database.url) / "_work"
-    return user_cache() / "lidar"
-
-
 def _lock(path: Path) -> int:
     """A lock that the system gives up when the process ends, however it ends."""
     import fcntl
@@ -99,12 +93,7 @@ def _lock(path: Path) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AddResult:
-    """What became of a scan.
-
-    Attributes:
-        created: False if the scan was there already and nothing was done.
-        scan: as it is in the database now.
-    """
+    """A scan as it is in the database now; `created` is False if it was there already."""
 
     created: bool
     scan: ScanSummary
@@ -239,31 +228,26 @@ def _read_all(
             item.to_utm.apply,
             lambda read: on_progress("read", read, total),
         )
-    counts = spill.counts
-    if counts.kept == 0:
+    if spill.read == spill.noise + spill.withheld:
         raise ScanError(
             f"expected points to keep, found none in {', '.join(str(item.file.path) for item in inputs)}: "
-            f"{counts.noise} are classified as noise and {counts.withheld} are withheld"
+            f"{spill.noise} are classified as noise and {spill.withheld} are withheld"
         )
     spacing_m = spill.spacing_m()
     plan = BlockPlan(
-        read=counts.read,
-        noise=counts.noise,
-        withheld=counts.withheld,
+        read=spill.read,
+        noise=spill.noise,
+        withheld=spill.withheld,
         spacing_m=spacing_m,
         finest_level=finest_level(spacing_m),
-        stretch=stretch_of(counts.intensity, options.intensity_low_percent, options.intensity_high_percent),
-        colour_bits=tuple(_colour_bits(largest) for largest in counts.largest_rgb),
+        stretch=stretch_of(spill.intensity, options.intensity_low_percent, options.intensity_high_percent),
+        # For the range that a file's colours use, none where all are black: many leave the fields so.
+        colour_bits=tuple(0 if top <= 0 else 8 if top <= _LARGEST_8_BIT else 16 for top in spill.largest_rgb),
         blocks=tuple(spill.split(options.block_points)),
     )
     with atomic_file(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(asdict(plan)))
     return plan
-
-
-def _colour_bits(largest: int) -> int:
-    """8 or 16 for the range that a file's colours use, 0 for none: many leave the fields black."""
-    return 0 if largest <= 0 else 8 if largest <= _LARGEST_8_BIT else 16
 
 
 def _clean_all(

@@ -134,7 +134,9 @@ def colour_by_ortho(
     rgb, coloured = own.copy(), np.zeros(len(utm), dtype=bool)
     if not len(utm):
         return rgb, coloured
-    xy = _converter(ortho.wkt, epsg, utm[0])(utm[:, :2])
+    # Made once for 100 km around: tiles must not differ in their datum shift.
+    east_km, north_km = (100 * round(place / 1e5) for place in utm[0, :2].tolist())
+    xy = _converter_at(ortho.wkt, epsg, east_km, north_km)(utm[:, :2])
     a, b, c, d, e, f = ortho.pixel_from_xy
     pixel = np.stack([xy @ [a, b] + c, xy @ [d, e] + f], axis=1)
     with np.errstate(invalid="ignore"):
@@ -153,11 +155,6 @@ def colour_by_ortho(
 @lru_cache(maxsize=4)
 def _converter_at(wkt: str, epsg: int, east_km: int, north_km: int) -> Callable[[FloatArray], FloatArray]:
     return raster_from_utm(wkt, epsg, np.array([1e3 * east_km, 1e3 * north_km]))
-
-
-def _converter(wkt: str, epsg: int, place: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """raster_from_utm, made once for 100 km around: tiles must not differ in their datum shift."""
-    return _converter_at(wkt, epsg, 100 * round(place[0] / 1e5), 100 * round(place[1] / 1e5))
 
 
 def _pixel_size_m(utm: FloatArray, pixel: FloatArray) -> float:

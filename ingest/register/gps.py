@@ -60,11 +60,11 @@ class GpsPlacement:
 
     reason: GpsReason | None
     message: str
-    provisional: str
-    local_from_sfm: Sim3 | None
-    covariance: FloatArray | None
     residuals_m: FloatArray
     inliers: NDArray[np.bool_]
+    provisional: str = ""
+    local_from_sfm: Sim3 | None = None
+    covariance: FloatArray | None = None
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -102,10 +102,10 @@ def place_by_gps(
     if start is None:
         return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
     many = receivers(camera_of, count) > 1.0
-    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, held, many)
+    given = (centers_sfm, positions_local, sigmas_m, times_s, held, many)
+    fit = fit_noisy(start, *given)
     if held is not None and (fit.local_from_sfm.rotation @ held.down)[2] > 0:  # a line, the wrong side up
-        turned = _turned_over(fit.local_from_sfm, centers_sfm)
-        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, held, many)
+        over = fit_noisy(_turned_over(fit.local_from_sfm, centers_sfm), *given)
         if over.log_chance <= fit.log_chance + np.log(1.0 / _WRONG):  # else pictures are upside down
             fit = over
     if held is not None:
@@ -289,9 +289,6 @@ def _refused(reason: GpsReason, message: str, count: int, figures: dict[str, Any
     return GpsPlacement(
         reason=reason,
         message=message,
-        provisional="",
-        local_from_sfm=None,
-        covariance=None,
         residuals_m=np.full((count, 3), np.nan),
         inliers=np.zeros(count, dtype=bool),
         figures=figures,

@@ -22,7 +22,6 @@ from ingest.register.frame_registration import FramePrior, FrameRegistration
 
 _LOG = logging.getLogger(__name__)
 
-
 FRAMES = 3  # accepted ones that are wanted; three spread ones show most of a map's bend
 # Frames tried until the first is registered, at most: more than are wanted. A wrong scan costs all of them.
 _LEAST_TRIES, _SPARE_TRIES = 6, 3

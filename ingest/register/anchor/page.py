@@ -117,7 +117,7 @@ def anchor_page(
         parts += ["<h2>Frames</h2>", f"<p>{words}</p>", f'<div class="tabs">{tabs}</div>', _CONTROLS, *frames]
     parts.append(
         "<h2>All frames</h2><section class='wide'>"
-        + table(FRAME_HEADER, rows, numbers=(1, 2, 3, 4, 5, 7, 8, 9), names=(0,))
+        + table(FRAME_HEADER, rows, numbers=(1, 2, 3, 5, 6, 7), names=(0,))
         + "</section>"
     )
     times = [(name, f"{seconds:.2f} s") for name, seconds in report.times_s().items()]

@@ -15,7 +15,6 @@ from ingest.register.frame_registration import FramePrior
 
 PhotoReader = Callable[[MapImage], NDArray[np.uint8]]
 
-
 _VIEW_WIDTH_PX = 200  # of the renders that tell coverage; figures change by a hundredth with twice as many
 _GRID = 8  # cells along each side of the photo in which map points are counted
 # Frames that see less of the scan are not proposed; scans have holes (brighton's frames see 0.4 to 0.65), but
@@ -121,17 +120,15 @@ def _spread_out(feature_map: FeatureMap, proposals: Sequence[FrameProposal]) -> 
     seen = np.zeros(len(feature_map.points), bool)
     left, ordered = list(proposals), []
     while left:
+        of = [seen[sees[p.image.image_id]] for p in left]
         values = [
-            p.score.score * (1.0 - _OVERLAP_PENALTY * _mean(seen[sees[p.image.image_id]])) for p in left
+            p.score.score * (1.0 - _OVERLAP_PENALTY * already.sum() / max(len(already), 1))
+            for p, already in zip(left, of, strict=True)
         ]
         chosen = left.pop(int(np.argmax(values)))
         seen[sees[chosen.image.image_id]] = True
         ordered.append(chosen)
     return ordered
-
-
-def _mean(values: NDArray[np.bool_]) -> float:
-    return float(values.mean()) if len(values) else 0.0
 
 
 def small_camera(camera: Camera, width_px: int) -> Camera:

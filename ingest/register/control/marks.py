@@ -79,10 +79,13 @@ def meet(file: ControlFile, block: Block, frame: LocalFrame) -> Control:
     marked = {mark.point for mark, _ in chosen}
     kept = [i for i, name in enumerate(file.names) if name in marked]
     index = {file.names[i]: row for row, i in enumerate(kept)}
+    # A point without height is taken at the frame's own.
+    surveyed = np.array(frame.enu_from_geodetic(np.nan_to_num(file.lat_lon_h[kept], nan=frame.height_m)))
+    surveyed[np.isnan(file.lat_lon_h[kept, 2]), 2] = np.nan
     return Control(
         file=file,
         names=tuple(index),
-        surveyed=_local(frame, file.lat_lon_h[kept]),
+        surveyed=surveyed,
         marks=tuple(mark for mark, _ in chosen),
         point_of=np.array([index[mark.point] for mark, _ in chosen], dtype=np.int64),
         photo_of=np.array([photo for _, photo in chosen], dtype=np.int64),
@@ -90,14 +93,6 @@ def meet(file: ControlFile, block: Block, frame: LocalFrame) -> Control:
         unused=tuple(unused),
         unmarked=tuple(name for name in file.names if name not in marked),
     )
-
-
-def _local(frame: LocalFrame, lat_lon_h: FloatArray) -> FloatArray:
-    """Local east, north, up; a point without height is taken at the frame's own, its up is NaN."""
-    unknown = np.isnan(lat_lon_h[:, 2])
-    enu = np.array(frame.enu_from_geodetic(np.nan_to_num(lat_lon_h, nan=frame.height_m)))
-    enu[unknown, 2] = np.nan
-    return enu
 
 
 def _file_name(name: str) -> str:

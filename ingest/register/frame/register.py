@@ -164,7 +164,11 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageC
         evidence = _evidence(views, prior, judged, covariance)
     if asks_elsewhere(evidence):
         with clock.stage("search elsewhere"):
-            evidence = _compared(views, prior, judged, evidence)
+            bears = highest_elsewhere(evidence.confirmation.log_nfa)
+            places, log_nfa = agreement_elsewhere(
+                views, prior, found.pose.cam_from_local, found.source, MAX_PLACES_ELSEWHERE, bears
+            )
+            evidence = replace(evidence, places_elsewhere=places, elsewhere_log_nfa=log_nfa)
     with clock.stage("verdict"):
         refusal = verdict(evidence)
     figures = asdict(evidence) | {
@@ -236,15 +240,6 @@ def _evidence(
         relief=relief,
         relief_only=by_relief,
     )
-
-
-def _compared(views: FrameViews, prior: FramePrior, judged: Judged, evidence: FrameEvidence) -> FrameEvidence:
-    """With how well the photo agrees with the scan at places where it cannot be."""
-    pose, enough = judged.found.pose.cam_from_local, highest_elsewhere(evidence.confirmation.log_nfa)
-    places, log_nfa = agreement_elsewhere(
-        views, prior, pose, judged.found.source, MAX_PLACES_ELSEWHERE, enough
-    )
-    return replace(evidence, places_elsewhere=places, elsewhere_log_nfa=log_nfa)
 
 
 def _accepted(

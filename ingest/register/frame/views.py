@@ -138,18 +138,11 @@ class FrameViews:
         """Longer side of the renders that features are found in."""
         return self.side_px(FEATURES_SPACING_PX, _FEATURES_SIDE_PX)
 
-    def render_camera(self, side_px: int) -> Camera:
-        """The photo's camera, shrunk."""
-        factor = side_px / max(self.camera.width, self.camera.height)
-        if factor >= 1.0:
-            return self.camera
-        return self.camera.scaled_to(
-            max(round(self.camera.width * factor), 1), max(round(self.camera.height * factor), 1)
-        )
-
     def renders(self, poses: Sequence[Rigid3], side_px: int) -> list[Rendering]:
-        """The scan from each pose; those that show next to nothing of it are left out."""
-        camera = self.render_camera(side_px)
+        """The scan from each pose, no larger than the photo, without those that show next to nothing of it."""
+        camera = self.camera
+        factor = min(side_px / max(camera.width, camera.height), 1.0)
+        camera = camera.scaled_to(max(round(camera.width * factor), 1), max(round(camera.height * factor), 1))
         single = RenderOptions(threads=1)
         with ThreadPoolExecutor(self._threads()) as threads:
             made = list(threads.map(lambda pose: render(self.cloud, camera, pose, single), poses))

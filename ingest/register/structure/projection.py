@@ -21,7 +21,6 @@ from ingest.register.structure.similarity import Pairs, SimilarityFit, ransac_si
 
 StructureReason = Literal["NO_FRAMES", "TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
 
-
 # A pair further off, as a share of its distance from the camera, is an outlier of RANSAC: reconstructions
 # bend by up to about a percent of the flying height.
 _TOLERANCE_REL = 0.015
@@ -77,7 +76,8 @@ def project_structure(
     if len(pairs) < _MIN_PAIRS:
         words = f"{len(pairs)} of the map's points meet the scan, at least {_MIN_PAIRS} are needed"
         return StructurePlacement(reason="TOO_FEW_PAIRS", message=words)
-    distances = _distances(pairs, registered)
+    centers = np.array([r.cam_from_local.center for r in registered.values()])  # type: ignore[union-attr]
+    distances = np.linalg.norm(pairs.target - centers[pairs.frame_of], axis=1)
     tolerance = np.maximum(_MIN_TOLERANCE_M, _TOLERANCE_REL * distances)
     start = ransac_similarity(pairs.source, pairs.target, tolerance)
     if start is None:
@@ -100,12 +100,6 @@ def project_structure(
         covariance=fit.covariance,
         figures=figures,
     )
-
-
-def _distances(pairs: Pairs, registered: Registered) -> FloatArray:
-    """(n,) from the registered cameras, metres."""
-    centers = np.array([r.cam_from_local.center for r in registered.values()])  # type: ignore[union-attr]
-    return np.asarray(np.linalg.norm(pairs.target - centers[pairs.frame_of], axis=1))
 
 
 def _gate_of_pairs(

@@ -7,7 +7,7 @@ many points agree by chance. Where a map as a whole lies nowhere, its parts are 
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -48,9 +48,7 @@ _TIED = 0.5  # of a photo's points that others see which stay
 _LEAST_PHOTOS = 10  # of two maps of eight one was accepted outside its 99.9 % bound
 _RIVALS = 20  # the best of other places that are compared one by one
 _LEAST_TRIES = 20  # elsewhere: fewer do not tell what chance gives
-_LIKE_SIZE = (
-    0.5  # logarithm: sizes at which chance is alike; the smaller a map, the more of it agrees anywhere
-)
+_LIKE_SIZE = 0.5  # logarithm: sizes at which chance is alike; of a smaller map more agrees anywhere
 _TAIL = 0.25  # share of the places elsewhere whose scores are taken for the tail of what chance gives
 _WALL_SIGMA_M = 0.15  # of all outlines together, outwards: eaves, and a laser's footprint
 _LEAST_SIGMA_M = 0.05  # of a point
@@ -215,7 +213,8 @@ def _judged(
             figures=figures,
         )
     rows = _rows_seen(unplaced, plan, kept)
-    away = np.array([_away_m(plan, rows, sim, one.fit.local_from_own) for one in there])
+    there_m = (one.fit.local_from_own.act(plan.points[rows]) - sim.act(plan.points[rows]) for one in there)
+    away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])
     elsewhere = scores[away > _ELSEWHERE_M]
     log_nfa = _log_nfa(scores[first], elsewhere) - float(np.log10(tests))
     others = [
@@ -227,6 +226,7 @@ def _judged(
         _rival_p(plan, shape, rows, sim, one.fit.local_from_own)
         for one in sorted(others, key=lambda one: _over(one, rate))[-_RIVALS:]
     ]
+    centers = sim.act(plan.centers[kept])
     figures |= {
         "places": final.evidence.places,
         "agreeing": final.evidence.agreeing,
@@ -235,7 +235,7 @@ def _judged(
         "elsewhere": len(elsewhere),
         "elsewhere_over_chance": float(elsewhere.max(initial=-np.inf)),
         "rival": max(rivals, default=0.0),
-        "camera_height_m": float(_eye_heights(shape, sim.act(plan.centers[kept])).mean()),
+        "camera_height_m": float((centers[:, 2] - shape.ground[shape.cells(centers[:, :2])]).mean()),
     }
     local_from_own = sim @ plan.upright_from_own
     words = (
@@ -253,9 +253,9 @@ def _judged(
         figures=figures,
     )
     if log_nfa < _LOG_RATE:
-        return _refused(found, "STRUCTURE", f"{words}, which chance gives, too")
+        return replace(found, reason="STRUCTURE", message=f"{words}, which chance gives, too")
     if max(rivals, default=0.0) > _RIVAL_RATE:
-        return _refused(found, "AMBIGUOUS", f"{words}, and nearly as many at another place")
+        return replace(found, reason="AMBIGUOUS", message=f"{words}, and nearly as many at another place")
     return found
 
 
@@ -271,21 +271,6 @@ def _log_nfa(best: float, elsewhere: FloatArray) -> float:
     mean = max(float(tail.mean()), 1.0)
     further = max(best - start, 0.0) / (len(tail) * mean)
     return float(len(tail) * np.log10(1.0 + further) - np.log10(len(tail)))
-
-
-def _refused(found: GroundPlace, reason: GroundReason, message: str) -> GroundPlace:
-    return GroundPlace(
-        reason=reason,
-        message=message,
-        local_from_own=found.local_from_own,
-        covariance=found.covariance,
-        image_ids=found.image_ids,
-        figures=found.figures,
-    )
-
-
-def _eye_heights(shape: ScanShape, centers: FloatArray) -> FloatArray:
-    return np.asarray(centers[:, 2] - shape.ground[shape.cells(centers[:, :2])])
 
 
 def _best_around(plan: StreetPlan, shape: ScanShape, best: _Tried, rate: float) -> _Tried:
@@ -344,12 +329,6 @@ def _lie_there(
 
 def _only_asked(plan: StreetPlan, shape: ScanShape, sim: Sim3, rows: NDArray[np.int64]) -> SolidFit:
     return fitted(shape, plan.points[rows], np.ones(len(rows)), sim, widths=())
-
-
-def _away_m(plan: StreetPlan, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:
-    """How far another similarity takes the map's points from where this one does, in the median."""
-    points = plan.points[rows]
-    return float(np.median(np.linalg.norm(sim.act(points) - other.act(points), axis=1)))
 
 
 def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:

@@ -84,18 +84,17 @@ def shape_of(cloud: PointCloud, circle: tuple[float, float, float] | None = None
     flat = at[:, 1] * size[0] + at[:, 0]
     top = np.full(size[0] * size[1], -np.inf)
     np.maximum.at(top, flat, xyz[:, 2])
-    low = np.full(size[0] * size[1], np.inf)
-    np.minimum.at(low, flat, xyz[:, 2])
+    lowest = np.full(size[0] * size[1], np.inf)
+    np.minimum.at(lowest, flat, xyz[:, 2])
     shape = (int(size[1]), int(size[0]))
-    top, low = top.reshape(shape), low.reshape(shape)
+    top, lowest = top.reshape(shape), lowest.reshape(shape)
     seen = np.isfinite(top)
     top, known = _filled(top, seen)
     top = median_filter(top, 3)
-    low = minimum_filter(_filled(low, seen)[0], 3)
-    low = median_filter(low, 5)
+    low = median_filter(minimum_filter(_filled(lowest, seen)[0], 3), 5)
     window = int(_WIDEST_M / CELL_M) | 1
     ground = gaussian_filter(grey_opening(low, (window, window)), 4.0)
-    surface, surface_normals = _surfaces(xyz, flat, top, seen)
+    surface, surface_normals = _surfaces(xyz, flat, top, lowest, seen)
     walls = _walls(top, known, corner, xyz)
     upright, upright_normals = _standing(walls)
     points = np.vstack([surface, upright])
@@ -118,7 +117,11 @@ def _filled(heights: FloatArray, seen: NDArray[np.bool_]) -> tuple[FloatArray, N
 
 
 def _surfaces(
-    xyz: FloatArray, cell_of: NDArray[np.int64], top: FloatArray, seen: NDArray[np.bool_]
+    xyz: FloatArray,
+    cell_of: NDArray[np.int64],
+    top: FloatArray,
+    lowest: FloatArray,
+    seen: NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray]:
     """Middles of the points of cells that lie on ground or roofs and are no edge, and their normals."""
     count = np.maximum(np.bincount(cell_of, minlength=top.size), 1)
@@ -129,9 +132,7 @@ def _surfaces(
     smooth[1:] &= steps[0]
     smooth[:, :-1] &= steps[1]
     smooth[:, 1:] &= steps[1]
-    low = np.full(top.size, np.inf)
-    np.minimum.at(low, cell_of, xyz[:, 2])
-    smooth &= (top.ravel() - low < 2.0 * _FLAT_M).reshape(top.shape)
+    smooth &= top - lowest < 2.0 * _FLAT_M
     heights = np.where(seen, middle[:, 2].reshape(top.shape), top)
     up, across = np.gradient(gaussian_filter(heights, _SLOPE_CELLS), CELL_M)
     normals = np.column_stack([-across[smooth], -up[smooth], np.ones(np.count_nonzero(smooth))])

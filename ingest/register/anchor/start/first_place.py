@@ -154,12 +154,21 @@ def started_images(
     Raises:
         RegistrationError: no such photo, or picks do not determine a pose.
     """
-    return [
-        _by_picks(feature_map, one, frame, epsg)
-        if isinstance(one, Picks)
-        else _by_pose(feature_map, one, frame, epsg)
-        for one in told
-    ]
+    started = []
+    for one in told:
+        if isinstance(one, Picks):
+            started.append(_by_picks(feature_map, one, frame, epsg))
+            continue
+        image = image_named(feature_map, str(one.image))
+        started.append(
+            StartedImage(
+                image=image,
+                prior=one.prior(frame, epsg),
+                camera=feature_map.cameras[image.camera_id],
+                note=f"{image.name} starts from the pose given for it",
+            )
+        )
+    return started
 
 
 def _by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -> StartedImage:
@@ -357,13 +366,3 @@ def plan_box(feature_map: FeatureMap) -> tuple[float, float, float, float]:
     both = np.vstack([inner, centers[:, :2]])
     low, high = both.min(axis=0) - MARGIN_M, both.max(axis=0) + MARGIN_M
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _by_pose(feature_map: AnyMap, rough: RoughPose, frame: LocalFrame, epsg: int) -> StartedImage:
-    image = image_named(feature_map, str(rough.image))
-    return StartedImage(
-        image=image,
-        prior=rough.prior(frame, epsg),
-        camera=feature_map.cameras[image.camera_id],
-        note=f"{image.name} starts from the pose given for it",
-    )

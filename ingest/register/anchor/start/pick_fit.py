@@ -26,13 +26,11 @@ _TRIED = 6  # of their poses, best first, that may be another explanation
 _ADJUSTMENT = (50, 1e-9)  # steps, and relative change of the cost
 _EXACT = 1e-5  # sigma of what is taken as known of a lens: all but its focal length
 
-
 _CHANCE = 0.001  # rate at which right picks are called contradictory: one set in a thousand
 # By how much the squared residuals must grow, in chi-square of one pick, until another explanation is out of
 # the question: one in a hundred.
 _APART = float(chi2.ppf(0.99, 2))
 _MAX_WRONG = 2  # so many wrong picks are looked for
-
 
 _SIGMA_PX_REL = 0.00075  # how well a person marks a point, over the longer side: 3 pixels in 4000
 _SIGMA_M = 0.2  # how well a person reads a point off the scan

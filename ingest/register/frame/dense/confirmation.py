@@ -23,7 +23,6 @@ from ingest.register.frame_registration import RenderSource
 
 _OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not
 
-
 # Where the line between confirmed and not is; docs/measurements/registration.md shows the distributions.
 _SIDE_PX = 480  # longer side of the view on which pieces are compared, where the scan is dense enough
 _SEARCH_PX = 16  # radius of the window in which a piece is searched
