@@ -282,7 +282,7 @@ def _row(
     notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
     return {
         "scan_id": scan_id,
-        "name": labels.name_of(inputs[0].file.path),
+        "name": labels.name or inputs[0].file.path.name,
         "files": [_file_row(item) for item in inputs],
         "epsg": inputs[0].to_utm.epsg,
         "height_datum": crs.height_datum,
@@ -304,7 +304,7 @@ def _row(
         "height_unit_m": crs.height_unit_m,
         "height_unit_reason": crs.height_unit_reason,
         "notes": list(dict.fromkeys(notes)),
-        "options": options.as_json(),
+        "options": json.dumps(asdict(options), sort_keys=True),
         "source": labels.source,
         "licence": labels.licence,
     }

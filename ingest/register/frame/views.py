@@ -139,7 +139,7 @@ class FrameViews:
         return self.side_px(FEATURES_SPACING_PX, _FEATURES_SIDE_PX)
 
     def renders(self, poses: Sequence[Rigid3], side_px: int) -> list[Rendering]:
-        """The scan from each pose, no larger than the photo, without those that show next to nothing of it."""
+        """The scan from each pose, no larger than the photo; without those that show next to nothing."""
         camera = self.camera
         factor = min(side_px / max(camera.width, camera.height), 1.0)
         camera = camera.scaled_to(max(round(camera.width * factor), 1), max(round(camera.height * factor), 1))

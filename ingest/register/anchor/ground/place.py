@@ -180,10 +180,7 @@ def _asked(shape: ScanShape, fit: SolidFit) -> _Tried:
     placed = fit.placed
     agrees = (np.abs(fit.off_m) < _AGREE_M) & (fit.near_m < _NEAR_M)
     above = (placed[:, 2] - shape.ground[shape.cells(placed[:, :2])] > _ABOVE_M) & shape.inside(placed[:, :2])
-    cells = np.unique(np.floor(placed[above] / _PLACE_M).astype(np.int64), axis=0, return_inverse=True)[1]
-    count = np.bincount(cells.reshape(-1))
-    share = np.bincount(cells.reshape(-1), agrees[above]) / np.maximum(count, 1)
-    evidence = JointEvidence(places=len(count), agreeing=float(share.sum()))
+    evidence = JointEvidence.of_cells(np.floor(placed[above] / _PLACE_M).astype(np.int64), agrees[above])
     return _Tried(fit=fit, agrees=agrees, above=above, evidence=evidence)
 
 

@@ -60,12 +60,15 @@ def starts_from_above(
     if not drawn.valid.any() or len(sizes) * len(turns) > _MOST_TRIES:
         return [], []
     search = ScanSearch(drawn, _COVER)
+    height = float(np.median(picture.height[picture.valid]))  # about as it is
 
     def best(around: float) -> list[Sim3]:
         """Similarities, best first, with headings about one."""
         found = [search.best(picture, one, around + angle) for one in sizes.tolist() for angle in turns]
         tries = sorted((one for one in found if one is not None), key=lambda one: -one.correlation)
-        return [_levelled(_in_plan(picture, one), points, drawn) for one in _distinct(tries, picture)]
+        return [
+            _levelled(one.similarity(picture, height), points, drawn) for one in _distinct(tries, picture)
+        ]
 
     quarters = _QUARTERS if turn < 0.5 * _QUARTERS[0] else ()
     return best(0.0), [one for quarter in quarters for one in best(quarter)[:_WRONG_PLACES]]
@@ -106,14 +109,6 @@ def _distinct(tries: Sequence[PictureTry], picture: OrthoPicture) -> list[Pictur
         if len(kept) == _PLACES:
             break
     return kept
-
-
-def _in_plan(picture: OrthoPicture, found: PictureTry) -> Sim3:
-    """The similarity that lays the picture where it was found; heights about as they are."""
-    scale, turn = found.size / picture.cell, so3_exp([0.0, 0.0, found.turn])
-    height = float(np.median(picture.height[picture.valid]))
-    middle, there = np.array([*picture.middle, height]), np.array([*found.middle, height])
-    return Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
 
 
 def _levelled(new_from_old: Sim3, points: FloatArray, scan: OrthoPicture) -> Sim3:
