@@ -279,8 +279,7 @@ class FrameAgreement:
     Attributes:
         agreeing: ids of the largest set of frames that all agree pairwise; empty where two such sets are
             equally large and neither can be preferred.
-        apart_m: median distance between the places of common points, by pair of ids.
-        allowed_m: what was allowed, likewise.
+        apart_m: median distance between the places of common points, by pair of ids; allowed_m: likewise.
     """
 
     agreeing: tuple[int, ...]

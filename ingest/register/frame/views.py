@@ -40,7 +40,6 @@ class DenseFitOptions:
         spacing_px: distance of neighbouring scan points in the renders, round by round: finer than the scan,
             since edges between splats are known better than their spacing.
         piece_px: least side of a piece, round by round.
-        piece_points: so many scan points are across a piece, as far as the picture has room.
         more_rounds: at most, like the last one, until the pose moves less than a fifth of a pixel.
         near_px: a piece's place is looked for this near, round by round: the first takes up what the search
             left.
@@ -48,7 +47,6 @@ class DenseFitOptions:
 
     spacing_px: tuple[float, ...] = (2.4, 3.75, 3.75)
     piece_px: tuple[int, ...] = (28, 40, 40)
-    piece_points: float = 15.0
     more_rounds: int = 8
     near_px: tuple[int, ...] = (10, 6, 6)
 

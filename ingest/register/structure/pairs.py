@@ -5,7 +5,6 @@ from dataclasses import fields
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -39,17 +38,8 @@ def structure_pairs(
 
     Args:
         source: (n, 3) the map's points in the cloud's local frame, at their present place.
-
-    Raises:
-        InvalidValueError: a registration that was refused, or of an image that the map does not have.
     """
     images = {image.image_id: image for image in feature_map.images}
-    wrong = [i for i, found in registered.items() if i not in images or not found.accepted]
-    if wrong:
-        raise InvalidValueError(
-            f"structure_pairs: expected accepted registrations of images of map {feature_map.map_id}, found "
-            f"others of {wrong}"
-        )
     uncertainty = full_covariances(feature_map.points.covariance)
     parts = [
         _pairs_of_frame(feature_map, source, uncertainty, images[image_id], registration, row, cloud)

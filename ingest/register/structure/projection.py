@@ -19,7 +19,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.register.structure.pairs import Registered, structure_pairs
 from ingest.register.structure.similarity import Pairs, SimilarityFit, ransac_similarity, refine_similarity
 
-StructureReason = Literal["NO_FRAMES", "TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
+StructureReason = Literal["TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
 
 # A pair further off, as a share of its distance from the camera, is an outlier of RANSAC: reconstructions
 # bend by up to about a percent of the flying height.
@@ -67,10 +67,8 @@ def project_structure(
     """Place a map on a scan by frames of the map that were registered to it.
 
     Args:
-        registered: frames with their poses in the cloud's local frame; one is enough.
+        registered: frames with their poses in the cloud's local frame, at least one.
     """
-    if not registered:
-        return StructurePlacement(reason="NO_FRAMES", message="no frame is registered to the scan")
     source = feature_map.points_local(cloud.frame)
     pairs = structure_pairs(feature_map, source, registered, cloud)
     if len(pairs) < _MIN_PAIRS:

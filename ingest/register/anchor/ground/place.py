@@ -20,7 +20,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.ground.parts import parts
-from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit, fitted, shape_of
+from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit, fitted, laid, shape_of
 from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
 from ingest.register.anchor.ground.street_plan import StreetPlan, street_plan
 from ingest.register.anchor.together.evidence import JointEvidence
@@ -143,7 +143,7 @@ def _tried(plan: StreetPlan, shape: ScanShape, search: PlanSearch, tags: Geotags
     found = search.tries(plan, sizes.tolist(), turns.tolist(), tags)
     fits = [_fitted(plan, shape, _start(plan, shape, one), rows, _COARSE_WIDTHS_M) for one in found]
     asked = np.random.default_rng(0).permutation(len(plan.points))[:_ASKED]
-    return [_asked(shape, _only_asked(plan, shape, fit.local_from_own, asked)) for fit in fits]
+    return [_asked(shape, laid(shape, plan.points[asked], fit.local_from_own)) for fit in fits]
 
 
 def _chance(there: Sequence[_Tried]) -> FloatArray:
@@ -173,7 +173,7 @@ def _fitted(
     plan: StreetPlan, shape: ScanShape, start: Sim3, rows: NDArray[np.int64], widths: tuple[float, ...]
 ) -> SolidFit:
     information = np.diag([*(len(rows) * 0.1 / np.square(_START_SIGMA)), 1e-3, 1e-3, 1e-3])
-    return fitted(shape, plan.points[rows], np.ones(len(rows)), start, prior=information, widths=widths)
+    return fitted(shape, plan.points[rows], start, information, widths)
 
 
 def _asked(shape: ScanShape, fit: SolidFit) -> _Tried:
@@ -299,7 +299,7 @@ def _lie_there(
     unplaced: UnplacedMap, plan: StreetPlan, shape: ScanShape, sim: Sim3, rate: float
 ) -> NDArray[np.bool_]:
     """Which photos lie where the similarity puts them: their points agree, and others that stay see them."""
-    asked = _asked(shape, _only_asked(plan, shape, sim, np.arange(len(plan.points))))
+    asked = _asked(shape, laid(shape, plan.points, sim))
     point_of = np.full(len(unplaced.points.xyz), -1)
     point_of[plan.rows] = np.arange(len(plan.rows))
     observations = unplaced.observations
@@ -324,13 +324,9 @@ def _lie_there(
     return stays
 
 
-def _only_asked(plan: StreetPlan, shape: ScanShape, sim: Sim3, rows: NDArray[np.int64]) -> SolidFit:
-    return fitted(shape, plan.points[rows], np.ones(len(rows)), sim, widths=())
-
-
 def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:
     """How often a place as good as another would agree in so many more blocks of the map."""
-    own, rival = (_asked(shape, _only_asked(plan, shape, of, rows)) for of in (sim, other))
+    own, rival = (_asked(shape, laid(shape, plan.points[rows], of)) for of in (sim, other))
     counted = own.above
     block = np.floor(sim.act(plan.points[rows[counted]]) / _BLOCK_M).astype(np.int64)
     group = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)

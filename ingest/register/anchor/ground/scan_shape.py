@@ -26,11 +26,9 @@ _LAST = 4  # points of a roof that tell where it ends
 _SMOOTH_CELLS = 1.5  # of the heights whose gradient says where a wall looks
 _SLOPE_CELLS = 0.7  # of the heights whose gradient is a surface's normal
 _FLAT_M = 0.5  # between cells of one surface
-_WIDTHS_M = (2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.7, 0.5, 0.5, 0.3, 0.3, 0.3)  # of the loss, round by round
-_FINE_M, _FINE_ROUNDS, _SETTLED = 0.3, 10, 1e-4
+_FINE_M, _FINE_ROUNDS, _SETTLED = 0.3, 10, 1e-4  # width of the loss, rounds with the last width
 _LEAST_REACH_M = 1.5  # of a point from what is known of the solid
 _MOST_TURN = 0.1  # of a step: radians, and of the size
-_DAMPING = 1e-3
 _UPRIGHT = 0.5  # rise of a wall's normal, at most
 
 
@@ -211,79 +209,63 @@ def _standing(walls: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SolidFit:
-    """Attributes:
-    local_from_own: similarity.
-    off_m: (n,) distances of the points from the solid's planes. near_m: (n,) from its nearest point.
-    placed: (n, 3) the points there.
-    normal: (7, 7) of the left perturbation about `middle`, for residuals of one metre. middle: (3,).
-    by_walls: (7,) what a metre of all walls outwards adds to its right side.
+    """Points of a map on a scan's solid.
+
+    Attributes:
+        local_from_own: similarity. placed: (n, 3) the points there. middle: (3,) of them.
+        off_m: (n,) distances of the points from the solid's planes. near_m: (n,) from its nearest point.
+        normal, right: (7, 7) and (7,) equations of the left perturbation about `middle` that lessens
+            `off_m`. by_walls: (7,) what a metre of all walls outwards adds to the right side.
     """
 
     local_from_own: Sim3
+    placed: FloatArray
+    middle: FloatArray
     off_m: FloatArray
     near_m: FloatArray
-    placed: FloatArray
     normal: FloatArray
+    right: FloatArray
     by_walls: FloatArray
-    middle: FloatArray
 
 
-def distances(shape: ScanShape, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Signed distances (n,) from the planes next to points (n, 3), from their points, and their normals."""
-    near_m, index = (np.asarray(found) for found in shape.tree.query(points))
+def laid(shape: ScanShape, own: FloatArray, local_from_own: Sim3, width_m: float = _FINE_M) -> SolidFit:
+    """How points (n, 3) of a map lie on a scan's solid; `width_m` of the loss by which they are weighed."""
+    placed = local_from_own.act(own)
+    middle = placed.mean(axis=0)
+    near_m, index = (np.asarray(found) for found in shape.tree.query(placed))
     normals = shape.normals[index]
-    off = np.einsum("ij,ij->i", normals, points - shape.points[index])
-    return np.asarray(off), near_m, np.asarray(normals)
+    off_m = np.einsum("ij,ij->i", normals, placed - shape.points[index])
+    weight = 1.0 / (1.0 + np.square(off_m / width_m)) ** 2
+    weight = np.where(near_m < max(4.0 * width_m, _LEAST_REACH_M), weight, 0.0)
+    jacobian = np.einsum("ij,ijk->ik", normals, point_jacobian(placed - middle))
+    return SolidFit(
+        local_from_own=local_from_own,
+        placed=placed,
+        middle=middle,
+        off_m=off_m,
+        near_m=near_m,
+        normal=jacobian.T @ (jacobian * weight[:, None]),
+        right=-jacobian.T @ (weight * off_m),
+        by_walls=jacobian.T @ (weight * (np.abs(normals[:, 2]) < _UPRIGHT)),
+    )
 
 
 def fitted(
-    shape: ScanShape,
-    own: FloatArray,
-    weight: FloatArray,
-    start: Sim3,
-    *,
-    prior: FloatArray | None = None,
-    widths: tuple[float, ...] = _WIDTHS_M,
+    shape: ScanShape, own: FloatArray, start: Sim3, prior: FloatArray, widths_m: tuple[float, ...]
 ) -> SolidFit:
     """The similarity that lays points (n, 3) of a map on a scan's solid.
 
     Args:
-        weight: (n,) of the points. prior: (7, 7) information of the start, left perturbation about the
-            middle of the points.
+        prior: (7, 7) information of the start, left perturbation about the middle of the points.
+        widths_m: of the loss, round by round; the last one until the similarity settles.
     """
     sim = start
-    for k in range(len(widths) + _FINE_ROUNDS if widths else 0):
-        width = widths[k] if k < len(widths) else widths[-1]
-        step, middle = _step(shape, sim.act(own), weight, width, prior)[:2]
-        about = Sim3(scale=1.0, rotation=np.eye(3), translation=middle)
+    for k in range(len(widths_m) + _FINE_ROUNDS):
+        fit = laid(shape, own, sim, widths_m[min(k, len(widths_m) - 1)])
+        step = np.linalg.solve(fit.normal + prior, fit.right)
+        step[:4] = np.clip(step[:4], -_MOST_TURN, _MOST_TURN)
+        about = Sim3(scale=1.0, rotation=np.eye(3), translation=fit.middle)
         sim = about @ Sim3.exp(step) @ about.inverse() @ sim
-        if k >= len(widths) and float(np.abs(step).max()) < _SETTLED:
+        if k >= len(widths_m) and float(np.abs(step).max()) < _SETTLED:
             break
-    placed = sim.act(own)
-    off, near_m, _ = distances(shape, placed)
-    _, middle, normal, by_walls = _step(shape, placed, weight, widths[-1] if widths else _FINE_M, None)
-    return SolidFit(
-        local_from_own=sim,
-        off_m=off,
-        near_m=near_m,
-        placed=placed,
-        normal=normal,
-        middle=middle,
-        by_walls=by_walls,
-    )
-
-
-def _step(
-    shape: ScanShape, placed: FloatArray, weight: FloatArray, width: float, prior: FloatArray | None
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The step about the middle of the points, that middle, the normal matrix, and what walls add."""
-    middle = np.average(placed, axis=0, weights=weight)
-    off, near_m, normals = distances(shape, placed)
-    root = weight / (1.0 + np.square(off / width)) ** 2
-    root = np.where(near_m < max(4.0 * width, _LEAST_REACH_M), root, 0.0)
-    jacobian = np.einsum("ij,ijk->ik", normals, point_jacobian(placed - middle))
-    normal = jacobian.T @ (jacobian * root[:, None])
-    damping = np.eye(7) * _DAMPING if prior is None else prior
-    step = np.linalg.solve(normal + damping, -jacobian.T @ (root * off))
-    step[:4] = np.clip(step[:4], -_MOST_TURN, _MOST_TURN)
-    return step, middle, normal, jacobian.T @ (root * (np.abs(normals[:, 2]) < _UPRIGHT))
+    return laid(shape, own, sim, widths_m[-1])

@@ -33,6 +33,7 @@ _WINDOW_PX = 12  # radius of the score map against whose spread a place is judge
 _MIN_SCORE = 1.5
 _TOLERANCE_PX = 4.0  # of an inlier, in the render
 _MAX_PIECES = 400  # per round
+_PIECE_POINTS = 15.0  # so many scan points are across a piece, as far as the picture has room
 _LEAST_ACROSS = 8  # pieces that are made larger still leave so many along the picture's longer side
 
 
@@ -124,7 +125,7 @@ def _fit_round(
     if not renderings:
         return None
     between_px = views.spacing_full_px * side_px / max(views.camera.width, views.camera.height)
-    wanted_px = min(views.options.dense_fit.piece_points * between_px, side_px / _LEAST_ACROSS)
+    wanted_px = min(_PIECE_POINTS * between_px, side_px / _LEAST_ACROSS)
     piece_px = max(piece_px, 2 * round(0.5 * wanted_px))
     matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px)
     if len(matches) < _MIN_PLACES:
