@@ -24,9 +24,9 @@ from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import list_scans
 from ingest.executor import Progress, no_progress
 from ingest.growth.unplaced import left_over
-from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, on_outlines, place_map
+from ingest.register.anchor.anchor_map import AnchorResult, on_outlines, place_map
 from ingest.register.anchor.files import PhotoFiles, find_photos, load_proposals, save_proposals
-from ingest.register.anchor.frames import TriedFrames, try_frames
+from ingest.register.anchor.frames import FRAMES, TriedFrames, try_frames
 from ingest.register.anchor.page import write_anchor_report
 from ingest.register.anchor.report import AnchorReport
 from ingest.register.anchor.start.first_place import (
@@ -110,18 +110,12 @@ class _Job:
     cloud: PointCloud
     scan_ids: tuple[str, ...]
     out: Path
-    options: AnchorOptions
 
     def rgb(self, image: MapImage) -> NDArray[np.uint8]:
         return decode_rgb(self.files.path(image), INGEST_LIMITS)
 
 
-def anchor(
-    database: Database,
-    request: AnchorRequest,
-    progress: Progress = no_progress,
-    options: AnchorOptions | None = None,
-) -> Anchoring:
+def anchor(database: Database, request: AnchorRequest, progress: Progress = no_progress) -> Anchoring:
     """Do what the request asks for.
 
     Raises:
@@ -129,7 +123,8 @@ def anchor(
         MapNotFoundError, ScanNotFoundError, ScanError, StoreError
         ConflictError: someone else placed the map anew meanwhile.
     """
-    job = _load(database, request, _with_frames(options or AnchorOptions(), request.frames))
+    job = _load(database, request)
+    wanted = FRAMES if request.frames is None else request.frames
     result: AnchorResult | None
     if request.confirm:
         tried = _confirmed(job)
@@ -144,8 +139,7 @@ def anchor(
             job.feature_map,
             job.cloud,
             job.files.gray,
-            job.options.frames,
-            job.options.max_tries,
+            wanted,
             starts=starts,
             readable=list(job.files.paths),
             together=job.first is None or not job.first.by_look,
@@ -156,7 +150,7 @@ def anchor(
     if request.auto or request.confirm:
         supervised = bool(request.confirm or request.start.pose or request.start.picks)
         result = place_map(
-            job.feature_map, job.cloud, tried, job.files.gray, job.options,
+            job.feature_map, job.cloud, tried, job.files.gray, wanted,
             confirmed=bool(request.confirm), supervised=supervised, progress=progress,
         )  # fmt: skip
     return _finished(database, job, tried, result, notes)
@@ -235,7 +229,7 @@ def _confirm_command(database: Database, job: _Job, decision: str) -> str:
     return f"{shlex.join(words)} {decision}"
 
 
-def _load(database: Database, request: AnchorRequest, options: AnchorOptions) -> _Job:
+def _load(database: Database, request: AnchorRequest) -> _Job:
     snapshot = database.snapshot()
     summary = snapshot.find(request.map_id)
     loaded = snapshot.load_any(summary.map_id)
@@ -274,7 +268,6 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
         cloud=cloud,
         scan_ids=tuple(scan_ids),
         out=request.out or Path(f"anchor-{summary.map_id}"),
-        options=options,
     )
 
 
@@ -375,15 +368,3 @@ def _about_photos(job: _Job, tried: TriedFrames) -> list[str]:
         notes.append(f"{len(job.files.missing)} of {len(names)} photos are not used: {few}")
     notes += [f"{name} cannot be read: {why}" for name, why in tried.unreadable.items()]
     return notes
-
-
-def _with_frames(options: AnchorOptions, frames: int | None) -> AnchorOptions:
-    """The options for a wanted number of frames; who asks for one does not ask for two that agree."""
-    if frames is None:
-        return options
-    return replace(
-        options,
-        frames=frames,
-        max_tries=max(options.max_tries, frames + 3),
-        min_agreeing=min(options.min_agreeing, frames),
-    )

@@ -25,8 +25,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.camera.shot import look_pose
-from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
+from ingest.register.frame.views import FrameOptions
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from tools.figures import median, off_pose, say, study_parser, write_figures
 from tools.worlds.clouds import build_cloud
@@ -48,7 +48,9 @@ def main() -> None:
     accepted, apart, seconds = 0, [], []
     for number, name in enumerate(names):
         data = (args.folder / name).read_bytes()
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = cv2.imdecode(
+            np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        )
         if image is None:
             raise SystemExit(f"{name}: not an image that can be read")
         image = np.asarray(image, dtype=np.uint8)

@@ -37,8 +37,8 @@ from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import TrueImage, WorldOptions, open_world, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
-from ingest.register.anchor.anchor_map import AnchorOptions, place_map
-from ingest.register.anchor.frames import try_frames
+from ingest.register.anchor.anchor_map import place_map
+from ingest.register.anchor.frames import FRAMES, try_frames
 from ingest.register.anchor.start.first_place import plan_box
 from ingest.register.anchor.together.register import register_together
 from ingest.register.frame.register import register_frame
@@ -176,8 +176,8 @@ def _together(folder: Path, scanned: Sequence[Database], seed: int) -> dict[str,
         ).accepted
         for image in start.images[:_ALONE]
     ]
-    tried = try_frames(start, scans[0], read, AnchorOptions().frames, AnchorOptions().max_tries)
-    placed = place_map(start, scans[0], tried, read, AnchorOptions()).feature_map
+    tried = try_frames(start, scans[0], read, FRAMES)
+    placed = place_map(start, scans[0], tried, read, FRAMES).feature_map
     own_m = None
     if placed is not None:
         own_m = float(np.median(camera_errors(placed, truth)[0]))

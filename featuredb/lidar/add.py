@@ -13,19 +13,19 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-from featuredb.atomic import user_cache
+from featuredb.atomic import atomic_file, user_cache
 from featuredb.errors import ConflictError, GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
 from featuredb.geo.crs.scan import ScanCrs, scan_crs
 from featuredb.geo.crs.utm_transform import UtmTransform, utm_transform
-from featuredb.lidar.clean import Colouring, clean_block
+from featuredb.lidar.clean import clean_block
 from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
+from featuredb.lidar.formats.ortho_image import OrthoImage, open_ortho
 from featuredb.lidar.levels import finest_level
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
-from featuredb.lidar.ortho import LAID, open_ortho
+from featuredb.lidar.ortho import LAID
 from featuredb.lidar.spill import Spill
 from featuredb.lidar.staged import BlockPlan, Staged, stretch_of
 from featuredb.store import Database
@@ -38,35 +38,12 @@ _LARGEST_8_BIT = 255
 
 # Spilled and finished points take 36 and 55 bytes, and both lie here at the end.
 _BYTES_PER_POINT = 100
-
-
-@dataclass(slots=True)
-class WorkFolder:
-    """A job's folder.
-
-    Attributes:
-        path: of the folder.
-        keep: whether it stays when the job ends with an error; set when there is something to go on from.
-    """
-
-    path: Path
-    keep: bool = False
-
-    def read(self, name: str) -> Any | None:
-        """What `write` has written, or None."""
-        file = self.path / name
-        return json.loads(file.read_text()) if file.is_file() else None
-
-    def write(self, name: str, value: Any) -> None:
-        """Write JSON so that it is there whole or not at all."""
-        temporary = self.path / f"{name}.tmp"
-        temporary.write_text(json.dumps(value))
-        temporary.replace(self.path / name)
+_PLAN = "spill.json"  # in a work folder: the first pass is done
 
 
 @contextmanager
-def work_folder(database: Database, work: Path | None, name: str, points: int) -> Iterator[WorkFolder]:
-    """The folder of one job, locked; removed at the end unless `keep` is set.
+def work_folder(database: Database, work: Path | None, name: str, points: int) -> Iterator[Path]:
+    """The folder of one job, locked; it stays when the job fails with a plan of blocks to go on from.
 
     Args:
         work: where jobs have their folders; by default `_work` in a local database, or a cache folder.
@@ -77,35 +54,28 @@ def work_folder(database: Database, work: Path | None, name: str, points: int) -
         ConflictError: another process works on the same job.
         ScanError: the folder cannot be made, or the disk is too small.
     """
-    parent = work or _default_parent(database)
+    parent = work or (Path(database.url) / "_work" if "://" not in database.url else user_cache() / "lidar")
     path = parent / name
     try:
         path.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path).free + sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
     except OSError as error:
         raise ScanError(f"cannot use the work folder {path} ({error}); choose another by --work") from error
-    folder = WorkFolder(path=path)
-    lock = _lock(path)
+    lock, done = _lock(path), False
     try:
         if free < points * _BYTES_PER_POINT:
             raise ScanError(
                 f"expected {points * _BYTES_PER_POINT / 1e9:.1f} GB free for the work folder {path}, found "
                 f"{free / 1e9:.1f} GB; choose another by --work"
             )
-        folder.keep = (path / "spill.json").is_file()
-        yield folder
+        yield path
+        done = True
     finally:
-        if not folder.keep:
+        if done or not (path / _PLAN).is_file():
             shutil.rmtree(path, ignore_errors=True)
             if work is None and parent.is_dir() and not any(parent.iterdir()):
                 parent.rmdir()
         os.close(lock)
-
-
-def _default_parent(database: Database) -> Path:
-    if "://" not in database.url:
-        return Path(database.url) / "_work"
-    return user_cache() / "lidar"
 
 
 def _lock(path: Path) -> int:
@@ -123,12 +93,7 @@ def _lock(path: Path) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AddResult:
-    """What became of a scan.
-
-    Attributes:
-        created: False if the scan was there already and nothing was done.
-        scan: as it is in the database now.
-    """
+    """A scan as it is in the database now; `created` is False if it was there already."""
 
     created: bool
     scan: ScanSummary
@@ -185,10 +150,7 @@ def add_scan(
     inputs = _place_all(opened, options)
     with work_folder(database, work, f"lidar-{scan_id}", sum(f.points for f in opened)) as folder:
         plan = _read_all(folder, inputs, options, on_progress)
-        colouring = None
-        if image is not None:
-            colouring = Colouring(image=image, epsg=inputs[0].to_utm.epsg, spacing_m=plan.spacing_m)
-        staged = _clean_all(folder, plan, options, colouring, on_progress)
+        staged = _clean_all(folder, plan, options, image, inputs[0].to_utm.epsg, on_progress)
         row = _row(scan_id, inputs, plan, staged, options, labels)
         if ortho is not None:
             row |= {"colour": "ortho", "ortho": json.dumps(_ortho_identity(ortho))}
@@ -199,7 +161,6 @@ def add_scan(
             staged.groups(),
             lambda points: on_progress("write", points, row["points"]),
         )
-        folder.keep = False
     return AddResult(created=created, scan=find_scan(database, scan_id))
 
 
@@ -224,7 +185,7 @@ def _open_all(files: Sequence[Path]) -> list[ScanFile]:
 
 
 def _place_all(files: Sequence[ScanFile], options: AddOptions) -> list[ScanInput]:
-    """The CRS of each file and its way to one UTM zone, that of the first."""
+    """The CRS of each file and its way to the zone that is wanted, or that of the first."""
     inputs: list[ScanInput] = []
     epsg = options.epsg
     for file in files:
@@ -252,14 +213,13 @@ def _place_all(files: Sequence[ScanFile], options: AddOptions) -> list[ScanInput
 
 
 def _read_all(
-    folder: WorkFolder, inputs: Sequence[ScanInput], options: AddOptions, on_progress: OnProgress
+    folder: Path, inputs: Sequence[ScanInput], options: AddOptions, on_progress: OnProgress
 ) -> BlockPlan:
     """Read all files into blocks, or find that this was done."""
-    done = folder.read("spill.json")
-    if done is not None:
-        return BlockPlan.from_json(done)
+    if (folder / _PLAN).is_file():
+        return BlockPlan.from_json(json.loads((folder / _PLAN).read_text()))
     total = sum(item.file.points for item in inputs)
-    spill = Spill(folder.path / "spill")
+    spill = Spill(folder / "spill")
     spill.clear()
     for number, item in enumerate(inputs):
         spill.add_file(
@@ -268,46 +228,42 @@ def _read_all(
             item.to_utm.apply,
             lambda read: on_progress("read", read, total),
         )
-    counts = spill.counts
-    if counts.kept == 0:
+    if spill.read == spill.noise + spill.withheld:
         raise ScanError(
             f"expected points to keep, found none in {', '.join(str(item.file.path) for item in inputs)}: "
-            f"{counts.noise} are classified as noise and {counts.withheld} are withheld"
+            f"{spill.noise} are classified as noise and {spill.withheld} are withheld"
         )
     spacing_m = spill.spacing_m()
     plan = BlockPlan(
-        read=counts.read,
-        noise=counts.noise,
-        withheld=counts.withheld,
+        read=spill.read,
+        noise=spill.noise,
+        withheld=spill.withheld,
         spacing_m=spacing_m,
         finest_level=finest_level(spacing_m),
-        stretch=stretch_of(counts.intensity, options.intensity_low_percent, options.intensity_high_percent),
-        colour_bits=tuple(_colour_bits(largest) for largest in counts.largest_rgb),
+        stretch=stretch_of(spill.intensity, options.intensity_low_percent, options.intensity_high_percent),
+        # For the range that a file's colours use, none where all are black: many leave the fields so.
+        colour_bits=tuple(0 if top <= 0 else 8 if top <= _LARGEST_8_BIT else 16 for top in spill.largest_rgb),
         blocks=tuple(spill.split(options.block_points)),
     )
-    folder.write("spill.json", asdict(plan))
-    folder.keep = True
+    with atomic_file(folder / _PLAN) as temporary:
+        temporary.write_text(json.dumps(asdict(plan)))
     return plan
 
 
-def _colour_bits(largest: int) -> int:
-    """8 or 16 for the range that a file's colours use, 0 for none: many leave the fields black."""
-    return 0 if largest <= 0 else 8 if largest <= _LARGEST_8_BIT else 16
-
-
 def _clean_all(
-    folder: WorkFolder,
+    folder: Path,
     plan: BlockPlan,
     options: AddOptions,
-    colouring: Colouring | None,
+    image: OrthoImage | None,
+    epsg: int,
     on_progress: OnProgress,
 ) -> Staged:
     """Clean, stretch and order block by block; finished ones are left alone."""
-    spill, staged = Spill(folder.path / "spill"), Staged(folder.path / "staged", plan)
+    spill, staged = Spill(folder / "spill"), Staged(folder / "staged", plan)
     total, done = sum(block.points for block in plan.blocks), 0
     for block in plan.blocks:
         if not staged.has(block):
-            staged.put(block, *clean_block(spill, plan, block, options.outliers, colouring))
+            staged.put(block, *clean_block(spill, plan, block, options.outliers, image, epsg))
         done += block.points
         on_progress("clean", done, total)
     return staged
@@ -326,7 +282,7 @@ def _row(
     notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
     return {
         "scan_id": scan_id,
-        "name": labels.name_of(inputs[0].file.path),
+        "name": labels.name or inputs[0].file.path.name,
         "files": [_file_row(item) for item in inputs],
         "epsg": inputs[0].to_utm.epsg,
         "height_datum": crs.height_datum,
@@ -348,7 +304,7 @@ def _row(
         "height_unit_m": crs.height_unit_m,
         "height_unit_reason": crs.height_unit_reason,
         "notes": list(dict.fromkeys(notes)),
-        "options": options.as_json(),
+        "options": json.dumps(asdict(options), sort_keys=True),
         "source": labels.source,
         "licence": labels.licence,
     }

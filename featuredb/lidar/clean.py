@@ -1,26 +1,17 @@
 """One block of a scan: outliers out, colours and intensities as bytes, ordered by level and node."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.lidar.formats.ortho_image import OrthoImage
 from featuredb.lidar.levels import order_by_level
-from featuredb.lidar.ortho import OrthoImage, colour_by_ortho, margin_m
+from featuredb.lidar.ortho import colour_by_ortho, margin_m
 from featuredb.lidar.outliers import OutlierOptions, find_outliers
 from featuredb.lidar.spill import SPILLED, Spill, TileBlock
 from featuredb.lidar.staged import BlockPlan
 from featuredb.store.scans import POINT_ROW
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Colouring:
-    """An ortho image for the points of a UTM zone, with one spacing for all blocks: none hides more."""
-
-    image: OrthoImage
-    epsg: int
-    spacing_m: float
 
 
 def clean_block(
@@ -28,18 +19,24 @@ def clean_block(
     plan: BlockPlan,
     block: TileBlock,
     outliers: OutlierOptions | None,
-    colouring: Colouring | None = None,
+    ortho: OrthoImage | None,
+    epsg: int,
 ) -> tuple[NDArray[Any], int]:
     """The rows of a block as they go into the store, and how many outliers were dropped.
+
+    Args:
+        ortho: colours the points. epsg: zone of the points.
 
     Returns:
         (n,) POINT_ROW, by level and node; n may be 0.
     """
-    rows, core, dropped = _without_outliers(spill, plan, block, outliers, colouring)
+    colour_m = 0.0 if ortho is None else margin_m(plan.spacing_m)
+    rows, core, dropped = _without_outliers(spill, plan, block, outliers, colour_m)
     rgb, has_rgb = _colours(rows, plan.colour_bits)
-    if colouring is not None:
-        # Where the image does not show a point, it keeps its colour, if it has one.
-        rgb, seen = colour_by_ortho(rows["utm"], colouring.epsg, rgb, colouring.image, colouring.spacing_m)
+    if ortho is not None:
+        # Where the image does not show a point, it keeps its colour, if it has one. With one spacing for all
+        # blocks, none hides more.
+        rgb, seen = colour_by_ortho(rows["utm"], epsg, rgb, ortho, plan.spacing_m)
         has_rgb = has_rgb | seen
     rows, rgb, has_rgb = rows[:core], rgb[:core], has_rgb[:core]
     cleaned = np.zeros(core, POINT_ROW)
@@ -59,15 +56,10 @@ def clean_block(
 
 
 def _without_outliers(
-    spill: Spill,
-    plan: BlockPlan,
-    block: TileBlock,
-    outliers: OutlierOptions | None,
-    colouring: Colouring | None,
+    spill: Spill, plan: BlockPlan, block: TileBlock, outliers: OutlierOptions | None, colour_m: float
 ) -> tuple[NDArray[Any], int, int]:
-    """Points of a block and then around it; how many are the block's; how many outliers it had."""
+    """Points of a block and then up to `colour_m` around it; how many are the block's; its outliers."""
     reach_m = 0.0 if outliers is None else outliers.margin_m(plan.spacing_m)
-    colour_m = 0.0 if colouring is None else margin_m(colouring.spacing_m)
     around = np.empty(0, SPILLED)
     core = spill.rows(block)
     if reach_m + colour_m > 0.0:

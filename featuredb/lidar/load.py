@@ -25,7 +25,6 @@ _GREY = 128  # of points that have neither colour nor intensity in a cloud that 
 
 PlanBox = tuple[float, float, float, float]
 
-
 # About 30 bytes each in memory, and what two cores draw ten times a second.
 _LARGEST_POINTS = 20_000_000
 

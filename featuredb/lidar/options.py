@@ -50,10 +50,6 @@ class AddOptions:
         text = json.dumps([_FORMAT, sorted(sha256), list(ortho), chosen], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-    def as_json(self) -> str:
-        """All options, for the scan's row."""
-        return json.dumps(asdict(self), sort_keys=True)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrthoChoice:
@@ -83,7 +79,3 @@ class ScanLabels:
     name: str = ""
     licence: str = ""
     source: str = ""
-
-    def name_of(self, first: Path) -> str:
-        """The name, or the first file's."""
-        return self.name or first.name

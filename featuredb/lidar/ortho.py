@@ -11,12 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.geo.crs.utm_transform import raster_from_utm
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.formats.ortho_image import OrthoImage as OrthoImage
-from featuredb.lidar.formats.ortho_image import open_ortho as open_ortho
-from featuredb.lidar.formats.ortho_image import sample_ortho
+from featuredb.lidar.formats.ortho_image import OrthoImage, sample_ortho
 
 # Radius of the disc that a point covers, in spacings of the points. Points of a regular pattern leave no gap
 # from 0.71 on; scan lines are farther apart than points within them.
@@ -41,9 +38,7 @@ LAID = {  # what a scan's id says of how the image is laid on its points
     "pixels_per_spacing": _PIXELS_PER_SPACING,
 }
 _EMPTY_M = np.float32(-1e9)
-_SPACING_CELL_M = 1.0  # cells in which the scan's area is counted
 _FINEST_M, _COARSEST_M = 0.03, 2.0
-_MAX_CELLS = 200_000_000
 
 
 def margin_m(spacing_m: float) -> float:
@@ -51,7 +46,7 @@ def margin_m(spacing_m: float) -> float:
     return GAP_M + 2.0 * SPLAT_SPACINGS * spacing_m
 
 
-def seen_from_above(xyz: FloatArray, spacing_m: float | None = None) -> NDArray[np.bool_]:
+def seen_from_above(xyz: FloatArray, spacing_m: float) -> NDArray[np.bool_]:
     """Which points (n,) a nadir view of the scan shows.
 
     Each point covers a disc; who lies clearly below such a disc, or in a narrow and deep hole of the surface
@@ -59,33 +54,20 @@ def seen_from_above(xyz: FloatArray, spacing_m: float | None = None) -> NDArray[
 
     Args:
         xyz: (n, 3) float64 in metres, z up; outliers above the scene hide what is below them.
-        spacing_m: of the points, or None to measure it.
+        spacing_m: of the points.
     """
     if not len(xyz):
         return np.zeros(0, dtype=bool)
-    spacing = spacing_m or point_spacing_m(xyz)
-    radius = float(np.clip(SPLAT_SPACINGS * spacing, _FINEST_M, _COARSEST_M))
+    radius = float(np.clip(SPLAT_SPACINGS * spacing_m, _FINEST_M, _COARSEST_M))
     local = (xyz - np.floor(xyz.min(axis=0))).astype(np.float32)
     cell = np.floor(local[:, :2] / radius).astype(np.int64) + 1
     columns, rows = (int(cell[:, k].max()) + 2 for k in (0, 1))
-    if columns * rows > _MAX_CELLS:
-        raise InvalidValueError(
-            f"seen_from_above: expected a tile, found points over {columns} x {rows} cells of "
-            f"{radius:.2f} m; call it by tiles with a margin"
-        )
     at = cell[:, 1] * columns + cell[:, 0]
     highest = _highest(at, local[:, 2], rows * columns)
     return ~(
         _below_neighbours(local, at, highest, columns, radius)
         | _in_hole(local[:, 2], at, highest, (rows, columns), radius)
     )
-
-
-def point_spacing_m(xyz: FloatArray) -> float:
-    """Root of the area per point, metres: of the cells of a square metre that hold points."""
-    cell = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / _SPACING_CELL_M).astype(np.int64)
-    occupied = len(np.unique(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]))
-    return float(np.clip(np.sqrt(occupied * _SPACING_CELL_M**2 / len(xyz)), _FINEST_M, _COARSEST_M))
 
 
 def _highest(at: NDArray[np.int64], z: NDArray[np.float32], cells: int) -> NDArray[np.int64]:
@@ -97,11 +79,7 @@ def _highest(at: NDArray[np.int64], z: NDArray[np.float32], cells: int) -> NDArr
 
 
 def _below_neighbours(
-    local: NDArray[np.float32],
-    at: NDArray[np.int64],
-    highest: NDArray[np.int64],
-    columns: int,
-    radius: float,
+    local: NDArray[np.float32], at: NDArray[np.int64], highest: NDArray[np.int64], columns: int, radius: float
 ) -> NDArray[np.bool_]:
     """Which points lie below the disc of the highest point of a cell next to theirs."""
     hidden = np.zeros(len(local), dtype=bool)
@@ -133,12 +111,7 @@ def _in_hole(
 
 
 def colour_by_ortho(
-    utm: FloatArray,
-    epsg: int,
-    own: NDArray[np.uint8] | None,
-    ortho: OrthoImage,
-    spacing_m: float | None = None,
-    pixels_per_spacing: float = _PIXELS_PER_SPACING,
+    utm: FloatArray, epsg: int, own: NDArray[np.uint8], ortho: OrthoImage, spacing_m: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colours of points, from the image where a nadir view shows them, their own elsewhere.
 
@@ -148,9 +121,8 @@ def colour_by_ortho(
     Args:
         utm: (n, 3) float64 easting, northing, height, metres, without outliers.
         epsg: zone of `utm`.
-        own: (n, 3) uint8 colours of the scan, or greys from its intensity, or None: black.
-        spacing_m: of the points, or None to measure it.
-        pixels_per_spacing: to which the image is averaged.
+        own: (n, 3) uint8 colours of the scan.
+        spacing_m: of the points.
 
     Returns:
         rgb (n, 3) uint8, and (n,) bool: which points took their colour from the image.
@@ -159,13 +131,12 @@ def colour_by_ortho(
         GeodesyError: the image's reference system cannot be used.
         ScanFileError: the image cannot be read.
     """
-    rgb = np.zeros((len(utm), 3), np.uint8) if own is None else own.copy()
-    if rgb.shape != (len(utm), 3):
-        raise InvalidValueError(f"colour_by_ortho: expected own colours ({len(utm)}, 3), found {rgb.shape}")
-    coloured = np.zeros(len(utm), dtype=bool)
+    rgb, coloured = own.copy(), np.zeros(len(utm), dtype=bool)
     if not len(utm):
         return rgb, coloured
-    xy = _converter(ortho.wkt, epsg, utm[0])(utm[:, :2])
+    # Made once for 100 km around: tiles must not differ in their datum shift.
+    east_km, north_km = (100 * round(place / 1e5) for place in utm[0, :2].tolist())
+    xy = _converter_at(ortho.wkt, epsg, east_km, north_km)(utm[:, :2])
     a, b, c, d, e, f = ortho.pixel_from_xy
     pixel = np.stack([xy @ [a, b] + c, xy @ [d, e] + f], axis=1)
     with np.errstate(invalid="ignore"):
@@ -174,9 +145,7 @@ def colour_by_ortho(
         return rgb, coloured
     # Visibility needs all points: one outside the image may hide one inside.
     rows = np.flatnonzero(inside & seen_from_above(utm, spacing_m))
-    shrink = (
-        (spacing_m or point_spacing_m(utm)) / pixels_per_spacing / _pixel_size_m(utm[inside], pixel[inside])
-    )
+    shrink = spacing_m / _PIXELS_PER_SPACING / _pixel_size_m(utm[inside], pixel[inside])
     found, valid = sample_ortho(ortho, pixel[rows], max(1.0, shrink))
     rgb[rows[valid]] = found[valid]
     coloured[rows[valid]] = True
@@ -186,11 +155,6 @@ def colour_by_ortho(
 @lru_cache(maxsize=4)
 def _converter_at(wkt: str, epsg: int, east_km: int, north_km: int) -> Callable[[FloatArray], FloatArray]:
     return raster_from_utm(wkt, epsg, np.array([1e3 * east_km, 1e3 * north_km]))
-
-
-def _converter(wkt: str, epsg: int, place: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """raster_from_utm, made once for 100 km around: tiles must not differ in their datum shift."""
-    return _converter_at(wkt, epsg, 100 * round(place[0] / 1e5), 100 * round(place[1] / 1e5))
 
 
 def _pixel_size_m(utm: FloatArray, pixel: FloatArray) -> float:

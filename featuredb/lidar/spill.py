@@ -6,7 +6,7 @@ levels of detail.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -66,9 +66,8 @@ class TileBlock:
         )
 
 
-@dataclass(slots=True)
-class SpillCounts:
-    """What the first pass counts; grows while it runs.
+class Spill:
+    """The folder of spilled points: one file per tile while writing, one per block after `split`.
 
     Attributes:
         read, noise, withheld: points of the files, and those dropped for their class or flag.
@@ -76,24 +75,12 @@ class SpillCounts:
         largest_rgb: largest colour value of each file; -1 where the format has none.
     """
 
-    read: int = 0
-    noise: int = 0
-    withheld: int = 0
-    intensity: NDArray[np.int64] = field(default_factory=lambda: np.zeros(65536, np.int64))
-    largest_rgb: list[int] = field(default_factory=list)
-
-    @property
-    def kept(self) -> int:
-        return self.read - self.noise - self.withheld
-
-
-class Spill:
-    """The folder of spilled points: one file per tile while writing, one per block after `split`."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.counts = SpillCounts()
+        self.read = self.noise = self.withheld = 0
+        self.intensity = np.zeros(65536, np.int64)
+        self.largest_rgb: list[int] = []
         self._tiles: dict[str, int] = {}
         self._occupied: dict[str, NDArray[np.bool_]] = {}
 
@@ -110,18 +97,17 @@ class Spill:
         on_progress: Callable[[int], None] = lambda points: None,
     ) -> None:
         """Read a file's chunks, drop noise and withheld points, and sort the rest into tiles."""
-        counts = self.counts
-        counts.largest_rgb.append(-1)
+        self.largest_rgb.append(-1)
         for points in chunks:
             noise = np.isin(points.classification, NOISE_CLASSES)
             kept = ~(noise | points.withheld)
-            counts.read += len(points)
-            counts.noise += int(noise.sum())
-            counts.withheld += int((points.withheld & ~noise).sum())
+            self.read += len(points)
+            self.noise += int(noise.sum())
+            self.withheld += int((points.withheld & ~noise).sum())
             if points.rgb is not None:
                 largest = int(points.rgb.max(initial=0))
-                counts.largest_rgb[number] = max(counts.largest_rgb[number], largest)
-            counts.intensity += np.bincount(points.intensity[kept], minlength=65536)
+                self.largest_rgb[number] = max(self.largest_rgb[number], largest)
+            self.intensity += np.bincount(points.intensity[kept], minlength=65536)
             rows = np.zeros(int(kept.sum()), SPILLED)
             rows["utm"] = to_utm(points.xyz[kept])
             if points.rgb is not None:
@@ -130,7 +116,7 @@ class Spill:
             rows["classification"] = points.classification[kept]
             rows["file"] = number
             self._append(rows)
-            on_progress(counts.read)
+            on_progress(self.read)
 
     def split(self, largest_points: int) -> list[TileBlock]:
         """Split what is too large; returns all blocks, ordered by tile."""

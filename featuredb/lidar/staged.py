@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.atomic import atomic_file
 from featuredb.errors import ScanError
 from featuredb.lidar.spill import TileBlock
 from featuredb.store.encode import Row
@@ -119,20 +120,16 @@ class Staged:
         np.save(self._path(block, "npy"), rows)
         classes, counts = np.unique(rows["classification"], return_counts=True)
         utm = rows["utm"]
-        done = self._path(block, "tmp")
-        done.write_text(
-            json.dumps(
-                {
-                    "points": len(rows),
-                    "outliers": outliers,
-                    "levels": np.bincount(rows["level"], minlength=self._plan.finest_level + 1).tolist(),
-                    "classes": dict(zip(classes.tolist(), counts.tolist(), strict=True)),
-                    "low": utm.min(axis=0).tolist() if len(utm) else None,
-                    "high": utm.max(axis=0).tolist() if len(utm) else None,
-                }
-            )
-        )
-        done.replace(self._path(block, "json"))
+        facts = {
+            "points": len(rows),
+            "outliers": outliers,
+            "levels": np.bincount(rows["level"], minlength=self._plan.finest_level + 1).tolist(),
+            "classes": dict(zip(classes.tolist(), counts.tolist(), strict=True)),
+            "low": utm.min(axis=0).tolist() if len(utm) else None,
+            "high": utm.max(axis=0).tolist() if len(utm) else None,
+        }
+        with atomic_file(self._path(block, "json")) as temporary:
+            temporary.write_text(json.dumps(facts))
 
     def totals(self) -> Row:
         """What all blocks hold together, by columns of the table `lidar`: counts, and their box in UTM.

@@ -31,7 +31,7 @@ def center_priors(
     known = np.flatnonzero(np.isfinite(sigmas[:, 2]))
     if one_height(positions, known):
         sigmas = sigmas * [1.0, 1.0, np.sqrt(len(known) / COUNTS_FOR)]
-    share = np.minimum(np.hypot(fit.noise.white, fit.noise.drift) / stated, 1.0)[[0, 0, 1]]
+    share = np.minimum(np.hypot(fit.white_m, fit.drift_m) / stated, 1.0)[[0, 0, 1]]
     move = fit.local_from_sfm.inverse()
     axes = move.scale * move.rotation * share
     return CenterPriors(

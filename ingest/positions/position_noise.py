@@ -42,20 +42,8 @@ _MOST_POSITIONS = 400  # more are thinned out evenly in time
 _TURNS = 8.0  # local maxima of the likelihood over turns: each is a chance of its own
 _INSIDE = 0.999  # of honest positions
 _AXES = (np.array([0, 1]), np.array([2]))  # horizontal, vertical
+_GROUP_OF = (0, 0, 1)  # of east, north, up
 _SIZES = np.array([2.0, 1.0])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Noise:
-    """Standard deviations, metres, of an axis: horizontal and vertical.
-
-    Attributes:
-        white: of the noise of one position.
-        drift: of the walk from the first position to the last.
-    """
-
-    white: tuple[float, float]
-    drift: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,7 +53,8 @@ class NoisyFit:
     Attributes:
         local_from_sfm: the similarity.
         covariance: (7, 7) of its left perturbation about the local origin, without the bias.
-        noise: its most likely components.
+        white_m, drift_m: (2,) most likely standard deviations, horizontal and vertical: of the noise of one
+            position, and of the walk from the first position to the last.
         lag_s: by which positions are late.
         checked_turn_rad: the same of its turn, without what is only assumed of how photos are held; largest.
         used: (n, 2) horizontal and vertical; others are so far out that one of a thousand honest ones is.
@@ -76,7 +65,8 @@ class NoisyFit:
 
     local_from_sfm: Sim3
     covariance: FloatArray
-    noise: Noise
+    white_m: FloatArray
+    drift_m: FloatArray
     lag_s: float
     checked_turn_rad: float
     used: NDArray[np.bool_]
@@ -218,11 +208,11 @@ def fit_noisy(
         checked = free.integrated(modes, stated)[1][2:5, 2:5]
     state, theta = state.moved(step), modes[0]
     chance = _log_chance(data, state, weights, int(taken.sum()))
-    white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(
         local_from_sfm=middle @ state.sim,
         covariance=middle.carried(covariance[1:, 1:]),
-        noise=Noise(white=(float(white[0]), float(white[1])), drift=(float(drift[0]), float(drift[1]))),
+        white_m=np.exp(theta[:2]),
+        drift_m=np.exp(theta[2:]),
         lag_s=state.lag_s,
         checked_turn_rad=float(np.sqrt(np.linalg.eigvalsh(checked)[-1])),
         used=used,
@@ -271,20 +261,14 @@ def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: Floa
         residual: (n, 3). jacobian: (n, 3, p).
     """
     result = []
-    for group, axes in enumerate(_AXES):
-        for axis in axes.tolist():
-            known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
-            root = np.sqrt(weights[known, group]) * data.stated[group] / data.sigmas[known, axis]
-            walk = data.walk[np.ix_(known, known)]
-            variance, basis = np.linalg.eigh(root[:, None] * walk * root)
-            result.append(
-                ModelAxis(
-                    group,
-                    basis.T @ (root * residual[known, axis]),
-                    basis.T @ (root[:, None] * jacobian[known, axis]),
-                    np.maximum(variance, 0.0),
-                )
-            )
+    for axis, group in enumerate(_GROUP_OF):
+        known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
+        root = np.sqrt(weights[known, group]) * data.stated[group] / data.sigmas[known, axis]
+        walk = data.walk[np.ix_(known, known)]
+        variance, basis = np.linalg.eigh(root[:, None] * walk * root)
+        whitened = basis.T @ (root * residual[known, axis])
+        by_step = basis.T @ (root[:, None] * jacobian[known, axis])
+        result.append(ModelAxis(group, whitened, by_step, np.maximum(variance, 0.0)))
     return result
 
 
@@ -297,15 +281,14 @@ def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: Float
     """The walk (n, 3) that is most likely for residuals (n, 3), with a constant taken off each axis."""
     result = np.zeros_like(residual)
     white, drift = data.shape_m**2 + np.exp(2.0 * theta[:2]), np.exp(2.0 * theta[2:])
-    for group, axes in enumerate(_AXES):
-        for axis in axes.tolist():
-            known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
-            if not known.any():
-                continue
-            ratio = data.sigmas[known, axis] / data.stated[group]
-            walk = drift[group] * data.walk
-            own = walk[np.ix_(known, known)] + np.diag(white[group] * ratio**2 / weights[known, group])
-            result[:, axis] = walk[:, known] @ np.linalg.solve(own, residual[known, axis])
+    for axis, group in enumerate(_GROUP_OF):
+        known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
+        if not known.any():
+            continue
+        ratio = data.sigmas[known, axis] / data.stated[group]
+        walk = drift[group] * data.walk
+        own = walk[np.ix_(known, known)] + np.diag(white[group] * ratio**2 / weights[known, group])
+        result[:, axis] = walk[:, known] @ np.linalg.solve(own, residual[known, axis])
     return result
 
 
@@ -385,16 +368,15 @@ def _own_share(data: _Data, residual: FloatArray, known: NDArray[np.bool_], thet
     """
     order = data.order
     together, alone = 0.0, _LEAST_M**2
-    for group, axes in enumerate(_AXES):
-        for axis in axes.tolist():
-            rows = order[known[order, axis]]
-            if len(rows) < _LEAST_PHOTOS:
-                continue
-            ratio = data.sigmas[rows, axis] / data.stated[group]
-            own = np.exp(2.0 * theta[2 + group]) * data.walk[np.ix_(rows, rows)]
-            factor = np.linalg.cholesky(own + np.diag(np.exp(2.0 * theta[group]) * ratio**2))
-            white = np.linalg.solve(factor, np.column_stack([residual[rows, axis], np.ones(len(rows))]))
-            left = white[:, 0] - white[:, 1] * (white[:, 1] @ white[:, 0]) / (white[:, 1] @ white[:, 1])
-            together, alone = together + float(left[1:] @ left[:-1]), alone + float(left @ left)
+    for axis, group in enumerate(_GROUP_OF):
+        rows = order[known[order, axis]]
+        if len(rows) < _LEAST_PHOTOS:
+            continue
+        ratio = data.sigmas[rows, axis] / data.stated[group]
+        own = np.exp(2.0 * theta[2 + group]) * data.walk[np.ix_(rows, rows)]
+        factor = np.linalg.cholesky(own + np.diag(np.exp(2.0 * theta[group]) * ratio**2))
+        white = np.linalg.solve(factor, np.column_stack([residual[rows, axis], np.ones(len(rows))]))
+        left = white[:, 0] - white[:, 1] * (white[:, 1] @ white[:, 0]) / (white[:, 1] @ white[:, 1])
+        together, alone = together + float(left[1:] @ left[:-1]), alone + float(left @ left)
     follows = min(max(together / alone, 0.0), _MOST_SMOOTH)
     return (1.0 - follows) / (1.0 + follows)

@@ -60,11 +60,11 @@ class GpsPlacement:
 
     reason: GpsReason | None
     message: str
-    provisional: str
-    local_from_sfm: Sim3 | None
-    covariance: FloatArray | None
     residuals_m: FloatArray
     inliers: NDArray[np.bool_]
+    provisional: str = ""
+    local_from_sfm: Sim3 | None = None
+    covariance: FloatArray | None = None
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -102,10 +102,10 @@ def place_by_gps(
     if start is None:
         return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
     many = receivers(camera_of, count) > 1.0
-    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, held, many)
+    given = (centers_sfm, positions_local, sigmas_m, times_s, held, many)
+    fit = fit_noisy(start, *given)
     if held is not None and (fit.local_from_sfm.rotation @ held.down)[2] > 0:  # a line, the wrong side up
-        turned = _turned_over(fit.local_from_sfm, centers_sfm)
-        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, held, many)
+        over = fit_noisy(_turned_over(fit.local_from_sfm, centers_sfm), *given)
         if over.log_chance <= fit.log_chance + np.log(1.0 / _WRONG):  # else pictures are upside down
             fit = over
     if held is not None:
@@ -144,7 +144,7 @@ def _judged(
     known = np.isfinite(sigmas)
     residuals = np.where(known, positions - fit.local_from_sfm.act(centers), np.nan)
     stated = np.array([stated_sigma(sigmas[:, k]) for k in range(3)])
-    white, drift = (np.array([of[0], of[0], of[1]]) for of in (fit.noise.white, fit.noise.drift))
+    white, drift = (of[[0, 0, 1]] for of in (fit.white_m, fit.drift_m))
     bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0))
     if by > 1.0:  # what each is off by shows among them, but not what all share: a datum of heights, a map
         shared = np.hypot(np.minimum(bias, white) / np.sqrt(by - 1.0), _MANY_SHARE * stated)
@@ -165,8 +165,8 @@ def _judged(
     axes = [any(told[:2]), told[2]]
     figures = figures | {
         "inliers": int(inliers.sum()),
-        "noise_m": _where(axes, fit.noise.white),
-        "drift_m": _where(axes, fit.noise.drift),
+        "noise_m": _where(axes, fit.white_m.tolist()),
+        "drift_m": _where(axes, fit.drift_m.tolist()),
         "lag_s": fit.lag_s,
         "bias_sigma_m": _where(told, bias.tolist()),
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
@@ -289,9 +289,6 @@ def _refused(reason: GpsReason, message: str, count: int, figures: dict[str, Any
     return GpsPlacement(
         reason=reason,
         message=message,
-        provisional="",
-        local_from_sfm=None,
-        covariance=None,
         residuals_m=np.full((count, 3), np.nan),
         inliers=np.zeros(count, dtype=bool),
         figures=figures,

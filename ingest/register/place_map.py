@@ -15,9 +15,7 @@ from ingest.register.anchor.proposals import small_camera
 from ingest.register.frame_registration import FramePrior
 
 _VIEW_PX = 800  # of the depth image that tells the scale
-_MIN_POINTS = (
-    20  # of the photo's map points that must meet the scan; their median then has a fifth of its spread
-)
+_MIN_POINTS = 20  # of the photo that must meet the scan; their median then has a fifth of its spread
 _MIN_SCALE_SIGMA = 0.02  # the lens of a reconstruction is known to that, and so is its depth
 
 
@@ -75,11 +73,9 @@ def _scale(
         cloud, small_camera(camera, _VIEW_PX), prior.cam_from_local, RenderOptions(attributes=False)
     )
     rows = unplaced.observations.image_id == image.image_id
-    xy = unplaced.observations.xy[rows] * [
-        view.camera.width / camera.width,
-        view.camera.height / camera.height,
-    ]
-    at = np.clip(np.floor(xy).astype(int), 0, [view.camera.width - 1, view.camera.height - 1])
+    size = np.array([view.camera.width, view.camera.height])
+    xy = unplaced.observations.xy[rows] * (size / (camera.width, camera.height))
+    at = np.clip(np.floor(xy).astype(int), 0, size - 1)
     ratio = view.depth[at[:, 1], at[:, 0]] / _depths(unplaced, image)
     ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
     if len(ratio) < _MIN_POINTS:

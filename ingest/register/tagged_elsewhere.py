@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from featuredb.geometry.arrays import FloatArray
 from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsPlacement
 from ingest.sfm.links import link_shares
@@ -65,7 +63,8 @@ def tagged_elsewhere(model: Model, with_gps: Sequence[int], placed: GpsPlacement
     for number in range(count):
         members = [k for k, of in zip(outside, label.tolist(), strict=True) if of == number]
         offsets = np.array([offset_of[k] for k in members])
-        agreeing = _agreeing(offsets, _MAX_SPREAD * least_m)
+        near = np.linalg.norm(offsets[:, None] - offsets[None], axis=2) <= _MAX_SPREAD * least_m
+        agreeing = near[near.sum(axis=1).argmax()]  # those near the one that most others are near to
         if agreeing.sum() < max(_MIN_PHOTOS, len(members) // 2 + 1):
             continue
         hanging = [k for k in untagged if links[k].max() >= _MIN_LINK and links[k].argmax() in members]
@@ -73,9 +72,3 @@ def tagged_elsewhere(model: Model, with_gps: Sequence[int], placed: GpsPlacement
         if offset_m >= least_m:
             found.append(TaggedElsewhere(photos=tuple(sorted([*members, *hanging])), offset_m=offset_m))
     return found
-
-
-def _agreeing(offsets: FloatArray, within_m: float) -> NDArray[np.bool_]:
-    """Of offsets (n, 2) those near the one that most others are near to."""
-    near = np.linalg.norm(offsets[:, None] - offsets[None], axis=2) <= within_m
-    return np.asarray(near[near.sum(axis=1).argmax()])

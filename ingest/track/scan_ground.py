@@ -19,9 +19,9 @@ from featuredb.geometry.rotation import skew
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame.dense.confirmation import ConfirmOptions
-from ingest.register.frame.options import DenseFitOptions, FrameOptions
 from ingest.register.frame.register import fit_near, register_frame
 from ingest.register.frame.sources import available_sources
+from ingest.register.frame.views import DenseFitOptions, FrameOptions
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.structure.depth_filter import surface_at
 from reloc.localise.result import LocaliseRequest, place_on_earth
@@ -142,7 +142,7 @@ class ScanGround:
         pixels = _corners(gray)
         rendering = render(self._cloud, camera, pose, RenderOptions(attributes=False, threads=1))
         hits = surface_at(rendering, self._cloud, pixels)
-        pixels, points = pixels[hits.valid], hits.points[hits.valid]
+        pixels, points = pixels[hits.rows], hits.points
         if len(points) < options.min_matches:
             return Unmatched(
                 reason="TOO_FEW_POINTS",

@@ -15,7 +15,6 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from ingest.anchoring import AnchorRequest
-from ingest.register.anchor.anchor_map import AnchorOptions
 from ingest.register.picks_page.server import create_app
 from ingest.register.picks_page.session import PickSession
 from reloc.localise.result import LocaliseRequest
@@ -36,7 +35,7 @@ SPOTS = [(0.2, 0.2), (0.8, 0.22), (0.78, 0.8), (0.22, 0.78), (0.5, 0.4), (0.45, 
 def _two_frames() -> Iterator[None]:
     """Two that agree are enough."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(AnchorOptions.__init__.__kwdefaults__, "frames", 2)
+        patch.setattr("ingest.anchoring.FRAMES", 2)
         yield
 
 

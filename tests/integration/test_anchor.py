@@ -21,7 +21,6 @@ from featuredb.store.scans import list_scans
 from ingest.anchoring import AnchorRequest, anchor
 from ingest.api.anchor_words import anchoring_text
 from ingest.register.anchor import frames
-from ingest.register.anchor.anchor_map import AnchorOptions
 from schemas import load_schema
 from tests.support.hill_map import hill_map
 from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos
@@ -181,7 +180,10 @@ def test_frames_are_proposed_and_one_is_confirmed(
 
 
 def test_a_scan_of_another_place_moves_nothing(
-    hills: tuple[Path, Path, Path], copied: Callable[[Path], Path], tmp_path: Path
+    hills: tuple[Path, Path, Path],
+    copied: Callable[[Path], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     photos, _, wrong = hills
     path, out = copied(wrong), tmp_path / "out"
@@ -189,7 +191,9 @@ def test_a_scan_of_another_place_moves_nothing(
     version = database.poll_version()
     request = AnchorRequest(map_id=only_map(path).map_id, photos=photos, out=out, auto=True)
     # Each frame that is refused has gone through every source and every search: one is enough here.
-    done = anchor(database, request, options=AnchorOptions(max_tries=1))
+    monkeypatch.setattr("ingest.register.anchor.frames._LEAST_TRIES", 1)
+    monkeypatch.setattr("ingest.register.anchor.frames._SPARE_TRIES", -2)
+    done = anchor(database, request)
     assert not done.placed
     result = done.report.result
     assert result is not None

@@ -17,7 +17,6 @@ from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMa
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from ingest.register.anchor import frames
-from ingest.register.anchor.anchor_map import AnchorOptions
 from ingest.register.anchor.files import PhotoFiles
 from ingest.register.anchor.start import first_place
 from ingest.register.anchor.start.from_ortho import FoundByOrtho
@@ -67,7 +66,7 @@ def words(made: Path, tmp_path: Path, texture: int, *, laser: bool = False) -> l
 def _found_once() -> Iterator[None]:
     """Two tests begin with the same map on the same scan; two frames that agree are enough."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(AnchorOptions.__init__.__kwdefaults__, "frames", 2)
+        patch.setattr("ingest.anchoring.FRAMES", 2)
         patch.setattr(first_place, "found_from_above", remembered(first_place.found_from_above))
         patch.setattr(frames, "register_frame", remembered(frames.register_frame))
         yield

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from rasterio.transform import Affine
 
-from featuredb.errors import GeodesyError, InvalidValueError, ScanFileError
+from featuredb.errors import GeodesyError, ScanFileError
 from featuredb.geo.crs.scan import scan_crs
 from featuredb.geo.crs.utm_transform import utm_transform
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.ortho import colour_by_ortho, open_ortho
+from featuredb.lidar.formats.ortho_image import OrthoImage, open_ortho
+from featuredb.lidar.ortho import colour_by_ortho
 from tests.support.geotiff import write_geotiff
 
 EPSG = 32632
@@ -55,10 +56,21 @@ def write(path: Path, image: NDArray[np.generic], **more: object) -> Path:
     return path
 
 
+def colours(
+    utm: NDArray[np.float64], epsg: int, own: NDArray[np.uint8] | None, ortho: OrthoImage
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Of an image that is not averaged; points are as dense as they are over their area in plan."""
+    spacing_m = float(np.sqrt(np.prod(np.ptp(utm[:, :2], axis=0)) / len(utm)))
+    black = np.zeros((len(utm), 3), np.uint8)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("featuredb.lidar.ortho._PIXELS_PER_SPACING", FINE)
+        return colour_by_ortho(utm, epsg, black if own is None else own, ortho, spacing_m)
+
+
 def test_colours_come_from_the_right_pixels(tmp_path: Path) -> None:
     utm = points()
     ortho = open_ortho(write(tmp_path / "o.tif", picture()))
-    rgb, coloured = colour_by_ortho(utm, EPSG, None, ortho, pixels_per_spacing=FINE)
+    rgb, coloured = colours(utm, EPSG, None, ortho)
     assert coloured.all()
     np.testing.assert_allclose(rgb[:, 0], expected_red(utm), atol=1.0)
     np.testing.assert_allclose(rgb[:, 1], expected_green(utm), atol=1.0)
@@ -77,7 +89,7 @@ def test_under_a_roof_a_tree_and_at_walls_points_keep_their_own(tmp_path: Path) 
     utm = np.concatenate([ground, roof, crown, wall])
     own = np.tile(np.array([1, 2, 3], np.uint8), (len(utm), 1))
     ortho = open_ortho(write(tmp_path / "o.tif", picture()))
-    rgb, coloured = colour_by_ortho(utm, EPSG, own, ortho, pixels_per_spacing=FINE)
+    rgb, coloured = colours(utm, EPSG, own, ortho)
     parts = np.split(np.arange(len(utm)), np.cumsum([len(ground), len(roof), len(crown)]))
     under = (np.abs(ground[:, :2] - [WEST + 20, NORTH - 30]) < 5.8).all(axis=1)
     under |= np.hypot(*(ground[:, :2] - [WEST + 45, NORTH - 30]).T) < 3.8
@@ -109,7 +121,7 @@ def test_images_in_other_systems(tmp_path: Path, epsg: int) -> None:
         transform=Affine(step_x, 0.0, west, 0.0, -step_y, north),
     ) as file:  # fmt: skip
         file.write(np.moveaxis(image, -1, 0))
-    rgb, coloured = colour_by_ortho(utm, EPSG, None, open_ortho(path), pixels_per_spacing=FINE)
+    rgb, coloured = colours(utm, EPSG, None, open_ortho(path))
     assert coloured.all()
     # Datum shifts of a metre or two (DHDN) may differ by operation; else it is one grey value, 0.3 m.
     tolerance = 5.0 if epsg == 31468 else 1.0
@@ -123,14 +135,14 @@ def test_smaller_images_and_gaps_leave_points_alone(tmp_path: Path) -> None:
     image[100:140] = 0
     ortho = open_ortho(write(tmp_path / "o.tif", image, nodata=0))
     own = np.full((len(utm), 3), 7, np.uint8)
-    rgb, coloured = colour_by_ortho(utm, EPSG, own, ortho, pixels_per_spacing=FINE)
+    rgb, coloured = colours(utm, EPSG, own, ortho)
     row, column = (NORTH - utm[:, 1]) / PIXEL, (utm[:, 0] - WEST) / PIXEL
     gap = (row >= 100) & (row < 140)
     np.testing.assert_array_equal(coloured, (column < SIZE) & ~gap)
     np.testing.assert_array_equal(rgb[~coloured], own[~coloured])
     # Nothing of the gap's black shines into its neighbours.
     np.testing.assert_allclose(rgb[coloured, 1], expected_green(utm[coloured]), atol=1.5)
-    elsewhere = colour_by_ortho(utm + np.array([5000.0, 0, 0]), EPSG, own, ortho)
+    elsewhere = colours(utm + np.array([5000.0, 0, 0]), EPSG, own, ortho)
     assert not elsewhere[1].any()
     np.testing.assert_array_equal(elsewhere[0], own)
 
@@ -166,7 +178,7 @@ def test_one_four_and_sixteen_bit_images(tmp_path: Path, make: Callable[[Path], 
     utm = points()
     path = tmp_path / "o.tif"
     make(path)
-    rgb, coloured = colour_by_ortho(utm, EPSG, None, open_ortho(path), pixels_per_spacing=FINE)
+    rgb, coloured = colours(utm, EPSG, None, open_ortho(path))
     red = expected_red(utm)
     if make is _grey:
         assert coloured.all()
@@ -191,19 +203,19 @@ def test_fine_images_are_averaged_to_the_scan(tmp_path: Path) -> None:
     board[::2, ::2] = board[1::2, 1::2] = 200
     ortho = open_ortho(write(tmp_path / "o.tif", board))
     utm = points(900)  # two metres apart
-    rgb, _ = colour_by_ortho(utm, EPSG, None, ortho)
+    rgb, _ = colour_by_ortho(utm, EPSG, np.zeros((900, 3), np.uint8), ortho, 2.0)
     assert rgb.mean() == pytest.approx(100, abs=4)
     assert rgb.std() < 15
-    sharp, _ = colour_by_ortho(utm, EPSG, None, ortho, pixels_per_spacing=FINE)
+    sharp, _ = colours(utm, EPSG, None, ortho)
     assert sharp.std() > 2 * rgb.std() + 15
 
 
 def test_large_images_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     utm = points()
     ortho = open_ortho(write(tmp_path / "o.tif", picture()))
-    whole = colour_by_ortho(utm, EPSG, None, ortho, pixels_per_spacing=FINE)
+    whole = colours(utm, EPSG, None, ortho)
     monkeypatch.setattr("featuredb.lidar.formats.ortho_image._MAX_READ_PX", 5000)
-    parts = colour_by_ortho(utm, EPSG, None, ortho, pixels_per_spacing=FINE)
+    parts = colours(utm, EPSG, None, ortho)
     np.testing.assert_array_equal(parts[1], whole[1])
     np.testing.assert_allclose(parts[0].astype(int), whole[0], atol=1)
 
@@ -227,14 +239,12 @@ def test_unusable_images_are_refused(tmp_path: Path) -> None:
         open_ortho(tmp_path / "hole.tif")
     ortho = open_ortho(write(tmp_path / "o.tif", picture()), crs="not a system")
     with pytest.raises(GeodesyError, match="not readable"):
-        colour_by_ortho(points(10), EPSG, None, ortho)
+        colours(points(10), EPSG, None, ortho)
     good = open_ortho(tmp_path / "o.tif")
-    with pytest.raises(InvalidValueError, match="own colours"):
-        colour_by_ortho(points(10), EPSG, np.zeros((9, 3), np.uint8), good)
     broken = (tmp_path / "o.tif").read_bytes()
     (tmp_path / "o.tif").write_bytes(broken[: len(broken) // 3])
     with pytest.raises(ScanFileError, match=r"cannot be read|GDAL reads"):
-        colour_by_ortho(points(), EPSG, None, good)
+        colours(points(), EPSG, None, good)
 
 
 @pytest.mark.real_data
@@ -247,7 +257,7 @@ def test_a_real_scan_takes_the_colours_that_it_was_given(shared_data: Path) -> N
     utm = to_utm.apply(np.asarray(las.xyz)[part])
     own = np.stack([las.red, las.green, las.blue], axis=1)[part].astype(np.uint8)
     ortho = open_ortho(shared_data / "autzen" / "stadium_ortho.tif")
-    rgb, coloured = colour_by_ortho(utm, to_utm.epsg, None, ortho, pixels_per_spacing=FINE)
+    rgb, coloured = colours(utm, to_utm.epsg, None, ortho)
     difference = np.abs(rgb.astype(int) - own)[coloured].mean(axis=1)
     print(
         f"{len(utm)} points, {coloured.mean():.1%} coloured; difference from the file's colours: median "

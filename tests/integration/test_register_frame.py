@@ -16,10 +16,9 @@ from featuredb.render.cloud import PointCloud
 from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
 from featuredb.simworld.town.town import make_town
-from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.sources import available_sources
-from ingest.register.frame.views import turned_about_vertical
+from ingest.register.frame.views import FrameOptions, turned_about_vertical
 from ingest.register.frame_registration import FramePrior
 from tools.worlds.clouds import build_cloud
 
@@ -54,7 +53,7 @@ def place() -> Place:
     rgb = above[pixels[:, 1], pixels[:, 0]]
     rotation = so3_exp([0.0, 0.0, 0.6]) @ so3_exp([-0.5, 0.0, 0.0]) @ down @ so3_exp([0.0, 0.0, 0.4])
     truth = Rigid3(rotation=rotation, translation=-rotation @ np.array([6.0, -18.0, 55.0]))
-    photo = cv2.cvtColor(render_view(scene, CAMERA, truth, moment=1), cv2.COLOR_RGB2BGR)
+    photo = cv2.cvtColor(render_view(scene, CAMERA, truth, moment=1), cv2.COLOR_RGB2GRAY)
     return Place(
         coloured=build_cloud(scan.frame, "ellipsoidal", xyz, rgb=rgb),
         intensity=build_cloud(scan.frame, "ellipsoidal", xyz, intensity=grey),

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
+from ingest.register.frame.views import FrameOptions
 from tools.frame_real_photos import exif_prior, lens, read_cloud, wrong_prior
 
 # Of all 18 photos, by bundle adjustment.

@@ -16,9 +16,8 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from ingest.register.frame.dense.confirmation import confirm_pose
 from ingest.register.frame.elsewhere import agreement_elsewhere
-from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
-from ingest.register.frame.views import FrameViews, first_look
+from ingest.register.frame.views import FrameOptions, FrameViews, first_look
 from ingest.register.frame_registration import FramePrior
 from tools.worlds.clouds import build_cloud
 
@@ -124,7 +123,7 @@ def test_the_photo_agrees_with_other_places_where_the_pattern_repeats_itself() -
     found = []
     for period in (None, 180):
         photo, scan = _photo(0, period), _ground(0, period)[0]
-        look = first_look(scan, CAMERA, _prior())
+        look = first_look(scan, CAMERA, _prior().cam_from_local)
         assert look is not None
         views = FrameViews(photo, CAMERA, scan, look, FrameOptions(threads=1))
         found.append(agreement_elsewhere(views, _prior(), TRUTH, "intensity", 2, 100.0))

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
-from ingest.register.frame_registration import FrameRegistration
 from ingest.register.structure.pairs import structure_pairs
 from ingest.register.structure.projection import project_structure
 from tests.support.scanned_map import (
@@ -129,10 +127,6 @@ def test_the_cloud_s_frame_need_not_be_the_map_s(world: ScannedMap) -> None:
     assert np.sqrt(spread.max()) < 0.3
 
 
-def test_no_frames_is_a_refusal(world: ScannedMap) -> None:
-    assert project_structure(world.feature_map, {}, world.cloud).reason == "NO_FRAMES"
-
-
 def test_too_few_points_on_the_scan_are_refused(world: ScannedMap) -> None:
     corner = world.cloud.xyz[(world.cloud.xyz[:, 0] > 12) & (world.cloud.xyz[:, 1] > 12)]
     structure = project_structure(world.feature_map, {4: world.registered(4)}, plain_cloud(corner))
@@ -176,25 +170,6 @@ def test_a_bent_map_is_refused(world: ScannedMap) -> None:
     )
     structure = project_structure(bent, {4: world.registered(4)}, world.cloud)
     assert structure.reason in ("RESIDUALS", "TOO_FEW_PAIRS")
-
-
-def test_an_image_that_the_map_does_not_have_is_an_error(world: ScannedMap) -> None:
-    with pytest.raises(InvalidValueError, match="77"):
-        project_structure(world.feature_map, {77: world.registered(4)}, world.cloud)
-
-
-def test_a_refused_registration_cannot_place(world: ScannedMap) -> None:
-    refused = FrameRegistration(
-        cam_from_local=None,
-        covariance=None,
-        reason="NOT_CONFIRMED",
-        message="",
-        source=None,
-        points_local=np.zeros((0, 3)),
-        pixels=np.zeros((0, 2)),
-    )
-    with pytest.raises(InvalidValueError, match="accepted"):
-        project_structure(world.feature_map, {0: refused}, world.cloud)
 
 
 def test_the_projection_is_repeatable(world: ScannedMap) -> None:

@@ -5,10 +5,9 @@ from pathlib import Path
 import pytest
 
 from featuredb.features.extractor import ExtractorOptions
-from ingest import pipeline
+from ingest import anchoring, pipeline
 from ingest.cli import video
 from ingest.register.anchor import frames, placing
-from ingest.register.anchor.anchor_map import AnchorOptions
 from ingest.register.anchor.together import register as together
 from tests.support.remembered import remembered
 
@@ -26,7 +25,7 @@ def shorten(patch: pytest.MonkeyPatch, work: Path) -> None:
     patch.setattr(pipeline, "default_root", lambda database_url: work)
     patch.setitem(ExtractorOptions.__init__.__kwdefaults__, "max_features", FEATURES)
     patch.setattr(video, "_FEATURES", FEATURES)
-    patch.setitem(AnchorOptions.__init__.__kwdefaults__, "frames", 2)
+    patch.setattr(anchoring, "FRAMES", 2)
     patch.setattr(frames, "register_frame", remembered(frames.register_frame))
     patch.setattr(frames, "fit_vouched_for", remembered(frames.fit_vouched_for))
     for name in ("evidence_of", "fitted_together", "fit_vouched_for"):

@@ -28,7 +28,7 @@ def tried(monkeypatch: pytest.MonkeyPatch, registered: Sequence[bool | None]) ->
     monkeypatch.setattr(frames, "propose_frames", lambda *_: proposals)
     monkeypatch.setattr(frames, "register_together", lambda *_: None)
     monkeypatch.setattr(frames, "_try", try_one)
-    found = try_frames(SimpleNamespace(images=images), _COLOURED, lambda _: None, 3, 6)  # type: ignore[arg-type, return-value]
+    found = try_frames(SimpleNamespace(images=images), _COLOURED, lambda _: None, 3)  # type: ignore[arg-type, return-value]
     return len(found.tried)
 
 
@@ -81,6 +81,6 @@ def test_all_photos_together_are_asked_where_one_does_not_tell(
     monkeypatch.setattr(frames, "propose_frames", lambda *_: proposals)
     monkeypatch.setattr(frames, "_tried_together", together)
     monkeypatch.setattr(frames, "_try", try_one)
-    found = try_frames(SimpleNamespace(images=images), scan, lambda _: None, 3, 6)  # type: ignore[arg-type, return-value]
+    found = try_frames(SimpleNamespace(images=images), scan, lambda _: None, 3)  # type: ignore[arg-type, return-value]
     assert len(calls) == asked
     assert "".join(one.name for one in found.tried) == names  # type: ignore[attr-defined]

@@ -1,25 +1,22 @@
 """Rasters of heights (DSM, DEM): a cell is a point, so that a place without a scan has a ground as well."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from featuredb.errors import ScanFileError
 from featuredb.file_digest import file_sha256
 from featuredb.lidar.formats.las import LONGEST_COORDINATE, UNCLASSIFIED, RawPoints, ScanFile, measured
-from featuredb.lidar.formats.ortho_image import import_rasterio
+from featuredb.lidar.formats.ortho_image import opened_raster
 
-SUFFIXES = (".tif", ".tiff")
 _MAGIC = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")  # TIFF and BigTIFF
 
 
 def is_raster(path: Path) -> bool:
     """Whether a file is a TIFF, by its first bytes."""
     if not path.is_file():
-        return path.suffix.lower() in SUFFIXES
+        return path.suffix.lower() in (".tif", ".tiff")
     with path.open("rb") as stream:
         return stream.read(4) in _MAGIC
 
@@ -33,8 +30,12 @@ def open_dsm(path: Path) -> ScanFile:
     """
     if not path.is_file():
         raise ScanFileError(f"{path}: expected a GeoTIFF of heights, found no file; check the path")
-    with _opened(path) as file:
-        _check(path, file)
+    with opened_raster(path) as file:
+        if file.count != 1 or file.dtypes[0] == "uint8" or np.dtype(file.dtypes[0]).kind not in "iuf":
+            raise ScanFileError(
+                f"{path}: expected one band of heights of 16 bits or more, found {file.count} of "
+                f"{file.dtypes[0]}; a picture colours a scan: --ortho {path.name}"
+            )
         wkt = file.crs.to_wkt() if file.crs else None
     points, low, high = measured(read_dsm(path, 1_000_000))
     if not points:
@@ -58,9 +59,9 @@ def read_dsm(path: Path, chunk_points: int) -> Iterator[RawPoints]:
     Raises:
         ScanFileError: the file is broken.
     """
-    from rasterio.windows import Window
+    with opened_raster(path) as file:
+        from rasterio.windows import Window
 
-    with _opened(path) as file:
         rows = max(1, chunk_points // file.width)
         scale, offset = file.scales[0], file.offsets[0]
         for top in range(0, file.height, rows):
@@ -82,29 +83,3 @@ def read_dsm(path: Path, chunk_points: int) -> Iterator[RawPoints]:
                 classification=np.full(len(xyz), UNCLASSIFIED, np.uint8),
                 withheld=np.zeros(len(xyz), np.bool_),
             )
-
-
-def _check(path: Path, file: Any) -> None:
-    if file.count != 1 or file.dtypes[0] == "uint8" or np.dtype(file.dtypes[0]).kind not in "iuf":
-        raise ScanFileError(
-            f"{path}: expected one band of heights of 16 bits or more, found {file.count} of "
-            f"{file.dtypes[0]}; a picture colours a scan: --ortho {path.name}"
-        )
-    if file.transform.is_identity or file.transform.determinant == 0:
-        raise ScanFileError(
-            f"{path}: the raster is not geo-referenced (no transform from cells to coordinates); expected a "
-            "GeoTIFF, or a raster with its world file"
-        )
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """The open file; what GDAL finds wrong is a ScanFileError."""
-    rasterio = import_rasterio()
-    try:
-        with rasterio.open(path) as file:
-            yield file
-    except rasterio.errors.RasterioError as error:
-        raise ScanFileError(
-            f"{path}: expected a raster that GDAL reads, e.g. a GeoTIFF: {error}; fetch it again"
-        ) from error

@@ -1,8 +1,7 @@
 """LAS 1.2 to 1.4, LAZ and COPC files: what the header says, and the points by chunks. The home of laspy.
 
 A file is read as a stream, so its size does not matter. Whatever is wrong with it becomes a `ScanFileError`
-that
-names the file: what was expected, what was found, what to do.
+that names the file: what was expected, what was found, what to do.
 """
 
 import struct
@@ -36,9 +35,6 @@ class ScanFile:
     """What a file says before its points are read.
 
     Attributes:
-        path: of the file.
-        sha256: of its bytes.
-        size_bytes: of the file.
         points: number of points by the header.
         low, high: (3,) box in file coordinates, by the header or, where that is wrong, by the points.
         wkt: the WKT record, or None.
@@ -91,7 +87,7 @@ def open_scan_file(path: Path) -> ScanFile:
         raise ScanFileError(f"{path}: expected a LAS, LAZ or COPC file, found none; check the path")
     size = path.stat().st_size
     _check_magic(path, size)
-    with _reading(path), _laspy().open(path) as reader:
+    with _reading(path), import_laspy().open(path) as reader:
         header = reader.header
         if header.point_count == 0:
             raise ScanFileError(f"{path}: expected points, found a header that says 0; the scan is empty")
@@ -128,7 +124,7 @@ def read_points(path: Path, chunk_points: int) -> Iterator[RawPoints]:
         ScanFileError: the file ends before the header's number of points, or is broken.
     """
     found = 0
-    with _reading(path), _laspy().open(path) as reader:
+    with _reading(path), import_laspy().open(path) as reader:
         expected = int(reader.header.point_count)
         for chunk in reader.chunk_iterator(chunk_points):
             points = _raw_points(chunk)
@@ -146,8 +142,13 @@ def read_points(path: Path, chunk_points: int) -> Iterator[RawPoints]:
         )
 
 
-def _laspy() -> ModuleType:
-    require("lidar", "Reading scans", "laspy", "lazrs")
+def import_laspy(purpose: str = "Reading scans") -> ModuleType:
+    """The package laspy.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    require("lidar", purpose, "laspy", "lazrs")
     import laspy
 
     module: ModuleType = laspy
@@ -157,7 +158,7 @@ def _laspy() -> ModuleType:
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     """Errors of laspy, lazrs and the system as ScanFileError."""
-    _laspy()
+    import_laspy()
     import lazrs
     from laspy.errors import LaspyException
 

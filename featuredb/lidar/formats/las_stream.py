@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.extras import require
 from featuredb.geometry.arrays import FloatArray
+from featuredb.lidar.formats.las import import_laspy
 
 _WITH_RGB, _WITHOUT_RGB = 7, 6  # LAS 1.4's point formats
 _TO_16_BIT = 257  # LAS colours are 16 bits wide: 255 becomes 65535
@@ -65,7 +65,7 @@ class LasStream(AbstractContextManager["LasStream"]):
         rgb: bool = True,
         extra: Mapping[str, tuple[DTypeLike, str]] | None = None,
     ) -> None:
-        laspy = _laspy()
+        laspy = import_laspy("Writing LAS")
         header = laspy.LasHeader(point_format=_WITH_RGB if rgb else _WITHOUT_RGB, version="1.4")
         header.scales, header.offsets = np.full(3, step_m), offset
         header.creation_date, header.generating_software = day, "featuredb"
@@ -98,10 +98,3 @@ class LasStream(AbstractContextManager["LasStream"]):
         self._writer.close()
         if not self._written:
             self._path.unlink()
-
-
-def _laspy() -> Any:
-    require("lidar", "Writing LAS", "laspy", "lazrs")
-    import laspy
-
-    return laspy

@@ -1,8 +1,9 @@
 """Ortho images on disk: where they lie, what their bands mean, colours at their pixels, read by windows."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
@@ -16,10 +17,8 @@ from featuredb.geometry.arrays import FloatArray
 Affine = tuple[float, float, float, float, float, float]
 
 _OVERVIEW_PX = 1024  # side of the reduced image from which the range of values is taken
-_RANGE_PERCENT = (
-    0.5,
-    99.5,
-)  # of values wider than 8 bits, which become 0 and 255: glints and gaps are left out
+# Of values wider than 8 bits, which become 0 and 255: glints and gaps are left out.
+_RANGE_PERCENT = (0.5, 99.5)
 _MAX_READ_PX = 40_000_000  # pixels read at a time, 160 MB with mask
 
 
@@ -59,34 +58,26 @@ def open_ortho(path: Path, crs: str | None = None) -> OrthoImage:
         ScanFileError: not an image that can be read, or without a place on Earth.
         MissingExtraError: the packages of the extra `lidar` are not installed.
     """
-    rasterio = import_rasterio()
-    try:
-        with rasterio.open(path) as file:
-            if crs is None and not file.crs:
-                raise ScanFileError(
-                    f"{path}: the image names no reference system; "
-                    "assign it, e.g. by gdal_edit.py -a_srs EPSG:25832"
-                )
-            if file.transform.is_identity or file.transform.determinant == 0:
-                raise ScanFileError(
-                    f"{path}: the image is not geo-referenced (no transform from pixels to coordinates); "
-                    "expected a GeoTIFF or a picture with its world file"
-                )
-            bands, palette = _bands(file)
-            low, high = _range(file, bands, palette)
-            return OrthoImage(
-                path=Path(path),
-                wkt=crs or file.crs.to_wkt(),
-                pixel_from_xy=_six(~file.transform),
-                width=file.width,
-                height=file.height,
-                bands=bands,
-                palette=palette,
-                low=low,
-                high=high,
+    with opened_raster(path) as file:
+        if crs is None and not file.crs:
+            raise ScanFileError(
+                f"{path}: the image names no reference system; "
+                "assign it, e.g. by gdal_edit.py -a_srs EPSG:25832"
             )
-    except rasterio.errors.RasterioError as error:
-        raise ScanFileError(f"{path}: expected an image that GDAL reads, e.g. a GeoTIFF: {error}") from error
+        bands, palette = _bands(file)
+        low, high = _range(file, bands, palette)
+        a, b, c, d, e, f = (float(v) for v in tuple(~file.transform)[:6])
+        return OrthoImage(
+            path=Path(path),
+            wkt=crs or file.crs.to_wkt(),
+            pixel_from_xy=(a, b, c, d, e, f),
+            width=file.width,
+            height=file.height,
+            bands=bands,
+            palette=palette,
+            low=low,
+            high=high,
+        )
 
 
 def sample_ortho(
@@ -94,24 +85,20 @@ def sample_ortho(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colours (n, 3) at pixel coordinates (n, 2), averaged over `shrink` pixels, and where there are any."""
     rgb, valid = np.zeros((len(pixel), 3), np.uint8), np.zeros(len(pixel), dtype=bool)
-    rasterio = import_rasterio()
     parts = [np.arange(len(pixel))] if len(pixel) else []
-    try:
-        with rasterio.open(ortho.path) as file:
-            while parts:
-                rows = parts.pop()
-                low = np.floor(pixel[rows].min(axis=0) - 2 * shrink).clip(0).astype(int)
-                limit = [ortho.width, ortho.height]
-                high = np.minimum(np.ceil(pixel[rows].max(axis=0) + 2 * shrink).astype(int), limit)
-                size = high - low
-                if size.prod() / shrink**2 > _MAX_READ_PX and len(rows) > 1:
-                    longest = int(np.argmax(size))
-                    left = pixel[rows, longest] < low[longest] + 0.5 * size[longest]
-                    parts += [part for part in (rows[left], rows[~left]) if len(part)]
-                    continue
-                rgb[rows], valid[rows] = _sample_window(file, ortho, pixel[rows], low, size, shrink)
-    except rasterio.errors.RasterioError as error:
-        raise ScanFileError(f"{ortho.path}: the image cannot be read: {error}") from error
+    with opened_raster(ortho.path) as file:
+        while parts:
+            rows = parts.pop()
+            low = np.floor(pixel[rows].min(axis=0) - 2 * shrink).clip(0).astype(int)
+            limit = [ortho.width, ortho.height]
+            high = np.minimum(np.ceil(pixel[rows].max(axis=0) + 2 * shrink).astype(int), limit)
+            size = high - low
+            if size.prod() / shrink**2 > _MAX_READ_PX and len(rows) > 1:
+                longest = int(np.argmax(size))
+                left = pixel[rows, longest] < low[longest] + 0.5 * size[longest]
+                parts += [part for part in (rows[left], rows[~left]) if len(part)]
+                continue
+            rgb[rows], valid[rows] = _sample_window(file, ortho, pixel[rows], low, size, shrink)
     return rgb, valid
 
 
@@ -171,22 +158,29 @@ def _bilinear(image: NDArray[np.uint8], at: NDArray[np.float32]) -> NDArray[np.u
     return np.asarray(found[:, 0], dtype=np.uint8)
 
 
-def import_rasterio() -> ModuleType:
-    """The package rasterio.
+@contextmanager
+def opened_raster(path: Path) -> Iterator[Any]:
+    """The open file.
 
     Raises:
-        MissingExtraError: it is not installed.
+        ScanFileError: GDAL finds something wrong, or it has no place on Earth.
+        MissingExtraError: rasterio is not installed.
     """
     require("lidar", "An ortho image or a raster of heights", "rasterio")
     import rasterio
 
-    module: ModuleType = rasterio
-    return module
-
-
-def _six(transform: Any) -> Affine:
-    a, b, c, d, e, f = (float(v) for v in tuple(transform)[:6])
-    return a, b, c, d, e, f
+    try:
+        with rasterio.open(path) as file:
+            if file.transform.is_identity or file.transform.determinant == 0:
+                raise ScanFileError(
+                    f"{path}: the raster is not geo-referenced (no transform from cells to coordinates); "
+                    "expected a GeoTIFF, or a raster with its world file"
+                )
+            yield file
+    except rasterio.errors.RasterioError as error:
+        raise ScanFileError(
+            f"{path}: expected a raster that GDAL reads, e.g. a GeoTIFF: {error}; fetch it again"
+        ) from error
 
 
 def _bands(file: Any) -> tuple[tuple[int, int, int], tuple[tuple[int, int, int], ...] | None]:

@@ -26,15 +26,8 @@ from ingest.register.anchor.frames import (
 from ingest.register.anchor.placing import PlaceRound, place_in_rounds
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.block import block_of_map
-from ingest.register.structure.map_move import (
-    MapMove,
-    MapResidual,
-    map_move,
-    map_residuals,
-)
-from ingest.register.structure.projection import (
-    project_structure,
-)
+from ingest.register.structure.map_move import MapMove, MapResidual, map_move, map_residuals
+from ingest.register.structure.projection import project_structure
 
 # How far the map may move in the plane and turn, in standard deviations of its placement. Six, because
 # receivers understate their errors. Heights are not judged: those of GPS have an unknown datum and differ
@@ -47,6 +40,10 @@ _MAX_SCALE_CHANGE = 0.1  # relative; GPS and scan both measure metres
 # Median distance of the map's points from the scan after, as a share of the distance from which they are
 # seen: 0.02 is 1 m from 50 m, what trees and a day's change leave.
 _MAX_RESIDUAL_SHARE = 0.02
+_GOOD_M = 0.05  # and that much is no objection
+# So many frames must agree before a map is moved without a person's word. One frame's verdict is good; two
+# that were found independently and agree are hardly both wrong. Who asks for one frame does not ask for two.
+_MIN_AGREEING = 2
 
 AnchorReason = Literal[
     "NO_SCAN",  # no frame of the map sees the scan
@@ -57,22 +54,6 @@ AnchorReason = Literal[
     "CONTRADICTS_PLACEMENT",  # the map would go where its placement says it cannot be
     "NOT_BETTER",  # the map's points are no closer to the scan than before
 ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnchorOptions:
-    """How a map is anchored.
-
-    Attributes:
-        frames: so many accepted ones are wanted; three spread ones show most of a map's bend.
-        max_tries: frames tried until the first one is registered, at most; a wrong scan costs all of them.
-        min_agreeing: so many frames must agree before a map is moved without a person's word. One frame's
-            verdict is good; two that were found independently and agree are hardly both wrong.
-    """
-
-    frames: int = 3
-    max_tries: int = 6
-    min_agreeing: int = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,7 +73,7 @@ class AnchorResult:
 
     reason: AnchorReason | None
     message: str
-    feature_map: FeatureMap | None
+    feature_map: FeatureMap | None = None
     agreement: FrameAgreement | None = None
     used: tuple[int, ...] = ()
     rounds: tuple[PlaceRound, ...] = ()
@@ -107,7 +88,7 @@ def place_map(
     cloud: PointCloud,
     tried: TriedFrames,
     read_gray: PhotoReader,
-    options: AnchorOptions,
+    wanted: int,
     *,
     confirmed: bool = False,
     supervised: bool = False,
@@ -116,6 +97,7 @@ def place_map(
     """Place the map by the frames that were registered, if they agree and all gates are passed.
 
     Args:
+        wanted: frames that were asked for.
         confirmed: a person has looked at these frames: one is enough.
         supervised: a person has said where the photos are: the map's placement may be wrong by any distance.
     """
@@ -125,7 +107,7 @@ def place_map(
     clock = StageClock()
     lone, refusals = _alone(feature_map, frames, cloud)
     agreement = frames_that_agree(lone)
-    needed = 1 if confirmed else options.min_agreeing
+    needed = 1 if confirmed else min(_MIN_AGREEING, wanted)
     refusal = _too_little(frames, lone, refusals, agreement, needed)
     if refusal is not None:
         return replace(refusal, agreement=agreement if lone else None)
@@ -140,7 +122,6 @@ def place_map(
     found = AnchorResult(
         reason="STRUCTURE",
         message=words,
-        feature_map=None,
         agreement=agreement,
         used=agreement.agreeing,
         rounds=tuple(rounds),
@@ -177,7 +158,6 @@ def _nothing_registered(tried: TriedFrames) -> AnchorResult:
             reason="NO_SCAN",
             message="no frame of the map sees enough of the scan from where the map is placed now; "
             "is it the scan of this place? A rough pose (--pose) or picks (--picks) can start elsewhere",
-            feature_map=None,
         )
     reasons = "; ".join(
         f"{f.image.name}: {f.registration.reason}: {f.registration.message}" for f in tried.tried
@@ -185,7 +165,6 @@ def _nothing_registered(tried: TriedFrames) -> AnchorResult:
     return AnchorResult(
         reason="NO_FRAME",
         message=f"none of {len(tried.tried)} frames was registered to the scan: {reasons}",
-        feature_map=None,
     )
 
 
@@ -230,7 +209,6 @@ def _too_little(
         return AnchorResult(
             reason="STRUCTURE",
             message=f"the map's points do not fit the scan through any registered frame: {words}",
-            feature_map=None,
         )
     if not agreement.agreeing or (len(agreement.agreeing) < needed and len(lone) >= 2):
         apart = "; ".join(
@@ -241,7 +219,6 @@ def _too_little(
             reason="FRAMES_DISAGREE",
             message=f"the frames send the map to different places ({apart}); look at them in anchor.html and "
             "confirm the right one (--confirm)",
-            feature_map=None,
         )
     if len(agreement.agreeing) < needed:
         others = "".join(f"; {name}: {why}" for name, why in refusals.items())
@@ -250,7 +227,6 @@ def _too_little(
             message=f"{len(agreement.agreeing)} frame places the map, {names[agreement.agreeing[0]]}{others}"
             f"; {needed} that agree are needed without a person; look at it in anchor.html and confirm it "
             "(--confirm), or accept one frame (--frames 1)",
-            feature_map=None,
         )
     return None
 
@@ -262,8 +238,9 @@ def _judged(
     before, after = map_residuals(old, new, cloud)
     move = map_move(old, new)
     distance = float(np.median(block_of_map(new).distances()))
-    apart = found.agreement.apart_m if found.agreement else {}
-    allowed = found.agreement.allowed_m if found.agreement else {}
+    most_m = max(_MAX_RESIDUAL_SHARE * distance, _GOOD_M)
+    assert found.agreement is not None
+    allowed = found.agreement.allowed_m
     checks: dict[str, Any] = {
         "before": before.as_figures(),
         "after": after.as_figures(),
@@ -271,27 +248,27 @@ def _judged(
         "viewing_distance_m": distance,
         "frames_apart_m": [
             {"frames": list(pair), "apart_m": metres, "allowed_m": allowed[pair]}
-            for pair, metres in apart.items()
+            for pair, metres in found.agreement.apart_m.items()
         ],
     }
     found = replace(found, before=before, after=after, checks=checks, message="")
-    if not len(after.distance_m) or after.median_m > max(_MAX_RESIDUAL_SHARE * distance, 0.05):
+    if not len(after.distance_m) or after.median_m > most_m:
         return replace(
             found,
             reason="NOT_BETTER",
             message=f"the map's points would lie {after.median_m:.2f} m (median) from the scan, "
-            f"{max(_MAX_RESIDUAL_SHARE * distance, 0.05):.2f} m allowed",
+            f"{most_m:.2f} m allowed",
         )
-    if after.median_m > max(before.median_m, 0.05):
+    if after.median_m > max(before.median_m, _GOOD_M):
         return replace(
             found,
             reason="NOT_BETTER",
             message=f"the map's points lie {before.median_m:.2f} m (median) from the scan now and would lie "
             f"{after.median_m:.2f} m from it",
         )
-    words = None if supervised else _contradiction(move)
-    if words is not None:
-        return replace(found, reason="CONTRADICTS_PLACEMENT", message=words)
+    contradiction = None if supervised else _contradiction(move)
+    if contradiction is not None:
+        return replace(found, reason="CONTRADICTS_PLACEMENT", message=contradiction)
     evidence = new.placement.evidence | {
         "anchor": checks
         | {

@@ -22,7 +22,6 @@ from ingest.workspace import read_json, write_json
 PROPOSALS = "proposals.json"
 _VERSION = 2
 
-
 State = tuple[str, str, str]
 """Ids of a map, of its state (another one has other poses), and of the scan with where its frame begins."""
 
@@ -78,13 +77,7 @@ def _registration(entry: dict[str, Any]) -> FrameRegistration:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoFiles:
-    """Where the photos of a map lie.
-
-    Attributes:
-        folder: that was searched.
-        paths: file of each image that was found, by image id.
-        missing: image id and why, in words, of the others.
-    """
+    """Files of the photos of a map that were found in a folder, by image id, and why others are missing."""
 
     folder: Path
     paths: dict[int, Path]

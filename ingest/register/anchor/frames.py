@@ -2,12 +2,11 @@
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
 from featuredb.geometry.arrays import FloatArray
@@ -15,12 +14,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress, no_progress
-from ingest.register.anchor.proposals import (
-    FrameProposal,
-    FrameScore,
-    PhotoReader,
-    propose_frames,
-)
+from ingest.register.anchor.proposals import FrameProposal, FrameScore, PhotoReader, propose_frames
 from ingest.register.anchor.start.priors import HeightShift, height_shift, prior_from_map
 from ingest.register.anchor.together.register import TOGETHER, prior_by_others, register_together
 from ingest.register.frame.register import fit_vouched_for, register_frame
@@ -28,7 +22,9 @@ from ingest.register.frame_registration import FramePrior, FrameRegistration
 
 _LOG = logging.getLogger(__name__)
 
-
+FRAMES = 3  # accepted ones that are wanted; three spread ones show most of a map's bend
+# Frames tried until the first is registered, at most: more than are wanted. A wrong scan costs all of them.
+_LEAST_TRIES, _SPARE_TRIES = 6, 3
 # Frames tried at most once one is registered. Where one of three registers, as low films over a scan without
 # colours, 18 leave fewer than two registered once in 150 maps.
 _MORE_TRIES = 18
@@ -40,13 +36,7 @@ _AGAIN_SIGMA_DEG = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TriedFrame:
-    """A frame that was tried.
-
-    Attributes:
-        proposal: with the prior that it started from.
-        registration: accepted or refused.
-        seconds: wall time of all of it; cpu_s: processor time.
-    """
+    """A frame that was tried from its proposal's prior: `seconds` are wall time, `cpu_s` the processor's."""
 
     proposal: FrameProposal
     registration: FrameRegistration
@@ -104,7 +94,6 @@ def try_frames(
     cloud: PointCloud,
     read_gray: PhotoReader,
     wanted: int,
-    max_tries: int,
     *,
     starts: Mapping[int, FramePrior] | None = None,
     readable: Sequence[int] | None = None,
@@ -120,7 +109,7 @@ def try_frames(
     Args:
         cloud: the scan around the map, in the map's local frame.
         read_gray: grey pixels (h, w) of an image of the map.
-        wanted: accepted frames. max_tries: until the first one is accepted.
+        wanted: accepted frames.
         starts: priors by a person, by image id; these frames are tried first.
         readable: ids of images whose photos are there; None for all.
         together: ask all photos together. Not where the map was put where it looks most like the scan: the
@@ -134,7 +123,7 @@ def try_frames(
         for image in feature_map.images
         if image.image_id in ids
     }
-    reader = _Reader(read_gray)
+    unreadable: dict[str, str] = {}
     ranking = propose_frames(feature_map, cloud, priors)
     ranked = {p.image.image_id: p for p in ranking}
     images = {image.image_id: image for image in feature_map.images}
@@ -143,7 +132,7 @@ def try_frames(
     order += [p for p in ranking if p.image.image_id not in starts]
     tried: list[TriedFrame] = []
     vouched: list[TriedFrame] = []
-    least = max(max_tries, len(starts))
+    least = max(_LEAST_TRIES, wanted + _SPARE_TRIES, len(starts))
     ask = together and not starts
     if ask and cloud.rgb is None:
         ask, vouched = False, _tried_together(feature_map, cloud, ranking, read_gray, wanted)
@@ -152,7 +141,7 @@ def try_frames(
         most = max(least, _MORE_TRIES) if accepted else least
         if vouched or accepted >= wanted or len(tried) >= most:
             break
-        frame = _try(feature_map, cloud, proposal, reader)
+        frame = _try(feature_map, cloud, proposal, read_gray, unreadable)
         if frame is None:
             continue
         tried.append(frame)
@@ -161,7 +150,7 @@ def try_frames(
             ask, vouched = False, _tried_together(feature_map, cloud, ranking, read_gray, wanted)
     by_others = {frame.image.image_id for frame in vouched}
     tried = [frame for frame in tried if frame.image.image_id not in by_others] + vouched
-    return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(tried), unreadable=reader.unreadable)
+    return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(tried), unreadable=unreadable)
 
 
 def _tried_together(
@@ -175,13 +164,13 @@ def _tried_together(
     start, cpu = time.perf_counter(), time.process_time()
     proposals = {p.image.image_id: p for p in ranking}
     found = register_together(feature_map, [p.image for p in ranking], cloud, read_gray, wanted)
-    count = 0 if found is None else len(found.registrations)
-    if found is None or count < min(wanted, _LEAST_TOGETHER):
+    if found is None or len(found) < min(wanted, _LEAST_TOGETHER):
         return []
-    seconds, cpu_s = (time.perf_counter() - start) / count, (time.process_time() - cpu) / count
+    seconds = (time.perf_counter() - start) / len(found)
+    cpu_s = (time.process_time() - cpu) / len(found)
     return [
         TriedFrame(proposal=proposals[i], registration=registration, seconds=seconds, cpu_s=cpu_s)
-        for i, registration in found.registrations.items()
+        for i, registration in found.items()
     ]
 
 
@@ -195,16 +184,21 @@ def _try(
     feature_map: FeatureMap,
     cloud: PointCloud,
     proposal: FrameProposal,
-    reader: "_Reader",
+    read_gray: PhotoReader,
+    unreadable: dict[str, str],
     before: FrameRegistration | None = None,
 ) -> TriedFrame | None:
     """A frame by itself, or where others vouch for it; None where its photo cannot be read.
 
     Args:
+        unreadable: takes up why, by the image's name.
         before: its registration with another lens.
     """
-    gray = reader.full(proposal.image)
-    if gray is None:
+    try:
+        gray = read_gray(proposal.image)
+    except ImageError as error:
+        unreadable[proposal.image.name] = str(error)
+        _LOG.warning("photo %s cannot be read: %s", proposal.image.name, error)
         return None
     camera = feature_map.cameras[proposal.image.camera_id]
     start, cpu = time.perf_counter(), time.process_time()
@@ -229,14 +223,10 @@ def _try(
 
 
 def register_again(
-    feature_map: FeatureMap,
-    cloud: PointCloud,
-    frames: Sequence[TriedFrame],
-    read_gray: PhotoReader,
+    feature_map: FeatureMap, cloud: PointCloud, frames: Sequence[TriedFrame], read_gray: PhotoReader
 ) -> list[TriedFrame]:
     """Register frames anew from where a placed map has them, with its lens."""
     again = []
-    reader = _Reader(read_gray)
     poses = {image.image_id: image for image in feature_map.images}
     points, observations = feature_map.points_local(cloud.frame), feature_map.observations
     for frame in frames:
@@ -246,26 +236,10 @@ def register_again(
             seen = observations.point_index[observations.image_id == image.image_id]
             prior = prior_by_others(image.cam_from_local, points[seen])
         proposal = replace(frame.proposal, image=image, prior=prior)
-        tried = _try(feature_map, cloud, proposal, reader, frame.registration)
+        tried = _try(feature_map, cloud, proposal, read_gray, {}, frame.registration)
         if tried is not None:
             again.append(tried)
     return again
-
-
-class _Reader:
-    """Reads photos and remembers which could not be read."""
-
-    def __init__(self, read_gray: PhotoReader) -> None:
-        self._read: Callable[[MapImage], NDArray[np.uint8]] = read_gray
-        self.unreadable: dict[str, str] = {}
-
-    def full(self, image: MapImage) -> NDArray[np.uint8] | None:
-        try:
-            return self._read(image)
-        except ImageError as error:
-            self.unreadable[image.name] = str(error)
-            _LOG.warning("photo %s cannot be read: %s", image.name, error)
-            return None
 
 
 # Do frames that were registered one by one move the map to the same place?
@@ -285,11 +259,9 @@ _MIN_APART_M = 0.3  # and never less than this, for frames that are close to wha
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoneFrame:
-    """One frame and the similarity that it alone gives.
+    """One frame and the similarity of the map's local frame that it alone gives.
 
     Attributes:
-        image_id: the frame.
-        new_from_old: similarity of the map's local frame.
         points: (n, 3) map points that the frame sees, old local frame.
         distance_m: median distance from the camera to them.
     """
@@ -307,8 +279,7 @@ class FrameAgreement:
     Attributes:
         agreeing: ids of the largest set of frames that all agree pairwise; empty where two such sets are
             equally large and neither can be preferred.
-        apart_m: median distance between the places of common points, by pair of ids.
-        allowed_m: what was allowed, likewise.
+        apart_m: median distance between the places of common points, by pair of ids; allowed_m: likewise.
     """
 
     agreeing: tuple[int, ...]

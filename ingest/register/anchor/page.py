@@ -73,11 +73,7 @@ _CONTROLS = (
 def write_anchor_report(
     folder: Path, report: AnchorReport, old: FeatureMap, cloud: PointCloud, read_rgb: PhotoRgb, command: str
 ) -> Path:
-    """Write `anchor.json` and `anchor.html` into the folder; returns the path of the page.
-
-    Args:
-        old, read_rgb, command: see `anchor_page`.
-    """
+    """Write `anchor.json` and `anchor.html` (see `anchor_page`) into the folder; the path of the page."""
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / REPORT_JSON, report_json(report))
     with atomic_file(folder / REPORT_HTML) as temporary:
@@ -121,7 +117,7 @@ def anchor_page(
         parts += ["<h2>Frames</h2>", f"<p>{words}</p>", f'<div class="tabs">{tabs}</div>', _CONTROLS, *frames]
     parts.append(
         "<h2>All frames</h2><section class='wide'>"
-        + table(FRAME_HEADER, rows, numbers=(1, 2, 3, 4, 5, 7, 8, 9), names=(0,))
+        + table(FRAME_HEADER, rows, numbers=(1, 2, 3, 5, 6, 7), names=(0,))
         + "</section>"
     )
     times = [(name, f"{seconds:.2f} s") for name, seconds in report.times_s().items()]

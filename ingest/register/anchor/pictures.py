@@ -123,8 +123,6 @@ def map_over_scan_png(
         xlabel="east, m",
         ylabel="up, m",
     )
-    for axes in (top, side):
-        _tidy(axes)
     return png_bytes(figure)
 
 
@@ -147,7 +145,6 @@ def residuals_png(before_m: FloatArray, after_m: FloatArray) -> bytes:
             )
     axes.set(xscale="log", xlabel="distance of a map point to the scan, m", ylabel="map points")
     axes.legend(fontsize=8)
-    _tidy(axes)
     return png_bytes(figure)
 
 
@@ -159,11 +156,3 @@ def _bounds(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _thinned(points: NDArray[Any], most: int = _MAX_POINTS) -> NDArray[Any]:
     return points[:: max(1, -(-len(points) // most))]
-
-
-def _tidy(axes: Any) -> None:
-    axes.tick_params(labelsize=8)
-    axes.grid(color="#e6ebef", lw=0.6)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)

@@ -25,10 +25,9 @@ _LENS_SETTLED = 0.003
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlaceRound:
-    """One round of projecting the structure and adjusting the map.
+    """One round of projecting the structure, by frames registered for it, and adjusting the map.
 
     Attributes:
-        frames: as they were registered for it.
         structure_s, adjust_s: wall time of the two steps. structure_cpu_s: processor time of the first.
         focal_px: of the map's cameras after it.
         figures: of both steps, JSON-able.

@@ -1,7 +1,7 @@
 """Which frames of a map are worth registering first."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame_registration import FramePrior
 
 PhotoReader = Callable[[MapImage], NDArray[np.uint8]]
-
 
 _VIEW_WIDTH_PX = 200  # of the renders that tell coverage; figures change by a hundredth with twice as many
 _GRID = 8  # cells along each side of the photo in which map points are counted
@@ -47,10 +46,6 @@ class FrameScore:
     points: int
     spread: float
 
-    def as_figures(self) -> dict[str, float]:
-        """JSON-able."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameProposal:
@@ -62,9 +57,7 @@ class FrameProposal:
 
 
 def propose_frames(
-    feature_map: FeatureMap,
-    cloud: PointCloud,
-    priors: Mapping[int, FramePrior],
+    feature_map: FeatureMap, cloud: PointCloud, priors: Mapping[int, FramePrior]
 ) -> list[FrameProposal]:
     """All frames that see enough of the scan, the most promising first.
 
@@ -127,17 +120,15 @@ def _spread_out(feature_map: FeatureMap, proposals: Sequence[FrameProposal]) -> 
     seen = np.zeros(len(feature_map.points), bool)
     left, ordered = list(proposals), []
     while left:
+        of = [seen[sees[p.image.image_id]] for p in left]
         values = [
-            p.score.score * (1.0 - _OVERLAP_PENALTY * _mean(seen[sees[p.image.image_id]])) for p in left
+            p.score.score * (1.0 - _OVERLAP_PENALTY * already.sum() / max(len(already), 1))
+            for p, already in zip(left, of, strict=True)
         ]
         chosen = left.pop(int(np.argmax(values)))
         seen[sees[chosen.image.image_id]] = True
         ordered.append(chosen)
     return ordered
-
-
-def _mean(values: NDArray[np.bool_]) -> float:
-    return float(values.mean()) if len(values) else 0.0
 
 
 def small_camera(camera: Camera, width_px: int) -> Camera:

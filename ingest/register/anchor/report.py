@@ -17,9 +17,8 @@ class AnchorReport:
     """All of an anchoring.
 
     Attributes:
-        map_id, map_name: of the map. database: its address. photos: their folder. scan_ids: of the scans.
-        epsg: of the map. datum_before, datum_after: of its heights; the scan's after.
-        tried: ranking and registrations.
+        database: its address. photos: their folder.
+        datum_before, datum_after: of the map's heights; the scan's after.
         result: of the placing, None where frames were only proposed.
         notes: for people.
     """
@@ -93,34 +92,21 @@ def frame_rows(report: AnchorReport) -> list[tuple[Any, ...]]:
     return rows
 
 
-FRAME_HEADER = (
-    *("frame", "score", "covers", "points", "registration"),
-    *("inliers", "sigma m", "B s"),
-)
+FRAME_HEADER = ("frame", "score", "covers", "points", "registration", "inliers", "sigma m", "B s")
 
 
 def report_json(report: AnchorReport) -> dict[str, Any]:
     """Everything as JSON of `schemas/ingest/anchor.json`."""
     result = report.result
-    placed: dict[str, Any] | None = None
-    if result is not None:
-        placed = {
-            "reason": result.reason,
-            "message": result.message,
-            "used": list(result.used),
-            "checks": result.checks,
-            "seconds": result.seconds,
-            "rounds": [
-                {
-                    "structure_s": r.structure_s,
-                    "structure_cpu_s": r.structure_cpu_s,
-                    "adjust_s": r.adjust_s,
-                    "focal_px": list(r.focal_px),
-                    "figures": r.figures,
-                }
-                for r in result.rounds
-            ],
-        }
+    of_round = ("structure_s", "structure_cpu_s", "adjust_s", "focal_px", "figures")
+    placed = result and {
+        "reason": result.reason,
+        "message": result.message,
+        "used": list(result.used),
+        "checks": result.checks,
+        "seconds": result.seconds,
+        "rounds": [{name: getattr(r, name) for name in of_round} for r in result.rounds],
+    }
     shift = report.tried.shift
     document: dict[str, Any] = plain(
         {
@@ -135,7 +121,7 @@ def report_json(report: AnchorReport) -> dict[str, Any]:
             "height_shift": shift and asdict(shift),
             "times_s": report.times_s(),
             "frames": [_frame_json(frame) for frame in report.tried.tried],
-            "ranking": [{"name": p.image.name, **p.score.as_figures()} for p in report.tried.ranking],
+            "ranking": [{"name": p.image.name, **asdict(p.score)} for p in report.tried.ranking],
             "placement": placed,
             "notes": list(report.notes),
         }

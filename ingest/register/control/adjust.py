@@ -13,20 +13,13 @@ from scipy.spatial import cKDTree
 from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.marginals import Whitened
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import (
-    Orientations,
-    PointPriors,
-    Targets,
-    Terms,
-    lens_prior,
-)
+from featuredb.adjust.terms import Orientations, PointPriors, Targets, Terms, lens_prior
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap.adjust import AdjustOptions, block_variance_px2
 from ingest.register.control.fit import Vertical
-from ingest.register.control.marks import Control
-from ingest.register.control.rays import on_ground
+from ingest.register.control.marks import Control, on_ground
 
 _LOOSE_M = 1e4  # of a coordinate that nobody surveyed
 _LOOSE_RAD = 10.0  # of a heading

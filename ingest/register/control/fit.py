@@ -20,14 +20,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import rotation_to_up, so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.register.control.marks import Control
-from ingest.register.control.rays import intersect, on_ground, shown
+from ingest.register.control.marks import Control, intersect, on_ground, shown
 
 _MOST_PAIRS = 45  # of one point's marks: all of ten
-_SIGMA_OF_MEDIAN = {
-    2: 1.0 / 1.1774,
-    3: 1.0 / 1.5382,
-}  # median length of a normal vector in the plane, in space
+# By the median length of a normal vector in the plane and in space.
+_SIGMA_OF_MEDIAN = {2: 1.0 / 1.1774, 3: 1.0 / 1.5382}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -145,7 +142,7 @@ def fit_similarity(
         return None
     sim = start
     for _ in range(_ROUNDS):
-        lengths = np.linalg.norm(_residuals(sim, xyz, surveyed[point]), axis=1)
+        lengths = _distances(sim, xyz, surveyed[point])
         sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical)
         chosen = _choose(found, point, lengths, _OUTLIER_SIGMAS * sigma)
         inliers = lengths[chosen] <= _OUTLIER_SIGMAS * sigma
@@ -155,9 +152,9 @@ def fit_similarity(
     )
 
 
-def _residuals(sim: Sim3, xyz: FloatArray, surveyed: FloatArray) -> FloatArray:
-    """Surveyed minus placed, zero where a height is unknown."""
-    return np.nan_to_num(surveyed - sim.act(xyz))
+def _distances(sim: Sim3, xyz: FloatArray, surveyed: FloatArray) -> FloatArray:
+    """(n,) of placed from surveyed points, in plan where a height is unknown."""
+    return np.asarray(np.linalg.norm(np.nan_to_num(surveyed - sim.act(xyz)), axis=1))
 
 
 def _per_point(lengths: FloatArray, point: NDArray[np.int64], count: int) -> FloatArray:
@@ -180,7 +177,7 @@ def _least_trimmed(
         sim = _similarity(xyz[rows], surveyed[point[rows]], vertical)
         if sim is None:
             continue
-        lengths = np.linalg.norm(_residuals(sim, xyz, surveyed[point]), axis=1)
+        lengths = _distances(sim, xyz, surveyed[point])
         cost = float((np.sort(_per_point(lengths, point, len(surveyed)))[:kept] ** 2).sum())
         if best is None or cost < best[0]:
             best = (cost, sim)

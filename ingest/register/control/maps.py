@@ -77,7 +77,11 @@ def register_by_gcp(
     frame = _frame(feature_map, survey.file)
     block = block_of_map(feature_map)
     frame_from_map = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
-    vertical = _vertical_of_map(feature_map, block.xyz, frame_from_map)
+    vertical, method = None, feature_map.placement.method
+    if method != "gcp":  # what control points have said would count twice
+        covariance = frame_from_map.carried(feature_map.placement.covariance)
+        source = f"the map's placement by {method}"
+        vertical = vertical_of(frame_from_map, covariance, block.xyz, source)
     positions = [image.gps for image in feature_map.images]
     found = place_by_survey(block, positions, frame, vertical, survey)
     if not found.accepted:
@@ -146,12 +150,3 @@ def _frame(feature_map: FeatureMap, file: ControlFile) -> LocalFrame:
     away = np.linalg.norm(feature_map.frame.enu_from(middle).translation)
     has_gps = any(image.gps is not None for image in feature_map.images)
     return feature_map.frame if has_gps or away <= _MAX_FRAME_DISTANCE_M else middle
-
-
-def _vertical_of_map(feature_map: FeatureMap, points: FloatArray, frame_from_map: Sim3) -> Vertical | None:
-    """What the map's present placement says; None where control points made it, which would count twice."""
-    method = feature_map.placement.method
-    if method == "gcp":
-        return None
-    covariance = frame_from_map.carried(feature_map.placement.covariance)
-    return vertical_of(frame_from_map, covariance, points, f"the map's placement by {method}")

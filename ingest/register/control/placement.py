@@ -26,14 +26,7 @@ from ingest.register.control.marks import Control
 from ingest.register.control.residuals import MarkResidual, PointResidual, gps_offset, residuals_of
 from ingest.register.control.snooping import improve, initial_weights
 
-GcpReason = Literal[
-    "TOO_FEW",
-    "DEGENERATE_LINE",
-    "RESIDUALS",
-    "SCALE",
-    "UPSIDE_DOWN",
-    "CONTRADICTS_GPS",
-]
+GcpReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE", "UPSIDE_DOWN", "CONTRADICTS_GPS"]
 
 _STEEP = 0.5  # sine of 30 degrees: half the photos look up more steeply than photos of a place ever do
 _MIN_POINTS = 3  # three are the least with which one can be found to be wrong
@@ -201,9 +194,14 @@ def place_by_gcp(
             "units, and that the marks are of these photos"
         )
         return GcpPlacement(control=control, reason="RESIDUALS", message=message)
-    placement = replace(_adjusted_placement(block, control, fit, vertical, options), notes=notes)
+    placement = _adjusted_placement(block, control, fit, vertical, options)
+    assert placement.block is not None
+    assert placement.covariance is not None
+    figures: dict[str, Any] = {}
     if gps_local is not None:
-        placement = _with_gps_offset(placement, gps_local, gps_sigma_m)
+        figures, told = gps_offset(gps_local, gps_sigma_m, placement.block.centers(), placement.covariance)
+        notes = (*notes, *told)
+    placement = replace(placement, notes=notes, figures=placement.figures | figures)
     reason, message = _verdict(placement, gps_sigma_m)
     return replace(placement, reason=reason, message=message)
 
@@ -256,11 +254,7 @@ def _vertical_is_needed(control: Control, usable: list[int]) -> bool:
 
 
 def _adjusted_placement(
-    block: Block,
-    control: Control,
-    fit: ControlFit,
-    vertical: Vertical | None,
-    options: GcpOptions,
+    block: Block, control: Control, fit: ControlFit, vertical: Vertical | None, options: GcpOptions
 ) -> GcpPlacement:
     free_height_m = 0.0
     if vertical is not None:
@@ -302,15 +296,6 @@ def _covariance(adjusted: Adjusted, free_height_m: float, freedom: float) -> Flo
     covariance = adjusted.covariance * (freedom / (freedom - 2.0) if freedom > 4 else 2.0)
     covariance[6, 6] += free_height_m**2
     return np.asarray((covariance + covariance.T) / 2)
-
-
-def _with_gps_offset(
-    placement: GcpPlacement, gps_local: FloatArray, gps_sigma_m: tuple[float, float]
-) -> GcpPlacement:
-    assert placement.block is not None
-    assert placement.covariance is not None
-    figures, notes = gps_offset(gps_local, gps_sigma_m, placement.block.centers(), placement.covariance)
-    return replace(placement, figures=placement.figures | figures, notes=(*placement.notes, *notes))
 
 
 def _verdict(placement: GcpPlacement, gps_sigma_m: tuple[float, float]) -> tuple[GcpReason | None, str]:

@@ -16,27 +16,20 @@ from ingest.workspace import write_json
 _HEADER = ("control point", "marks", "east m", "north m", "up m", "horizontal m", "without it m", "")
 
 
-def control_plan(placement: GcpPlacement) -> PlanView | None:
-    """The map, the cameras and the control points with their residuals; None where there are none."""
-    if placement.block is None or not placement.points:
-        return None
-    return PlanView(
-        title="Control points: surveyed minus found",
-        what="control points",
-        points=placement.block.xyz,
-        cameras=placement.block.centers(),
-        places=np.array([p.found_m for p in placement.points]),
-        residuals=np.array([p.residual_m for p in placement.points]),
-        used=np.array([p.used for p in placement.points]),
-        names=tuple(f"{p.name} {p.horizontal_m:.2f} m" for p in placement.points),
-    )
-
-
 def control_html(placement: GcpPlacement) -> str:
     """Picture, remarks, residuals of points and marks; a part of a page."""
     parts = ["<h3>Control points</h3>"]
-    plan = control_plan(placement)
-    if plan is not None:
+    if placement.block is not None and placement.points:
+        plan = PlanView(
+            title="Control points: surveyed minus found",
+            what="control points",
+            points=placement.block.xyz,
+            cameras=placement.block.centers(),
+            places=np.array([p.found_m for p in placement.points]),
+            residuals=np.array([p.residual_m for p in placement.points]),
+            used=np.array([p.used for p in placement.points]),
+            names=tuple(f"{p.name} {p.horizontal_m:.2f} m" for p in placement.points),
+        )
         parts.append(picture(plan_png(plan), "Control points and their residuals"))
     parts += [note(remark) for remark in remarks(placement)]
     points = [["" if cell is None else str(cell) for cell in row] for row in _rows(placement)]

@@ -10,8 +10,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.register.control.adjust import Adjusted
 from ingest.register.control.control_file import Mark
-from ingest.register.control.marks import Control
-from ingest.register.control.rays import mark_residuals, shown
+from ingest.register.control.marks import Control, mark_residuals, shown
 from ingest.register.control.snooping import left_out
 
 _SAME_TARGET_PX = 10.0  # a mark that near to where another point shows is that point's target
@@ -58,13 +57,7 @@ class PointResidual:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MarkResidual:
-    """One mark.
-
-    Attributes:
-        residual_px: (2,) mark minus where the adjusted block shows the point.
-        used: took part.
-        remark: what is odd about it, "" for nothing.
-    """
+    """One mark: (2,) mark minus where the adjusted block shows the point, and the rest as of points."""
 
     mark: Mark
     residual_px: FloatArray

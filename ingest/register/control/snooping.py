@@ -15,8 +15,7 @@ from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.control.adjust import Adjusted, Task, Weights, adjust
 from ingest.register.control.fit import ControlFit
-from ingest.register.control.marks import Control
-from ingest.register.control.rays import mark_residuals
+from ingest.register.control.marks import Control, mark_residuals
 
 _SETTLED = 0.01  # relative change of the sigma, whose own uncertainty is tens of per cent
 _SIGNIFICANCE = 0.01  # chance of naming a good observation as wrong, over the whole file
@@ -133,13 +132,17 @@ def _tested(adjusted: Adjusted, control: Control, freedom: float) -> Weights:
     points |= _fitting(adjusted, control, freedom)
     if (marks != weights.marks).any() or (points != weights.points).any():
         return replace(weights, marks=marks, points=points)
-    mark = _worst_mark(adjusted)
+    rows = np.flatnonzero(weights.marks)
+    residuals = adjusted.marks.of(np.ones((len(rows), 2), dtype=bool))
+    tests = [chance_of(residuals, 2 * k + np.arange(2)) for k in range(len(rows))]
+    mark = _worst(rows, tests, _MIN_MARK_PX / weights.mark_px)
     if mark is not None:
         marks[mark] = False
         point = int(control.point_of[mark])
         points[point] &= marks[control.marks_of(point)].any()
         return replace(weights, marks=marks, points=points)
-    worst = _worst_point(adjusted, control)
+    rows = np.flatnonzero(weights.points)
+    worst = _worst(rows, [left_out(adjusted, control, p) for p in rows.tolist()], _MIN_POINT_M)
     if worst is not None:
         points[worst] = False
     return replace(weights, points=points)
@@ -157,18 +160,6 @@ def _fitting(adjusted: Adjusted, control: Control, freedom: float) -> NDArray[np
         chance = float(fdtrc(axes, max(freedom, 1.0), statistic / axes))
         fitting[point] = chance > _READMISSION or np.linalg.norm(rest) <= _MIN_POINT_M
     return fitting
-
-
-def _worst_mark(adjusted: Adjusted) -> int | None:
-    rows = np.flatnonzero(adjusted.weights.marks)
-    residuals = adjusted.marks.of(np.ones((len(rows), 2), dtype=bool))
-    tests = [chance_of(residuals, 2 * k + np.arange(2)) for k in range(len(rows))]
-    return _worst(rows, tests, _MIN_MARK_PX / adjusted.weights.mark_px)
-
-
-def _worst_point(adjusted: Adjusted, control: Control) -> int | None:
-    rows = np.flatnonzero(adjusted.weights.points)
-    return _worst(rows, [left_out(adjusted, control, point) for point in rows.tolist()], _MIN_POINT_M)
 
 
 def _worst(rows: NDArray[np.int64], tests: list[tuple[FloatArray, float]], least: float) -> int | None:

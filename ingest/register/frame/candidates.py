@@ -7,19 +7,8 @@ from dataclasses import dataclass, replace
 
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.dense.confirmation import PictureConfirmation
-from ingest.register.frame.dense.fit import (
-    confirmed,
-    dense_fitted,
-    dense_hypotheses,
-    searched_again,
-)
-from ingest.register.frame.features.search import (
-    FrameHypothesis,
-    fan_groups,
-    prior_group,
-    search,
-    star_group,
-)
+from ingest.register.frame.dense.fit import confirmed, dense_fitted, dense_hypotheses, searched_again
+from ingest.register.frame.features.search import FrameHypothesis, fan_groups, prior_group, search, star_group
 from ingest.register.frame.prior_fit import loosened
 from ingest.register.frame.sources import available_sources, searched_sources
 from ingest.register.frame.verdict import DECISIVE_LOG_NFA, SURE_CONFIRMATION_LOG_NFA, beyond_doubt

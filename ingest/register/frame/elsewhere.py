@@ -11,8 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.register.frame.dense.confirmation import confirm_pose
 from ingest.register.frame.dense.search import REACH_SIGMA, register_dense
@@ -27,12 +25,7 @@ _KNOWN_HEADING_DEG = 30.0  # with a heading so sure a photo is not upside down
 
 
 def agreement_elsewhere(
-    views: FrameViews,
-    prior: FramePrior,
-    pose: Rigid3,
-    source: RenderSource,
-    max_places: int,
-    enough: float,
+    views: FrameViews, prior: FramePrior, pose: Rigid3, source: RenderSource, max_places: int, enough: float
 ) -> tuple[int, float]:
     """The strongest agreement at wrong places: how many were searched, and the largest evidence (0 for none).
 
@@ -65,25 +58,17 @@ def _priors_beside(views: FrameViews, prior: FramePrior, pose: Rigid3) -> Iterat
     for side in (right, ahead, -right, -ahead):
         center = pose.center + _APART * reach * side
         moved = replace(prior, cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center))
-        if _sees(views, moved):
+        look = first_look(views.cloud, views.camera, moved.cam_from_local)
+        if look is not None and look.cover >= _MIN_COVER * views.look.cover:
             yield moved
     if prior.sigma_heading_deg <= _KNOWN_HEADING_DEG:
         yield replace(prior, cam_from_local=turned_about_vertical(prior.cam_from_local, 180.0))
 
 
-def _sees(views: FrameViews, prior: FramePrior) -> bool:
-    look = first_look(views.cloud, views.camera, prior)
-    return look is not None and look.cover >= _MIN_COVER * views.look.cover
-
-
 def _same_view(views: FrameViews, pose: Rigid3, other: Rigid3) -> bool:
     """Whether two poses show about the same piece of ground."""
-    width_m = views.look.depth_m * views.camera.width / views.camera.focal_px
-    apart = _middle(views.camera, pose, views.look.depth_m) - _middle(views.camera, other, views.look.depth_m)
-    return bool(np.linalg.norm(apart) < _SAME_VIEW * width_m)
-
-
-def _middle(camera: Camera, pose: Rigid3, depth_m: float) -> FloatArray:
-    """What the picture's middle shows at a distance, local frame."""
+    camera, depth_m = views.camera, views.look.depth_m
     ray = camera.unproject(np.array([[camera.width / 2.0, camera.height / 2.0]]))[0]
-    return pose.inverse().act(depth_m * np.array([*ray, 1.0]))
+    middle = depth_m * np.array([*ray, 1.0])
+    apart_m = np.linalg.norm(pose.inverse().act(middle) - other.inverse().act(middle))
+    return bool(apart_m < _SAME_VIEW * depth_m * camera.width / camera.focal_px)

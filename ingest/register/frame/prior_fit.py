@@ -12,7 +12,7 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_log
+from featuredb.geometry.rotation import so3_exp, so3_log
 from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame_registration import FramePrior
 from reloc.localise.jacobians import pixel_jacobians
@@ -35,8 +35,7 @@ def prior_residual(pose: Rigid3, prior: FramePrior) -> FloatArray:
     moved = pose.center - prior.cam_from_local.center
     turn = pose.rotation.T @ prior.cam_from_local.rotation
     heading = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
-    cosine, sine = np.cos(heading), np.sin(heading)
-    tilt = so3_log(turn @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]))
+    tilt = so3_log(turn @ so3_exp([0.0, 0.0, -heading]))
     if prior.sigma_heading_deg >= 180.0:
         heading = 0.0
     angles = np.degrees([tilt[0], tilt[1], heading])
@@ -72,10 +71,7 @@ def prior_information(pose: Rigid3, prior: FramePrior) -> FloatArray:
 
 
 def fitted_under_prior(
-    matches: FrameMatches,
-    pose: PoseHypothesis,
-    prior: FramePrior,
-    options: PoseOptions,
+    matches: FrameMatches, pose: PoseHypothesis, prior: FramePrior, options: PoseOptions
 ) -> PoseHypothesis:
     """The most likely pose next to `pose`, given matches with Cauchy residuals and the prior.
 

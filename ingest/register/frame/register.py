@@ -3,7 +3,6 @@
 from dataclasses import asdict, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +16,6 @@ from ingest.register.frame.candidates import Judged, best_candidate, by_agreemen
 from ingest.register.frame.dense.fit import confirmed, dense_fitted
 from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.features.search import FrameHypothesis, pose_options, unmatched
-from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import CORRELATED_INLIERS, loosened, prior_information, prior_sigmas
 from ingest.register.frame.verdict import (
     MAX_PLACES_ELSEWHERE,
@@ -31,7 +29,7 @@ from ingest.register.frame.verdict import (
     highest_elsewhere,
     verdict,
 )
-from ingest.register.frame.views import MIN_SIDE_PX, FrameViews, first_look
+from ingest.register.frame.views import MIN_SIDE_PX, FrameOptions, FrameViews, first_look
 from ingest.register.frame_registration import FramePrior, FrameReason, FrameRegistration, RenderSource
 from reloc.localise.pose import pose_uncertainty
 
@@ -42,7 +40,7 @@ _SHARED_POINT_SHARE = 0.1
 
 
 def register_frame(
-    image: NDArray[np.uint8],
+    gray: NDArray[np.uint8],
     camera: Camera,
     prior: FramePrior,
     cloud: PointCloud,
@@ -51,7 +49,7 @@ def register_frame(
     """Find the pose of a photo in a scan, or say why not.
 
     Args:
-        image: (h, w) or (h, w, 3) BGR uint8, the pixels that `camera` describes.
+        gray: (h, w) uint8, the pixels that `camera` describes.
         camera: calibrated intrinsics.
         prior: coarse pose in the frame of `cloud`, with honest standard deviations.
         cloud: the scan around it.
@@ -59,10 +57,13 @@ def register_frame(
     Raises:
         ImageError: the image is not 8-bit, or not of the camera's size.
     """
-    options = options or FrameOptions()
+    if gray.dtype != np.uint8 or gray.shape != (camera.height, camera.width):
+        raise ImageError(
+            f"register_frame: expected uint8 pixels of the camera's size {camera.width}x{camera.height}, "
+            f"found {gray.dtype} {gray.shape}"
+        )
     clock = StageClock()
-    gray = _gray(image, camera)
-    views = _views(gray, camera, prior, cloud, options, clock)
+    views = _views(gray, camera, prior, cloud, options or FrameOptions(), clock)
     if isinstance(views, FrameRegistration):
         return views
     judged = best_candidate(views, prior, clock)
@@ -148,7 +149,7 @@ def _views(
 ) -> FrameViews | FrameRegistration:
     """Photo and scan, or the refusal where the scan is not in view."""
     with clock.stage("look"):
-        look = first_look(cloud, camera, prior)
+        look = first_look(cloud, camera, prior.cam_from_local)
     if look is not None and look.cover >= MIN_COVER:
         return FrameViews(gray, camera, cloud, look, options)
     cover = 0.0 if look is None else look.cover
@@ -163,7 +164,11 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageC
         evidence = _evidence(views, prior, judged, covariance)
     if asks_elsewhere(evidence):
         with clock.stage("search elsewhere"):
-            evidence = _compared(views, prior, judged, evidence)
+            bears = highest_elsewhere(evidence.confirmation.log_nfa)
+            places, log_nfa = agreement_elsewhere(
+                views, prior, found.pose.cam_from_local, found.source, MAX_PLACES_ELSEWHERE, bears
+            )
+            evidence = replace(evidence, places_elsewhere=places, elsewhere_log_nfa=log_nfa)
     with clock.stage("verdict"):
         refusal = verdict(evidence)
     figures = asdict(evidence) | {
@@ -237,15 +242,6 @@ def _evidence(
     )
 
 
-def _compared(views: FrameViews, prior: FramePrior, judged: Judged, evidence: FrameEvidence) -> FrameEvidence:
-    """With how well the photo agrees with the scan at places where it cannot be."""
-    pose, enough = judged.found.pose.cam_from_local, highest_elsewhere(evidence.confirmation.log_nfa)
-    places, log_nfa = agreement_elsewhere(
-        views, prior, pose, judged.found.source, MAX_PLACES_ELSEWHERE, enough
-    )
-    return replace(evidence, places_elsewhere=places, elsewhere_log_nfa=log_nfa)
-
-
 def _accepted(
     found: FrameHypothesis, covariance: FloatArray | None, evidence: dict[str, Any], clock: StageClock
 ) -> FrameRegistration:
@@ -277,14 +273,3 @@ def _refused(
         evidence=evidence,
         seconds=clock.seconds,
     )
-
-
-def _gray(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    if image.dtype != np.uint8 or image.shape[:2] != (camera.height, camera.width):
-        raise ImageError(
-            f"register_frame: expected uint8 pixels of the camera's size {camera.width}x{camera.height}, "
-            f"found {image.dtype} {image.shape}"
-        )
-    if image.ndim == 2:
-        return image
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

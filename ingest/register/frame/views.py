@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -14,11 +14,12 @@ from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
+from ingest.register.frame.dense.confirmation import ConfirmOptions
 from ingest.register.frame.features.matching import Pool, pool_features
-from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.verdict import MIN_COVER
 from ingest.register.frame_registration import FramePrior, RenderSource
 
@@ -32,8 +33,42 @@ _LOOK_WIDER = 2.0  # and sees so many times as far to every side: the prior may 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DenseFitOptions:
+    """How pieces are matched; lengths in pixels of the render.
+
+    Attributes:
+        spacing_px: distance of neighbouring scan points in the renders, round by round: finer than the scan,
+            since edges between splats are known better than their spacing.
+        piece_px: least side of a piece, round by round.
+        more_rounds: at most, like the last one, until the pose moves less than a fifth of a pixel.
+        near_px: a piece's place is looked for this near, round by round: the first takes up what the search
+            left.
+    """
+
+    spacing_px: tuple[float, ...] = (2.4, 3.75, 3.75)
+    piece_px: tuple[int, ...] = (28, 40, 40)
+    more_rounds: int = 8
+    near_px: tuple[int, ...] = (10, 6, 6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameOptions:
+    """How one photo is registered.
+
+    Attributes:
+        threads: for renders and features; 0 takes as many as the process may use, up to four.
+        dense_fit: how a pose is fitted to pieces.
+        confirm: how the pictures are asked.
+    """
+
+    threads: int = 0
+    dense_fit: DenseFitOptions = field(default_factory=DenseFitOptions)
+    confirm: ConfirmOptions = field(default_factory=ConfirmOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FirstLook:
-    """What the prior sees of the scan.
+    """What a pose sees of the scan.
 
     Attributes:
         depth_m: median distance along the optical axis.
@@ -46,12 +81,12 @@ class FirstLook:
     spacing_m: float
 
 
-def first_look(cloud: PointCloud, camera: Camera, prior: FramePrior) -> FirstLook | None:
-    """Distance, cover and density of the scan where the prior looks; None where it sees nothing."""
+def first_look(cloud: PointCloud, camera: Camera, cam_from_local: Rigid3) -> FirstLook | None:
+    """Distance, cover and density of the scan where a pose looks; None where it sees nothing."""
     factor = _LOOK_SIDE_PX / max(camera.width, camera.height)
     width, height = (max(round(side * factor), 32) for side in (camera.width, camera.height))
     wide = Camera.from_focal(width, height, camera.focal_px * factor / _LOOK_WIDER, model="PINHOLE")
-    rendering = render(cloud, wide, prior.cam_from_local, RenderOptions(attributes=False, threads=1))
+    rendering = render(cloud, wide, cam_from_local, RenderOptions(attributes=False, threads=1))
     depth = rendering.depth[rendering.valid]
     if len(depth) == 0:
         return None
@@ -101,18 +136,11 @@ class FrameViews:
         """Longer side of the renders that features are found in."""
         return self.side_px(FEATURES_SPACING_PX, _FEATURES_SIDE_PX)
 
-    def render_camera(self, side_px: int) -> Camera:
-        """The photo's camera, shrunk."""
-        factor = side_px / max(self.camera.width, self.camera.height)
-        if factor >= 1.0:
-            return self.camera
-        return self.camera.scaled_to(
-            max(round(self.camera.width * factor), 1), max(round(self.camera.height * factor), 1)
-        )
-
     def renders(self, poses: Sequence[Rigid3], side_px: int) -> list[Rendering]:
-        """The scan from each pose; those that show next to nothing of it are left out."""
-        camera = self.render_camera(side_px)
+        """The scan from each pose, no larger than the photo; without those that show next to nothing."""
+        camera = self.camera
+        factor = min(side_px / max(camera.width, camera.height), 1.0)
+        camera = camera.scaled_to(max(round(camera.width * factor), 1), max(round(camera.height * factor), 1))
         single = RenderOptions(threads=1)
         with ThreadPoolExecutor(self._threads()) as threads:
             made = list(threads.map(lambda pose: render(self.cloud, camera, pose, single), poses))
@@ -195,9 +223,8 @@ def fan_headings_deg(sigma_heading_deg: float) -> list[float]:
 
 def turned_about_vertical(cam_from_local: Rigid3, angle_deg: float) -> Rigid3:
     """The camera at the same place, its heading turned clockwise seen from above."""
-    a = np.radians(angle_deg)
-    turn = np.array([[np.cos(a), np.sin(a), 0.0], [-np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
-    return _pose(cam_from_local.rotation @ turn.T, cam_from_local.center)
+    turn = so3_exp([0.0, 0.0, np.radians(angle_deg)])
+    return _pose(cam_from_local.rotation @ turn, cam_from_local.center)
 
 
 def _sigma_along(prior: FramePrior, axis: FloatArray) -> float:

@@ -13,6 +13,7 @@ from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import INGEST_LIMITS, decode_rgb
 from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.lidar.picture import ground_of
 from featuredb.maps.feature_map import MapImage
@@ -75,8 +76,8 @@ class PickSession:
                 {
                     "id": image.image_id,
                     "name": image.name,
-                    "width": self._camera(image).width,
-                    "height": self._camera(image).height,
+                    "width": self.map.cameras[image.camera_id].width,
+                    "height": self.map.cameras[image.camera_id].height,
                     "points": int(counts[image.image_id]),
                     "least": least_picks(focal_sigma_rel(self.map, image)),
                 }
@@ -115,7 +116,7 @@ class PickSession:
     def solve(self, image_id: int, spots: Sequence[PickedSpot]) -> dict[str, Any]:
         """The pose by the picks so far, the residual of each, and what is missing or wrong."""
         image = self.image(image_id)
-        camera, focal_rel = self._camera(image), focal_sigma_rel(self.map, image)
+        camera, focal_rel = self.map.cameras[image.camera_id], focal_sigma_rel(self.map, image)
         pixels, points = self.spots(spots)
         self._fits.pop(image_id, None)
         least = least_picks(focal_rel)
@@ -229,10 +230,8 @@ class PickSession:
                 for pixel, place in zip(pixels, utm, strict=True)
             )
 
-    def _camera(self, image: MapImage) -> Any:
-        return self.map.cameras[image.camera_id]
-
-    def _upright(self, image: MapImage) -> Any:
+    def _upright(self, image: MapImage) -> Rigid3 | None:
+        """Where the map has a camera now, in the cloud's frame; None where the map does not know up."""
         if isinstance(self.map, UnplacedMap):
             return image.cam_from_local if self.map.frame.upright else None
         return image.cam_from_local @ self.map.frame.enu_from(self.cloud.frame)

@@ -6,7 +6,6 @@ ground, and yet its cameras stand metres too high. What the registered frames se
 correspondences) and the scan's surface under all points of the map determine poses, lens and points together.
 """
 
-import logging
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -31,7 +30,6 @@ from ingest.register.structure.pairs import Registered
 from ingest.register.structure.projection import StructurePlacement
 from ingest.register.structure.surface_fit import Surface, nearest_planes, surface_near
 
-_LOG = logging.getLogger(__name__)
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
 # Least standard deviation of keypoints and of correspondences with the scan, as a share of the photo's longer
 # side: a pixel in 4000. Tracks alone may fit to a third of that, but what lens models leave is common to
@@ -142,10 +140,7 @@ def adjust_to_scan(
 
 
 def placed_map(
-    feature_map: FeatureMap,
-    structure: StructurePlacement,
-    cloud: PointCloud,
-    adjustment: LidarAdjustment,
+    feature_map: FeatureMap, structure: StructurePlacement, cloud: PointCloud, adjustment: LidarAdjustment
 ) -> FeatureMap:
     """The map at its new place: same ids, descriptors and local frame; the scan's height datum.
 
@@ -191,23 +186,17 @@ def _control_of(feature_map: FeatureMap, registered: Registered) -> Marks:
 
 
 def _iterate(start: Block, lenses: tuple[Camera, ...], control: Marks, surface: Surface) -> Block:
-    """Rounds of planes, standard deviations and solving until the points settle."""
+    """Rounds of planes, standard deviations and solving until points and cameras settle."""
     block = start
     for _ in range(_ROUNDS):
         problem = Problem(block, _terms(block, control, surface, lenses, _MIN_SIGMA_REL, _MIN_SURFACE_M))
         problem.solve(_STEPS, _FUNCTION_TOLERANCE)
-        moved = problem.block()
-        step_m, block = _step_m(block, moved), moved
-        _LOG.debug("points moved %.4f m", step_m)
-        if step_m < _SETTLED_M:
+        before, block = block, problem.block()
+        points_m = np.median(np.linalg.norm(block.xyz - before.xyz, axis=1))
+        cameras_m = np.linalg.norm(block.centers() - before.centers(), axis=1).max()
+        if max(points_m, cameras_m / 5.0) < _SETTLED_M:
             break
     return block
-
-
-def _step_m(before: Block, after: Block) -> float:
-    """How far points (median) or cameras (largest, a fifth of it) have moved."""
-    points = float(np.median(np.linalg.norm(after.xyz - before.xyz, axis=1)))
-    return max(points, float(np.linalg.norm(after.centers() - before.centers(), axis=1).max()) / 5.0)
 
 
 def _terms(

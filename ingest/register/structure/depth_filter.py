@@ -5,7 +5,7 @@ closed across a gap, ambiguous along silhouettes, and amplified by every pixel o
 surface is seen at a grazing angle (structure-projection paper, 3.1: "not all depth values are valid").
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,21 +38,18 @@ class SurfaceHits:
     """Where rays meet the scan.
 
     Attributes:
-        valid: (n,) bool; other rows of the arrays below hold NaN.
+        rows: (n,) of the rays, ascending; others meet nothing that can be trusted.
         points: (n, 3) local frame of the cloud, metres.
         normals: (n, 3) unit, towards the camera.
         sigma_ray_m: (n,) standard deviation along the ray from the surface's roughness in the window.
         depths: (n,) along the optical axis, metres.
     """
 
-    valid: NDArray[np.bool_]
+    rows: NDArray[np.intp]
     points: FloatArray
     normals: FloatArray
     sigma_ray_m: FloatArray
     depths: FloatArray
-
-    def rows(self, chosen: NDArray[np.intp]) -> "SurfaceHits":
-        return SurfaceHits(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
 
 def _reliable_at(
@@ -128,10 +125,6 @@ def _intersect(
     index: NDArray[np.int32],
 ) -> SurfaceHits:
     """Planes through the scan points of each row of `index` (-1: none), met by the rays of `pixels[rows]`."""
-    total = len(pixels)
-    valid = np.zeros(total, dtype=bool)
-    points, normals = np.full((total, 3), np.nan), np.full((total, 3), np.nan)
-    sigma, depths = np.full(total, np.nan), np.full(total, np.nan)
     pose = rendering.cam_from_local
     mean, count, values, vectors = _principal_axes(cloud, index)
     normal = vectors[:, :, 0]
@@ -150,13 +143,13 @@ def _intersect(
         # A line of points (one scan line in the window) makes no plane.
         & (values[:, 1] > 0.01 * values[:, 2])
     )
-    rows, depth = rows[ok], depth[ok]
-    valid[rows] = True
-    points[rows] = pose.center + depth[:, None] * rays[ok]
-    normals[rows] = -normal[ok] * np.sign(facing[ok])[:, None]
-    sigma[rows] = rough[ok] / cosine[ok]
-    depths[rows] = depth
-    return SurfaceHits(valid=valid, points=points, normals=normals, sigma_ray_m=sigma, depths=depths)
+    return SurfaceHits(
+        rows=rows[ok],
+        points=pose.center + depth[ok, None] * rays[ok],
+        normals=-normal[ok] * np.sign(facing[ok])[:, None],
+        sigma_ray_m=rough[ok] / cosine[ok],
+        depths=depth[ok],
+    )
 
 
 def _principal_axes(

@@ -5,7 +5,6 @@ from dataclasses import fields
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -39,17 +38,8 @@ def structure_pairs(
 
     Args:
         source: (n, 3) the map's points in the cloud's local frame, at their present place.
-
-    Raises:
-        InvalidValueError: a registration that was refused, or of an image that the map does not have.
     """
     images = {image.image_id: image for image in feature_map.images}
-    wrong = [i for i, found in registered.items() if i not in images or not found.accepted]
-    if wrong:
-        raise InvalidValueError(
-            f"structure_pairs: expected accepted registrations of images of map {feature_map.map_id}, found "
-            f"others of {wrong}"
-        )
     uncertainty = full_covariances(feature_map.points.covariance)
     parts = [
         _pairs_of_frame(feature_map, source, uncertainty, images[image_id], registration, row, cloud)
@@ -76,28 +66,27 @@ def _pairs_of_frame(
     rendering = render(cloud, small, pose, RenderOptions(threads=1, attributes=False))
     observations = feature_map.observations
     mine = observations.image_id == image.image_id
-    points = observations.point_index[mine]
     pixels = observations.xy[mine].astype(np.float64) * (
         small.width / camera.width,
         small.height / camera.height,
     )
     hits = surface_at(rendering, cloud, pixels)
-    distance = np.linalg.norm(hits.points - pose.center, axis=1)
-    kept = np.flatnonzero(hits.valid)
-    largest = np.linalg.eigvalsh(uncertainty[points[kept]])[:, -1]
-    kept = kept[largest <= (_MAX_POINT_SIGMA_REL * distance[kept]) ** 2]
-    own, by_frame = _errors(hits.rows(kept), pose, camera)
-    grid = np.minimum((pixels / (small.width, small.height) * _CELLS).astype(np.int64), _CELLS - 1)
-    cell = row * _CELLS**2 + grid[:, 1] * _CELLS + grid[:, 0]
-    return Pairs(
-        frame_of=np.full(len(kept), row, dtype=np.int64),
-        source=source[points[kept]],
-        target=hits.points[kept],
-        covariance=own + uncertainty[points[kept]],
+    points = observations.point_index[mine][hits.rows]
+    largest = np.linalg.eigvalsh(uncertainty[points])[:, -1]
+    own, by_frame = _errors(hits, pose, camera)
+    at = pixels[hits.rows] / (small.width, small.height)
+    grid = np.minimum((at * _CELLS).astype(np.int64), _CELLS - 1)
+    pairs = Pairs(
+        frame_of=np.full(len(points), row, dtype=np.int64),
+        source=source[points],
+        target=hits.points,
+        covariance=own + uncertainty[points],
         by_frame=by_frame,
-        cell_of=cell[kept],
+        cell_of=row * _CELLS**2 + grid[:, 1] * _CELLS + grid[:, 0],
         frame_covariance=covariance[None],
     )
+    distance = np.linalg.norm(hits.points - pose.center, axis=1)
+    return pairs.of(largest <= (_MAX_POINT_SIGMA_REL * distance) ** 2)
 
 
 def _errors(hits: SurfaceHits, pose: Rigid3, camera: Camera) -> tuple[FloatArray, FloatArray]:

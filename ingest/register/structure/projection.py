@@ -17,15 +17,9 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.structure.pairs import Registered, structure_pairs
-from ingest.register.structure.similarity import (
-    Pairs,
-    SimilarityFit,
-    ransac_similarity,
-    refine_similarity,
-)
+from ingest.register.structure.similarity import Pairs, SimilarityFit, ransac_similarity, refine_similarity
 
-StructureReason = Literal["NO_FRAMES", "TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
-
+StructureReason = Literal["TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
 
 # A pair further off, as a share of its distance from the camera, is an outlier of RANSAC: reconstructions
 # bend by up to about a percent of the flying height.
@@ -73,16 +67,15 @@ def project_structure(
     """Place a map on a scan by frames of the map that were registered to it.
 
     Args:
-        registered: frames with their poses in the cloud's local frame; one is enough.
+        registered: frames with their poses in the cloud's local frame, at least one.
     """
-    if not registered:
-        return StructurePlacement(reason="NO_FRAMES", message="no frame is registered to the scan")
     source = feature_map.points_local(cloud.frame)
     pairs = structure_pairs(feature_map, source, registered, cloud)
     if len(pairs) < _MIN_PAIRS:
         words = f"{len(pairs)} of the map's points meet the scan, at least {_MIN_PAIRS} are needed"
         return StructurePlacement(reason="TOO_FEW_PAIRS", message=words)
-    distances = _distances(pairs, registered)
+    centers = np.array([r.cam_from_local.center for r in registered.values()])  # type: ignore[union-attr]
+    distances = np.linalg.norm(pairs.target - centers[pairs.frame_of], axis=1)
     tolerance = np.maximum(_MIN_TOLERANCE_M, _TOLERANCE_REL * distances)
     start = ransac_similarity(pairs.source, pairs.target, tolerance)
     if start is None:
@@ -105,12 +98,6 @@ def project_structure(
         covariance=fit.covariance,
         figures=figures,
     )
-
-
-def _distances(pairs: Pairs, registered: Registered) -> FloatArray:
-    """(n,) from the registered cameras, metres."""
-    centers = np.array([r.cam_from_local.center for r in registered.values()])  # type: ignore[union-attr]
-    return np.asarray(np.linalg.norm(pairs.target - centers[pairs.frame_of], axis=1))
 
 
 def _gate_of_pairs(

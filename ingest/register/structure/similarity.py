@@ -19,7 +19,6 @@ _CHI2_3_95 = 7.815  # 95 % of the squared Mahalanobis length of three normal coo
 _CHI2_3_MEDIAN = 2.366
 _SETTLED = 0.003  # standard deviations of a step; rounds that follow add up to a few times as much at most
 
-
 _SAMPLES = 300  # of three pairs, at most. With half of the pairs wrong, these miss all-inlier samples
 _MISSED = 1e-17  # so often; with fewer wrong pairs, fewer samples miss as rarely.
 _SCORE_PAIRS = 800  # pairs that score a sample; more only take longer

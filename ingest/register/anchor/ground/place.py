@@ -7,7 +7,7 @@ many points agree by chance. Where a map as a whole lies nowhere, its parts are 
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -19,9 +19,8 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.anchor.ground.fit import SolidFit, fitted
 from ingest.register.anchor.ground.parts import parts
-from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, shape_of
+from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit, fitted, laid, shape_of
 from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
 from ingest.register.anchor.ground.street_plan import StreetPlan, street_plan
 from ingest.register.anchor.together.evidence import JointEvidence
@@ -49,9 +48,7 @@ _TIED = 0.5  # of a photo's points that others see which stay
 _LEAST_PHOTOS = 10  # of two maps of eight one was accepted outside its 99.9 % bound
 _RIVALS = 20  # the best of other places that are compared one by one
 _LEAST_TRIES = 20  # elsewhere: fewer do not tell what chance gives
-_LIKE_SIZE = (
-    0.5  # logarithm: sizes at which chance is alike; the smaller a map, the more of it agrees anywhere
-)
+_LIKE_SIZE = 0.5  # logarithm: sizes at which chance is alike; of a smaller map more agrees anywhere
 _TAIL = 0.25  # share of the places elsewhere whose scores are taken for the tail of what chance gives
 _WALL_SIGMA_M = 0.15  # of all outlines together, outwards: eaves, and a laser's footprint
 _LEAST_SIGMA_M = 0.05  # of a point
@@ -146,7 +143,7 @@ def _tried(plan: StreetPlan, shape: ScanShape, search: PlanSearch, tags: Geotags
     found = search.tries(plan, sizes.tolist(), turns.tolist(), tags)
     fits = [_fitted(plan, shape, _start(plan, shape, one), rows, _COARSE_WIDTHS_M) for one in found]
     asked = np.random.default_rng(0).permutation(len(plan.points))[:_ASKED]
-    return [_asked(shape, _only_asked(plan, shape, fit.local_from_own, asked)) for fit in fits]
+    return [_asked(shape, laid(shape, plan.points[asked], fit.local_from_own)) for fit in fits]
 
 
 def _chance(there: Sequence[_Tried]) -> FloatArray:
@@ -176,17 +173,14 @@ def _fitted(
     plan: StreetPlan, shape: ScanShape, start: Sim3, rows: NDArray[np.int64], widths: tuple[float, ...]
 ) -> SolidFit:
     information = np.diag([*(len(rows) * 0.1 / np.square(_START_SIGMA)), 1e-3, 1e-3, 1e-3])
-    return fitted(shape, plan.points[rows], np.ones(len(rows)), start, prior=information, widths=widths)
+    return fitted(shape, plan.points[rows], start, information, widths)
 
 
 def _asked(shape: ScanShape, fit: SolidFit) -> _Tried:
     placed = fit.placed
     agrees = (np.abs(fit.off_m) < _AGREE_M) & (fit.near_m < _NEAR_M)
     above = (placed[:, 2] - shape.ground[shape.cells(placed[:, :2])] > _ABOVE_M) & shape.inside(placed[:, :2])
-    cells = np.unique(np.floor(placed[above] / _PLACE_M).astype(np.int64), axis=0, return_inverse=True)[1]
-    count = np.bincount(cells.reshape(-1))
-    share = np.bincount(cells.reshape(-1), agrees[above]) / np.maximum(count, 1)
-    evidence = JointEvidence(places=len(count), agreeing=float(share.sum()))
+    evidence = JointEvidence.of_cells(np.floor(placed[above] / _PLACE_M).astype(np.int64), agrees[above])
     return _Tried(fit=fit, agrees=agrees, above=above, evidence=evidence)
 
 
@@ -216,7 +210,8 @@ def _judged(
             figures=figures,
         )
     rows = _rows_seen(unplaced, plan, kept)
-    away = np.array([_away_m(plan, rows, sim, one.fit.local_from_own) for one in there])
+    there_m = (one.fit.local_from_own.act(plan.points[rows]) - sim.act(plan.points[rows]) for one in there)
+    away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])
     elsewhere = scores[away > _ELSEWHERE_M]
     log_nfa = _log_nfa(scores[first], elsewhere) - float(np.log10(tests))
     others = [
@@ -228,6 +223,7 @@ def _judged(
         _rival_p(plan, shape, rows, sim, one.fit.local_from_own)
         for one in sorted(others, key=lambda one: _over(one, rate))[-_RIVALS:]
     ]
+    centers = sim.act(plan.centers[kept])
     figures |= {
         "places": final.evidence.places,
         "agreeing": final.evidence.agreeing,
@@ -236,7 +232,7 @@ def _judged(
         "elsewhere": len(elsewhere),
         "elsewhere_over_chance": float(elsewhere.max(initial=-np.inf)),
         "rival": max(rivals, default=0.0),
-        "camera_height_m": float(_eye_heights(shape, sim.act(plan.centers[kept])).mean()),
+        "camera_height_m": float((centers[:, 2] - shape.ground[shape.cells(centers[:, :2])]).mean()),
     }
     local_from_own = sim @ plan.upright_from_own
     words = (
@@ -254,9 +250,9 @@ def _judged(
         figures=figures,
     )
     if log_nfa < _LOG_RATE:
-        return _refused(found, "STRUCTURE", f"{words}, which chance gives, too")
+        return replace(found, reason="STRUCTURE", message=f"{words}, which chance gives, too")
     if max(rivals, default=0.0) > _RIVAL_RATE:
-        return _refused(found, "AMBIGUOUS", f"{words}, and nearly as many at another place")
+        return replace(found, reason="AMBIGUOUS", message=f"{words}, and nearly as many at another place")
     return found
 
 
@@ -272,21 +268,6 @@ def _log_nfa(best: float, elsewhere: FloatArray) -> float:
     mean = max(float(tail.mean()), 1.0)
     further = max(best - start, 0.0) / (len(tail) * mean)
     return float(len(tail) * np.log10(1.0 + further) - np.log10(len(tail)))
-
-
-def _refused(found: GroundPlace, reason: GroundReason, message: str) -> GroundPlace:
-    return GroundPlace(
-        reason=reason,
-        message=message,
-        local_from_own=found.local_from_own,
-        covariance=found.covariance,
-        image_ids=found.image_ids,
-        figures=found.figures,
-    )
-
-
-def _eye_heights(shape: ScanShape, centers: FloatArray) -> FloatArray:
-    return np.asarray(centers[:, 2] - shape.ground[shape.cells(centers[:, :2])])
 
 
 def _best_around(plan: StreetPlan, shape: ScanShape, best: _Tried, rate: float) -> _Tried:
@@ -318,7 +299,7 @@ def _lie_there(
     unplaced: UnplacedMap, plan: StreetPlan, shape: ScanShape, sim: Sim3, rate: float
 ) -> NDArray[np.bool_]:
     """Which photos lie where the similarity puts them: their points agree, and others that stay see them."""
-    asked = _asked(shape, _only_asked(plan, shape, sim, np.arange(len(plan.points))))
+    asked = _asked(shape, laid(shape, plan.points, sim))
     point_of = np.full(len(unplaced.points.xyz), -1)
     point_of[plan.rows] = np.arange(len(plan.rows))
     observations = unplaced.observations
@@ -343,19 +324,9 @@ def _lie_there(
     return stays
 
 
-def _only_asked(plan: StreetPlan, shape: ScanShape, sim: Sim3, rows: NDArray[np.int64]) -> SolidFit:
-    return fitted(shape, plan.points[rows], np.ones(len(rows)), sim, widths=())
-
-
-def _away_m(plan: StreetPlan, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:
-    """How far another similarity takes the map's points from where this one does, in the median."""
-    points = plan.points[rows]
-    return float(np.median(np.linalg.norm(sim.act(points) - other.act(points), axis=1)))
-
-
 def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:
     """How often a place as good as another would agree in so many more blocks of the map."""
-    own, rival = (_asked(shape, _only_asked(plan, shape, of, rows)) for of in (sim, other))
+    own, rival = (_asked(shape, laid(shape, plan.points[rows], of)) for of in (sim, other))
     counted = own.above
     block = np.floor(sim.act(plan.points[rows[counted]]) / _BLOCK_M).astype(np.int64)
     group = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)

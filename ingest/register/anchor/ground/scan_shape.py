@@ -1,7 +1,8 @@
-"""A scan as a solid: ground, roofs, and the walls that stand where its heights jump.
+"""A scan as a solid, ground, roofs and the walls that stand where its heights jump; and a map laid on it.
 
 A laser in the air sees hardly any walls. Where the heights of neighbouring cells differ by a storey,
-something stands upright between them, and that is what a photo from the street shows.
+something stands upright between them, and that is what a photo from the street shows. A map is laid on it by
+its points' distances from planes, robust, from a start within some metres.
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, grey_opening,
 from scipy.spatial import cKDTree
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.render.cloud import PointCloud
 
 CELL_M = 0.5
@@ -24,6 +26,10 @@ _LAST = 4  # points of a roof that tell where it ends
 _SMOOTH_CELLS = 1.5  # of the heights whose gradient says where a wall looks
 _SLOPE_CELLS = 0.7  # of the heights whose gradient is a surface's normal
 _FLAT_M = 0.5  # between cells of one surface
+_FINE_M, _FINE_ROUNDS, _SETTLED = 0.3, 10, 1e-4  # width of the loss, rounds with the last width
+_LEAST_REACH_M = 1.5  # of a point from what is known of the solid
+_MOST_TURN = 0.1  # of a step: radians, and of the size
+_UPRIGHT = 0.5  # rise of a wall's normal, at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,18 +82,17 @@ def shape_of(cloud: PointCloud, circle: tuple[float, float, float] | None = None
     flat = at[:, 1] * size[0] + at[:, 0]
     top = np.full(size[0] * size[1], -np.inf)
     np.maximum.at(top, flat, xyz[:, 2])
-    low = np.full(size[0] * size[1], np.inf)
-    np.minimum.at(low, flat, xyz[:, 2])
+    lowest = np.full(size[0] * size[1], np.inf)
+    np.minimum.at(lowest, flat, xyz[:, 2])
     shape = (int(size[1]), int(size[0]))
-    top, low = top.reshape(shape), low.reshape(shape)
+    top, lowest = top.reshape(shape), lowest.reshape(shape)
     seen = np.isfinite(top)
     top, known = _filled(top, seen)
     top = median_filter(top, 3)
-    low = minimum_filter(_filled(low, seen)[0], 3)
-    low = median_filter(low, 5)
+    low = median_filter(minimum_filter(_filled(lowest, seen)[0], 3), 5)
     window = int(_WIDEST_M / CELL_M) | 1
     ground = gaussian_filter(grey_opening(low, (window, window)), 4.0)
-    surface, surface_normals = _surfaces(xyz, flat, top, seen)
+    surface, surface_normals = _surfaces(xyz, flat, top, lowest, seen)
     walls = _walls(top, known, corner, xyz)
     upright, upright_normals = _standing(walls)
     points = np.vstack([surface, upright])
@@ -110,7 +115,11 @@ def _filled(heights: FloatArray, seen: NDArray[np.bool_]) -> tuple[FloatArray, N
 
 
 def _surfaces(
-    xyz: FloatArray, cell_of: NDArray[np.int64], top: FloatArray, seen: NDArray[np.bool_]
+    xyz: FloatArray,
+    cell_of: NDArray[np.int64],
+    top: FloatArray,
+    lowest: FloatArray,
+    seen: NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray]:
     """Middles of the points of cells that lie on ground or roofs and are no edge, and their normals."""
     count = np.maximum(np.bincount(cell_of, minlength=top.size), 1)
@@ -121,12 +130,9 @@ def _surfaces(
     smooth[1:] &= steps[0]
     smooth[:, :-1] &= steps[1]
     smooth[:, 1:] &= steps[1]
-    low = np.full(top.size, np.inf)
-    np.minimum.at(low, cell_of, xyz[:, 2])
-    smooth &= (top.ravel() - low < 2.0 * _FLAT_M).reshape(top.shape)
-    up, across = np.gradient(
-        gaussian_filter(np.where(seen, middle[:, 2].reshape(top.shape), top), 0.7), CELL_M
-    )
+    smooth &= top - lowest < 2.0 * _FLAT_M
+    heights = np.where(seen, middle[:, 2].reshape(top.shape), top)
+    up, across = np.gradient(gaussian_filter(heights, _SLOPE_CELLS), CELL_M)
     normals = np.column_stack([-across[smooth], -up[smooth], np.ones(np.count_nonzero(smooth))])
     return middle[smooth.ravel()], normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
@@ -199,3 +205,67 @@ def _standing(walls: FloatArray) -> tuple[FloatArray, FloatArray]:
     within = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
     heights = walls[of, 4] + (within + 0.5) * _STEP_M
     return np.column_stack([walls[of, :2], heights]), np.column_stack([walls[of, 2:4], np.zeros(len(of))])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SolidFit:
+    """Points of a map on a scan's solid.
+
+    Attributes:
+        local_from_own: similarity. placed: (n, 3) the points there. middle: (3,) of them.
+        off_m: (n,) distances of the points from the solid's planes. near_m: (n,) from its nearest point.
+        normal, right: (7, 7) and (7,) equations of the left perturbation about `middle` that lessens
+            `off_m`. by_walls: (7,) what a metre of all walls outwards adds to the right side.
+    """
+
+    local_from_own: Sim3
+    placed: FloatArray
+    middle: FloatArray
+    off_m: FloatArray
+    near_m: FloatArray
+    normal: FloatArray
+    right: FloatArray
+    by_walls: FloatArray
+
+
+def laid(shape: ScanShape, own: FloatArray, local_from_own: Sim3, width_m: float = _FINE_M) -> SolidFit:
+    """How points (n, 3) of a map lie on a scan's solid; `width_m` of the loss by which they are weighed."""
+    placed = local_from_own.act(own)
+    middle = placed.mean(axis=0)
+    near_m, index = (np.asarray(found) for found in shape.tree.query(placed))
+    normals = shape.normals[index]
+    off_m = np.einsum("ij,ij->i", normals, placed - shape.points[index])
+    weight = 1.0 / (1.0 + np.square(off_m / width_m)) ** 2
+    weight = np.where(near_m < max(4.0 * width_m, _LEAST_REACH_M), weight, 0.0)
+    jacobian = np.einsum("ij,ijk->ik", normals, point_jacobian(placed - middle))
+    return SolidFit(
+        local_from_own=local_from_own,
+        placed=placed,
+        middle=middle,
+        off_m=off_m,
+        near_m=near_m,
+        normal=jacobian.T @ (jacobian * weight[:, None]),
+        right=-jacobian.T @ (weight * off_m),
+        by_walls=jacobian.T @ (weight * (np.abs(normals[:, 2]) < _UPRIGHT)),
+    )
+
+
+def fitted(
+    shape: ScanShape, own: FloatArray, start: Sim3, prior: FloatArray, widths_m: tuple[float, ...]
+) -> SolidFit:
+    """The similarity that lays points (n, 3) of a map on a scan's solid.
+
+    Args:
+        prior: (7, 7) information of the start, left perturbation about the middle of the points.
+        widths_m: of the loss, round by round; the last one until the similarity settles.
+    """
+    sim = start
+    for k in range(len(widths_m) + _FINE_ROUNDS):
+        fit = laid(shape, own, sim, widths_m[min(k, len(widths_m) - 1)])
+        step = np.linalg.solve(fit.normal + prior, fit.right)
+        step[:4] = np.clip(step[:4], -_MOST_TURN, _MOST_TURN)
+        about = Sim3(scale=1.0, rotation=np.eye(3), translation=fit.middle)
+        sim = about @ Sim3.exp(step) @ about.inverse() @ sim
+        if k >= len(widths_m) and float(np.abs(step).max()) < _SETTLED:
+            break
+    return laid(shape, own, sim, widths_m[-1])

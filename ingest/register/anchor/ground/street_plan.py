@@ -55,7 +55,8 @@ def street_plan(unplaced: UnplacedMap) -> StreetPlan | None:
         [np.bincount(observations.point_index, seen_from[:, k], len(xyz)) / count for k in range(3)]
     )
     distance = float(np.median(np.linalg.norm(xyz[observations.point_index] - seen_from, axis=1)))
-    first = _one_each(xyz, _VOXEL_SHARE * distance)
+    voxels = np.floor(xyz / (_VOXEL_SHARE * distance)).astype(np.int64)
+    first = np.unique(voxels, axis=0, return_index=True)[1]
     xyz, eye = xyz[first], eye[first]
     if len(xyz) < 10 * _NEIGHBOURS:
         return None
@@ -105,12 +106,6 @@ def _level(unplaced: UnplacedMap) -> FloatArray:
         ]
         up = steady * np.sign(steady @ up)
     return rotation_to_up(up)
-
-
-def _one_each(xyz: FloatArray, side: float) -> NDArray[np.int64]:
-    """A row of each voxel."""
-    cells = np.floor(xyz / side).astype(np.int64)
-    return np.unique(cells, axis=0, return_index=True)[1]
 
 
 def _planes(xyz: FloatArray, eye: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

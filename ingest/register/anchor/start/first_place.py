@@ -154,12 +154,21 @@ def started_images(
     Raises:
         RegistrationError: no such photo, or picks do not determine a pose.
     """
-    return [
-        _by_picks(feature_map, one, frame, epsg)
-        if isinstance(one, Picks)
-        else _by_pose(feature_map, one, frame, epsg)
-        for one in told
-    ]
+    started = []
+    for one in told:
+        if isinstance(one, Picks):
+            started.append(_by_picks(feature_map, one, frame, epsg))
+            continue
+        image = image_named(feature_map, str(one.image))
+        started.append(
+            StartedImage(
+                image=image,
+                prior=one.prior(frame, epsg),
+                camera=feature_map.cameras[image.camera_id],
+                note=f"{image.name} starts from the pose given for it",
+            )
+        )
+    return started
 
 
 def _by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -> StartedImage:
@@ -182,11 +191,7 @@ def _by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -
 
 
 def first_place(
-    database: Database,
-    unplaced: UnplacedMap,
-    files: StartFiles,
-    scan_ids: Sequence[str],
-    photos: PhotoFiles,
+    database: Database, unplaced: UnplacedMap, files: StartFiles, scan_ids: Sequence[str], photos: PhotoFiles
 ) -> FirstPlace:
     """Put a map without a place where a person's photo says, or where it is found near, on the scans.
 
@@ -279,11 +284,7 @@ def _cloud_near(database: Database, near: Circle, scan_ids: tuple[str, ...]) -> 
 
 
 def _found_near(
-    database: Database,
-    unplaced: UnplacedMap,
-    near: Circle,
-    scan_ids: tuple[str, ...],
-    photos: PhotoFiles,
+    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...], photos: PhotoFiles
 ) -> tuple[FeatureMap, str, bool]:
     """The map where the scans near a place show the same, a line on it, and whether it was only its look."""
     cloud, reach = _cloud_near(database, near, scan_ids), near.radius_m
@@ -365,13 +366,3 @@ def plan_box(feature_map: FeatureMap) -> tuple[float, float, float, float]:
     both = np.vstack([inner, centers[:, :2]])
     low, high = both.min(axis=0) - MARGIN_M, both.max(axis=0) + MARGIN_M
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _by_pose(feature_map: AnyMap, rough: RoughPose, frame: LocalFrame, epsg: int) -> StartedImage:
-    image = image_named(feature_map, str(rough.image))
-    return StartedImage(
-        image=image,
-        prior=rough.prior(frame, epsg),
-        camera=feature_map.cameras[image.camera_id],
-        note=f"{image.name} starts from the pose given for it",
-    )

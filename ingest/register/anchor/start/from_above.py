@@ -26,7 +26,7 @@ from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.features.matching import pool_features
+from ingest.register.frame.features.matching import joined_pools, pool_features
 from ingest.register.frame.sources import available_sources
 from ingest.register.frame.verdict import MIN_COVER
 from ingest.register.frame.views import FEATURES_SPACING_PX
@@ -90,14 +90,18 @@ def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundFromAbove
 
 
 def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> FoundFromAbove | None:
-    wide_m = _wide_m(cloud)
+    # A picture shows as much as is as fine as the scan's points are dense, in no more than so many pictures.
+    plan = np.ptp(cloud.xyz[:, :2], axis=0)
+    spacing = float(np.sqrt(np.prod(plan) / len(cloud)))
+    wide_m = max(_SIDE_PX * spacing / FEATURES_SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
     if wide_m <= 0.0:  # a single point
         return None
     pools = [pool_features(view, source, upright=False) for view in _views(cloud, wide_m)]
     if not pools:
         return None
-    places = np.concatenate([pool.points for pool in pools])
-    point, place = _matched(unplaced, np.concatenate([pool.descriptors for pool in pools]))
+    pool = joined_pools(pools)
+    places = pool.points
+    point, place = _matched(unplaced, pool.descriptors)
     if len(point) <= _SAMPLE:
         return None
     own, local = unplaced.points.xyz[point], places[place]
@@ -109,13 +113,6 @@ def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> Fo
         sim = _most_fitting(own, local, upwards, tolerance_m)
         judged.append(_judged(sim, own, local, upwards, point, tolerance_m, area_m2, source))
     return max((one for one in judged if one is not None), key=lambda one: one.log_nfa, default=None)
-
-
-def _wide_m(cloud: PointCloud) -> float:
-    """What a picture shows: as fine as the scan's points are dense, and no more than so many pictures."""
-    plan = np.ptp(cloud.xyz[:, :2], axis=0)
-    spacing = float(np.sqrt(np.prod(plan) / len(cloud)))
-    return max(_SIDE_PX * spacing / FEATURES_SPACING_PX, 2.0 * float(plan.max()) / _VIEWS)
 
 
 def _views(cloud: PointCloud, wide_m: float) -> Iterator[Rendering]:

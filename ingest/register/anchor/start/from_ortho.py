@@ -59,7 +59,7 @@ class FoundByOrtho:
 
     Attributes:
         local_from_own: similarity. covariance: (7, 7) of its left perturbation, by the steps of the search.
-        over_chance, elsewhere: as in `PicturePlace`.
+        over_chance, elsewhere: as in `best_place`.
         source: what of the scan was drawn.
     """
 
@@ -78,29 +78,23 @@ class FoundByOrtho:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PictureTry:
-    """A place that was tried, as in `PicturePlace`."""
+    """A picture with cells of `size` metres, turned by `turn` (radians, x to y), its middle at `middle` (2,).
+
+    Attributes:
+        correlation: of the gradients there.
+    """
 
     size: float
     turn: float
     middle: FloatArray
     correlation: float
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PicturePlace:
-    """A picture with cells of `size` metres, turned by `turn` (radians, x to y), its middle at `middle` (2,).
-
-    Attributes:
-        over_chance: correlation of the gradients there over those of the mirrored picture, which is nowhere,
-            in deviations. elsewhere: the same of the best with another heading or place, or of the mirrored
-            picture over the picture.
-    """
-
-    size: float
-    turn: float
-    middle: FloatArray
-    over_chance: float
-    elsewhere: float
+    def similarity(self, picture: OrthoPicture, up: float) -> Sim3:
+        """That lays the picture there, the median of its heights at `up`."""
+        scale, turn = self.size / picture.cell, so3_exp([0.0, 0.0, self.turn])
+        middle = np.array([*picture.middle, float(np.median(picture.height[picture.valid]))])
+        there = np.array([*self.middle, up])
+        return Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
 
 
 class ScanSearch:
@@ -197,29 +191,32 @@ def _found(
     """
     extent_m = float(np.ptp(cloud.xyz[:, :2], axis=0).max())
     drawn = picture_of_scan(cloud, source, max(extent_m / _CELLS, plan_spacing_m(cloud)))
-    best = best_place(picture, drawn)
+    found = best_place(picture, drawn)
     # Chance alone passes this in one case of two: what is placed is up to the photos that are registered.
-    if best is None or best.over_chance <= best.elsewhere:
+    if found is None or found[1] <= found[2]:
         return None
-    middle = np.array([*picture.middle, float(np.median(picture.height[picture.valid]))])
-    there = np.array([*best.middle, float(np.nanmedian(_under(drawn, picture, best)))])
-    scale, turn = best.size / picture.cell, so3_exp([0.0, 0.0, best.turn])
-    local_from_upright = Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
+    best, over_chance, elsewhere = found
+    up = float(np.nanmedian(_under(drawn, picture, best)))
     tilt = _TILT_SIGMA if by_photos else _SLOPE_SIGMA
     plan_m = float(np.hypot(_PLAN_SIGMA_M, _PLAN_CELLS * drawn.cell))
     sigmas = [_SIZE_SIGMA, tilt, tilt, _TURN_SIGMA, plan_m, plan_m, _HEIGHT_SIGMA_M]
-    about = Sim3(scale=1.0, rotation=np.eye(3), translation=there)
+    about = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([*best.middle, up]))
     return FoundByOrtho(
-        local_from_own=local_from_upright @ upright,
+        local_from_own=best.similarity(picture, up) @ upright,
         covariance=about.carried(np.diag(np.square(sigmas))),
-        over_chance=best.over_chance,
-        elsewhere=best.elsewhere,
+        over_chance=over_chance,
+        elsewhere=elsewhere,
         source=source,
     )
 
 
-def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | None:
-    """Where a picture of whatever unit agrees best with one in metres; None where it fits nowhere on it."""
+def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> tuple[PictureTry, float, float] | None:
+    """Where a picture of whatever unit agrees best with one in metres; None where it fits nowhere on it.
+
+    Returns:
+        The place; its correlation over those of the mirrored picture, which is nowhere, in deviations; and
+        the same of the best with another heading or place, or of the mirrored picture over the picture.
+    """
     searched, longer = ScanSearch(drawn), max(picture.gray.shape)
     extent_m = min(drawn.gray.shape) * drawn.cell
     sizes = np.exp(np.arange(np.log(_LEAST_SHARE), 0.0, _SIZE_STEP)) * extent_m / longer
@@ -239,13 +236,7 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> PicturePlace | Non
     others += [
         other_chance(one) for one in again_mirrored if abs(np.log(one.size / best.size)) > 1.5 * _SIZE_STEP
     ]
-    return PicturePlace(
-        size=best.size,
-        turn=best.turn,
-        middle=best.middle,
-        over_chance=chance(best),
-        elsewhere=max(others, default=-np.inf),
-    )
+    return best, chance(best), max(others, default=-np.inf)
 
 
 def _again(
@@ -301,7 +292,7 @@ def _apart(one: PictureTry, other: PictureTry, cells: int) -> bool:
     return bool(turn > 2.0 * _TURN_STEP or away > 0.1 * cells * other.size)
 
 
-def _under(scan: OrthoPicture, picture: OrthoPicture, found: PicturePlace) -> FloatArray:
+def _under(scan: OrthoPicture, picture: OrthoPicture, found: PictureTry) -> FloatArray:
     """Heights of the scan under the map's picture."""
     _, valid, matrix = _turned(picture, found.size / scan.cell, found.turn)
     half = matrix @ np.array([picture.gray.shape[1] / 2, picture.gray.shape[0] / 2, 1.0])

@@ -61,10 +61,7 @@ class OrthoPicture:
 
 
 def picture_of_map(
-    xyz: FloatArray,
-    images: Sequence[MapImage],
-    cameras: Sequence[Camera],
-    read_gray: PhotoReader,
+    xyz: FloatArray, images: Sequence[MapImage], cameras: Sequence[Camera], read_gray: PhotoReader
 ) -> OrthoPicture | None:
     """The photos laid over the ground of a map, each cell by the photo that looks at it most steeply.
 
@@ -134,10 +131,7 @@ def _seen(
 
 
 def picture_of_scan(
-    cloud: PointCloud,
-    source: RenderSource,
-    cell_m: float,
-    box: tuple[FloatArray, FloatArray] | None = None,
+    cloud: PointCloud, source: RenderSource, cell_m: float, box: tuple[FloatArray, FloatArray] | None = None
 ) -> OrthoPicture:
     """The scan by one of its properties.
 

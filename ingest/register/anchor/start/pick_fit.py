@@ -26,16 +26,16 @@ _TRIED = 6  # of their poses, best first, that may be another explanation
 _ADJUSTMENT = (50, 1e-9)  # steps, and relative change of the cost
 _EXACT = 1e-5  # sigma of what is taken as known of a lens: all but its focal length
 
-
 _CHANCE = 0.001  # rate at which right picks are called contradictory: one set in a thousand
 # By how much the squared residuals must grow, in chi-square of one pick, until another explanation is out of
 # the question: one in a hundred.
 _APART = float(chi2.ppf(0.99, 2))
 _MAX_WRONG = 2  # so many wrong picks are looked for
 
-
 _SIGMA_PX_REL = 0.00075  # how well a person marks a point, over the longer side: 3 pixels in 4000
 _SIGMA_M = 0.2  # how well a person reads a point off the scan
+
+_Start = tuple[Rigid3, Camera]  # to begin with
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,14 +77,6 @@ class PickFit:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Start:
-    """A pose and a lens to begin with."""
-
-    pose: Rigid3
-    camera: Camera
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Fitted:
     """A pose and a lens adjusted to some picks, with the sum of the squared whitened residuals."""
 
@@ -109,11 +101,12 @@ class _Picked:
 
     def rough_cost(self, start: _Start, rows: list[int]) -> float:
         """Truncated, so that a wrong pick counts for no more than a bad one."""
-        in_camera = start.pose.act(self.points[rows])
+        pose, camera = start
+        in_camera = pose.act(self.points[rows])
         if (in_camera[:, 2] <= 0).sum() > _MAX_WRONG:
             return float("inf")
-        off = np.nan_to_num(start.camera.project(in_camera) - self.pixels[rows], nan=1e6)
-        by_point = _SIGMA_M * start.camera.focal_px / np.maximum(in_camera[:, 2], 1e-3)
+        off = np.nan_to_num(camera.project(in_camera) - self.pixels[rows], nan=1e6)
+        by_point = _SIGMA_M * camera.focal_px / np.maximum(in_camera[:, 2], 1e-3)
         sigma = np.hypot(self.sigma_px, by_point)
         return float(np.minimum((off**2).sum(axis=1) / (3 * sigma) ** 2, 25.0).sum())
 
@@ -122,9 +115,9 @@ class _Picked:
         count, none = len(rows), np.zeros(0, dtype=np.int64)
         block = Block(
             names=("picked",),
-            cameras=(start.camera,),
+            cameras=(start[1],),
             camera_of=np.zeros(1, dtype=np.int64),
-            cam_from_block=(start.pose,),
+            cam_from_block=(start[0],),
             xyz=self.points[rows],
             point_of=none,
             photo_of=none,
@@ -225,8 +218,8 @@ def _suspects(picked: _Picked, starts: list[_Start], rows: list[int], count: int
     """Picks that may be among several wrong ones: the worst under the pose that most agree with."""
     if count < 2:
         return rows
-    start = starts[0]
-    off = np.hypot(*(start.camera.project(start.pose.act(picked.points)) - picked.pixels).T)
+    pose, camera = starts[0]
+    off = np.hypot(*(camera.project(pose.act(picked.points)) - picked.pixels).T)
     worst = np.argsort(-np.nan_to_num(off, nan=np.inf))[: count + 2]
     return sorted(int(i) for i in worst)
 
@@ -247,8 +240,7 @@ def _starts(picked: _Picked) -> list[_Start]:
         for triple in map(list, triples):
             for solution in poselib.p3p(rays[triple], picked.points[triple]):
                 if np.isfinite(solution.Rt).all():
-                    pose = Rigid3.from_matrix(np.vstack([solution.Rt, [0, 0, 0, 1]]))
-                    start = _Start(pose=pose, camera=camera)
+                    start = (Rigid3.from_matrix(np.vstack([solution.Rt, [0, 0, 0, 1]])), camera)
                     found.append((picked.rough_cost(start, rows), start))
     found = [f for f in found if np.isfinite(f[0])]
     found.sort(key=lambda f: f[0])
@@ -268,9 +260,10 @@ def _another(
     far_m = max(6.0 * float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])), 1.0)
     tried = [found.pose.center]
     for start in starts[: 8 * _TRIED]:
-        if min(float(np.linalg.norm(start.pose.center - t)) for t in tried) < far_m:
+        center = start[0].center
+        if min(float(np.linalg.norm(center - t)) for t in tried) < far_m:
             continue
-        tried.append(start.pose.center)
+        tried.append(center)
         other = picked.fitted(start, kept)
         if other is not None:
             apart = float(np.linalg.norm(other.pose.center - found.pose.center))

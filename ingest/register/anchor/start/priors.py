@@ -47,8 +47,6 @@ def height_shift(feature_map: FeatureMap, cloud: PointCloud) -> HeightShift | No
     The surface at a place is the scan point nearest in plan. Horizontal errors of some metres only widen the
     spread of the differences where the ground is not a cliff, and the median forgives houses and trees.
     """
-    if not len(cloud):
-        return None
     points = feature_map.points_local(cloud.frame)
     step = max(1, len(points) // _MAX_SHIFT_POINTS)
     points = points[::step]

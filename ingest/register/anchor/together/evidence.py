@@ -16,7 +16,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import MapImage
 from featuredb.render.cloud import PointCloud
-from ingest.register.frame.dense.confirmation import CHANCE, Pieces, compared_pieces
+from ingest.register.frame.dense.confirmation import CHANCE, compared_pieces
 from ingest.register.frame_registration import RenderSource
 
 # Of a piece's side, half of its area: pieces that overlap by half say about half as much as ones that do not.
@@ -35,6 +35,14 @@ class JointEvidence:
 
     places: int
     agreeing: float
+
+    @classmethod
+    def of_cells(cls, cells: NDArray[np.int64], agrees: NDArray[np.bool_]) -> "JointEvidence":
+        """Of pieces (n,) that agree or not, in cells (n, d)."""
+        place = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+        count = np.bincount(place)
+        share = np.bincount(place, weights=agrees) / np.maximum(count, 1)
+        return cls(places=len(count), agreeing=float(share.sum()))
 
     def log_nfa(self, elsewhere: Sequence["JointEvidence"], asked: int) -> float:
         """-log10 of how often as many would agree at one of so many wrong places (beta-binomial).
@@ -78,15 +86,9 @@ def evidence_of(
         )
         for image in images
     ]
-    return _counted([pieces for pieces in asked if len(pieces.near)])
-
-
-def _counted(asked: Sequence[Pieces]) -> JointEvidence:
+    asked = [pieces for pieces in asked if len(pieces.near)]
     if not asked:
         return JointEvidence(places=0, agreeing=0.0)
     side_m = _CELL * float(np.median([pieces.side_m for pieces in asked]))
     cells = np.floor(np.vstack([pieces.points_local for pieces in asked])[:, :2] / side_m)
-    place = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
-    count = np.bincount(place)
-    near = np.bincount(place, weights=np.concatenate([pieces.near for pieces in asked]))
-    return JointEvidence(places=len(count), agreeing=float((near / count).sum()))
+    return JointEvidence.of_cells(cells.astype(np.int64), np.concatenate([pieces.near for pieces in asked]))

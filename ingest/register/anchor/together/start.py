@@ -6,7 +6,6 @@ tilted by some degrees looks the same from above; its points against the scan's 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,31 +36,19 @@ _LEAST_POINTS = 30
 _LEAST_M = 1e-3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Starts:
-    """Similarities of a map's frame under which it looks like the scan from above.
-
-    Attributes:
-        there: within what the placement leaves open, apart from each other, best first.
-        wrong: the best few of those that are turned by one, two and three right angles: streets of most towns
-            are square to each other, so these agree as wrong places do.
-    """
-
-    there: tuple[Sim3, ...]
-    wrong: tuple[Sim3, ...]
-
-
 def starts_from_above(
-    feature_map: FeatureMap,
-    picture: OrthoPicture,
-    cloud: PointCloud,
-    source: RenderSource,
-) -> Starts:
-    """The best places within what the placement leaves open; none where that is too much.
+    feature_map: FeatureMap, picture: OrthoPicture, cloud: PointCloud, source: RenderSource
+) -> tuple[list[Sim3], list[Sim3]]:
+    """Similarities of a map's frame under which it looks like the scan from above.
 
     Args:
         picture: of the map, in its frame.
         cloud: the scan around the map, in the map's frame.
+
+    Returns:
+        The places within what the placement leaves open, apart from each other, best first; none where that
+        is too much. And the best few of those that are turned by one, two and three right angles: streets of
+        most towns are square to each other, so these agree as wrong places do.
     """
     points = feature_map.points_local(cloud.frame)
     reach_m, turn, size = _left_open(feature_map, picture)
@@ -71,20 +58,20 @@ def starts_from_above(
     sizes = picture.cell * np.exp(_steps(size, _SIZE_STEP))
     turns = _steps(turn, _TURN_STEP).tolist()
     if not drawn.valid.any() or len(sizes) * len(turns) > _MOST_TRIES:
-        return Starts(there=(), wrong=())
+        return [], []
     search = ScanSearch(drawn, _COVER)
+    height = float(np.median(picture.height[picture.valid]))  # about as it is
 
     def best(around: float) -> list[Sim3]:
         """Similarities, best first, with headings about one."""
         found = [search.best(picture, one, around + angle) for one in sizes.tolist() for angle in turns]
         tries = sorted((one for one in found if one is not None), key=lambda one: -one.correlation)
-        return [_levelled(_in_plan(picture, one), points, drawn) for one in _distinct(tries, picture)]
+        return [
+            _levelled(one.similarity(picture, height), points, drawn) for one in _distinct(tries, picture)
+        ]
 
     quarters = _QUARTERS if turn < 0.5 * _QUARTERS[0] else ()
-    return Starts(
-        there=tuple(best(0.0)),
-        wrong=tuple(one for quarter in quarters for one in best(quarter)[:_WRONG_PLACES]),
-    )
+    return best(0.0), [one for quarter in quarters for one in best(quarter)[:_WRONG_PLACES]]
 
 
 def _left_open(feature_map: FeatureMap, picture: OrthoPicture) -> tuple[float, float, float]:
@@ -122,14 +109,6 @@ def _distinct(tries: Sequence[PictureTry], picture: OrthoPicture) -> list[Pictur
         if len(kept) == _PLACES:
             break
     return kept
-
-
-def _in_plan(picture: OrthoPicture, found: PictureTry) -> Sim3:
-    """The similarity that lays the picture where it was found; heights about as they are."""
-    scale, turn = found.size / picture.cell, so3_exp([0.0, 0.0, found.turn])
-    height = float(np.median(picture.height[picture.valid]))
-    middle, there = np.array([*picture.middle, height]), np.array([*found.middle, height])
-    return Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
 
 
 def _levelled(new_from_old: Sim3, points: FloatArray, scan: OrthoPicture) -> Sim3:

@@ -1,14 +1,13 @@
 """Whether pictures confirm a pose: do pieces of the photo, each on its own, put the scan where it does?
 
-Each piece of the rendering at the pose is searched in the
-photo within a window; without any relation between the two its best place is anywhere in the window, and
-near the middle with the small probability that the area gives. A pose that is right has a third or more of
-its pieces at the middle; a wrong one, even when it was fitted to the same pictures, as many as chance and
-six free parameters give. The evidence is the binomial tail. It does not ask how the pose was found.
+Each piece of the rendering at the pose is searched in the photo within a window; without any relation between
+the two its best place is anywhere in the window, and near the middle with the small probability that the area
+gives. A pose that is right has a third or more of its pieces at the middle; a wrong one, even when it was
+fitted to the same pictures, as many as chance and six free parameters give. The evidence is the binomial
+tail. It does not ask how the pose was found.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,33 +17,18 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
-from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.dense.pictures import (
-    PinholeView,
-    finest_side_px,
-    oriented_gradients,
-    pinhole_view,
-    with_margin,
-)
-from ingest.register.frame.dense.score_maps import (
-    ScoreMaps,
-    TemplateOptions,
-    cut_templates,
-    peaks,
-    search_around,
-)
-from ingest.register.frame.sources import source_image
+from ingest.register.frame.dense.pictures import finest_side_px, pinhole_view
+from ingest.register.frame.dense.score_maps import PIECE_PX, peaks, score_maps_of
 from ingest.register.frame_registration import RenderSource
 
 _OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not
-
 
 # Where the line between confirmed and not is; docs/measurements/registration.md shows the distributions.
 _SIDE_PX = 480  # longer side of the view on which pieces are compared, where the scan is dense enough
 _SEARCH_PX = 16  # radius of the window in which a piece is searched
 _NEAR_PX = 3.0  # a piece agrees with the pose when its best place is this near
 MIN_PIECES = 25  # fewer pieces with structure cannot confirm anything
-_PIECES = TemplateOptions(size_px=40, spacing_px=20, max_count=600)  # overlapping by half
+_MAX_PIECES = 600
 # A pose is refused when less than that share of the lower half of the pieces, by height, agrees while of the
 # upper half that many times as many do, and the halves lie that far apart: then what stands on the ground was
 # matched, which an ortho image shows displaced, and not the ground.
@@ -103,15 +87,10 @@ class PictureConfirmation:
 
     confirmed: bool
     pieces: int
-    agreeing: int
-    log_nfa: float
-    cells: int
     message: str
-
-    @property
-    def share(self) -> float:
-        """Of pieces that agree."""
-        return self.agreeing / self.pieces if self.pieces else 0.0
+    agreeing: int = 0
+    log_nfa: float = 0.0
+    cells: int = 0
 
 
 def confirm_pose(
@@ -133,16 +112,12 @@ def confirm_pose(
         return PictureConfirmation(
             confirmed=False,
             pieces=n,
-            agreeing=0,
-            log_nfa=0.0,
-            cells=0,
             message=f"only {n} pieces of the picture have structure, {MIN_PIECES} are needed",
         )
     agreeing = int(near.sum())
     log_nfa = log_nfa_of(agreeing, n)
     cells = len(np.unique(np.clip((found.pixels[near] * 4).astype(int), 0, 3) @ (4, 1)))
-    layers = _layers(found.points_local[:, 2], near)
-    message = _objection(agreeing / n, log_nfa, cells, layers, options)
+    message = _objection(agreeing / n, log_nfa, cells, options) or _layers_differ(found)
     return PictureConfirmation(
         confirmed=not message,
         pieces=n,
@@ -175,43 +150,19 @@ def compared_pieces(
     """
     finest = finest_side_px(camera, cam_from_local, cloud, options.finest_spacing)
     view = pinhole_view(photo_gray, camera, min(_SIDE_PX, finest))
-    maps = _maps(view, cam_from_local, cloud, source)
+    margin_px = PIECE_PX // 2
+    maps = score_maps_of(view, cam_from_local, margin_px, cloud, source, _SEARCH_PX, _MAX_PIECES)
     places = peaks(maps.maps)[0] if len(maps) else np.zeros((0, 2))
     depth = cam_from_local.act(maps.points_local)[:, 2] if len(maps) else np.zeros(1)
     return Pieces(
         points_local=maps.points_local,
         pixels=(maps.origin + places) / (view.camera.width, view.camera.height),
         near=np.linalg.norm(places - _SEARCH_PX, axis=1) <= _NEAR_PX,
-        side_m=_PIECES.size_px * float(np.median(depth)) / view.camera.focal_px,
+        side_m=PIECE_PX * float(np.median(depth)) / view.camera.focal_px,
     )
 
 
-def _maps(view: PinholeView, pose: Rigid3, cloud: PointCloud, source: RenderSource) -> ScoreMaps:
-    margin = _PIECES.size_px // 2
-    rendering = render(cloud, with_margin(view.camera, margin), pose, RenderOptions(threads=1))
-    channels = oriented_gradients(source_image(rendering, source), rendering.valid)
-    templates = cut_templates(channels, rendering, _PIECES)
-    photo = oriented_gradients(view.image, view.valid)
-    return search_around(templates, photo, view.camera, pose, _SEARCH_PX)
-
-
-class _Layers(NamedTuple):
-    """Shares of agreeing pieces in the lower and the upper half by height, and how far apart these lie."""
-
-    low: float
-    high: float
-    apart_m: float
-
-
-def _layers(height: FloatArray, near: NDArray[np.bool_]) -> _Layers:
-    low = height <= np.median(height)
-    if low.all():
-        return _Layers(float(near.mean()), float(near.mean()), 0.0)
-    apart = float(np.median(height[~low]) - np.median(height[low]))
-    return _Layers(float(near[low].mean()), float(near[~low].mean()), apart)
-
-
-def _objection(share: float, log_nfa: float, cells: int, layers: _Layers, options: ConfirmOptions) -> str:
+def _objection(share: float, log_nfa: float, cells: int, options: ConfirmOptions) -> str:
     if share < options.min_agreeing:
         return (
             f"{share:.0%} of the pieces lie where the pose puts them, {options.min_agreeing:.0%} are needed"
@@ -220,7 +171,16 @@ def _objection(share: float, log_nfa: float, cells: int, layers: _Layers, option
         return f"evidence of 10^-{log_nfa:.1f} against chance, 10^-{MIN_LOG_NFA:g} is needed"
     if cells < _MIN_CELLS:
         return f"agreement in {cells} of 16 parts of the picture, {_MIN_CELLS} are needed"
-    ground_differs = layers.low < _MIN_LOW_AGREEING and layers.high > _MAX_LAYER_RATIO * layers.low
-    if ground_differs and layers.apart_m > _MIN_LAYER_M:
-        return f"{layers.low:.0%} of the lower pieces agree and {layers.high:.0%} of the upper ones"
+    return ""
+
+
+def _layers_differ(found: Pieces) -> str:
+    """Why the lower and the upper half of the pieces, by height, speak against a pose, or ""."""
+    height = found.points_local[:, 2]
+    low = height <= np.median(height)
+    if low.all() or np.median(height[~low]) - np.median(height[low]) <= _MIN_LAYER_M:
+        return ""
+    below, above = float(found.near[low].mean()), float(found.near[~low].mean())
+    if below < _MIN_LOW_AGREEING and above > _MAX_LAYER_RATIO * below:
+        return f"{below:.0%} of the lower pieces agree and {above:.0%} of the upper ones"
     return ""

@@ -16,15 +16,13 @@ from featuredb.geometry.camera import Camera
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
 from ingest.register.frame.dense.pictures import oriented_gradients
-from ingest.register.frame.dense.score_maps import TemplateOptions, cut_templates, peaks, search_around
+from ingest.register.frame.dense.score_maps import cut_templates, peaks, search_around
 from ingest.register.frame.dense.search import register_dense, searched_near
 from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
-from ingest.register.frame.options import DenseFitOptions
 from ingest.register.frame.prior_fit import fitted_under_prior
-from ingest.register.frame.sources import source_image
 from ingest.register.frame.verdict import DECISIVE_LOG_NFA
-from ingest.register.frame.views import FrameViews
+from ingest.register.frame.views import DenseFitOptions, FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import refine_pose
@@ -35,6 +33,7 @@ _WINDOW_PX = 12  # radius of the score map against whose spread a place is judge
 _MIN_SCORE = 1.5
 _TOLERANCE_PX = 4.0  # of an inlier, in the render
 _MAX_PIECES = 400  # per round
+_PIECE_POINTS = 15.0  # so many scan points are across a piece, as far as the picture has room
 _LEAST_ACROSS = 8  # pieces that are made larger still leave so many along the picture's longer side
 
 
@@ -51,9 +50,7 @@ def near_places(
     Args:
         photo_gray: (h, w) uint8 of `camera`'s size. rendering: made with that camera, shrunk.
     """
-    channels = oriented_gradients(source_image(rendering, source), rendering.valid)
-    pieces = TemplateOptions(size_px=piece_px, spacing_px=piece_px // 2, max_count=_MAX_PIECES)
-    templates = cut_templates(channels, rendering, pieces)
+    templates = cut_templates(rendering, source, piece_px, _MAX_PIECES)
     size = (rendering.camera.width, rendering.camera.height)
     small = np.asarray(cv2.resize(photo_gray, size, interpolation=cv2.INTER_AREA))
     photo = oriented_gradients(small, None)
@@ -128,7 +125,7 @@ def _fit_round(
     if not renderings:
         return None
     between_px = views.spacing_full_px * side_px / max(views.camera.width, views.camera.height)
-    wanted_px = min(views.options.dense_fit.piece_points * between_px, side_px / _LEAST_ACROSS)
+    wanted_px = min(_PIECE_POINTS * between_px, side_px / _LEAST_ACROSS)
     piece_px = max(piece_px, 2 * round(0.5 * wanted_px))
     matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px)
     if len(matches) < _MIN_PLACES:

@@ -22,7 +22,6 @@ from featuredb.render.cloud import PointCloud
 
 FloatImage = NDArray[np.float32]
 
-
 _PRESMOOTHING_PX = 1.0  # sigma before the gradient. Laser intensity has speckle of one pixel.
 _POOLING_PX = 1.2  # sigma of pooling after it: the play that small misalignments of neighbouring edges have
 # Share of the median strength that is added when pixels are normalised, so that noise of empty ground does
@@ -49,8 +48,9 @@ def oriented_gradients(image: NDArray[np.generic], valid: NDArray[np.bool_] | No
     strength, angle = cv2.cartToPolar(dx, dy)
     if valid is not None:
         strength[~inner_part(valid, int(np.ceil(2.0 * _PRESMOOTHING_PX)))] = 0.0
-    pooled = cv2.GaussianBlur(strength, (0, 0), _POOLING_PX)
-    weight = 1.0 / (pooled + _SOFTENING * _typical(pooled) + 1e-9)
+    pooled = np.asarray(cv2.GaussianBlur(strength, (0, 0), _POOLING_PX))
+    typical = float(np.median(pooled[pooled > 0])) if (pooled > 0).any() else 1.0
+    weight = 1.0 / (pooled + _SOFTENING * typical + 1e-9)
     channels = [
         cv2.GaussianBlur(strength * wave(order * angle), (0, 0), _POOLING_PX) * weight
         for order in _HARMONICS
@@ -74,11 +74,6 @@ def _smooth_inside(image: FloatImage, valid: NDArray[np.bool_] | None, sigma_px:
     total = cv2.GaussianBlur(weight, (0, 0), sigma_px)
     blurred = cv2.GaussianBlur(image * weight, (0, 0), sigma_px)
     return np.asarray(blurred / np.maximum(total, 1e-6), dtype=np.float32)
-
-
-def _typical(strength: FloatImage) -> float:
-    values = strength[strength > 0]
-    return float(np.median(values)) if len(values) else 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

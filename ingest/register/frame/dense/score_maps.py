@@ -16,32 +16,21 @@ from scipy import fft
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.render.cloud import PointCloud
+from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.dense.pictures import FloatImage
+from ingest.register.frame.dense.pictures import FloatImage, PinholeView, oriented_gradients, with_margin
+from ingest.register.frame.sources import source_image
+from ingest.register.frame_registration import RenderSource
 
+# Side of a square piece. Larger ones are more distinct and bear less change of view; 40 pixels found airborne
+# intensity from far off where 28 did not.
+PIECE_PX = 40
 _MIN_OVERLAP = 0.6  # of a piece that lies over the photo's border
-
-
 _MIN_VALID = 0.6  # share of the piece that must show the scan
 # Mean squared length of its channels; below it there is no edge to hold on to. White noise has 0.1, a kerb
 # through the piece 0.3.
 _MIN_STRUCTURE = 0.05
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TemplateOptions:
-    """Which pieces of a rendering are searched for.
-
-    Attributes:
-        size_px: side of a square piece. Larger ones are more distinct and bear less change of view; 40 pixels
-            found airborne intensity from far off where 28 did not.
-        spacing_px: between neighbours on the grid; half the size, so that each edge is in the middle of one.
-        max_count: the ones with most structure are kept; bounds the time.
-    """
-
-    size_px: int = 40
-    spacing_px: int = 20
-    max_count: int = 260
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,23 +69,46 @@ class ScoreMaps:
         return len(self.points_local)
 
 
-def cut_templates(channels: FloatImage, rendering: Rendering, options: TemplateOptions) -> Templates:
-    """Pieces on a grid of a rendering where it shows the scan and has structure.
+def score_maps_of(
+    view: PinholeView,
+    cam_from_local: Rigid3,
+    margin_px: int,
+    cloud: PointCloud,
+    source: RenderSource,
+    radius_px: int | None,
+    max_count: int,
+) -> ScoreMaps:
+    """Renders at a pose and searches the pieces in the photo, all over it if `radius_px` is None.
 
     Args:
-        channels: (k, h, w) of the rendering's picture.
+        margin_px: by which the render is wider than the photo on each side. max_count: of pieces.
     """
-    size, (height, width) = options.size_px, channels.shape[1:]
+    rendering = render(cloud, with_margin(view.camera, margin_px), cam_from_local, RenderOptions(threads=1))
+    templates = cut_templates(rendering, source, PIECE_PX, max_count)
+    photo = oriented_gradients(view.image, view.valid)
+    if radius_px is None:
+        return search_everywhere(templates, photo, view.camera)
+    return search_around(templates, photo, view.camera, cam_from_local, radius_px)
+
+
+def cut_templates(rendering: Rendering, source: RenderSource, size: int, max_count: int) -> Templates:
+    """Pieces of a rendering that show the scan and have structure; they overlap by half.
+
+    Args:
+        size: of a piece, pixels. max_count: the ones with most structure are kept; bounds the time.
+    """
+    channels = oriented_gradients(source_image(rendering, source), rendering.valid)
+    height, width = channels.shape[1:]
     grid = np.meshgrid(
-        np.arange(0, height - size + 1, options.spacing_px),
-        np.arange(0, width - size + 1, options.spacing_px),
+        np.arange(0, height - size + 1, size // 2),
+        np.arange(0, width - size + 1, size // 2),
         indexing="ij",
     )
     rows, columns = (axis.ravel() for axis in grid)
     valid = _window_means(rendering.valid.astype(np.float32), size)[rows, columns]
     structure = _window_means(np.einsum("khw,khw->hw", channels, channels), size)[rows, columns]
     keep = np.flatnonzero((valid >= _MIN_VALID) & (structure >= _MIN_STRUCTURE))
-    keep = np.sort(keep[np.argsort(-structure[keep], kind="stable")[: options.max_count]])
+    keep = np.sort(keep[np.argsort(-structure[keep], kind="stable")[:max_count]])
     rows, columns = rows[keep], columns[keep]
     points, known = _centre_points(rendering, rows + size / 2.0, columns + size / 2.0)
     rows, columns, points = rows[known], columns[known], points[known]
@@ -138,9 +150,8 @@ def search_around(
     h, w = photo.shape[1:]
     inside: NDArray[np.bool_] = np.asarray(np.isfinite(pixels).all(axis=1))
     inside[inside] &= ((pixels[inside] > 0) & (pixels[inside] < (w, h))).all(axis=1)
-    corner = (
-        np.round(pixels[inside] - size / 2.0).astype(np.int64) - radius_px
-    )  # first row and column of the window
+    # First column and row of the window.
+    corner = np.round(pixels[inside] - size / 2.0).astype(np.int64) - radius_px
     padded = np.pad(photo, ((0, 0), (reach + 1, reach + 1), (reach + 1, reach + 1)))
     energy = _window_means(np.einsum("khw,khw->hw", padded, padded), size) * size**2
     picture = np.ascontiguousarray(padded.transpose(1, 2, 0))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -23,21 +24,11 @@ from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame.dense.pictures import (
     PinholeView,
     finest_side_px,
-    oriented_gradients,
     pinhole_view,
     viewing_distance_m,
-    with_margin,
 )
-from ingest.register.frame.dense.score_maps import (
-    ScoreMaps,
-    TemplateOptions,
-    cut_templates,
-    scores_at,
-    search_around,
-    search_everywhere,
-)
+from ingest.register.frame.dense.score_maps import ScoreMaps, score_maps_of, scores_at
 from ingest.register.frame.prior_fit import prior_sigmas
-from ingest.register.frame.sources import source_image
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 # Longer side of the photo's view at each octave, coarse to fine. Octaves finer than the scan's points allow
@@ -61,6 +52,7 @@ _CANDIDATES = 12
 _KEPT = 6
 _SEPARATION_PX = 5.0  # two candidates are different if they predict pixels this far apart
 _REFINE_RADIUS_PX = 12  # of the score maps at the finer octaves
+_MAX_PIECES = 260
 _SCORE_CLIP = 6.0  # a single piece counts no more than this many standard deviations
 _SCORE_WEIGHT = 0.3  # of the summed scores against the prior; pieces overlap, so each says less than it seems
 _MAX_POSITIONS_PER_AXIS = 5
@@ -83,15 +75,11 @@ class DensePose:
 
 
 def register_dense(
-    photo_gray: NDArray[np.uint8],
-    camera: Camera,
-    prior: FramePrior,
-    cloud: PointCloud,
-    source: RenderSource,
+    photo_gray: NDArray[np.uint8], camera: Camera, prior: FramePrior, cloud: PointCloud, source: RenderSource
 ) -> list[DensePose]:
     """Poses of a photo, best first; empty where the scan shows nothing that could be searched for.
 
-    They are hypotheses: whether the first is right is for `agreement.confirm_pose` to say.
+    They are hypotheses: whether the first is right is for `confirm_pose` to say.
 
     Args:
         photo_gray: (h, w) uint8 of `camera`'s size.
@@ -122,25 +110,6 @@ def searched_near(
     return _refined(view, pose, prior, cloud, source)
 
 
-def score_maps_of(
-    view: PinholeView,
-    cam_from_local: Rigid3,
-    margin_px: int,
-    cloud: PointCloud,
-    source: RenderSource,
-    radius_px: int | None,
-) -> ScoreMaps:
-    """Renders at a pose and searches the pieces in the photo, all over it if `radius_px` is None."""
-    rendering = render(cloud, with_margin(view.camera, margin_px), cam_from_local, RenderOptions(threads=1))
-    picture = source_image(rendering, source)
-    channels = oriented_gradients(picture, rendering.valid)
-    templates = cut_templates(channels, rendering, TemplateOptions())
-    photo = oriented_gradients(view.image, view.valid)
-    if radius_px is None:
-        return search_everywhere(templates, photo, view.camera)
-    return search_around(templates, photo, view.camera, cam_from_local, radius_px)
-
-
 def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: RenderSource) -> list[Rigid3]:
     """The best poses of a grid around the prior, at the coarsest octave."""
     tilt = REACH_SIGMA * np.radians(prior.sigma_tilt_deg)
@@ -159,7 +128,7 @@ def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: Rende
     found: list[tuple[float, Rigid3]] = []
     for turn in turns:
         start = Rigid3(rotation=so3_exp([0, 0, turn]), translation=np.zeros(3)) @ prior.cam_from_local
-        maps = score_maps_of(view, start, margin, cloud, source, None)
+        maps = score_maps_of(view, start, margin, cloud, source, None, _MAX_PIECES)
         if len(maps) < 4:
             continue
         for offset in offsets:
@@ -236,17 +205,8 @@ def _pan_tilts(reach_px: float, camera: Camera) -> FloatArray:
     side = int(np.ceil(reach * focal / _GRID_STEP_PX))
     steps = np.arange(-side, side + 1) * (_GRID_STEP_PX / focal)
     pan, tilt = (axis.ravel() for axis in np.meshgrid(steps, steps))
-    angle = np.hypot(pan, tilt)
-    pan, tilt, angle = (values[angle <= reach + 1e-9] for values in (pan, tilt, angle))
-    # Rodrigues' formula for axes in the picture's plane.
-    x, y = tilt / np.maximum(angle, 1e-12), pan / np.maximum(angle, 1e-12)
-    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
-    rows = [
-        [c + x * x * (1 - c), x * y * (1 - c), y * s],
-        [x * y * (1 - c), c + y * y * (1 - c), -x * s],
-        [-y * s, x * s, c + zero],
-    ]
-    return np.asarray(rows, dtype=np.float64).transpose(2, 0, 1)
+    axes = np.column_stack([tilt, pan, np.zeros(len(pan))])[np.hypot(pan, tilt) <= reach + 1e-9]
+    return np.asarray(Rotation.from_rotvec(axes).as_matrix())
 
 
 def _refined(
@@ -254,7 +214,7 @@ def _refined(
 ) -> DensePose | None:
     """Downhill simplex on the score maps of a render made at the pose."""
     radius = _REFINE_RADIUS_PX
-    maps = score_maps_of(view, pose, radius, cloud, source, radius)
+    maps = score_maps_of(view, pose, radius, cloud, source, radius, _MAX_PIECES)
     if len(maps) < 4:
         return None
     depth = float(np.median(pose.act(maps.points_local)[:, 2]))

@@ -32,10 +32,7 @@ _MIN_LOG_CHANCE = -0.5
 
 
 def consistent_matches(
-    photo: FloatArray,
-    reference: FloatArray,
-    side_px: float,
-    area_px: float,
+    photo: FloatArray, reference: FloatArray, side_px: float, area_px: float
 ) -> NDArray[np.bool_]:
     """Which matches (m,) have more neighbours that one similarity moves than chance gives them.
 

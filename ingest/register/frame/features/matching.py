@@ -41,6 +41,14 @@ class Pool:
         return len(self.points)
 
 
+def joined_pools(pools: Sequence[Pool]) -> Pool:
+    """One pool of all, at least one."""
+    return Pool(
+        points=np.concatenate([p.points for p in pools]),
+        descriptors=np.concatenate([p.descriptors for p in pools]),
+    )
+
+
 def pool_features(rendering: Rendering, source: RenderSource, *, upright: bool = True) -> Pool:
     """Features of a render, lifted to the scan by its depth.
 

@@ -10,13 +10,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.consistency import consistent_matches
-from ingest.register.frame.features.matching import FrameMatches, Pool, joined, pooled_matches
-from ingest.register.frame.views import (
-    FrameViews,
-    fan_headings_deg,
-    star_poses,
-    turned_about_vertical,
-)
+from ingest.register.frame.features.matching import FrameMatches, joined, joined_pools, pooled_matches
+from ingest.register.frame.views import FrameViews, fan_headings_deg, star_poses, turned_about_vertical
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.acceptance import independent_inliers, log_nfa
 from reloc.localise.lens_prior import LensPriors
@@ -104,7 +99,12 @@ def search(views: FrameViews, groups: Sequence[RenderGroup], source: RenderSourc
         same_place_m = _SAME_PLACE * views.look.depth_m
         matches = pooled_matches(views.features, joined_pools(pools), same_place_m, _MAX_RATIO)
         raw.append(matches)
-        kept.append(_consistent(views, matches, group))
+        width, height = views.camera.width, views.camera.height
+        reference = views.camera.project(group.reference.act(matches.points))
+        consistent = consistent_matches(
+            matches.pixels, reference, float(max(width, height)), float(width * height)
+        )
+        kept.append(matches.take(consistent))
     return _hypothesis(views, joined(raw), joined(kept), source)
 
 
@@ -136,26 +136,6 @@ def pose_options(views: FrameViews) -> PoseOptions:
     tolerance = float(np.clip(by_scan, _TOLERANCE_REL, _MAX_TOLERANCE_REL))
     # A frame on a scan has too few matches for more of a lens.
     return PoseOptions(tolerance_rel=tolerance, lens=LensPriors(whole_lens=False))
-
-
-def joined_pools(pools: Sequence[Pool]) -> Pool:
-    """One pool of all."""
-    return Pool(
-        points=np.concatenate([p.points for p in pools]),
-        descriptors=np.concatenate([p.descriptors for p in pools]),
-    )
-
-
-def _consistent(views: FrameViews, matches: FrameMatches, group: RenderGroup) -> FrameMatches:
-    camera = views.camera
-    reference = camera.project(group.reference.act(matches.points))
-    found = consistent_matches(
-        matches.pixels,
-        reference,
-        float(max(camera.width, camera.height)),
-        float(camera.width * camera.height),
-    )
-    return matches.take(found)
 
 
 def _hypothesis(
