@@ -36,9 +36,7 @@ def another_day(scene: Scene, options: DayOptions) -> Scene:
         crowns = replace(crowns, tint=crowns.tint * np.asarray(options.leaf_tint))
     if options.to_sun is not None:
         sun = np.asarray(options.to_sun) / np.linalg.norm(options.to_sun)
-        old, new = (
-            faces.sunlight(scene.enu_from_town @ direction) for direction in (np.asarray(plan.to_sun), sun)
-        )
+        old, new = (faces.sunlight(scene.enu_from_town @ np.asarray(way)) for way in (plan.to_sun, sun))
         faces = replace(faces, tint=faces.tint * (new / old)[:, None])
         plan = replace(plan, to_sun=(float(sun[0]), float(sun[1]), float(sun[2])))
     return replace(scene, faces=faces, ellipsoids=crowns, plan=plan)
