@@ -49,9 +49,9 @@ class Change:
     flagged: tuple[str, ...] = ()
 
 
-def live_row(rows: Iterable[Row], map_id: str) -> Row | None:
-    """The row of a map that is visible and not retired, or None."""
-    return next((row for row in rows if row["map_id"] == map_id and row["status"] != RETIRED), None)
+def live_row(rows: Iterable[Row], wanted: str, column: str = "map_id") -> Row | None:
+    """The row of a map, or of a scan by `scan_id`, that is visible and not retired, or None."""
+    return next((row for row in rows if row[column] == wanted and row["status"] != RETIRED), None)
 
 
 def check_unchanged(rows: Sequence[Row], based_on: Mapping[str, str]) -> None:

@@ -10,7 +10,6 @@ from featuredb.store.changes import Change
 from featuredb.store.delta import Table
 from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, rows_table
-from featuredb.store.tables import FORMAT_VERSION
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
 # orphans; it is well below the vacuum's shortest default grace of a day.
@@ -106,11 +105,6 @@ def commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:
 def oldest_kept_version(commits: Sequence[Commit]) -> int:
     """The oldest version whose files no vacuum has taken; vacuum notes it in its commit."""
     return max((int(c.metadata.get(KEPT_FROM, 0)) for c in commits), default=0)
-
-
-def upgrade_metadata() -> dict[str, str]:
-    """What an upgrade's commit to `maps` says about itself."""
-    return {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {FORMAT_VERSION}"}
 
 
 def check_children(encoded: EncodedMap, table_of: Callable[[str], Table]) -> None:

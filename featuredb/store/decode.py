@@ -203,11 +203,7 @@ def _decode_image(row: Row) -> MapImage:
 def _gathered(
     batches: Iterable[pa.RecordBatch], name: str, index_column: str, count: int
 ) -> tuple[pa.Table, NDArray[np.int64]]:
-    """The rows of a child table, and the index (count,) of each.
-
-    Raises:
-        StoreError: rows are missing or double.
-    """
+    """The rows of a child table, and the index (count,) of each."""
     parts = list(batches)
     table = pa.Table.from_batches(parts) if parts else SPECS[name].schema.empty_table()
     index: NDArray[np.int64] = table[index_column].to_numpy()

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geometry.arrays import FloatArray
-from featuredb.store.changes import RETIRED, Change
+from featuredb.store.changes import RETIRED, Change, live_row
 from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, apply_change, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import of_columns, read_rows
@@ -142,7 +142,7 @@ def commit_scan(
         StoreError: the store failed.
     """
     database.make(LIDAR)
-    visible = _live(scan_rows(database), row["scan_id"])
+    visible = live_row(scan_rows(database), row["scan_id"], "scan_id")
     if visible is not None:
         return False, visible["write_id"]
     started = monotonic()
@@ -168,10 +168,8 @@ def commit_scan(
         raise StoreError(f"scan {row['scan_id']}: expected {row['points']} points, {written} were written")
     if (left := database.table(LIDAR_POINTS).count("write_id", write_id)) != written:
         raise ConflictError(f"scan {row['scan_id']}: a vacuum left {left} of {written} points; add it again")
-    full = {
-        **row, "write_id": write_id, "points_checksum": checksum.text(), "status": "active", "status_reason":
-        "", "created_at": datetime.now(UTC),
-    }  # fmt: skip
+    made = {"write_id": write_id, "points_checksum": checksum.text(), "created_at": datetime.now(UTC)}
+    full = {**row, **made, "status": "active", "status_reason": ""}
     winner = retry_stale(f"commit of scan {row['scan_id']}", lambda: _add_row(database, full))
     return winner == write_id, winner
 
@@ -190,7 +188,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
     def attempt() -> bool:
         table = database.table(LIDAR)
         rows = read_rows(table)
-        if _live(rows, scan_id) is None:
+        if live_row(rows, scan_id, "scan_id") is None:
             return False
         changed = [
             {**r, "status": RETIRED, "status_reason": reason} if r["scan_id"] == scan_id else r for r in rows
@@ -271,15 +269,11 @@ class PointsChecksum:
         return hashlib.sha256(f"{self._sums} {self._count}".encode()).hexdigest()
 
 
-def _live(rows: Iterable[Row], scan_id: str) -> Row | None:
-    return next((r for r in rows if r["scan_id"] == scan_id and r["status"] != RETIRED), None)
-
-
 def _add_row(database: Database, row: Row) -> str:
     """Add the row unless the scan is visible; a retired one gives way. Returns the visible write id."""
     table = database.table(LIDAR)
     rows = read_rows(table)
-    visible = _live(rows, row["scan_id"])
+    visible = live_row(rows, row["scan_id"], "scan_id")
     if visible is not None:
         return str(visible["write_id"])
     kept = [r for r in rows if r["scan_id"] != row["scan_id"]]

@@ -22,13 +22,7 @@ from featuredb.store.decode import decode_images, decode_map, decode_no_place, f
 from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
-from featuredb.store.tables import (
-    BOUNDS,
-    CHILD_TABLES,
-    IMAGES,
-    SPECS,
-    UTM_COORDINATES,
-)
+from featuredb.store.tables import BOUNDS, CHILD_TABLES, IMAGES, SPECS, UTM_COORDINATES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,12 +47,8 @@ class UtmBox:
 
     def touches(self, e0: float, n0: float, e1: float, n1: float) -> bool:
         """Whether the box has a point in e0 <= e <= e1, n0 <= n <= n1, at any height."""
-        return (
-            self.min_easting <= e1
-            and e0 <= self.max_easting
-            and self.min_northing <= n1
-            and n0 <= self.max_northing
-        )
+        across = self.min_easting <= e1 and e0 <= self.max_easting
+        return across and self.min_northing <= n1 and n0 <= self.max_northing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,13 +225,10 @@ class Snapshot:
         """The map with a place exactly as it was committed; only its status may differ.
 
         Raises:
-            MapNotFoundError: the snapshot has no such map.
-            UnplacedMapError: it has no place.
+            MapNotFoundError, UnplacedMapError: as `get`.
             StoreError: rows are missing or unreadable.
         """
-        if not has_place(self._row(map_id)):
-            raise _without_place(self._row(map_id))
-        loaded = self.load_any(map_id)
+        loaded = self.load_any(self.get(map_id).map_id)
         assert isinstance(loaded, FeatureMap)
         return loaded
 

@@ -129,11 +129,10 @@ def _vouched_reason(row: Row, missing: Mapping[str, Sequence[str]]) -> str:
 
 
 def _commit(database: Database, feature_map: AnyMap, reason: str, missing: bool, trusted: bool) -> None:
-    if missing and isinstance(feature_map, FeatureMap):
+    new = not trusted and feature_map.status != RETIRED
+    if (missing or new) and isinstance(feature_map, FeatureMap):
         feature_map = feature_map.with_status("quarantined")
-    if not trusted and feature_map.status != RETIRED:
-        if isinstance(feature_map, FeatureMap):
-            feature_map = feature_map.with_status("quarantined")
+    if new:
         reason = IMPORTED  # not what the dataset says: reasons decide what growth does with a map
     if feature_map.status == RETIRED and not reason:
         reason = "it was retired where the dataset is from"

@@ -226,7 +226,10 @@ def _contributor_of(event: "Row") -> Contributor:
 
 
 def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidate:
-    """A candidate out of all its events, in order, among them at least one contribution."""
+    """A candidate out of all its events, in order, among them at least one contribution.
+
+    Its `answer` is empty where the events were read without answers.
+    """
     given = contributions_of(events)
     first = given[0]
     request: dict[str, Any] = json.loads(first["request"] or "{}")
@@ -236,5 +239,5 @@ def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candida
         **{name: first[name] for name in _AS_GIVEN},
         contributors=tuple(map(_contributor_of, given)),
         request=request,
-        answer=json.loads(first["answer"] or "{}"),
+        answer=json.loads(first.get("answer") or "{}"),
     )
