@@ -344,11 +344,7 @@ def _identity(
 
 
 def _described(made: MapKind) -> MapKind:
-    """Zeros are no descriptors.
-
-    Raises:
-        IngestError: nothing is described.
-    """
+    """Zeros are no descriptors."""
     seen = made.observations
     described = seen.has_descriptor & seen.descriptors.any(axis=1)
     if not described.any():

@@ -163,11 +163,7 @@ def _pixels(parts: _Parts) -> FloatArray:
 
 
 def _kept(parts: _Parts, xy: FloatArray, path: Path) -> NDArray[np.bool_]:
-    """Observations (m,) that are no outliers, of points that two or more of them see.
-
-    Raises:
-        IngestError: so many are that the tracks are those of another reconstruction.
-    """
+    """Observations (m,) that are no outliers, of points that two or more of them see."""
     tracks, count = parts.tracks, len(parts.xyz)
     unseen = int((np.bincount(tracks.track, minlength=count) < 2).sum())
     if unseen > _MOST_UNSEEN * count:
@@ -246,11 +242,7 @@ def _diameter_over_size(config: Path) -> float:
 
 
 def _reference(found: OpensfmReconstruction, place: Path, path: Path) -> LocalFrame | None:
-    """Of the reconstruction itself, or of the data set.
-
-    Raises:
-        IngestError: broken, or the two contradict each other.
-    """
+    """Of the reconstruction itself, or of the data set."""
     frames: list[LocalFrame] = []
     if found.reference_lla is not None:
         frames.append(_frame(found.reference_lla, f"{path}: reference_lla"))

@@ -167,11 +167,7 @@ def raster_from_utm(wkt: str, epsg: int, place: FloatArray) -> Callable[[FloatAr
 def _operations(
     source: CRS, target: CRS, box: tuple[float, float, float, float], advice: str
 ) -> TransformerGroup:
-    """What PROJ knows between two systems in a box of degrees, best stated accuracy first.
-
-    Raises:
-        GeodesyError: nothing; with the advice.
-    """
+    """What PROJ knows between two systems in a box of degrees, best stated accuracy first."""
     west, south, east, north = box
     area: Any = AreaOfInterest(west, max(south, -90.0), east, min(north, 90.0))
     with warnings.catch_warnings():
