@@ -5,7 +5,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -22,13 +22,7 @@ from featuredb.simworld import negatives
 from featuredb.simworld.camera.photograph import photo_bytes, take_photo
 from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
 from featuredb.simworld.camera.shot import Shot
-from featuredb.simworld.flight import (
-    FlightOptions,
-    pedestrians,
-    survey,
-    survey_half_extent,
-    visitors,
-)
+from featuredb.simworld.flight import FlightOptions, pedestrians, survey, survey_half_extent, visitors
 from featuredb.simworld.negatives import NEGATIVE_KINDS, NegativeKind
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
@@ -47,7 +41,6 @@ class TrueImage:
 
     Attributes:
         name: path within the world's folder, with forward slashes.
-        camera: true intrinsics.
         cam_from_local: true pose, local ENU frame to camera, metres.
         utm: (3,) easting, northing, ellipsoidal height of the camera centre, metres.
         gps_error_m: (3,) east, north, up: what the EXIF position is off by, None without GPS.
@@ -165,14 +158,10 @@ class WorldOptions:
     """What to write. The same options give the same bytes.
 
     Attributes:
-        seed: of everything.
-        town_size_m: width and height of the town.
         flight: the survey; its gps_error holds for the queries too.
         queries, street: numbers of held-out drone photos and of street photos.
-        query_width: pixels.
         street_width: pixels, of the widest of the cameras.
         negatives_per_kind: photos of each of NEGATIVE_KINDS.
-        sensor: of all cameras.
         workers: processes; 0 takes one per core.
     """
 
@@ -212,7 +201,6 @@ class World:
 
     Attributes:
         folder: holds drone/, queries/, street/, negatives/<kind>/ and truth.json.
-        truth: of the photos of the town.
     """
 
     folder: Path
@@ -242,9 +230,6 @@ def write_world(folder: Path, options: WorldOptions, progress: Progress | None =
 
     Args:
         progress: called with (files done, files in all).
-
-    Raises:
-        OSError: the folder cannot be written.
     """
     folder = Path(folder)
     tasks = _tasks(options)
@@ -353,7 +338,7 @@ def _negative(task: _Task) -> bytes:
     rng = np.random.default_rng((options.seed, 21, NEGATIVE_KINDS.index(kind), task.index))
     width = options.query_width
     if kind == "other_town":
-        shot = replace(_shots(options, "queries", other=True, seed_shift=_VISITORS_SEED)[task.index])
+        shot = _shots(options, "queries", other=True, seed_shift=_VISITORS_SEED)[task.index]
         return photo_bytes(other_town_of(options), shot, options.sensor)
     if kind in ("mirrored", "blurred"):
         shot = _shots(options, "queries", seed_shift=_VISITORS_SEED)[task.index]
@@ -362,4 +347,4 @@ def _negative(task: _Task) -> bytes:
     else:
         painter = {"blank": negatives.blank, "noise": negatives.noise, "text": negatives.text}[kind]
         image = painter(rng, width, width * 3 // 4)
-    return jpeg_bytes(image, options.sensor.jpeg_quality)
+    return jpeg_bytes(image)

@@ -27,7 +27,6 @@ class Reflectance:
 
     Attributes:
         ground: (h, w) float32 of the painted rectangle, rows to the north in town axes.
-        ground_texel_m: size of its texels.
         patches: (p, p) float32 periodic factors.
     """
 
@@ -36,11 +35,7 @@ class Reflectance:
     patches: NDArray[np.float32]
 
     def at(
-        self,
-        scene: Scene,
-        xyz: FloatArray,
-        texture: NDArray[np.integer],
-        object_id: NDArray[np.integer],
+        self, scene: Scene, xyz: FloatArray, texture: NDArray[np.integer], object_id: NDArray[np.integer]
     ) -> FloatArray:
         """Reflectance (n,) at points (n, 3) of the local frame on faces of these textures and objects."""
         value = np.array(list(REFLECTANCE.values()))[texture]

@@ -208,7 +208,6 @@ class GroundPlan:
     """What the ground painter needs, in town axes, metres.
 
     Attributes:
-        seed: of all randomness in the paint.
         size: width (x) and height (y) of the painted rectangle, centred on the origin.
         streets, buildings: as laid out. plazas, car_parks, gardens: rectangles (x0, y0, x1, y1).
         trees: (n, 3) x, y, crown radius, for their shadows.
