@@ -234,6 +234,4 @@ def _descriptors(
                 "hold SIFT only: ingest the photos instead"
             )
     data = _blob(database, "descriptors", image_id, np.dtype("u1"))
-    if data is None:
-        return None
-    return as_rootsift(data, name, count)
+    return None if data is None else as_rootsift(data, name, count)
