@@ -86,7 +86,6 @@ def render(
 
     Args:
         faces, ellipsoids: in the local frame, metres.
-        cam_from_local: pose of the camera.
         supersample: rays per pixel and direction.
     """
     job = _Job(

@@ -41,7 +41,6 @@ def make_town(
     Args:
         place: latitude and longitude in degrees, ellipsoidal height in metres of the local frame's
             origin, EPSG code of the UTM zone for answers.
-        texel_m: resolution of the painted ground, metres.
         pieces: of walls and tiled roofs. With one, buildings of a material share every brick and curtain;
             with more, only those that are meant to be identical (terraces, slabs) do.
 
