@@ -38,7 +38,6 @@ class CommitResult:
     Attributes:
         created: False if the map was visible already and nothing had to be done.
         version: snapshot in which the map is visible.
-        write_id: of its child rows.
         flagged: ids of other maps that this commit put into quarantine, because what placed them gave way.
     """
 
@@ -54,7 +53,6 @@ class StatusResult:
     """What a change of status did.
 
     Attributes:
-        version: snapshot that shows it.
         changed: ids of the maps whose status changed, none where nothing was to be done; those asked for
             first, behind them maps that were quarantined because they hang on one of these alone.
     """

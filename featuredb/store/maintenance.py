@@ -8,14 +8,7 @@ import pyarrow.compute as pc
 
 from featuredb.store.candidates.upkeep import named_writes, superfluous_images
 from featuredb.store.changes import RETIRED, Change
-from featuredb.store.commits import (
-    CHANGED,
-    KEPT_FROM,
-    OPERATION,
-    REASON,
-    apply_change,
-    oldest_kept_version,
-)
+from featuredb.store.commits import CHANGED, KEPT_FROM, OPERATION, REASON, apply_change, oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
 from featuredb.store.delta import Table

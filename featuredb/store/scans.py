@@ -52,7 +52,6 @@ class TilePoints:
     """Points of one tile on their way into the store.
 
     Attributes:
-        tile: name of the tile.
         rows: (n,) POINT_ROW, by level and then node.
         has_intensity: whether the intensities mean something.
     """
@@ -67,12 +66,10 @@ class ScanSummary:
     """A scan as its row in `lidar` describes it.
 
     Attributes:
-        box: of the points, UTM.
         points, points_in_files: stored, and before anything was dropped.
         level_points: stored points of each level, coarsest first.
         spacing_m: typical distance between neighbouring points in plan.
         classes: points of each ASPRS class.
-        colour: "file", "ortho", or "" for none.
         row: everything, by the columns of `lidar`.
     """
 
@@ -132,7 +129,6 @@ def commit_scan(
     Args:
         row: columns of `lidar` but `write_id`, `points_checksum`, `status`, `status_reason`, `created_at`.
         groups: each gives the points of some tiles when called; one commit to `lidar_points` each.
-        on_progress: is told how many points have been written.
 
     Returns:
         Whether this call made the scan visible, and the `write_id` of its points.
@@ -178,8 +174,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
     """Take a scan out of service; False if it was already.
 
     Raises:
-        ScanNotFoundError: no such scan.
-        StoreError: no reason given.
+        ScanNotFoundError, StoreError: no reason given.
     """
     if not reason.strip():
         raise StoreError(f"retire {scan_id}: expected a reason, for those who will ask later")
@@ -210,7 +205,6 @@ def scan_points(
 
     Args:
         box: (e0, n0, e1, n1), closed, metres in the scan's zone; None for all.
-        columns: of `lidar_points`.
 
     Raises:
         StoreError: they cannot be read.
@@ -305,7 +299,6 @@ def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
 def _level_rows(
     database: Database, scan: ScanSummary, level: int, box: tuple[float, float, float, float] | None
 ) -> ds.Dataset:
-    """A level's points in a box."""
     where: list[Condition] = [("zone", "=", scan.epsg), ("level", "=", level)]
     where.append(("write_id", "=", scan.write_id))
     if box is not None:

@@ -59,8 +59,6 @@ class _Summary:
         write_id: names the child rows; changes with each re-placement, so it is a key for derived artefacts.
         content_digest: SHA-256 of everything but the status.
         status_reason: why it was promoted, quarantined or retired; "" where it has its first status.
-        created_at: UTC.
-        images, points, observations, descriptors: counts.
     """
 
     map_id: str
@@ -84,7 +82,6 @@ class MapSummary(_Summary):
 
     Attributes:
         box: of the points; None for a map without points.
-        tiles: names of all tiles that hold rows of the map.
         residual_rms_m: of the placement, metres.
         drift_m, budget_m: of a map that other maps placed: 95 % bound of its position against its anchors,
             and what growth allowed, metres; None where the placement does not say.
@@ -128,18 +125,19 @@ class Snapshot:
         self._rows = {row["map_id"]: row for row in rows}
         self._children = children
 
+    def any_maps(self, *, include_retired: bool = False) -> list[MapSummary | UnplacedSummary]:
+        """All maps, oldest first."""
+        rows = [row for row in self._rows.values() if include_retired or row["status"] != RETIRED]
+        rows.sort(key=lambda r: (r["created_at"], r["map_id"]))
+        return [self.get_any(row["map_id"]) for row in rows]
+
     def maps(self, *, include_retired: bool = False) -> list[MapSummary]:
-        """The maps with a place, oldest first; those without are `unplaced_maps`."""
-        return [_summary(row) for row in self._oldest_first(include_retired) if has_place(row)]
+        """Those of `any_maps` with a place."""
+        return [m for m in self.any_maps(include_retired=include_retired) if isinstance(m, MapSummary)]
 
     def unplaced_maps(self, *, include_retired: bool = False) -> list[UnplacedSummary]:
-        """The maps without a place, oldest first."""
-        rows = self._oldest_first(include_retired)
-        return [_unplaced_summary(row) for row in rows if not has_place(row)]
-
-    def _oldest_first(self, include_retired: bool) -> list[Row]:
-        rows = [row for row in self._rows.values() if include_retired or row["status"] != RETIRED]
-        return sorted(rows, key=lambda r: (r["created_at"], r["map_id"]))
+        """Those without."""
+        return [m for m in self.any_maps(include_retired=include_retired) if isinstance(m, UnplacedSummary)]
 
     def get(self, map_id: str) -> MapSummary:
         """The summary of one map with a place, retired or not.
@@ -148,10 +146,13 @@ class Snapshot:
             MapNotFoundError: the snapshot has no such map.
             UnplacedMapError: it has no place.
         """
-        row = self._row(map_id)
-        if not has_place(row):
-            raise _without_place(row)
-        return _summary(row)
+        found = self.get_any(map_id)
+        if isinstance(found, MapSummary):
+            return found
+        ways = "; ".join(found.no_place.ways) or "docs/anchoring.md has the ways"
+        raise UnplacedMapError(
+            f"map {map_id} has no place on Earth ({found.no_place.reason}), and this needs one; {ways}"
+        )
 
     def place_bounds(self) -> dict[str, PlaceBounds]:
         """What holds 95 % of the errors of each placement, by map, at the middle of the map's cameras."""
@@ -248,8 +249,7 @@ class Snapshot:
         """Images of maps, by map, in their order.
 
         Raises:
-            MapNotFoundError: the snapshot has no such map.
-            StoreError: rows are missing or unreadable.
+            MapNotFoundError, StoreError: as `load_any`.
         """
         rows = [self._row(map_id) for map_id in map_ids]
         own: Condition = ("write_id", "in", [row["write_id"] for row in rows])
@@ -268,8 +268,7 @@ class Snapshot:
         """The map without a place exactly as it was committed; only its status may differ.
 
         Raises:
-            MapNotFoundError: the snapshot has no such map, or it has a place.
-            StoreError: rows are missing or unreadable.
+            MapNotFoundError, StoreError: as `load_any`; and where the map has a place.
         """
         loaded = self.load_any(map_id)
         if isinstance(loaded, FeatureMap):
@@ -332,14 +331,6 @@ def _grouped(column: pa.ChunkedArray) -> dict[str, NDArray[np.int64]]:
         value: order[start:end]
         for value, (start, end) in zip(encoded.dictionary.to_pylist(), itertools.pairwise(ends), strict=True)
     }
-
-
-def _without_place(row: Row) -> UnplacedMapError:
-    no_place = decode_no_place(row)
-    ways = "; ".join(no_place.ways) or "docs/anchoring.md has the ways"
-    return UnplacedMapError(
-        f"map {row['map_id']} has no place on Earth ({no_place.reason}), and this needs one; {ways}"
-    )
 
 
 def _unplaced_summary(row: Row) -> UnplacedSummary:

@@ -80,22 +80,7 @@ _PARTITION = [*required(_INT, "zone"), *required(_TEXT, "tile")]
 
 BOUNDS = ("min_easting", "min_northing", "min_height", "max_easting", "max_northing", "max_height")
 OWN_COORDINATES = ("x", "y", "z")  # of points of maps without a place, in their own frame
-# Columns of `maps` that are null for a map without a place, besides BOUNDS; those that only such a map has.
-PLACE_COLUMNS = (
-    "epsg",
-    "height_datum",
-    "method",
-    "residual_rms_m",
-    "origin_latitude_deg",
-    "origin_longitude_deg",
-    "origin_height_m",
-    "local_from_sfm_scale",
-    "local_from_sfm_rotation",
-    "local_from_sfm_translation",
-    "placement_covariance",
-    "placement_evidence",
-)
-NO_PLACE_COLUMNS = ("frame_is_metric", "frame_is_upright", "no_place")
+NO_PLACE_COLUMNS = ("frame_is_metric", "frame_is_upright", "no_place")  # that only a map without a place has
 POINT_COVARIANCE = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
 
 _MAPS_SCHEMA = pa.schema(
@@ -121,6 +106,10 @@ _MAPS_SCHEMA = pa.schema(
         *nullable(pa.bool_(), "frame_is_metric", "frame_is_upright"),
         *nullable(_TEXT, "no_place"),
     ]
+)
+# Columns of `maps` that are null for a map without a place, besides BOUNDS.
+PLACE_COLUMNS = tuple(
+    field.name for field in _MAPS_SCHEMA if field.nullable and field.name not in (*BOUNDS, *NO_PLACE_COLUMNS)
 )
 
 _IMAGES_SCHEMA = pa.schema(

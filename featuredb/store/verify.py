@@ -65,7 +65,6 @@ class VerifyReport:
 
     Attributes:
         version: of the snapshot that was checked; -1 where a log is so damaged that none can be read.
-        maps, scans, candidates, canaries, files, rows: how many of each were checked.
         problems: damage; empty in a sound database.
         orphans: write ids of child rows that no version names, left by a crash or written just now by a
             commit under way. No damage: nobody reads them, and `vacuum` removes them.

@@ -162,7 +162,6 @@ class StillsOptions:
     """From a film to photos.
 
     Attributes:
-        start_s, end_s: the stretch of the film; None: all of it.
         telemetry_late_s: telemetry that is shown at t belongs to t minus this; None: estimated (`lag.py`),
             and 0 where that says nothing.
         film_start_s: where the film begins in telemetry that has a clock of its own (`film_time.film_start`);

@@ -37,9 +37,6 @@ def write_tile(database: Database, scan: ScanSummary, tile: str, path: Path) -> 
     point without colour in a scan with colours is black. The order is that of levels, coarsest first, then
     of nodes and coordinates: compaction of the store does not show in the file.
 
-    Args:
-        path: ends in .laz.
-
     Raises:
         StoreError: the points cannot be read.
         MissingExtraError: laspy is not installed.

@@ -50,8 +50,6 @@ class InboxCounts:
     """How much there is.
 
     Attributes:
-        by_state: number of candidates in each state that occurs.
-        waiting_by_owner: number of waiting candidates of each (first) owner.
         stored_bytes: of all images that are kept: those that are not withdrawn.
     """
 
@@ -69,8 +67,6 @@ class WithdrawReport:
     """What a withdrawal did.
 
     Attributes:
-        candidates: ids of the photos whose bytes are gone now.
-        files: data files that were removed from the disk or bucket.
         used_by: living maps that were built with one of them; they keep its features, not its pixels.
     """
 

@@ -40,8 +40,6 @@ class CopyReport:
     """What a backup or a restore did.
 
     Attributes:
-        version: of `maps` in the copy.
-        files, bytes: that were copied.
         kept: files that were there already.
         removed: files of the backup before that this one does not need.
     """
@@ -80,7 +78,6 @@ def restore(source: str, target: Database, storage_options: Mapping[str, str] | 
 
     Args:
         source: URL of the backup; `storage_options` are its.
-        target: where the database shall be; not one that exists.
 
     Raises:
         StoreError: there is no whole backup, one of its files is lost or damaged, the target is not empty, or

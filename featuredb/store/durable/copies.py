@@ -43,7 +43,6 @@ class CopyList:
     """What a copy of a database holds.
 
     Attributes:
-        purpose: "backup" or "restore".
         source: URL of what was copied.
         began: when, UTC.
         attempt: a name of the run that makes the copy.
