@@ -87,7 +87,6 @@ class ModelOptions:
             at the same keypoints.
         height_datum: of the heights where no georeference.json says it.
         min_track_length: points seen by at least that many photos carry descriptors.
-        name, owner, licence: of the map and of photos that do not name their own.
     """
 
     photos: Path | None = None
