@@ -24,7 +24,7 @@ td.name{overflow-wrap:anywhere;min-width:130px}
 .pill{border-radius:9px;padding:1px 9px;font-size:12px;white-space:nowrap;color:#fff}
 .good{background:var(--good)}.fair{background:var(--fair)}.bad{background:var(--bad)}.none{background:#78879a}
 .wide{overflow-x:auto}img{max-width:100%;height:auto;display:block;margin:10px auto}
-.track{width:55%}.bar{background:#3f7fbf;height:11px;border-radius:3px;min-width:1px}
+.bars td:nth-child(3){width:55%}.bar{background:#3f7fbf;height:11px;border-radius:3px;min-width:1px}
 .note{border-left:4px solid var(--fair);background:#fff8ec;padding:8px 14px;
 margin:10px 0;border-radius:0 6px 6px 0}
 .stop{border-left-color:var(--bad);background:#fdf0ef}
@@ -58,17 +58,18 @@ def table(
     rows: Iterable[Sequence[str]],
     numbers: Sequence[int] = (),
     names: Sequence[int] = (),
+    html: Sequence[int] = (),
 ) -> str:
-    """A table of escaped cells; columns in `numbers` to the right, in `names` broken anywhere."""
+    """A table; columns in `numbers` to the right, in `names` broken anywhere, all but `html` escaped."""
 
     def kind(i: int) -> str:
         return "n" if i in numbers else "name" if i in names else ""
 
+    def cell(i: int, text: str) -> str:
+        return f'<td class="{kind(i)}">{text if i in html else escape(text)}</td>'
+
     header = "".join(f'<th class="{kind(i)}">{escape(h)}</th>' for i, h in enumerate(head))
-    body = "".join(
-        "<tr>" + "".join(f'<td class="{kind(i)}">{escape(cell)}</td>' for i, cell in enumerate(row)) + "</tr>"
-        for row in rows
-    )
+    body = "".join(f"<tr>{''.join(cell(i, text) for i, text in enumerate(row))}</tr>" for row in rows)
     return f"<table>{f'<thead><tr>{header}</tr></thead>' if head else ''}<tbody>{body}</tbody></table>"
 
 

@@ -94,7 +94,7 @@ def drawn(film: FilmOptions, folder: Path) -> list[Path]:
 
 
 def _jpeg(film: FilmOptions, frame: int) -> bytes:
-    return jpeg_bytes(film_frame(film, frame), 92)
+    return jpeg_bytes(film_frame(film, frame), quality=92)
 
 
 def pose_at(film: FilmOptions, time_s: float) -> Rigid3:
@@ -127,7 +127,7 @@ def tagged(film: FilmOptions, pictures: Sequence[Path], rtk: bool, folder: Path)
             gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
             gps[ExifTags.GPS.GPSHPositioningError.value] = rational(1.51 * _RTK_M, 10_000)
         with Image.open(picture) as image:
-            (folder / picture.name).write_bytes(jpeg_bytes(np.asarray(image), 92, exif))
+            (folder / picture.name).write_bytes(jpeg_bytes(np.asarray(image), exif, 92))
     return folder
 
 

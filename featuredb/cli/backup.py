@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 
 
 def register(subparsers: Any) -> None:
-    """Add both commands; `register` of `featuredb.cli.database` calls it."""
     for name, run, text, source in (
         ("backup", run_backup, "copy a database that may be in use; again: what is new", "the database"),
         ("restore", run_restore, "make a database of a backup, where there is none", "the backup"),

@@ -16,7 +16,6 @@ _SHORTEST_ID = 8
 
 
 def register(subparsers: Any) -> None:
-    """Add `candidates` to the parser of `featuredb`."""
     parser = add_command(
         subparsers,
         "candidates",
@@ -51,7 +50,6 @@ def register(subparsers: Any) -> None:
 
 
 def run_candidates(args: argparse.Namespace) -> int:
-    """List the inbox, or withdraw."""
     from featuredb.store.candidates.photos import list_candidates, withdraw
 
     database = open_database(args)

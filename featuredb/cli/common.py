@@ -112,6 +112,21 @@ def add_as_of_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def numbers(text: str, what: str, *counts: int) -> tuple[float, ...]:
+    """Numbers with commas between them, as many as one of `counts`; for `type` of an argument.
+
+    Args:
+        what: is expected, for the message.
+    """
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in counts:
+        raise argparse.ArgumentTypeError(f"expected {what}, found {text!r}")
+    return values
+
+
 def hours(text: str) -> float:
     """A number of hours, >= 0."""
     try:

@@ -9,7 +9,6 @@ from typing import Any
 
 
 def register(subparsers: Any) -> None:
-    """Add `completion` to the parser of `featuredb`."""
     completion = subparsers.add_parser(
         "completion",
         help="print a script for the shell's completion",

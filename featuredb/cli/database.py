@@ -38,7 +38,6 @@ _BOUNDS = (
 
 
 def register(subparsers: Any) -> None:
-    """Add the database commands to the parser of `featuredb`."""
     add_command(subparsers, "init", run_init, "make an empty database")
     maps = add_command(subparsers, "maps", run_maps, "list the maps")
     maps.add_argument("--all", action="store_true", help="retired maps, too")
@@ -90,7 +89,7 @@ def run_maps(args: argparse.Namespace) -> int:
     maps = snapshot.maps(include_retired=args.all)
     unplaced = snapshot.unplaced_maps(include_retired=args.all)
     if args.json:
-        wanted = {m.map_id for m in maps} | {m.map_id for m in unplaced}
+        wanted = {m.map_id for m in snapshot.any_maps(include_retired=args.all)}
         rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
         write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
         return 0

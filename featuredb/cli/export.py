@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 from featuredb.cli.common import (
     add_as_of_argument,
     add_command,
+    numbers,
     open_database,
     progress_of_maps,
     write_json,
@@ -29,7 +30,6 @@ _STATUSES = tuple(dict.fromkeys((*MAP_STATUSES, *UNPLACED_STATUSES)))
 
 
 def register(subparsers: Any) -> None:
-    """Add `export` to the parser of `featuredb`."""
     text = "write maps for other systems"
     parser = add_command(
         subparsers,
@@ -71,7 +71,7 @@ def add_selection_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--bbox",
-        type=_bbox,
+        type=lambda text: numbers(text, "four numbers of degrees, west,south,east,north", 4),
         default=None,
         metavar="W,S,E,N",
         help="maps that touch this box, WGS84 degrees; whole maps",
@@ -92,7 +92,6 @@ def add_selection_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_export(args: argparse.Namespace) -> int:
-    """Export and say in a line what was written."""
     database = open_database(args)
     done = export_maps(
         database,
@@ -129,16 +128,6 @@ def _statuses(text: str) -> tuple[MapStatus | UnplacedStatus, ...]:
     if not names or any(name not in _STATUSES for name in names):
         raise argparse.ArgumentTypeError(f"expected names of {', '.join(_STATUSES)}, found {text!r}")
     return cast("tuple[MapStatus | UnplacedStatus, ...]", names)
-
-
-def _bbox(text: str) -> tuple[float, float, float, float]:
-    try:
-        west, south, east, north = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"expected four numbers of degrees, west,south,east,north, found {text!r}"
-        ) from error
-    return west, south, east, north
 
 
 def _names(text: str) -> tuple[str, ...]:

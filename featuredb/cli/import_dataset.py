@@ -9,7 +9,6 @@ from featuredb.cli.common import add_command, open_database, progress_of_maps
 
 
 def register(subparsers: Any) -> None:
-    """Add `import` to the parser of `featuredb`."""
     text = "bring the maps of an exported dataset into a database"
     parser = add_command(subparsers, "import", run_import, text, description=f"{text}; see docs/export.md")
     parser.add_argument(
@@ -24,15 +23,10 @@ def register(subparsers: Any) -> None:
 
 
 def run_import(args: argparse.Namespace) -> int:
-    """Import, and say what became of the maps."""
     from featuredb.export.dataset import import_dataset
 
     done = import_dataset(
-        open_database(args),
-        args.folder,
-        trusted=args.trusted,
-        dry_run=args.dry_run,
-        told=progress_of_maps(),
+        open_database(args), args.folder, trusted=args.trusted, dry_run=args.dry_run, told=progress_of_maps()
     )
     would = "would import" if done.dry_run else "imported"
     lines = [f"{would} {len(done.created)} maps; {len(done.present)} were there already"]

@@ -35,7 +35,6 @@ _CLASS_NAMES = {
 
 
 def register(subparsers: Any) -> None:
-    """Add `lidar` with its commands to the parser of `featuredb`."""
     parser = subparsers.add_parser(
         "lidar", help="LiDAR scans: add, list, picture", description="LiDAR scans, see docs/lidar.md."
     )
@@ -50,7 +49,6 @@ def register(subparsers: Any) -> None:
 
 
 def run_add(args: argparse.Namespace) -> int:
-    """Add a scan and say what is in it."""
     from featuredb.lidar.add import add_scan
     from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 
@@ -79,7 +77,6 @@ def run_add(args: argparse.Namespace) -> int:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Print a table of the scans."""
     from featuredb.store.scans import list_scans
 
     scans = list_scans(open_database(args), include_retired=args.all)
@@ -104,7 +101,6 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def run_picture(args: argparse.Namespace) -> int:
-    """Draw one scan."""
     from featuredb.lidar.picture import write_plan_view
     from featuredb.store.scans import find_scan
 

@@ -16,7 +16,6 @@ _OF_SUMMARY = ("name", "status", "status_reason", "method", "generation", "paren
 
 
 def register(subparsers: Any) -> None:
-    """Add `lineage` to the parser of `featuredb`."""
     parser = add_command(
         subparsers,
         "lineage",
@@ -34,7 +33,6 @@ def register(subparsers: Any) -> None:
 
 
 def run_lineage(args: argparse.Namespace) -> int:
-    """Draw the tree."""
     snapshot = open_database(args).snapshot(args.as_of)
     lineages = snapshot.lineages()
     maps = _wanted(snapshot, args.map_id, include_retired=args.all)
@@ -56,7 +54,6 @@ def draw_tree(
     """Lines of ASCII: each map once, under the parent on its shortest chain to an anchor.
 
     Args:
-        maps: to be drawn, oldest first.
         lineages: of at least these maps.
         marked: a map that gets an asterisk.
     """

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
 
 def register(subparsers: Any) -> None:
-    """Add `simworld` to the parser of `featuredb`."""
     parser = subparsers.add_parser(
         "simworld",
         help="write photos of a simulated town, with exact truth",
@@ -39,7 +38,6 @@ def register(subparsers: Any) -> None:
 
 
 def run_simworld(args: argparse.Namespace) -> int:
-    """Write the world and say what is in it."""
     from rich.console import Console
 
     from featuredb.simworld.scan_world import write_lidar

@@ -2,12 +2,13 @@
 
 import argparse
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from featuredb.cli.common import add_command, open_database
 from featuredb.errors import StoreError
 
 if TYPE_CHECKING:
+    from featuredb.maps.feature_map import FeatureMap
     from featuredb.maps.unplaced_map import AnyMap
     from featuredb.store import MapSummary, Snapshot, UnplacedSummary
 
@@ -16,7 +17,6 @@ _COVER = 400
 
 
 def register(subparsers: Any) -> None:
-    """Add `thin` to the parser of `featuredb`."""
     text = "keep only as many descriptors as answers need; the earlier state stays, see rollback"
     parser = add_command(subparsers, "thin", run_thin, text)
     parser.add_argument(
@@ -33,28 +33,14 @@ def register(subparsers: Any) -> None:
 
 
 def run_thin(args: argparse.Namespace) -> int:
-    """Thin the map and commit it as a new state of itself.
-
-    Raises:
-        MapNotFoundError: no live map of that id, or several that begin so.
-        StoreError: the map is quarantined.
-        InvalidValueError: the cover is too small.
-        ConflictError: someone else changed the map meanwhile.
-    """
+    """Thin the map and commit it as a new state of itself."""
     from featuredb.maps.thin import thin_map
-    from featuredb.store import UnplacedSummary
 
     database = open_database(args)
     snapshot = database.snapshot()
     summary = _thinnable(snapshot, args.map_id)
-    before: AnyMap
-    after: AnyMap
-    if isinstance(summary, UnplacedSummary):
-        before = unplaced = snapshot.load_unplaced(summary.map_id)
-        after = thin_map(unplaced, args.cover)
-    else:
-        before = placed = snapshot.load_map(summary.map_id)
-        after = thin_map(placed, args.cover)
+    before = snapshot.load_any(summary.map_id)
+    after: AnyMap = thin_map(cast("FeatureMap", before), args.cover)  # either kind comes out as it goes in
     sys.stdout.write(f"map {summary.map_id}: {_figures(before)} -> {_figures(after)}\n")
     if args.dry_run:
         return 0

@@ -21,7 +21,6 @@ class Format:
     """One way to write maps.
 
     Attributes:
-        text: what it is, for --help.
         write: module and function in `featuredb.export`; imported when it is wanted, so that a missing extra
             concerns nobody else. It is given an ExportJob.
         options: arguments of its own, by the parser's names, which the function is given; others refuse them.

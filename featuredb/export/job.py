@@ -30,8 +30,6 @@ class ExportJob:
 
     Attributes:
         out: the file or folder to be made, in a folder that exists.
-        selection: which maps, and what of them.
-        told: progress.
         counts: maps, images, points and observations of the maps that it has given.
     """
 

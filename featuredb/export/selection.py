@@ -25,7 +25,6 @@ class Selection:
 
     Attributes:
         maps: ids of maps, whatever their status; empty: all with one of `statuses`.
-        statuses: of the maps.
         bbox: west, south, east, north in WGS84 degrees; maps whose points' box touches it, whole. West may be
             larger than east, across the antimeridian.
         where: an SQL condition on the columns of the view `maps`, such as "images > 20"; "": none.
@@ -85,11 +84,7 @@ def selected_any(
         ExportError: no map is; which condition left none. StoreError: `where` is no condition.
         MapNotFoundError: an id that the snapshot does not have.
     """
-    there: list[MapSummary | UnplacedSummary] = [
-        *snapshot.maps(include_retired=True),
-        *snapshot.unplaced_maps(include_retired=True),
-    ]
-    there.sort(key=lambda m: m.created_at)
+    there = snapshot.any_maps(include_retired=True)
     if selection.maps:
         wanted = {snapshot.get_any(map_id).map_id for map_id in selection.maps}
         found = [m for m in there if m.map_id in wanted]
@@ -151,9 +146,6 @@ def licensed(feature_map: MapKind, licences: tuple[str, ...] | None) -> MapKind 
     Photos with other licences, or without, are left out, with their observations and descriptors, and with
     what evidence and provenance say of them by name. A point stays if two of the photos that are left see it:
     they could have made it alone.
-
-    Args:
-        licences: see `licence_is`; None: everything.
     """
     if licences is None:
         return feature_map

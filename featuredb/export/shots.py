@@ -1,7 +1,7 @@
 """A map's photos as poses on Earth: position, angles, accuracy and whose they are, for formats of photos."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
@@ -67,12 +67,7 @@ def shots_of(feature_map: FeatureMap) -> Iterator[PosedPhoto]:
             name=image.name,
             sha256=image.sha256,
             camera=feature_map.cameras[image.camera_id],
-            geopose=GeoPose(
-                latitude_deg=placed.latitude_deg,
-                longitude_deg=placed.longitude_deg,
-                height_m=height,
-                quaternion_xyzw=placed.quaternion_xyzw,
-            ),
+            geopose=replace(placed, height_m=height),
             height_datum=feature_map.height_datum if converted.height_m is None else "ellipsoidal",
             map_height_m=placed.height_m,
             map_height_datum=feature_map.height_datum,

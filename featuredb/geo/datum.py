@@ -39,7 +39,6 @@ class HeightConversion:
     """A height above the WGS84 ellipsoid, or why there is none.
 
     Attributes:
-        height_m: metres above the ellipsoid, or None when it cannot be known here.
         reason: "" when converted; otherwise what is missing and what to do.
     """
 
@@ -79,9 +78,6 @@ def ellipsoidal_height(
     """Height above the WGS84 ellipsoid of a height in a datum, at a place.
 
     Args:
-        latitude_deg, longitude_deg: WGS84 degrees.
-        height_m: metres in `datum`.
-        datum: one of HEIGHT_DATUMS.
         grid_directories: where to look for geoid grids; by default PROJ's own data directories.
 
     Returns:

@@ -98,7 +98,6 @@ def geopose_from_camera(cam_from_local: Rigid3, frame: LocalFrame) -> GeoPose:
 
     Args:
         cam_from_local: local ENU (metres) to camera axes (x right, y down, z forward).
-        frame: that local frame.
     """
     latitude, longitude, height = frame.geodetic_from_enu(cam_from_local.center)
     true_enu_from_local = frame.true_enu_from_enu(cam_from_local.center)

@@ -73,9 +73,6 @@ def utm_from_geodetic(lat_lon_h: ArrayLike, epsg: int) -> FloatArray:
         lat_lon_h: (n, 3) or (3,) float64.
         epsg: 326zz or 327zz.
 
-    Returns:
-        UTM coordinates of the same shape, float64.
-
     Raises:
         GeodesyError: not a UTM code, latitude or longitude out of range, or too far from the zone.
         InvalidValueError: wrong shape or not finite.

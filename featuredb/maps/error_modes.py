@@ -52,9 +52,6 @@ class ErrorModes:
     def of_provenance(cls, provenance: dict[str, Any], cameras: int) -> "ErrorModes | None":
         """None for maps that keep none.
 
-        Args:
-            cameras: of the map.
-
         Raises:
             InvalidValueError: it is not what `as_provenance` writes of such a map.
         """

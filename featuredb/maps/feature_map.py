@@ -69,7 +69,6 @@ class MapImage:
         cam_from_local: pose, local ENU frame of the map to camera (x right, y down, z forward), metres.
         covariance: (6, 6) of cam_from_local's left perturbation, relative to the map's placement, or None.
         capture_time: as the photo says, timezone-aware where it says so, or None.
-        gps: the photo's own position, or None.
         owner, licence: attribution, "" where unknown.
     """
 
@@ -219,9 +218,7 @@ class MapParts:
     Attributes:
         map_id: unique in the database; ingest derives it from the photos and options, so that the same
             job gives the same map.
-        name: for people.
         cameras: intrinsics; images name them by index.
-        observations: of `points`, by `images`.
         extractor_fingerprint: of all descriptors.
         status: one of `statuses`.
         camera_keys: for each camera the EXIF key (make, model, size, focal, saved anew) that a query may
@@ -277,6 +274,11 @@ class MapParts:
         ids = np.array([image.image_id for image in self.images], dtype=np.int32)
         by_id = np.argsort(ids)
         return np.asarray(by_id[np.searchsorted(ids[by_id], image_id)], dtype=np.int64)
+
+    def image_sizes(self) -> FloatArray:
+        """Width and height (i, 2) of each image, pixels."""
+        cameras = [self.cameras[image.camera_id] for image in self.images]
+        return np.array([(c.width, c.height) for c in cameras], dtype=np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -43,10 +43,7 @@ class PlaceBounds:
             for of, a, b in ((turn, 0, 2), (turn, 2, 3), (place, 0, 2), (place, 2, 3))
         )
         return cls(
-            horizontal_m=across,
-            vertical_m=up,
-            tilt_deg=math.degrees(tilt),
-            heading_deg=math.degrees(heading),
+            horizontal_m=across, vertical_m=up, tilt_deg=math.degrees(tilt), heading_deg=math.degrees(heading)
         )
 
     def words(self) -> tuple[str, str]:

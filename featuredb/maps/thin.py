@@ -107,20 +107,15 @@ def described_points_of_images(feature_map: AnyMap) -> NDArray[np.int64]:
     return np.bincount(image, minlength=len(feature_map.images)).astype(np.int64)
 
 
-def _sightings(
-    feature_map: AnyMap,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _sightings(feature_map: AnyMap) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Point row, image row and cell of the image's grid, once for each image that sees a described point."""
     seen = feature_map.observations
     rows = np.flatnonzero(seen.has_descriptor)
     image = feature_map.image_rows(seen.image_id[rows])
     _, first = np.unique(seen.point_index[rows] * len(feature_map.images) + image, return_index=True)
     rows, image = rows[first], image[first]
-    sizes = np.array(
-        [(feature_map.cameras[i.camera_id].width, feature_map.cameras[i.camera_id].height) for i in
-         feature_map.images], dtype=np.float64,
-    ).reshape(-1, 2)  # fmt: skip
-    place = np.clip((seen.xy[rows] * (_GRID / sizes[image])).astype(np.int64), 0, _GRID - 1)
+    cells = seen.xy[rows] * (_GRID / feature_map.image_sizes()[image])
+    place = np.clip(cells.astype(np.int64), 0, _GRID - 1)
     return seen.point_index[rows], image, place[:, 1] * _GRID + place[:, 0]
 
 

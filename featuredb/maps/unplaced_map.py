@@ -38,7 +38,6 @@ class NoPlace:
 
     Attributes:
         reason_code: as in ingest reports (TOO_FEW, RESIDUALS, DEGENERATE_LINE, ...).
-        reason: a sentence for people.
         ways: commands or means that would place it, a sentence each.
         evidence: figures behind the reason, JSON-able.
     """
@@ -72,8 +71,6 @@ class UnplacedMap(MapParts):
     Attributes:
         frame: of poses, points and covariances.
         images: `cam_from_local` leads from the own frame to the camera.
-        points: in the own frame.
-        no_place: why it has no place, and what would give it one.
         status: unplaced or retired.
 
     Raises:

@@ -45,10 +45,7 @@ class RenderOptions:
 
 
 def render(
-    cloud: PointCloud,
-    camera: Camera,
-    cam_from_local: Rigid3,
-    options: RenderOptions | None = None,
+    cloud: PointCloud, camera: Camera, cam_from_local: Rigid3, options: RenderOptions | None = None
 ) -> Rendering:
     """What the camera sees of the cloud, in colour, intensity, depth and by index.
 
@@ -92,12 +89,7 @@ def _painted(
 
 
 def visible_nodes(
-    nodes: CloudNodes,
-    camera: Camera,
-    cam_from_local: Rigid3,
-    *,
-    near_m: float,
-    finest_px: float,
+    nodes: CloudNodes, camera: Camera, cam_from_local: Rigid3, *, near_m: float, finest_px: float
 ) -> NDArray[np.intp]:
     """Rows of the nodes to draw, in order.
 

@@ -21,7 +21,6 @@ class Rendering:
             hole was closed from its surroundings.
         rgb: (h, w, 3) uint8 or None; zero where depth is NaN.
         intensity: (h, w) uint8 or None; zero where depth is NaN.
-        points_drawn: how many points survived culling and levels of detail.
     """
 
     camera: Camera

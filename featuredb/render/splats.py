@@ -37,7 +37,6 @@ class BlockPlanes:
     Attributes:
         planes: (blocks down, blocks across, 3) float64: nearness (1/m) at the block's middle and its slopes
             per pixel across and down; NaN where unknown. Of shape (0, 0, 3) before anything is known.
-        side: pixels.
     """
 
     planes: FloatArray
@@ -69,7 +68,6 @@ class Splats:
     """What is nearest in each pixel.
 
     Attributes:
-        points: the points drawn.
         nearest: (h, w) uint64 z-buffer of their slots, see draw_loops.
     """
 

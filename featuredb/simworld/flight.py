@@ -14,6 +14,7 @@ from featuredb.simworld.town.scene import Scene, Street
 GpsError = Literal["realistic", "rtk", "none"]
 
 RTK_SIGMA_M = (0.015, 0.015, 0.025)  # east, north, up: fixed ambiguities, a station nearby
+_FORWARD_OVERLAP, _SIDE_OVERLAP = 0.78, 0.70  # shares of a photo's footprint
 _PHOTOS_PER_SIGHT = 5
 _START = datetime(2025, 6, 14, 9, 12, 5, tzinfo=UTC)
 
@@ -24,8 +25,6 @@ class FlightOptions:
 
     Attributes:
         lines, per_line: photos = lines * per_line, plus the oblique ones.
-        height_m: over the town's origin.
-        forward_overlap, side_overlap: shares of the footprint.
         oblique: photos from the rim, looking inward at 50 degrees below the horizon.
         width: of the photos, pixels; they are 4:3.
         gps_error: "realistic", "rtk" for a surveyor's receiver, or "none" for truth priors.
@@ -35,8 +34,6 @@ class FlightOptions:
     lines: int = 7
     per_line: int = 10
     height_m: float = 70.0
-    forward_overlap: float = 0.78
-    side_overlap: float = 0.70
     oblique: int = 8
     width: int = 1600
     gps_error: GpsError = "realistic"
@@ -204,8 +201,8 @@ def survey_half_extent(options: FlightOptions) -> tuple[float, float]:
 def _spacing_m(options: FlightOptions) -> tuple[float, float]:
     """Between photos of a line, and between lines."""
     camera = drone_device(options.width).camera
-    step = (1 - options.forward_overlap) * options.height_m * camera.height / camera.focal_px
-    return step, (1 - options.side_overlap) * options.height_m * camera.width / camera.focal_px
+    step = (1 - _FORWARD_OVERLAP) * options.height_m * camera.height / camera.focal_px
+    return step, (1 - _SIDE_OVERLAP) * options.height_m * camera.width / camera.focal_px
 
 
 def received_positions(

@@ -31,15 +31,11 @@ class OrthoOptions:
     """An ortho image. The same options and scene give the same pixels.
 
     Attributes:
-        seed: of cars, waves and noise.
-        pixel_m: size of a pixel in UTM metres.
         lean: buildings lean as in an ordinary ortho image; without, it is a true ortho image.
         flight_height_m: of the aerial photos over the town's origin.
         spacing_m: between aerial photos, both ways.
-        margin_m: how far it reaches beyond the town.
         shift_m: east, north: how far from its place it shows everything; real ones and real scans disagree.
         season: factors on red, green, blue of what is green.
-        contrast, gamma: of the other camera and its processing.
         day: what differs from the day of the photos: sun, cars, leaves.
     """
 
@@ -64,9 +60,7 @@ class Ortho:
 
     Attributes:
         rgb: (h, w, 3) uint8.
-        epsg: UTM zone.
         west, north: outer corner of the top-left pixel, metres.
-        pixel_m: size of a pixel.
     """
 
     rgb: Image8
@@ -83,9 +77,7 @@ def make_ortho(scene: Scene, options: OrthoOptions = OrthoOptions()) -> Ortho:
     ground = _ground_points(scene, west, north, width, height, options.pixel_m)
     rgb = np.zeros((height, width, 3), np.uint8)
     stations = _stations(scene, options)
-    town = np.stack([ground[..., k] for k in range(2)], axis=-1) @ scene.enu_from_town[:2, :2].astype(
-        np.float32
-    )
+    town = ground[..., :2] @ scene.enu_from_town[:2, :2].astype(np.float32)
     owner = _nearest(town, stations)
     for i, station in enumerate(stations):
         mine = owner == i

@@ -66,7 +66,6 @@ def write_lidar(
 
     Raises:
         MissingExtraError: the packages of the extra `lidar` are not installed.
-        OSError: the folder cannot be written.
     """
     require("lidar", "A scan with an ortho image", "laspy", "lazrs", "rasterio")
     Path(folder).mkdir(parents=True, exist_ok=True)

@@ -59,7 +59,6 @@ class Summary:
     """What a group of queries came to.
 
     Attributes:
-        queries, localised: counts.
         position_m, angle_deg: (median, 95th percentile) over the localised ones; NaN where there are none.
         within: share of all queries within 0.25 m and 0.3 degrees.
         wrong: answers more than 5 m off.

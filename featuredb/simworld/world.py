@@ -5,7 +5,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -22,13 +22,7 @@ from featuredb.simworld import negatives
 from featuredb.simworld.camera.photograph import photo_bytes, take_photo
 from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
 from featuredb.simworld.camera.shot import Shot
-from featuredb.simworld.flight import (
-    FlightOptions,
-    pedestrians,
-    survey,
-    survey_half_extent,
-    visitors,
-)
+from featuredb.simworld.flight import FlightOptions, pedestrians, survey, survey_half_extent, visitors
 from featuredb.simworld.negatives import NEGATIVE_KINDS, NegativeKind
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
@@ -47,7 +41,6 @@ class TrueImage:
 
     Attributes:
         name: path within the world's folder, with forward slashes.
-        camera: true intrinsics.
         cam_from_local: true pose, local ENU frame to camera, metres.
         utm: (3,) easting, northing, ellipsoidal height of the camera centre, metres.
         gps_error_m: (3,) east, north, up: what the EXIF position is off by, None without GPS.
@@ -165,14 +158,10 @@ class WorldOptions:
     """What to write. The same options give the same bytes.
 
     Attributes:
-        seed: of everything.
-        town_size_m: width and height of the town.
         flight: the survey; its gps_error holds for the queries too.
         queries, street: numbers of held-out drone photos and of street photos.
-        query_width: pixels.
         street_width: pixels, of the widest of the cameras.
         negatives_per_kind: photos of each of NEGATIVE_KINDS.
-        sensor: of all cameras.
         workers: processes; 0 takes one per core.
     """
 
@@ -212,7 +201,6 @@ class World:
 
     Attributes:
         folder: holds drone/, queries/, street/, negatives/<kind>/ and truth.json.
-        truth: of the photos of the town.
     """
 
     folder: Path
@@ -227,14 +215,7 @@ class World:
         return sorted((self.folder / "negatives").glob(f"{kind or '*'}/*.jpg"))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Task:
-    """One file: a shot of the town, or the i-th negative of a kind."""
-
-    options: WorldOptions
-    group: Literal["drone", "queries", "street", "negatives"]
-    index: int
-    kind: NegativeKind = "blank"
+_Task = tuple[str, int]  # one file: of a group of shots or a kind of negatives, and its number
 
 
 def write_world(folder: Path, options: WorldOptions, progress: Progress | None = None) -> World:
@@ -242,17 +223,14 @@ def write_world(folder: Path, options: WorldOptions, progress: Progress | None =
 
     Args:
         progress: called with (files done, files in all).
-
-    Raises:
-        OSError: the folder cannot be written.
     """
     folder = Path(folder)
     tasks = _tasks(options)
     for task in tasks:
-        (folder / _task_name(task)).parent.mkdir(parents=True, exist_ok=True)
+        (folder / _task_name(options, task)).parent.mkdir(parents=True, exist_ok=True)
     # truth.json comes last: a folder with it is complete.
     (folder / "truth.json").unlink(missing_ok=True)
-    for done, (name, data) in enumerate(_run(tasks, options.workers), start=1):
+    for done, (name, data) in enumerate(_run(options, tasks), start=1):
         (folder / name).write_bytes(data)
         if progress is not None:
             progress(done, len(tasks))
@@ -304,32 +282,29 @@ def _shots(options: WorldOptions, group: str, other: bool = False, seed_shift: i
 def _tasks(options: WorldOptions) -> list[_Task]:
     counts = {"drone": options.flight.lines * options.flight.per_line + options.flight.oblique}
     counts |= {"queries": options.queries, "street": options.street}
-    tasks = [_Task(options=options, group=g, index=i) for g, n in counts.items() for i in range(n)]  # type: ignore[arg-type]
     # Kind by kind, so that a process paints the other town once at most.
-    kinds = [kind for kind in NEGATIVE_KINDS for _ in range(options.negatives_per_kind)]
-    return tasks + [
-        _Task(options=options, group="negatives", index=i % options.negatives_per_kind, kind=kind)
-        for i, kind in enumerate(kinds)
-    ]
+    counts |= dict.fromkeys(NEGATIVE_KINDS, options.negatives_per_kind)
+    return [(group, index) for group, count in counts.items() for index in range(count)]
 
 
-def _task_name(task: _Task) -> str:
-    if task.group == "negatives":
-        return f"negatives/{task.kind}/{task.kind}_{task.index + 1:04d}.jpg"
-    return _shots(task.options, task.group)[task.index].name
+def _task_name(options: WorldOptions, task: _Task) -> str:
+    group, index = task
+    if group in NEGATIVE_KINDS:
+        return f"negatives/{group}/{group}_{index + 1:04d}.jpg"
+    return _shots(options, group)[index].name
 
 
-def _run(tasks: list[_Task], workers: int) -> Iterator[tuple[str, bytes]]:
+def _run(options: WorldOptions, tasks: list[_Task]) -> Iterator[tuple[str, bytes]]:
     """Names and bytes of all files, in any order, from a pool of processes (or here, for one worker)."""
-    count = min(workers or os.cpu_count() or 1, len(tasks))
+    count = min(options.workers or os.cpu_count() or 1, len(tasks))
     if count <= 1:
         for task in tasks:
-            yield _make(task)
+            yield _make(options, task)
         return
     # Spawned, not forked: the caller may have threads (Zenoh, a progress bar) that a fork would cut off.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread) as pool:
-        futures = [pool.submit(_make, task) for task in tasks]
+        futures = [pool.submit(_make, options, task) for task in tasks]
         for future in as_completed(futures):
             yield future.result()
 
@@ -339,27 +314,25 @@ def _one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def _make(task: _Task) -> tuple[str, bytes]:
+def _make(options: WorldOptions, task: _Task) -> tuple[str, bytes]:
     """Name and bytes of one file."""
-    options = task.options
-    if task.group != "negatives":
-        shot = _shots(options, task.group)[task.index]
-        return shot.name, photo_bytes(town_of(options), shot, options.sensor)
-    return _task_name(task), _negative(task)
+    name, (group, index) = _task_name(options, task), task
+    if group in NEGATIVE_KINDS:
+        return name, _negative(options, group, index)
+    return name, photo_bytes(town_of(options), _shots(options, group)[index], options.sensor)
 
 
-def _negative(task: _Task) -> bytes:
-    options, kind = task.options, task.kind
-    rng = np.random.default_rng((options.seed, 21, NEGATIVE_KINDS.index(kind), task.index))
+def _negative(options: WorldOptions, kind: str, index: int) -> bytes:
+    rng = np.random.default_rng((options.seed, 21, NEGATIVE_KINDS.index(kind), index))
     width = options.query_width
     if kind == "other_town":
-        shot = replace(_shots(options, "queries", other=True, seed_shift=_VISITORS_SEED)[task.index])
+        shot = _shots(options, "queries", other=True, seed_shift=_VISITORS_SEED)[index]
         return photo_bytes(other_town_of(options), shot, options.sensor)
     if kind in ("mirrored", "blurred"):
-        shot = _shots(options, "queries", seed_shift=_VISITORS_SEED)[task.index]
+        shot = _shots(options, "queries", seed_shift=_VISITORS_SEED)[index]
         photo = take_photo(town_of(options), shot, options.sensor)
         image = negatives.mirrored(photo) if kind == "mirrored" else negatives.blurred(photo, rng)
     else:
         painter = {"blank": negatives.blank, "noise": negatives.noise, "text": negatives.text}[kind]
         image = painter(rng, width, width * 3 // 4)
-    return jpeg_bytes(image, options.sensor.jpeg_quality)
+    return jpeg_bytes(image)

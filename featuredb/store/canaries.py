@@ -77,11 +77,9 @@ class Canary:
         canary_id: first 32 hex digits of the SHA-256 of its name.
         name: unique.
         created_at: UTC.
-        sha256: of the image file's bytes.
         request: what is asked with it (camera, prior), as on the wire.
         pose: the right answer; None: it must not be localised (a photo of another town).
         origin: "person": someone vouches for it; "answer": it is what `snapshot` answered.
-        snapshot: that snapshot, or None.
     """
 
     canary_id: str
@@ -157,8 +155,7 @@ def remove_canary(database: Database, name: str) -> None:
     """Remove a known query.
 
     Raises:
-        CanaryNotFoundError: there is none of this name.
-        ConflictError, StoreError
+        CanaryNotFoundError, ConflictError, StoreError
     """
     mine = [row["canary_id"] for row in _rows(database) if row["name"] == name]
     if not mine:

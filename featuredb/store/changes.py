@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from featuredb.errors import ConflictError, MapNotFoundError, StoreError
 from featuredb.store.encode import Row
+from featuredb.store.tables import PLACE_COLUMNS
 
 ACTIVE = "active"
 QUARANTINED = "quarantined"
@@ -14,22 +15,7 @@ UNPLACED = "unplaced"
 IMPORTED = "imported, and nobody here has vouched for it"
 VOUCHED = "imported, and vouched for later"
 # Columns that say where a map lies; equal ones mean that it was not placed anew.
-_PLACE = (
-    "epsg",
-    "height_datum",
-    "method",
-    "generation",
-    "parents",
-    "origin_latitude_deg",
-    "origin_longitude_deg",
-    "origin_height_m",
-    "local_from_sfm_scale",
-    "local_from_sfm_rotation",
-    "local_from_sfm_translation",
-    "placement_covariance",
-    "placement_evidence",
-    "cameras",
-)
+_PLACE = (*sorted({*PLACE_COLUMNS} - {"residual_rms_m"}), "generation", "parents", "cameras")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,9 +35,9 @@ class Change:
     flagged: tuple[str, ...] = ()
 
 
-def live_row(rows: Iterable[Row], map_id: str) -> Row | None:
-    """The row of a map that is visible and not retired, or None."""
-    return next((row for row in rows if row["map_id"] == map_id and row["status"] != RETIRED), None)
+def live_row(rows: Iterable[Row], wanted: str, column: str = "map_id") -> Row | None:
+    """The row of a map, or of a scan by `scan_id`, that is visible and not retired, or None."""
+    return next((row for row in rows if row[column] == wanted and row["status"] != RETIRED), None)
 
 
 def check_unchanged(rows: Sequence[Row], based_on: Mapping[str, str]) -> None:
@@ -143,17 +129,12 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
         return Change(rows=list(rows), only_adds=True), []
     dependants = sorted(anchored(rows) - anchored(rows, without=map_id) - {map_id})
     retired = [map_id, *dependants]
-    changed = [
-        {
-            **row,
-            "status": RETIRED,
-            "status_reason": reason if row["map_id"] == map_id else f"{reason} ({map_id})",
-        }
-        if row["map_id"] in retired and row["status"] != RETIRED
-        else row
-        for row in rows
-    ]
-    return Change(rows=changed), retired
+    changed = _with_status(rows, [map_id], RETIRED, reason)
+    return Change(rows=_with_status(changed, dependants, RETIRED, f"{reason} ({map_id})")), retired
+
+
+def _with_status(rows: Iterable[Row], map_ids: Sequence[str], status: str, reason: str) -> list[Row]:
+    return [{**r, "status": status, "status_reason": reason} if r["map_id"] in map_ids else r for r in rows]
 
 
 def change_status(
@@ -184,17 +165,13 @@ def change_status(
     wanted = [m for m in dict.fromkeys(map_ids) if known[m]["status"] != status]
     if not wanted:
         return Change(rows=list(rows), only_adds=True), []
-    changed = [{**r, "status": status, "status_reason": reason} if r["map_id"] in wanted else r for r in rows]
+    changed = _with_status(rows, wanted, status, reason)
     standing = anchored(changed, statuses=(ACTIVE,))
     if status == ACTIVE:
         _check_parents(known, [m for m in wanted if m not in standing])
         return Change(rows=changed), wanted
     fallen = sorted(anchored(rows, statuses=(ACTIVE,)) - standing - set(wanted))
-    because = f"{reason} ({', '.join(wanted)})"
-    changed = [
-        {**r, "status": QUARANTINED, "status_reason": because} if r["map_id"] in fallen else r
-        for r in changed
-    ]
+    changed = _with_status(changed, fallen, QUARANTINED, f"{reason} ({', '.join(wanted)})")
     return Change(rows=changed), [*wanted, *fallen]
 
 
@@ -296,9 +273,7 @@ def _quarantined(row: Row, ancestor: str) -> Row:
 
 
 def anchored(
-    rows: Iterable[Row],
-    without: str | None = None,
-    statuses: Collection[str] = (ACTIVE, QUARANTINED),
+    rows: Iterable[Row], without: str | None = None, statuses: Collection[str] = (ACTIVE, QUARANTINED)
 ) -> set[str]:
     """Ids of maps of the given statuses that have a chain of such parents down to a map without parents.
 

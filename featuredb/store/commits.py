@@ -10,7 +10,6 @@ from featuredb.store.changes import Change
 from featuredb.store.delta import Table
 from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, rows_table
-from featuredb.store.tables import FORMAT_VERSION
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
 # orphans; it is well below the vacuum's shortest default grace of a day.
@@ -39,7 +38,6 @@ class CommitResult:
     Attributes:
         created: False if the map was visible already and nothing had to be done.
         version: snapshot in which the map is visible.
-        write_id: of its child rows.
         flagged: ids of other maps that this commit put into quarantine, because what placed them gave way.
     """
 
@@ -55,7 +53,6 @@ class StatusResult:
     """What a change of status did.
 
     Attributes:
-        version: snapshot that shows it.
         changed: ids of the maps whose status changed, none where nothing was to be done; those asked for
             first, behind them maps that were quarantined because they hang on one of these alone.
     """
@@ -106,11 +103,6 @@ def commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:
 def oldest_kept_version(commits: Sequence[Commit]) -> int:
     """The oldest version whose files no vacuum has taken; vacuum notes it in its commit."""
     return max((int(c.metadata.get(KEPT_FROM, 0)) for c in commits), default=0)
-
-
-def upgrade_metadata() -> dict[str, str]:
-    """What an upgrade's commit to `maps` says about itself."""
-    return {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {FORMAT_VERSION}"}
 
 
 def check_children(encoded: EncodedMap, table_of: Callable[[str], Table]) -> None:

@@ -2,8 +2,9 @@
 
 import logging
 import threading
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from time import monotonic
 
@@ -11,6 +12,7 @@ from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import MapStatus
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store.changes import (
+    ACTIVE,
     RETIRED,
     Change,
     add_maps,
@@ -41,8 +43,6 @@ from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import CHILD_TABLES, CHILDREN, FORMAT_VERSION, MAPS, SPECS
 
 logger = logging.getLogger(__name__)
-
-_STATUS_OPERATION = {"active": "promote", "quarantined": "quarantine"}
 
 
 class Database:
@@ -164,12 +164,8 @@ class Database:
             based_on: write id of the replaced map that the new one was made from.
         """
         write_ids = {replaces: based_on} if replaces is not None and based_on is not None else {}
-        return self.commit_maps(
-            [feature_map],
-            replaces=() if replaces is None else (replaces,),
-            based_on=write_ids,
-            moves=moves,
-        )[0]
+        old = () if replaces is None else (replaces,)
+        return self.commit_maps([feature_map], replaces=old, based_on=write_ids, moves=moves)[0]
 
     def commit_maps(
         self,
@@ -206,9 +202,7 @@ class Database:
         if len(set(ids)) != len(ids):
             raise StoreError(f"commit_maps: expected different map ids, found {ids}")
         why = reasons or {}
-        if any(
-            feature_map.status == RETIRED and not why.get(feature_map.map_id) for feature_map in feature_maps
-        ):
+        if any(m.status == RETIRED and not why.get(m.map_id) for m in feature_maps):
             raise StoreError("commit_maps: expected active or quarantined maps, found a retired one")
         started = monotonic()
         encoded: dict[str, EncodedMap] = {}
@@ -233,25 +227,15 @@ class Database:
             flagged: tuple[str, ...] = ()
             if pending:
                 change = add_maps(rows, [encoded[m.map_id].row for m in pending], replaces, moves=moves)
-                version = apply_change(
-                    maps,
-                    change,
-                    operation="commit",
-                    changed=[*(m.map_id for m in pending), *change.flagged],
-                )
                 flagged = change.flagged
+                changed = [*(m.map_id for m in pending), *flagged]
+                version = apply_change(maps, change, operation="commit", changed=changed)
             # After a commit whose answer was lost the map is there already, by our own write.
             ours = {m: e.row["write_id"] for m, e in encoded.items()}
             found = {m: visible[m]["write_id"] if m in visible else ours[m] for m in ids}
             return [
-                CommitResult(
-                    map_id=m,
-                    created=found[m] == ours.get(m),
-                    version=version,
-                    write_id=found[m],
-                    flagged=flagged,
-                )
-                for m in ids
+                CommitResult(map_id=m, created=w == ours.get(m), version=version, write_id=w, flagged=flagged)
+                for m, w in found.items()
             ]
 
         results = retry_stale(f"commit of {', '.join(ids)}", attempt)
@@ -264,15 +248,8 @@ class Database:
         Raises:
             MapNotFoundError, ConflictError, StoreError
         """
-        retired: list[str] = []
-
-        def attempt() -> int:
-            maps = self.table(MAPS)
-            change, retired[:] = retire_map(read_rows(maps), map_id, reason)
-            return apply_change(maps, change, operation="retire", changed=retired, reason=reason)
-
-        retry_stale(f"retire {map_id}", attempt)
-        return tuple(retired)
+        retire = partial(retire_map, map_id=map_id, reason=reason)
+        return self.change_maps(f"retire {map_id}", "retire", reason, retire).changed
 
     def set_status(
         self,
@@ -300,18 +277,31 @@ class Database:
             MapNotFoundError: no such map.
             StoreError: no reason, a retired map, another status than these two, a chain that is not there.
         """
+
+        def decided(rows: list[Row]) -> tuple[Change, list[str]]:
+            check_unchanged(rows, based_on or {})
+            check_active(rows, active)
+            return change_status(rows, map_ids, status, reason)
+
+        operation = "promote" if status == ACTIVE else "quarantine"
+        return self.change_maps(f"{status} for {', '.join(map_ids)}", operation, reason, decided)
+
+    def change_maps(
+        self, what: str, operation: str, reason: str, make: Callable[[list[Row]], tuple[Change, list[str]]]
+    ) -> StatusResult:
+        """Commit what `make` makes of the newest rows of `maps`: the change, and the ids that it is about.
+
+        Raises:
+            ConflictError: other writers were faster too many times. StoreError; and what `make` raises.
+        """
         changed: list[str] = []
 
         def attempt() -> int:
             maps = self.table(MAPS)
-            rows = read_rows(maps)
-            check_unchanged(rows, based_on or {})
-            check_active(rows, active)
-            change, changed[:] = change_status(rows, map_ids, status, reason)
-            operation = _STATUS_OPERATION[status]
+            change, changed[:] = make(read_rows(maps))
             return apply_change(maps, change, operation=operation, changed=changed, reason=reason)
 
-        version = retry_stale(f"{status} for {', '.join(map_ids)}", attempt)
+        version = retry_stale(what, attempt)
         return StatusResult(version=version, changed=tuple(changed))
 
     def rollback(self, as_of: int | datetime) -> int:
@@ -352,12 +342,8 @@ class Database:
         return [history_entry(commit) for commit in self.table(MAPS).commits()]
 
     def _snapshot_of(self, maps: Table, commit: Commit) -> Snapshot:
-        return Snapshot(
-            version=commit.version,
-            timestamp=commit.timestamp,
-            rows=read_rows(maps),
-            children={name: self.table(name) for name in CHILD_TABLES},
-        )
+        rows, children = read_rows(maps), {name: self.table(name) for name in CHILD_TABLES}
+        return Snapshot(version=commit.version, timestamp=commit.timestamp, rows=rows, children=children)
 
     def _write_children(self, feature_map: AnyMap) -> EncodedMap:
         """Write the rows that stay invisible until a row of `maps` names them."""

@@ -185,9 +185,6 @@ def decode_images(batches: Iterable[pa.RecordBatch], count: int) -> tuple[MapIma
 
 
 def _decode_image(row: Row) -> MapImage:
-    gps = None
-    if row["gps_latitude_deg"] is not None:
-        gps = of_columns(GeoPrior, row, "gps_")
     return MapImage(
         **{name: row[name] for name in ("image_id", "name", "sha256", "camera_id", "owner", "licence")},
         cam_from_local=Rigid3(
@@ -196,18 +193,14 @@ def _decode_image(row: Row) -> MapImage:
         ),
         covariance=None if row["covariance"] is None else np.reshape(row["covariance"], (6, 6)),
         capture_time=None if row["capture_time"] is None else datetime.fromisoformat(row["capture_time"]),
-        gps=gps,
+        gps=None if row["gps_latitude_deg"] is None else of_columns(GeoPrior, row, "gps_"),
     )
 
 
 def _gathered(
     batches: Iterable[pa.RecordBatch], name: str, index_column: str, count: int
 ) -> tuple[pa.Table, NDArray[np.int64]]:
-    """The rows of a child table, and the index (count,) of each.
-
-    Raises:
-        StoreError: rows are missing or double.
-    """
+    """The rows of a child table, and the index (count,) of each."""
     parts = list(batches)
     table = pa.Table.from_batches(parts) if parts else SPECS[name].schema.empty_table()
     index: NDArray[np.int64] = table[index_column].to_numpy()

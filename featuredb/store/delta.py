@@ -22,13 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.fs as fs
-from deltalake import (
-    CommitProperties,
-    DeltaTable,
-    PostCommitHookProperties,
-    Schema,
-    write_deltalake,
-)
+from deltalake import CommitProperties, DeltaTable, PostCommitHookProperties, Schema, write_deltalake
 from deltalake.exceptions import CommitFailedError, DeltaError
 
 from featuredb.errors import ConflictError, StoreError
@@ -65,7 +59,6 @@ class DataFile:
     """One live Parquet file of a table, as the log describes it.
 
     Attributes:
-        path: relative to the table.
         write_id: of all its rows; None where the log does not say that they have the same.
     """
 
@@ -288,12 +281,7 @@ class Table:
         return int(metrics["numFilesRemoved"]) - int(metrics["numFilesAdded"])
 
     def vacuum(
-        self,
-        grace: timedelta,
-        *,
-        dry_run: bool,
-        keep_versions: Sequence[int] = (),
-        untracked: bool = True,
+        self, grace: timedelta, *, dry_run: bool, keep_versions: Sequence[int] = (), untracked: bool = True
     ) -> list[str]:
         """Delete files that no version uses any more; returns their paths.
 

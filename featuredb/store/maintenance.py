@@ -8,7 +8,7 @@ import pyarrow.compute as pc
 
 from featuredb.store.candidates.upkeep import named_writes, superfluous_images
 from featuredb.store.changes import RETIRED, Change
-from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, upgrade_metadata
+from featuredb.store.commits import CHANGED, KEPT_FROM, OPERATION, REASON, apply_change, oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
 from featuredb.store.delta import Table
@@ -187,13 +187,12 @@ def _vacuum_candidates(
     if not database.has(CANDIDATES):
         return set(), set()
     table = database.table(CANDIDATE_IMAGES)
-    named = named_writes(database)
     grace = timedelta(hours=options.orphan_grace_h)
     writes = write_ids_in(table)
     times = write_times(writes, table.storage)
     fresh = {write_id for write_id in writes if write_id not in times or now - times[write_id] < grace}
     refused = superfluous_images(database, now, timedelta(hours=options.history_h), fresh)
-    orphans = _remove_orphans(table, named, now - grace, dry_run)
+    orphans = _remove_orphans(table, named_writes(database), now - grace, dry_run)
     if refused and not dry_run:
         table.delete_rows("candidate_id", refused)
     return orphans, refused
@@ -239,7 +238,8 @@ def _to_newest_format(database: Database, name: str) -> None:
     def attempt() -> None:
         table = database.table(name)
         if name == MAPS:
-            table.upgrade(rows_table(MAPS, read_rows(table)), upgrade_metadata())
+            said = {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {FORMAT_VERSION}"}
+            table.upgrade(rows_table(MAPS, read_rows(table)), said)
         else:
             table.upgrade()
 

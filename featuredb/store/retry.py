@@ -11,9 +11,7 @@ from featuredb.errors import ConflictError, StoreError
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-ATTEMPTS = (
-    40  # 20 writers that all collide need at most 20 turns; twice that bounds the wait to about a minute
-)
+ATTEMPTS = 40  # 20 writers that all collide need at most 20 turns; twice that takes about a minute at most
 FIRST_PAUSE_S = 0.02  # a commit on a local disk takes about 10 ms
 LONGEST_PAUSE_S = 2.0
 

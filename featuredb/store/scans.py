@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geometry.arrays import FloatArray
-from featuredb.store.changes import RETIRED, Change
+from featuredb.store.changes import RETIRED, Change, live_row
 from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, apply_change, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import of_columns, read_rows
@@ -52,7 +52,6 @@ class TilePoints:
     """Points of one tile on their way into the store.
 
     Attributes:
-        tile: name of the tile.
         rows: (n,) POINT_ROW, by level and then node.
         has_intensity: whether the intensities mean something.
     """
@@ -67,12 +66,10 @@ class ScanSummary:
     """A scan as its row in `lidar` describes it.
 
     Attributes:
-        box: of the points, UTM.
         points, points_in_files: stored, and before anything was dropped.
         level_points: stored points of each level, coarsest first.
         spacing_m: typical distance between neighbouring points in plan.
         classes: points of each ASPRS class.
-        colour: "file", "ortho", or "" for none.
         row: everything, by the columns of `lidar`.
     """
 
@@ -132,7 +129,6 @@ def commit_scan(
     Args:
         row: columns of `lidar` but `write_id`, `points_checksum`, `status`, `status_reason`, `created_at`.
         groups: each gives the points of some tiles when called; one commit to `lidar_points` each.
-        on_progress: is told how many points have been written.
 
     Returns:
         Whether this call made the scan visible, and the `write_id` of its points.
@@ -142,7 +138,7 @@ def commit_scan(
         StoreError: the store failed.
     """
     database.make(LIDAR)
-    visible = _live(scan_rows(database), row["scan_id"])
+    visible = live_row(scan_rows(database), row["scan_id"], "scan_id")
     if visible is not None:
         return False, visible["write_id"]
     started = monotonic()
@@ -168,10 +164,8 @@ def commit_scan(
         raise StoreError(f"scan {row['scan_id']}: expected {row['points']} points, {written} were written")
     if (left := database.table(LIDAR_POINTS).count("write_id", write_id)) != written:
         raise ConflictError(f"scan {row['scan_id']}: a vacuum left {left} of {written} points; add it again")
-    full = {
-        **row, "write_id": write_id, "points_checksum": checksum.text(), "status": "active", "status_reason":
-        "", "created_at": datetime.now(UTC),
-    }  # fmt: skip
+    made = {"write_id": write_id, "points_checksum": checksum.text(), "created_at": datetime.now(UTC)}
+    full = {**row, **made, "status": "active", "status_reason": ""}
     winner = retry_stale(f"commit of scan {row['scan_id']}", lambda: _add_row(database, full))
     return winner == write_id, winner
 
@@ -180,8 +174,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
     """Take a scan out of service; False if it was already.
 
     Raises:
-        ScanNotFoundError: no such scan.
-        StoreError: no reason given.
+        ScanNotFoundError, StoreError: no reason given.
     """
     if not reason.strip():
         raise StoreError(f"retire {scan_id}: expected a reason, for those who will ask later")
@@ -190,7 +183,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
     def attempt() -> bool:
         table = database.table(LIDAR)
         rows = read_rows(table)
-        if _live(rows, scan_id) is None:
+        if live_row(rows, scan_id, "scan_id") is None:
             return False
         changed = [
             {**r, "status": RETIRED, "status_reason": reason} if r["scan_id"] == scan_id else r for r in rows
@@ -212,7 +205,6 @@ def scan_points(
 
     Args:
         box: (e0, n0, e1, n1), closed, metres in the scan's zone; None for all.
-        columns: of `lidar_points`.
 
     Raises:
         StoreError: they cannot be read.
@@ -271,15 +263,11 @@ class PointsChecksum:
         return hashlib.sha256(f"{self._sums} {self._count}".encode()).hexdigest()
 
 
-def _live(rows: Iterable[Row], scan_id: str) -> Row | None:
-    return next((r for r in rows if r["scan_id"] == scan_id and r["status"] != RETIRED), None)
-
-
 def _add_row(database: Database, row: Row) -> str:
     """Add the row unless the scan is visible; a retired one gives way. Returns the visible write id."""
     table = database.table(LIDAR)
     rows = read_rows(table)
-    visible = _live(rows, row["scan_id"])
+    visible = live_row(rows, row["scan_id"], "scan_id")
     if visible is not None:
         return str(visible["write_id"])
     kept = [r for r in rows if r["scan_id"] != row["scan_id"]]
@@ -311,7 +299,6 @@ def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
 def _level_rows(
     database: Database, scan: ScanSummary, level: int, box: tuple[float, float, float, float] | None
 ) -> ds.Dataset:
-    """A level's points in a box."""
     where: list[Condition] = [("zone", "=", scan.epsg), ("level", "=", level)]
     where.append(("write_id", "=", scan.write_id))
     if box is not None:

@@ -22,13 +22,7 @@ from featuredb.store.decode import decode_images, decode_map, decode_no_place, f
 from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import Row
-from featuredb.store.tables import (
-    BOUNDS,
-    CHILD_TABLES,
-    IMAGES,
-    SPECS,
-    UTM_COORDINATES,
-)
+from featuredb.store.tables import BOUNDS, CHILD_TABLES, IMAGES, SPECS, UTM_COORDINATES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,12 +47,8 @@ class UtmBox:
 
     def touches(self, e0: float, n0: float, e1: float, n1: float) -> bool:
         """Whether the box has a point in e0 <= e <= e1, n0 <= n <= n1, at any height."""
-        return (
-            self.min_easting <= e1
-            and e0 <= self.max_easting
-            and self.min_northing <= n1
-            and n0 <= self.max_northing
-        )
+        across = self.min_easting <= e1 and e0 <= self.max_easting
+        return across and self.min_northing <= n1 and n0 <= self.max_northing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,8 +59,6 @@ class _Summary:
         write_id: names the child rows; changes with each re-placement, so it is a key for derived artefacts.
         content_digest: SHA-256 of everything but the status.
         status_reason: why it was promoted, quarantined or retired; "" where it has its first status.
-        created_at: UTC.
-        images, points, observations, descriptors: counts.
     """
 
     map_id: str
@@ -94,7 +82,6 @@ class MapSummary(_Summary):
 
     Attributes:
         box: of the points; None for a map without points.
-        tiles: names of all tiles that hold rows of the map.
         residual_rms_m: of the placement, metres.
         drift_m, budget_m: of a map that other maps placed: 95 % bound of its position against its anchors,
             and what growth allowed, metres; None where the placement does not say.
@@ -138,18 +125,19 @@ class Snapshot:
         self._rows = {row["map_id"]: row for row in rows}
         self._children = children
 
+    def any_maps(self, *, include_retired: bool = False) -> list[MapSummary | UnplacedSummary]:
+        """All maps, oldest first."""
+        rows = [row for row in self._rows.values() if include_retired or row["status"] != RETIRED]
+        rows.sort(key=lambda r: (r["created_at"], r["map_id"]))
+        return [self.get_any(row["map_id"]) for row in rows]
+
     def maps(self, *, include_retired: bool = False) -> list[MapSummary]:
-        """The maps with a place, oldest first; those without are `unplaced_maps`."""
-        return [_summary(row) for row in self._oldest_first(include_retired) if has_place(row)]
+        """Those of `any_maps` with a place."""
+        return [m for m in self.any_maps(include_retired=include_retired) if isinstance(m, MapSummary)]
 
     def unplaced_maps(self, *, include_retired: bool = False) -> list[UnplacedSummary]:
-        """The maps without a place, oldest first."""
-        rows = self._oldest_first(include_retired)
-        return [_unplaced_summary(row) for row in rows if not has_place(row)]
-
-    def _oldest_first(self, include_retired: bool) -> list[Row]:
-        rows = [row for row in self._rows.values() if include_retired or row["status"] != RETIRED]
-        return sorted(rows, key=lambda r: (r["created_at"], r["map_id"]))
+        """Those without."""
+        return [m for m in self.any_maps(include_retired=include_retired) if isinstance(m, UnplacedSummary)]
 
     def get(self, map_id: str) -> MapSummary:
         """The summary of one map with a place, retired or not.
@@ -158,10 +146,13 @@ class Snapshot:
             MapNotFoundError: the snapshot has no such map.
             UnplacedMapError: it has no place.
         """
-        row = self._row(map_id)
-        if not has_place(row):
-            raise _without_place(row)
-        return _summary(row)
+        found = self.get_any(map_id)
+        if isinstance(found, MapSummary):
+            return found
+        ways = "; ".join(found.no_place.ways) or "docs/anchoring.md has the ways"
+        raise UnplacedMapError(
+            f"map {map_id} has no place on Earth ({found.no_place.reason}), and this needs one; {ways}"
+        )
 
     def place_bounds(self) -> dict[str, PlaceBounds]:
         """What holds 95 % of the errors of each placement, by map, at the middle of the map's cameras."""
@@ -235,13 +226,10 @@ class Snapshot:
         """The map with a place exactly as it was committed; only its status may differ.
 
         Raises:
-            MapNotFoundError: the snapshot has no such map.
-            UnplacedMapError: it has no place.
+            MapNotFoundError, UnplacedMapError: as `get`.
             StoreError: rows are missing or unreadable.
         """
-        if not has_place(self._row(map_id)):
-            raise _without_place(self._row(map_id))
-        loaded = self.load_any(map_id)
+        loaded = self.load_any(self.get(map_id).map_id)
         assert isinstance(loaded, FeatureMap)
         return loaded
 
@@ -261,8 +249,7 @@ class Snapshot:
         """Images of maps, by map, in their order.
 
         Raises:
-            MapNotFoundError: the snapshot has no such map.
-            StoreError: rows are missing or unreadable.
+            MapNotFoundError, StoreError: as `load_any`.
         """
         rows = [self._row(map_id) for map_id in map_ids]
         own: Condition = ("write_id", "in", [row["write_id"] for row in rows])
@@ -281,8 +268,7 @@ class Snapshot:
         """The map without a place exactly as it was committed; only its status may differ.
 
         Raises:
-            MapNotFoundError: the snapshot has no such map, or it has a place.
-            StoreError: rows are missing or unreadable.
+            MapNotFoundError, StoreError: as `load_any`; and where the map has a place.
         """
         loaded = self.load_any(map_id)
         if isinstance(loaded, FeatureMap):
@@ -345,14 +331,6 @@ def _grouped(column: pa.ChunkedArray) -> dict[str, NDArray[np.int64]]:
         value: order[start:end]
         for value, (start, end) in zip(encoded.dictionary.to_pylist(), itertools.pairwise(ends), strict=True)
     }
-
-
-def _without_place(row: Row) -> UnplacedMapError:
-    no_place = decode_no_place(row)
-    ways = "; ".join(no_place.ways) or "docs/anchoring.md has the ways"
-    return UnplacedMapError(
-        f"map {row['map_id']} has no place on Earth ({no_place.reason}), and this needs one; {ways}"
-    )
 
 
 def _unplaced_summary(row: Row) -> UnplacedSummary:

@@ -5,6 +5,7 @@ needs, and has no way to files, network, extensions or settings.
 """
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -134,11 +135,8 @@ class SqlSession:
         Raises:
             StoreError: not one reading statement, or DuckDB refuses it; the message is DuckDB's.
         """
-        statement = self._statement(text)
-        try:
-            self._connection.execute(statement)
-        except duckdb.Error as error:
-            raise StoreError(f"SQL: {error}") from error
+        with _sql_errors():
+            self._connection.execute(self._statement(text))
         columns = tuple(column[0] for column in self._connection.description or [])
         return SqlResult(columns=columns, rows=self._fetch())
 
@@ -148,17 +146,11 @@ class SqlSession:
         Raises:
             StoreError: as `query`.
         """
-        statement = self._statement(text)
-        try:
-            return SqlTable(table=self._connection.sql(statement).to_arrow_table())
-        except (duckdb.Error, OSError, pa.ArrowException) as error:
-            raise StoreError(f"SQL: {error}") from error
+        with _sql_errors():
+            return SqlTable(table=self._connection.sql(self._statement(text)).to_arrow_table())
 
     def _statement(self, text: str) -> Any:
-        try:
-            statements = self._connection.extract_statements(text)
-        except duckdb.Error as error:
-            raise StoreError(f"SQL: {error}") from error
+        statements = self._connection.extract_statements(text)
         if len(statements) != 1 or statements[0].type not in _ALLOWED:
             found = ", ".join(s.type.name for s in statements) or "nothing"
             raise StoreError(f"SQL: expected one SELECT, found {found}; this is read-only")
@@ -193,8 +185,14 @@ class SqlSession:
             self._connection.register(name, plain_times(rows))
 
     def _fetch(self) -> Iterator[tuple[Any, ...]]:
-        try:
+        with _sql_errors():
             while rows := self._connection.fetchmany(_BATCH_ROWS):
                 yield from rows
-        except (duckdb.Error, OSError, pa.ArrowException) as error:
-            raise StoreError(f"SQL: {error}") from error
+
+
+@contextmanager
+def _sql_errors() -> Iterator[None]:
+    try:
+        yield
+    except (duckdb.Error, OSError, pa.ArrowException) as error:
+        raise StoreError(f"SQL: {error}") from error

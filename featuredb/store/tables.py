@@ -56,11 +56,13 @@ class TableSpec:
     row_group_rows: int = ROW_GROUP_ROWS
 
 
-def _required(kind: pa.DataType, *names: str) -> list[pa.Field]:
+def required(kind: pa.DataType, *names: str) -> list[pa.Field]:
+    """Columns of a type that are never null."""
     return [pa.field(name, kind, nullable=False) for name in names]
 
 
-def _nullable(kind: pa.DataType, *names: str) -> list[pa.Field]:
+def nullable(kind: pa.DataType, *names: str) -> list[pa.Field]:
+    """Columns of a type that may be null."""
     return [pa.field(name, kind) for name in names]
 
 
@@ -70,181 +72,168 @@ def _list(element: pa.DataType) -> pa.DataType:
 
 _TEXT, _TIME = pa.string(), pa.timestamp("us", tz="UTC")
 _INT, _LONG, _SHORT = pa.int32(), pa.int64(), pa.int16()
-_FLOAT, _DOUBLE, _DOUBLES = pa.float32(), pa.float64(), _list(pa.float64())
-_CAMERA = pa.struct(
-    [*_required(_TEXT, "model"), *_required(_INT, "width", "height"), *_required(_DOUBLES, "params")]
-)
+_FLOAT, _DOUBLE, DOUBLES = pa.float32(), pa.float64(), _list(pa.float64())
+CAMERA = [*required(_TEXT, "model"), *required(_INT, "width", "height"), *required(DOUBLES, "params")]
 UTM_COORDINATES = ("easting", "northing", "height")
-_UTM = _required(_DOUBLE, *UTM_COORDINATES)
-_PARTITION = [*_required(_INT, "zone"), *_required(_TEXT, "tile")]
+_UTM = required(_DOUBLE, *UTM_COORDINATES)
+_PARTITION = [*required(_INT, "zone"), *required(_TEXT, "tile")]
 
 BOUNDS = ("min_easting", "min_northing", "min_height", "max_easting", "max_northing", "max_height")
 OWN_COORDINATES = ("x", "y", "z")  # of points of maps without a place, in their own frame
-# Columns of `maps` that are null for a map without a place, besides BOUNDS; those that only such a map has.
-PLACE_COLUMNS = (
-    "epsg",
-    "height_datum",
-    "method",
-    "residual_rms_m",
-    "origin_latitude_deg",
-    "origin_longitude_deg",
-    "origin_height_m",
-    "local_from_sfm_scale",
-    "local_from_sfm_rotation",
-    "local_from_sfm_translation",
-    "placement_covariance",
-    "placement_evidence",
-)
-NO_PLACE_COLUMNS = ("frame_is_metric", "frame_is_upright", "no_place")
+NO_PLACE_COLUMNS = ("frame_is_metric", "frame_is_upright", "no_place")  # that only a map without a place has
 POINT_COVARIANCE = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
 
 _MAPS_SCHEMA = pa.schema(
     [
-        *_required(_TEXT, "map_id", "write_id", "content_digest", "name", "status", "status_reason"),
-        *_required(_TIME, "created_at"),
-        *_nullable(_INT, "epsg"),
-        *_nullable(_TEXT, "height_datum"),
-        *_nullable(_DOUBLE, *BOUNDS),
-        *_required(_list(_TEXT), "tiles"),
-        *_required(_LONG, "images", "points", "observations", "descriptors"),
-        *_nullable(_TEXT, "method"),
-        *_required(_INT, "generation"),
-        *_required(_list(_TEXT), "parents"),
-        *_nullable(_DOUBLE, "residual_rms_m"),
-        *_nullable(_DOUBLE, "origin_latitude_deg", "origin_longitude_deg", "origin_height_m"),
-        *_nullable(_DOUBLE, "local_from_sfm_scale"),
-        *_nullable(_DOUBLES, "local_from_sfm_rotation", "local_from_sfm_translation", "placement_covariance"),
-        *_nullable(_TEXT, "placement_evidence"),
-        *_required(_list(_TEXT), "camera_keys"),
-        *_required(_list(_CAMERA), "cameras"),
-        *_required(_TEXT, "extractor_fingerprint", "source", "licence", "provenance"),
-        *_nullable(pa.bool_(), "frame_is_metric", "frame_is_upright"),
-        *_nullable(_TEXT, "no_place"),
+        *required(_TEXT, "map_id", "write_id", "content_digest", "name", "status", "status_reason"),
+        *required(_TIME, "created_at"),
+        *nullable(_INT, "epsg"),
+        *nullable(_TEXT, "height_datum"),
+        *nullable(_DOUBLE, *BOUNDS),
+        *required(_list(_TEXT), "tiles"),
+        *required(_LONG, "images", "points", "observations", "descriptors"),
+        *nullable(_TEXT, "method"),
+        *required(_INT, "generation"),
+        *required(_list(_TEXT), "parents"),
+        *nullable(_DOUBLE, "residual_rms_m"),
+        *nullable(_DOUBLE, "origin_latitude_deg", "origin_longitude_deg", "origin_height_m"),
+        *nullable(_DOUBLE, "local_from_sfm_scale"),
+        *nullable(DOUBLES, "local_from_sfm_rotation", "local_from_sfm_translation", "placement_covariance"),
+        *nullable(_TEXT, "placement_evidence"),
+        *required(_list(_TEXT), "camera_keys"),
+        *required(_list(pa.struct(CAMERA)), "cameras"),
+        *required(_TEXT, "extractor_fingerprint", "source", "licence", "provenance"),
+        *nullable(pa.bool_(), "frame_is_metric", "frame_is_upright"),
+        *nullable(_TEXT, "no_place"),
     ]
+)
+# Columns of `maps` that are null for a map without a place, besides BOUNDS.
+PLACE_COLUMNS = tuple(
+    field.name for field in _MAPS_SCHEMA if field.nullable and field.name not in (*BOUNDS, *NO_PLACE_COLUMNS)
 )
 
 _IMAGES_SCHEMA = pa.schema(
     [
-        *_required(_TEXT, "write_id", "map_id"),
-        *_required(_INT, "image_id"),
-        *_required(_LONG, "image_index"),
-        *_required(_TEXT, "name", "sha256"),
-        *_required(_INT, "camera_id"),
-        *_required(_DOUBLES, "cam_from_local_rotation", "cam_from_local_translation"),
-        *_nullable(_DOUBLES, "covariance"),
+        *required(_TEXT, "write_id", "map_id"),
+        *required(_INT, "image_id"),
+        *required(_LONG, "image_index"),
+        *required(_TEXT, "name", "sha256"),
+        *required(_INT, "camera_id"),
+        *required(DOUBLES, "cam_from_local_rotation", "cam_from_local_translation"),
+        *nullable(DOUBLES, "covariance"),
         *_UTM,
-        *_nullable(_TEXT, "capture_time"),
-        *_nullable(_DOUBLE, "gps_latitude_deg", "gps_longitude_deg", "gps_height_m"),
-        *_nullable(_DOUBLE, "gps_sigma_horizontal_m", "gps_sigma_vertical_m"),
-        *_required(_TEXT, "owner", "licence"),
+        *nullable(_TEXT, "capture_time"),
+        *nullable(_DOUBLE, "gps_latitude_deg", "gps_longitude_deg", "gps_height_m"),
+        *nullable(_DOUBLE, "gps_sigma_horizontal_m", "gps_sigma_vertical_m"),
+        *required(_TEXT, "owner", "licence"),
         *_PARTITION,
     ]
 )
 
 _POINTS_SCHEMA = pa.schema(
     [
-        *_required(_TEXT, "write_id", "map_id"),
-        *_required(_LONG, "point_index"),
+        *required(_TEXT, "write_id", "map_id"),
+        *required(_LONG, "point_index"),
         *_UTM,
-        *_required(_SHORT, "red", "green", "blue"),
-        *_required(_INT, "track_length"),
-        *_required(_FLOAT, "error_px", *POINT_COVARIANCE),
+        *required(_SHORT, "red", "green", "blue"),
+        *required(_INT, "track_length"),
+        *required(_FLOAT, "error_px", *POINT_COVARIANCE),
         *_PARTITION,
-        *_nullable(_DOUBLE, *OWN_COORDINATES),
+        *nullable(_DOUBLE, *OWN_COORDINATES),
     ]
 )
 
 _OBSERVATIONS_SCHEMA = pa.schema(
     [
-        *_required(_TEXT, "write_id", "map_id"),
-        *_required(_LONG, "observation_index", "point_index"),
-        *_required(_INT, "image_id"),
-        *_required(_FLOAT, "x", "y", "scale", "angle"),
-        *_nullable(pa.binary(), "descriptor"),
+        *required(_TEXT, "write_id", "map_id"),
+        *required(_LONG, "observation_index", "point_index"),
+        *required(_INT, "image_id"),
+        *required(_FLOAT, "x", "y", "scale", "angle"),
+        *nullable(pa.binary(), "descriptor"),
         *_PARTITION,
     ]
 )
 
 _SCAN_FILE = pa.struct(
     [
-        *_required(_TEXT, "name", "sha256"),
-        *_required(_LONG, "size_bytes", "points"),
-        *_required(_TEXT, "crs", "transformation"),
-        *_nullable(_DOUBLE, "transformation_accuracy_m"),
+        *required(_TEXT, "name", "sha256"),
+        *required(_LONG, "size_bytes", "points"),
+        *required(_TEXT, "crs", "transformation"),
+        *nullable(_DOUBLE, "transformation_accuracy_m"),
     ]
 )
-_CLASS_COUNT = pa.struct([*_required(_INT, "classification"), *_required(_LONG, "points")])
+_CLASS_COUNT = pa.struct([*required(_INT, "classification"), *required(_LONG, "points")])
 
 _LIDAR_SCHEMA = pa.schema(
     [
-        *_required(_TEXT, "scan_id", "write_id", "points_checksum", "name", "status", "status_reason"),
-        *_required(_TIME, "created_at"),
-        *_required(_list(_SCAN_FILE), "files"),
-        *_required(_INT, "epsg"),
-        *_required(_TEXT, "height_datum"),
-        *_required(_DOUBLE, *BOUNDS),
-        *_required(_list(_TEXT), "tiles"),
-        *_required(_LONG, "points", "points_in_files"),
-        *_required(_LONG, "dropped_noise", "dropped_withheld", "dropped_outliers"),
-        *_required(_list(_LONG), "level_points"),
-        *_required(_DOUBLE, "spacing_m"),
-        *_required(_list(_CLASS_COUNT), "classes"),
-        *_required(_TEXT, "colour", "ortho"),
-        *_required(pa.bool_(), "has_intensity"),
-        *_nullable(_DOUBLE, "intensity_low", "intensity_high"),
-        *_required(_TEXT, "crs_source", "horizontal_unit", "vertical_crs", "height_unit"),
-        *_required(_DOUBLE, "height_unit_m"),
-        *_required(_TEXT, "height_unit_reason"),
-        *_required(_list(_TEXT), "notes"),
-        *_required(_TEXT, "options", "source", "licence"),
+        *required(_TEXT, "scan_id", "write_id", "points_checksum", "name", "status", "status_reason"),
+        *required(_TIME, "created_at"),
+        *required(_list(_SCAN_FILE), "files"),
+        *required(_INT, "epsg"),
+        *required(_TEXT, "height_datum"),
+        *required(_DOUBLE, *BOUNDS),
+        *required(_list(_TEXT), "tiles"),
+        *required(_LONG, "points", "points_in_files"),
+        *required(_LONG, "dropped_noise", "dropped_withheld", "dropped_outliers"),
+        *required(_list(_LONG), "level_points"),
+        *required(_DOUBLE, "spacing_m"),
+        *required(_list(_CLASS_COUNT), "classes"),
+        *required(_TEXT, "colour", "ortho"),
+        *required(pa.bool_(), "has_intensity"),
+        *nullable(_DOUBLE, "intensity_low", "intensity_high"),
+        *required(_TEXT, "crs_source", "horizontal_unit", "vertical_crs", "height_unit"),
+        *required(_DOUBLE, "height_unit_m"),
+        *required(_TEXT, "height_unit_reason"),
+        *required(_list(_TEXT), "notes"),
+        *required(_TEXT, "options", "source", "licence"),
     ]
 )
 
 _LIDAR_POINTS_SCHEMA = pa.schema(
     [
-        *_required(_TEXT, "write_id"),
+        *required(_TEXT, "write_id"),
         *_UTM,
-        *_nullable(_SHORT, "red", "green", "blue", "intensity"),
-        *_required(_SHORT, "classification"),
-        *_required(_LONG, "node"),
-        *_required(_FLOAT, "node_spacing_m"),
+        *nullable(_SHORT, "red", "green", "blue", "intensity"),
+        *required(_SHORT, "classification"),
+        *required(_LONG, "node"),
+        *required(_FLOAT, "node_spacing_m"),
         *_PARTITION,
-        *_required(_INT, "level"),
+        *required(_INT, "level"),
     ]
 )
 
 _CANDIDATES_SCHEMA = pa.schema(
     [
-        *_required(_TEXT, "candidate_id", "write_id"),
-        *_required(_INT, "event_index"),
-        *_required(_TEXT, "event"),
-        *_required(_TIME, "happened_at"),
-        *_nullable(_TEXT, "owner", "licence", "client_id", "sha256"),
-        *_nullable(_LONG, "size_bytes"),
-        *_nullable(_INT, "width", "height"),
-        *_nullable(_LONG, "snapshot"),
-        *_nullable(_TEXT, "answer_status", "request", "answer", "map_id", "reason_code", "reason"),
+        *required(_TEXT, "candidate_id", "write_id"),
+        *required(_INT, "event_index"),
+        *required(_TEXT, "event"),
+        *required(_TIME, "happened_at"),
+        *nullable(_TEXT, "owner", "licence", "client_id", "sha256"),
+        *nullable(_LONG, "size_bytes"),
+        *nullable(_INT, "width", "height"),
+        *nullable(_LONG, "snapshot"),
+        *nullable(_TEXT, "answer_status", "request", "answer", "map_id", "reason_code", "reason"),
     ]
 )
 
 _CANDIDATE_IMAGES_SCHEMA = pa.schema(
-    [*_required(_TEXT, "candidate_id", "write_id"), *_required(pa.binary(), "image")]
+    [*required(_TEXT, "candidate_id", "write_id"), *required(pa.binary(), "image")]
 )
 
 _CANARIES_SCHEMA = pa.schema(
     [
-        *_required(_TEXT, "canary_id", "write_id", "name"),
-        *_required(_TIME, "created_at"),
-        *_required(_TEXT, "sha256", "request", "expected"),
-        *_nullable(_INT, "epsg"),
-        *_nullable(_DOUBLE, *UTM_COORDINATES),
-        *_nullable(_DOUBLES, "cam_from_utm_xyzw"),
-        *_nullable(_TEXT, "height_datum"),
-        *_nullable(_DOUBLE, "tolerance_m", "tolerance_deg"),
-        *_required(_TEXT, "origin"),
-        *_nullable(_LONG, "snapshot"),
-        *_required(_TEXT, "note"),
-        *_required(pa.binary(), "image"),
+        *required(_TEXT, "canary_id", "write_id", "name"),
+        *required(_TIME, "created_at"),
+        *required(_TEXT, "sha256", "request", "expected"),
+        *nullable(_INT, "epsg"),
+        *nullable(_DOUBLE, *UTM_COORDINATES),
+        *nullable(DOUBLES, "cam_from_utm_xyzw"),
+        *nullable(_TEXT, "height_datum"),
+        *nullable(_DOUBLE, "tolerance_m", "tolerance_deg"),
+        *required(_TEXT, "origin"),
+        *nullable(_LONG, "snapshot"),
+        *required(_TEXT, "note"),
+        *required(pa.binary(), "image"),
     ]
 )
 

@@ -11,7 +11,6 @@ import pyarrow.dataset as ds
 
 from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
-from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.photos import count_candidates
 from featuredb.store.candidates.upkeep import check_growth_tables, named_writes
@@ -23,13 +22,7 @@ from featuredb.store.durable.filesystem import one_line, sha256_of, store_errors
 from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, encode_map
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
-from featuredb.store.scans import (
-    PointsChecksum,
-    ScanSummary,
-    list_scans,
-    scan_batches,
-    scan_rows,
-)
+from featuredb.store.scans import PointsChecksum, ScanSummary, list_scans, scan_batches, scan_rows
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import (
     BOUNDS,
@@ -72,7 +65,6 @@ class VerifyReport:
 
     Attributes:
         version: of the snapshot that was checked; -1 where a log is so damaged that none can be read.
-        maps, scans, candidates, canaries, files, rows: how many of each were checked.
         problems: damage; empty in a sound database.
         orphans: write ids of child rows that no version names, left by a crash or written just now by a
             commit under way. No damage: nobody reads them, and `vacuum` removes them.
@@ -125,7 +117,7 @@ def _read_all(place: CopyPlace) -> None:
     """Raises OSError where the store does not answer."""
     for path in place.sizes():
         with suppress(FileNotFoundError):
-            place.sha256(path)
+            sha256_of(place.files, path)
 
 
 def _verify(database: Database) -> VerifyReport:
@@ -251,7 +243,7 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
     elsewhere = 0
     try:
         for batch in scan_batches(database, scan, (*UTM_COORDINATES, "tile", "level")):
-            utm = _utm(batch)
+            utm = np.column_stack([batch[name].to_numpy() for name in UTM_COORDINATES])
             coordinates.add(utm)
             levels += np.bincount(batch["level"].to_numpy(), minlength=len(levels))[: len(levels)]
             if not np.isfinite(utm).all():
@@ -271,10 +263,6 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
 
 def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
     return tuple(DatabaseProblem(where=where, what=what) for where, what in problems)
-
-
-def _utm(table: pa.RecordBatch) -> FloatArray:
-    return np.column_stack([table[name].to_numpy() for name in UTM_COORDINATES])
 
 
 def _orphans(database: Database) -> list[str]:

@@ -169,12 +169,7 @@ class ContainerVideo(Video):
         gray = _converted(self._pixels.gray, picture, self.info.name)
         self._tally.damaged += picture.is_corrupt
         name, rgb = self.info.name, self._pixels.rgb  # and not the whole film, which frames may outlive
-        return VideoFrame(
-            index=index,
-            time_s=time_s,
-            gray=gray,
-            rgb=lambda: _converted(rgb, picture, name),
-        )
+        return VideoFrame(index=index, time_s=time_s, gray=gray, rgb=lambda: _converted(rgb, picture, name))
 
 
 def _converted(
@@ -270,7 +265,8 @@ def _info(
     opening: Opening,
     options: VideoOptions,
 ) -> VideoInfo:
-    clockwise_deg = clockwise_from_display_matrix(_display_matrix(first), opening.name)
+    matrix = cast("Mapping[str, Any]", first.side_data).get("DISPLAYMATRIX")
+    clockwise_deg = clockwise_from_display_matrix(None if matrix is None else bytes(matrix), opening.name)
     size = (first.width, first.height)
     if clockwise_deg in (90, 270):
         size = size[::-1]
@@ -293,17 +289,8 @@ def _info(
     )
 
 
-def _display_matrix(picture: av.VideoFrame) -> bytes | None:
-    matrix = cast("Mapping[str, Any]", picture.side_data).get("DISPLAYMATRIX")
-    return None if matrix is None else bytes(matrix)
-
-
 def _first(tags: Mapping[str, str], names: tuple[str, ...]) -> str | None:
-    for name in names:
-        value = tags.get(name, "").strip()
-        if value:
-            return value
-    return None
+    return next((value for name in names if (value := tags.get(name, "").strip())), None)
 
 
 def _maker(tags: Mapping[str, str]) -> str | None:

@@ -62,12 +62,7 @@ class FilmClock:
 
 
 class Decoder:
-    """Decodes one stream of an open container; to be used from one thread.
-
-    Args:
-        name: of the film, for messages.
-        tally: is counted up.
-    """
+    """Decodes one stream of an open container; to be used from one thread."""
 
     def __init__(
         self, container: InputContainer, stream: VideoStream, clock: FilmClock, tally: VideoReport, name: str

@@ -71,7 +71,6 @@ class VideoInfo:
         frame_count: number of frames that the file's index lists, or None.
         creation_time: when the recording was started by the camera's clock, or None. Said to be UTC, but
             many action cameras write their local time.
-        make, model: of the camera, where a tag says so.
         camera_key: by which maps know the lens (featuredb.features.exif), "" where the camera is not named.
         focal_px: by EXIF of a folder's pictures, for the full size; None: not said.
         live: whether the source cannot be read twice or sought in: URLs, devices, pipes.
@@ -134,8 +133,6 @@ class VideoReport:
         damaged: frames that were handed out although parts of them are made up.
         out_of_order: frames that were dropped because their time is not after that of the frame before.
         times_guessed: frames without a time, which were given the next one at the nominal rate.
-        last_s: time of the last decoded frame, or None.
-        at_end: whether the end of the file, folder or stream was reached.
         packets: of the film that were read, whole or not.
         missing: frames that the file's index lists but that are not there; known at the end of whole films.
         short_by_s: how much earlier than the stated length the last frame ends; known at the end, where

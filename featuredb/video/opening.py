@@ -36,9 +36,7 @@ class Opening:
     Attributes:
         name: for messages, without password.
         target: the address or path that `av.open` takes.
-        path: the regular file that it is, or None.
         input_format: libav's name of the format where it cannot tell itself, or None.
-        input_options: libav's, see VideoOptions.
         live: whether it is read once from its start, with a timeout.
     """
 
@@ -70,15 +68,9 @@ def _address(url: str, options: VideoOptions) -> Opening:
         )
     given = {"protocol_whitelist": _NETWORK_PROTOCOLS}
     if parts.scheme in ("rtsp", "rtsps"):
-        given["rtsp_transport"] = (
-            "tcp"  # over UDP a lost datagram smears the picture until the next key frame
-        )
-    return Opening(
-        name=name,
-        target=url,
-        input_options={**given, **options.input_options},
-        live=True,
-    )
+        # Over UDP a lost datagram smears the picture until the next key frame.
+        given["rtsp_transport"] = "tcp"
+    return Opening(name=name, target=url, input_options={**given, **options.input_options}, live=True)
 
 
 def _file_or_device(path: Path, options: VideoOptions) -> Opening:
@@ -89,8 +81,7 @@ def _file_or_device(path: Path, options: VideoOptions) -> Opening:
         raise VideoError(f"{path}: the film cannot be opened: {reason}") from error
     if not (stat.S_ISREG(mode) or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)):
         raise VideoError(f"{path}: expected a film, a folder of pictures, a pipe or a camera's device")
-    regular = stat.S_ISREG(mode)
-    device = stat.S_ISCHR(mode)
+    regular, device = stat.S_ISREG(mode), stat.S_ISCHR(mode)
     given = {} if device else {"format_whitelist": _FILE_FORMATS, "protocol_whitelist": "file"}
     return Opening(
         name=path.name if regular else str(path),

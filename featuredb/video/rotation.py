@@ -29,7 +29,6 @@ def clockwise_from_display_matrix(matrix: bytes | None, name: str) -> int:
 
     Args:
         matrix: the side data DISPLAYMATRIX, 36 bytes, or None for a film without one.
-        name: of the film, for messages.
 
     Raises:
         VideoError: another angle, a mirrored picture, or no matrix of that size.

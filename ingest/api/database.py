@@ -61,9 +61,7 @@ class FeatureDatabase:
         snapshot = self.store.snapshot()
         placed = tuple(snapshot.maps())
         return ListedMaps(
-            placed=placed,
-            unplaced=tuple(snapshot.unplaced_maps()),
-            bounds=snapshot.place_bounds(),
+            placed=placed, unplaced=tuple(snapshot.unplaced_maps()), bounds=snapshot.place_bounds()
         )
 
     def __repr__(self) -> str:

@@ -73,9 +73,7 @@ def ingest(
     """Make maps of photos, with bars that show the progress.
 
     Args:
-        folder: of photos, or a table of them.
         films: whose keyframes the folder holds.
-        report: folder for report.html and report.json.
 
     Raises:
         IngestError, StoreError: see `ingest_photos`.
@@ -133,7 +131,6 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
 
 
 def _survey(asked: dict[str, Any], keep_focal: bool) -> Survey | None:
-    """The control points, where there are some."""
     if asked.get("gcp") is None:
         return None
     return Survey(

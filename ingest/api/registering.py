@@ -6,12 +6,7 @@ from pathlib import Path
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import CommitResult, Database
 from ingest.register.control.control_file import read_control_file
-from ingest.register.control.maps import (
-    GcpRegistration,
-    Survey,
-    place_unplaced_by_gcp,
-    register_by_gcp,
-)
+from ingest.register.control.maps import GcpRegistration, Survey, place_unplaced_by_gcp, register_by_gcp
 from ingest.register.control.placement import GcpOptions
 from ingest.register.control.report import residual_table, write_control_report
 

@@ -18,8 +18,17 @@ from ingest.plot_parts import plan_png
 from ingest.report.values import IngestReport
 
 
+class _Shown:
+    """What a notebook shows as it is printed."""
+
+    __slots__ = ()
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ListedMaps:
+class ListedMaps(_Shown):
     """The maps of a database at one version; those without a place come last.
 
     Attributes:
@@ -46,12 +55,9 @@ class ListedMaps:
     def __repr__(self) -> str:
         return str(self)
 
-    def _repr_html_(self) -> str:
-        return _pre(str(self))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Ingested:
+class Ingested(_Shown):
     """What an ingest did with every file and map; `report` has the figures."""
 
     report: IngestReport
@@ -66,11 +72,11 @@ class Ingested:
 
     def _repr_html_(self) -> str:
         plans = (picture(plan_png(m.plan), m.name) for m in self.report.maps if m.plan is not None)
-        return _pre(str(self)) + "".join(plans)
+        return _Shown._repr_html_(self) + "".join(plans)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Aligned:
+class Aligned(_Shown):
     """A map that was to be placed, and by what.
 
     Attributes:
@@ -88,12 +94,9 @@ class Aligned:
     def __str__(self) -> str:
         return self.text
 
-    def _repr_html_(self) -> str:
-        return _pre(self.text)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FilmTrack:
+class FilmTrack(_Shown):
     """The poses of a film's frames; `film.video.trajectory.points` has each with its covariance."""
 
     film: TrackedFilm
@@ -101,22 +104,12 @@ class FilmTrack:
     def __str__(self) -> str:
         return self.film.as_text()
 
-    def _repr_html_(self) -> str:
-        return _pre(str(self))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Grown:
+class Grown(_Shown):
     """What became of contributed photos and of maps without a place."""
 
     report: GrowthReport
 
     def __str__(self) -> str:
         return self.report.as_text()
-
-    def _repr_html_(self) -> str:
-        return _pre(str(self))
-
-
-def _pre(text: str) -> str:
-    return f"<pre>{escape(text)}</pre>"

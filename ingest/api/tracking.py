@@ -53,7 +53,7 @@ class TrackedFilm:
         summary = self.summary()
         lines = [
             f"{summary['video']}: {summary['frames']} frames, {summary['tracking']} tracked, "
-            f"{summary['relocalised']} relocalised, {summary['lost']} lost",
+            f"{summary['relocalised']} relocalised, {summary['lost']} lost"
         ]
         lines += [f"  from {a:.2f} s to {b:.2f} s" for a, b in summary["stretches"]]
         if summary["last_reason"]:

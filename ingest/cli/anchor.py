@@ -19,7 +19,6 @@ x, y, easting, northing, height: full-size pixels and metres. See docs/anchoring
 
 
 def register(subparsers: Any) -> None:
-    """Add `anchor` to the parser of `featuredb`."""
     anchor = add_command(
         subparsers,
         "anchor",

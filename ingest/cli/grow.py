@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 def register(subparsers: Any) -> None:
-    """Add the commands of growth to the parser of `featuredb`."""
     _register_grow(subparsers)
     _register_promote(subparsers)
     _register_canary(subparsers)

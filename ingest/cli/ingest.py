@@ -16,7 +16,6 @@ _STAGES = ("scan", "extract", "match", "reconstruct", "build")
 
 
 def register(subparsers: Any) -> None:
-    """Add `ingest` to the parser of `featuredb`."""
     ingest = subparsers.add_parser("ingest", help="make maps of photos")
     kinds = ingest.add_subparsers(title="what to ingest", metavar="KIND", required=True)
     photos = add_command(
@@ -34,10 +33,7 @@ def register(subparsers: Any) -> None:
         help="folder of photos, searched through; or a table (.csv, .parquet, .jsonl) with the columns path "
         "or id, lat, lon, accuracy, time, owner, licence, title; or OpenDroneMap's geo.txt",
     )
-    _add_selection(photos)
-    _add_making(photos)
-    _add_control(photos)
-    _add_running(photos)
+    _add_arguments(photos)
     _register_video(kinds)
     _register_model(kinds)
 
@@ -69,13 +65,10 @@ def _register_video(kinds: Any) -> None:
         "where it was when it was killed.",
     )
     add_video_arguments(video)
-    _add_selection(video)
-    _add_making(video)
-    _add_control(video)
-    _add_running(video)
+    _add_arguments(video)
 
 
-def _add_selection(parser: argparse.ArgumentParser) -> None:
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("which photos, and whose")
     group.add_argument(
         "--exclude",
@@ -93,9 +86,6 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         help="positions of a table place active maps, as those of a folder do; by default such maps are "
         "quarantined",
     )
-
-
-def _add_making(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("how maps are made")
     group.add_argument(
         "--cameras",
@@ -112,9 +102,7 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         "height, with a camera that is known well",
     )
     group.add_argument(
-        "--max-features",
-        type=int,
-        help="per photo; default: 12000, for films 5000; fewer match faster",
+        "--max-features", type=int, help="per photo; default: 12000, for films 5000; fewer match faster"
     )
     group.add_argument("--max-side", type=int, metavar="PX", help="features are looked for at; default: 2400")
     group.add_argument(
@@ -135,9 +123,6 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of the photos' positions in metres, horizontal and vertical, instead of "
         "what EXIF suggests",
     )
-
-
-def _add_control(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("ground control points")
     group.add_argument(
         "--gcp",
@@ -146,9 +131,6 @@ def _add_control(parser: argparse.ArgumentParser) -> None:
         help="control points, OpenDroneMap's gcp_list.txt, which place the map instead of the photos' GPS",
     )
     add_control_arguments(group)
-
-
-def _add_running(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("how the job runs")
     group.add_argument("--workers", type=int, help="processes; default: one per core")
     group.add_argument(
@@ -169,7 +151,6 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
 
 
 def run_photos(args: argparse.Namespace) -> int:
-    """Ingest, print what happened; 0 if a map is in the database, 1 if none could be made."""
     return ingest_folder(args, args.folder)
 
 
@@ -177,7 +158,6 @@ def ingest_folder(args: argparse.Namespace, folder: Path, films: Sequence["FilmO
     """Ingest, print what happened; 0 if a map is in the database, 1 if none could be made.
 
     Args:
-        args: of `featuredb ingest photos` or `video`.
         films: whose keyframes the folder holds, a folder for each.
     """
     from featuredb.store import Database

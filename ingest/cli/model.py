@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from featuredb.cli.common import place_for_database, storage_options
+from featuredb.cli.common import numbers, place_for_database, storage_options
 from ingest.cli.register import sigmas_m
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     place.add_argument("--epsg", type=int, help="UTM zone, 326zz or 327zz")
     place.add_argument(
         "--origin",
-        type=_three,
+        type=lambda text: numbers(text, "easting,northing,height in metres", 3),
         metavar="E,N,H",
         help="of the model's coordinates in that zone, metres",
     )
@@ -135,13 +135,3 @@ def _stated(args: argparse.Namespace) -> "Stated | None":
             "without its accuracy is no place for a map"
         )
     return Stated(axes=args.axes, epsg=args.epsg, origin=origin, sigma_m=args.sigma)
-
-
-def _three(text: str) -> tuple[float, float, float]:
-    try:
-        easting, northing, height = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"expected easting,northing,height in metres, found {text!r}"
-        ) from error
-    return easting, northing, height

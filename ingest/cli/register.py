@@ -5,11 +5,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from featuredb.cli.common import add_command, open_database
+from featuredb.cli.common import add_command, numbers, open_database
 
 
 def register(subparsers: Any) -> None:
-    """Add `register` to the parser of `featuredb`."""
     parser = add_command(
         subparsers,
         "register",
@@ -74,25 +73,15 @@ def run_register(args: argparse.Namespace) -> int:
 
 def sigmas_m(text: str) -> tuple[float, float]:
     """One or two lengths in metres: horizontal and vertical, or both."""
-    values = _numbers(text)
+    values = numbers(text, "metres such as 3 or 3,5", 1, 2)
     if not all(0 < v < 1e6 for v in values):
         raise argparse.ArgumentTypeError(f"expected one or two lengths > 0 m, found {text!r}")
     return values[0], values[-1]
 
 
 def _height(text: str) -> tuple[float, float]:
-    values = _numbers(text)
+    values = numbers(text, "metres such as 3 or 3,5", 1, 2)
     sigma = values[1] if len(values) == 2 else 10.0
     if not -500 < values[0] < 9000 or not 0 < sigma < 1e4:
         raise argparse.ArgumentTypeError(f"expected a height in metres, and a sigma > 0, found {text!r}")
     return values[0], sigma
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"expected metres such as 3 or 3,5, found {text!r}") from error
-    if len(values) > 2:
-        raise argparse.ArgumentTypeError(f"expected one or two numbers, found {text!r}")
-    return values

@@ -11,7 +11,6 @@ from reloc.cli.live import add_film_arguments
 
 
 def register(subparsers: Any) -> None:
-    """Add `track` to the parser of `featuredb`."""
     parser = add_command(
         subparsers,
         "track",

@@ -113,11 +113,7 @@ def _check_options(args: argparse.Namespace, films: int) -> None:
 
 
 def _telemetry(args: argparse.Namespace, film: Path) -> "Telemetry | None":
-    """A film's telemetry, checked against what was told of it.
-
-    Raises:
-        TelemetryError, InvalidValueError
-    """
+    """A film's telemetry, checked against what was told of it."""
     import numpy as np
 
     from featuredb.errors import InvalidValueError

@@ -207,11 +207,7 @@ def open_keypoints(path: Path, stored: StoredModel) -> Iterator[ReadKeypoints]:
 def _blob(
     database: sqlite3.Connection, table: str, image_id: int, kind: np.dtype[np.generic]
 ) -> NDArray[np.generic] | None:
-    """The (rows, cols) array of an image in `keypoints` or `descriptors`, None where there is none.
-
-    Raises:
-        IngestError: it has other bytes than its size says.
-    """
+    """The (rows, cols) array of an image in `keypoints` or `descriptors`, None where there is none."""
     query = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
     found = database.execute(query, (image_id,)).fetchone()
     if found is None:
@@ -228,11 +224,7 @@ def _blob(
 def _descriptors(
     database: sqlite3.Connection, name: str, image_id: int, count: int
 ) -> NDArray[np.uint8] | None:
-    """Descriptors (k, 128) that can be compared with ours, or None.
-
-    Raises:
-        IngestError: other features than SIFT, or not RootSIFT.
-    """
+    """Descriptors (k, 128) that can be compared with ours, or None."""
     columns = {row[1] for row in database.execute("PRAGMA table_info(descriptors)")}
     if "type" in columns:  # since COLMAP 4
         kind = database.execute("SELECT type FROM descriptors WHERE image_id = ?", (image_id,)).fetchone()
@@ -242,6 +234,4 @@ def _descriptors(
                 "hold SIFT only: ingest the photos instead"
             )
     data = _blob(database, "descriptors", image_id, np.dtype("u1"))
-    if data is None:
-        return None
-    return as_rootsift(data, name, count)
+    return None if data is None else as_rootsift(data, name, count)

@@ -52,22 +52,18 @@ def open_model(folder: Path, colmap_database: Path | None, reconstruction: int |
         IngestError: there is none, or it cannot be read, or an option belongs to another format.
     """
     place = opensfm_folder(folder)
-    if place is None and reconstruction is not None:
+    if place is not None:
+        if colmap_database is not None:
+            raise IngestError(
+                f"--database: expected a COLMAP model, found one of OpenSfM in {folder}; leave it out"
+            )
+        return read_opensfm(place, reconstruction)
+    if reconstruction is not None:
         raise IngestError(
             "--reconstruction: expected OpenSfM's reconstruction.json, found none; leave it out"
         )
-    if place is None:
-        return _colmap(folder, colmap_database)
-    if colmap_database is not None:
-        raise IngestError(
-            f"--database: expected a COLMAP model, found one of OpenSfM in {folder}; leave it out"
-        )
-    return _opensfm(folder, place, reconstruction)
-
-
-def _colmap(folder: Path, database: Path | None) -> ModelSource:
     stored, place = read_colmap(folder), model_folder(folder)
-    path = database or folder / DATABASE
+    path = colmap_database or folder / DATABASE
     return ModelSource(
         format="colmap",
         place=place,
@@ -78,15 +74,6 @@ def _colmap(folder: Path, database: Path | None) -> ModelSource:
     )
 
 
-def _opensfm(folder: Path, place: Path, reconstruction: int | None) -> ModelSource:
-    folders = (place / "images", folder / "images", place.absolute().parent / "images")
-    return replace(
-        read_opensfm(place, reconstruction),
-        photos=next((path for path in folders if path.is_dir()), None),
-        choice="" if reconstruction is None else f"reconstruction {reconstruction}",
-    )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelOptions:
     """How a model is imported.
@@ -94,16 +81,12 @@ class ModelOptions:
     Attributes:
         photos: folder of the photos under the names that the model has; needed where no georeference.json
             names them, and where descriptors are made of them; None: where the format has its photos.
-        stated: where the model lies, if a person says so.
         sigma_m: how well the place is known that the model's own reference gives, horizontally and
             vertically, if a person says so.
-        reconstruction: which of several in an OpenSfM file, counted from 0.
-        colmap_database: None: database.db in the model's folder.
         descriptors: those in the files (also where None, if the format has them), or made anew of the photos
             at the same keypoints.
         height_datum: of the heights where no georeference.json says it.
         min_track_length: points seen by at least that many photos carry descriptors.
-        name, owner, licence: of the map and of photos that do not name their own.
     """
 
     photos: Path | None = None
@@ -115,7 +98,7 @@ class ModelOptions:
     name: str = ""
     owner: str = ""
     licence: str = ""
-    # Not in the text that names maps (`_plain`): without them it is as it was before they were there.
+    # Not in the text that names maps: without them it is as it was before they were there.
     sigma_m: tuple[float, float] | None = field(default=None, repr=False)
     reconstruction: int | None = field(default=None, repr=False)
 
@@ -173,7 +156,6 @@ def _built(
 
 
 def _described_anew(source: ModelSource, options: ModelOptions) -> bool:
-    """Whether descriptors are made of the photos."""
     if not source.has_descriptors and options.descriptors == "stored":
         raise IngestError(
             f"--descriptors stored: {NAMES[source.format]} keeps none that can be compared with ours; leave "
@@ -323,7 +305,7 @@ def _identity(
     document_file = georeference_file(folder, source.place)
     files = [*source.files, *([] if document_file is None else [document_file]), *source.feature_files]
     texts = [f"{path.name} {file_sha256(path)}" for path in files]
-    texts.append(_plain(options))
+    texts.append(repr(replace(options, photos=None, colmap_database=None)))  # not where its photos lie
     if not source.has_descriptors:  # they are the photos'
         texts += [photo.sha256 for photo in photos]
     if options.sigma_m is not None:
@@ -344,11 +326,7 @@ def _identity(
 
 
 def _described(made: MapKind) -> MapKind:
-    """Zeros are no descriptors.
-
-    Raises:
-        IngestError: nothing is described.
-    """
+    """Zeros are no descriptors."""
     seen = made.observations
     described = seen.has_descriptor & seen.descriptors.any(axis=1)
     if not described.any():
@@ -367,8 +345,3 @@ def _finished(made: FeatureMap, place: Place) -> FeatureMap:
     if made.epsg != place.epsg:
         points = replace(points, utm=made.frame.utm_from_enu(made.points_local(), place.epsg))
     return replace(made, epsg=place.epsg, status=place.status, points=points)
-
-
-def _plain(options: ModelOptions) -> str:
-    """The options that the map depends on; not where its photos lie."""
-    return repr(replace(options, photos=None, colmap_database=None))

@@ -108,6 +108,8 @@ def read_opensfm(place: Path, chosen: int | None = None) -> ModelSource:
         stored=stored,
         open_keypoints=lambda: nullcontext(keypoints),
         has_descriptors=False,
+        photos=next((p for p in (place / "images", place.absolute().parent / "images") if p.is_dir()), None),
+        choice="" if chosen is None else f"reconstruction {chosen}",
         reference=reference,
         gps=tuple(_gps(shots[i][1], reference, f"{path}: shot {shots[i][0]!r}") for i in images),
         files=tuple(p for p in (path, place / TRACKS, place / REFERENCE, place / CONFIG) if p.is_file()),
@@ -163,11 +165,7 @@ def _pixels(parts: _Parts) -> FloatArray:
 
 
 def _kept(parts: _Parts, xy: FloatArray, path: Path) -> NDArray[np.bool_]:
-    """Observations (m,) that are no outliers, of points that two or more of them see.
-
-    Raises:
-        IngestError: so many are that the tracks are those of another reconstruction.
-    """
+    """Observations (m,) that are no outliers, of points that two or more of them see."""
     tracks, count = parts.tracks, len(parts.xyz)
     unseen = int((np.bincount(tracks.track, minlength=count) < 2).sum())
     if unseen > _MOST_UNSEEN * count:
@@ -246,11 +244,7 @@ def _diameter_over_size(config: Path) -> float:
 
 
 def _reference(found: OpensfmReconstruction, place: Path, path: Path) -> LocalFrame | None:
-    """Of the reconstruction itself, or of the data set.
-
-    Raises:
-        IngestError: broken, or the two contradict each other.
-    """
+    """Of the reconstruction itself, or of the data set."""
     frames: list[LocalFrame] = []
     if found.reference_lla is not None:
         frames.append(_frame(found.reference_lla, f"{path}: reference_lla"))

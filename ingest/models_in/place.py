@@ -9,6 +9,7 @@ import numpy as np
 from featuredb.errors import FeatureDbError, IngestError
 from featuredb.export.georeference import FORMAT, GEOREFERENCE
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.projections import geodetic_from_ecef
 from featuredb.geo.utm import geodetic_from_utm, utm_epsg, zone_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
@@ -51,7 +52,6 @@ class Place:
 
     Attributes:
         frame: local frame of the map. placement: leads there from the model's coordinates.
-        epsg: zone of the points.
         height_datum: of all heights; None: whoever imports says.
         status: quarantined where nothing in this database vouches for the place.
     """
@@ -121,19 +121,9 @@ def place_as_stated(model: Model, stated: Stated) -> Place:
     zone_of(stated.epsg)
     centers = model.centers()
     own_from_model, frame, residual_m = _to_local(model, centers, stated)
-    evidence = {"imported": f"axes {stated.axes}, EPSG:{stated.epsg}, origin {list(stated.origin)}"}
-    evidence["sigma_m"] = str(list(stated.sigma_m))
-    return Place(
-        frame=frame,
-        placement=Placement(
-            method="gcp",  # a person answers for it
-            local_from_sfm=own_from_model,
-            covariance=_covariance(own_from_model.act(centers), stated.sigma_m),
-            residual_rms_m=residual_m,
-            evidence=evidence,
-        ),
-        epsg=stated.epsg,
-    )
+    said = f"axes {stated.axes}, EPSG:{stated.epsg}, origin {list(stated.origin)}"
+    placement = _vouched(own_from_model, centers, stated.sigma_m, residual_m, said)
+    return Place(frame=frame, placement=placement, epsg=stated.epsg)
 
 
 def place_at_reference(model: Model, reference: LocalFrame, sigma_m: tuple[float, float]) -> Place:
@@ -150,17 +140,9 @@ def place_at_reference(model: Model, reference: LocalFrame, sigma_m: tuple[float
             f"found one at {farthest / 1000:.0f} km: the coordinates are no metres in its frame; give "
             "--epsg, --origin and --axes with --sigma"
         )
-    return Place(
-        frame=reference,
-        placement=Placement(
-            method="gcp",  # a person answers for it
-            local_from_sfm=Sim3.identity(),
-            covariance=_covariance(centers, sigma_m),
-            residual_rms_m=0.0,
-            evidence={"imported": "the model's own reference", "sigma_m": str(list(sigma_m))},
-        ),
-        epsg=utm_epsg(reference.latitude_deg, reference.longitude_deg),
-    )
+    placement = _vouched(Sim3.identity(), centers, sigma_m, 0.0, "the model's own reference")
+    epsg = utm_epsg(reference.latitude_deg, reference.longitude_deg)
+    return Place(frame=reference, placement=placement, epsg=epsg)
 
 
 def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place | NoPlace:
@@ -197,19 +179,17 @@ def _to_local(model: Model, centers: FloatArray, stated: Stated) -> tuple[Sim3, 
     """The similarity from the model to a local frame near its cameras, and what it leaves, metres RMS."""
     middle = np.median(centers, axis=0)
     if stated.axes == "enu":
-        there = _at(np.array(stated.origin), stated.epsg)
+        there = LocalFrame.from_utm(*stated.origin, stated.epsg)
         frame = _rounded(there.geodetic_from_enu(middle))
-        return _rigid(frame.enu_from(there).matrix()), frame, 0.0
+        return Sim3.from_rigid3(frame.enu_from(there)), frame, 0.0
     if stated.axes == "ecef":
         radius_km = float(np.linalg.norm(middle)) / 1000.0
         if not 6300.0 < radius_km < 6400.0:
             raise IngestError(
                 f"--axes ecef: expected cameras some 6,370 km from the Earth's centre, found {radius_km:.1f}"
             )
-        somewhere = LocalFrame(latitude_deg=0.0, longitude_deg=0.0, height_m=0.0)
-        from_ecef = somewhere.ecef_from_enu().inverse()
-        frame = _rounded(somewhere.geodetic_from_enu(from_ecef.act(middle)))
-        return _rigid(frame.ecef_from_enu().inverse().matrix()), frame, 0.0
+        frame = _rounded(geodetic_from_ecef(middle[None])[0])
+        return Sim3.from_rigid3(frame.ecef_from_enu().inverse()), frame, 0.0
     utm = np.concatenate([centers, model.xyz]) + stated.origin
     frame = _rounded(geodetic_from_utm(middle + stated.origin, stated.epsg))
     enu = frame.enu_from_utm(utm, stated.epsg)
@@ -226,21 +206,20 @@ def _to_local(model: Model, centers: FloatArray, stated: Stated) -> tuple[Sim3, 
     return fitted, frame, float(residual)
 
 
-def _covariance(centers: FloatArray, sigma_m: tuple[float, float]) -> FloatArray:
-    """(7, 7) of a placement that is known so well, over the spread of its cameras (k, 3)."""
+def _vouched(
+    local_from_model: Sim3, centers: FloatArray, sigma_m: tuple[float, float], residual_m: float, said: str
+) -> Placement:
+    """A placement that a person answers for, known so well over the spread of the cameras (k, 3)."""
     horizontal, vertical = sigma_m
-    radius = max(float(np.sqrt(((centers - centers.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)
-    relative = horizontal / radius
-    return np.diag([relative**2] * 4 + [horizontal**2, horizontal**2, vertical**2])
-
-
-def _at(utm: FloatArray, epsg: int) -> LocalFrame:
-    easting, northing, height = (float(v) for v in utm)
-    return LocalFrame.from_utm(easting, northing, height, epsg)
-
-
-def _rigid(matrix: FloatArray) -> Sim3:
-    return Sim3(scale=1.0, rotation=matrix[:3, :3], translation=matrix[:3, 3])
+    local = local_from_model.act(centers)
+    relative = horizontal / max(float(np.sqrt(((local - local.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)
+    return Placement(
+        method="gcp",
+        local_from_sfm=local_from_model,
+        covariance=np.diag([relative**2] * 4 + [horizontal**2, horizontal**2, vertical**2]),
+        residual_rms_m=residual_m,
+        evidence={"imported": said, "sigma_m": str(list(sigma_m))},
+    )
 
 
 def _rounded(lat_lon_h: FloatArray) -> LocalFrame:

@@ -74,9 +74,7 @@ class ModelSource:
     """A model that has been read.
 
     Attributes:
-        place: the folder that it was found in.
         files: what it was read from. feature_files: what its features will be.
-        open_keypoints: of its images.
         has_descriptors: whether the format keeps descriptors that can be compared with ours.
         photos: where the format has its photos, None where that is anywhere.
         reference: the frame of the model's coordinates, without its accuracy; None: the files do not say.

@@ -53,7 +53,6 @@ class FilmOutcome:
 
     Attributes:
         name: the folder of its keyframes within the ingest, unique there. path: the film.
-        status: used, or refused for `reason`.
         telemetry: where it is from, and to how many keyframes it gives a position; "" without any.
         notes: what was found of the film and its telemetry, and what was wrong with them.
     """

@@ -105,24 +105,23 @@ def photo_outcomes(
 
 
 def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> PhotoOutcome:
-    """A file that is in no reconstruction."""
-    code, reason = photo.reason_code, photo.reason
-    if photo.status == "ok" and photo.name in result.unreadable:
+    if photo.status != "ok":
+        code, reason = photo.reason_code, photo.reason
+    elif photo.name in result.unreadable:
         code, reason = "unreadable", result.unreadable[photo.name]
-    elif photo.status == "ok" and stop_after is not None:
+    elif stop_after is not None:
         code, reason = "stopped", f"the ingest stopped after {stop_after}, as asked"
-    elif photo.status == "ok" and photo.name in result.lost:
+    elif photo.name in result.lost:
         code, reason = "lost", result.lost[photo.name]
-    elif photo.status == "ok" and photo.name in result.copies:
+    elif photo.name in result.copies:
         code, reason = "copy", f"the picture of {result.copies[photo.name]}, cut, framed or marked"
-    elif photo.status == "ok" and not result.matches_per_photo.get(photo.name):
+    elif not result.matches_per_photo.get(photo.name):
         code, reason = "no_matches", "no other photo shows the same place"
-    elif photo.status == "ok":
+    else:
         code, reason = "no_pose", _NO_POSE
     skipped = photo.status == "skipped" or code in ("unreadable", "copy")
-    return _outcome(
-        photo, result, status="skipped" if skipped else "not_registered", code=code, reason=reason
-    )
+    status = "skipped" if skipped else "not_registered"
+    return _outcome(photo, result, status=status, code=code, reason=reason)
 
 
 def registered_photos(component: Component, result: Reconstructed) -> dict[str, PhotoOutcome]:
@@ -132,11 +131,12 @@ def registered_photos(component: Component, result: Reconstructed) -> dict[str, 
     if made is None:
         return {p.name: _outcome(p, result, status="not_registered", **why) for p in component.photos}
     counts, errors = _counts_and_errors(made)
+    what = {"status": "unplaced", **why} if isinstance(made, UnplacedMap) else {"status": "registered"}
     outcomes = {
         photo.name: _outcome(
             photo,
             result,
-            status="registered",
+            **what,
             observations=int(counts[k]),
             map_id=made.map_id,
             reprojection_px=float(errors[k]),
@@ -144,10 +144,7 @@ def registered_photos(component: Component, result: Reconstructed) -> dict[str, 
         for k, photo in enumerate(component.photos)
     }
     if isinstance(made, UnplacedMap):
-        return {
-            name: replace(o, status="unplaced", reason_code=why["code"], reason=why["reason"])
-            for name, o in outcomes.items()
-        }
+        return outcomes
     _, residuals = _centers_and_residuals(component, made)
     used = _gps_used(component)
     return {
@@ -170,13 +167,7 @@ def _counts_and_errors(any_map: AnyMap) -> tuple[NDArray[np.int64], FloatArray]:
 
 
 def _outcome(
-    photo: Photo,
-    result: Reconstructed,
-    *,
-    status: str,
-    code: str = "",
-    reason: str = "",
-    **more: object,
+    photo: Photo, result: Reconstructed, *, status: str, code: str = "", reason: str = "", **more: object
 ) -> PhotoOutcome:
     return PhotoOutcome(
         name=photo.name,

@@ -150,8 +150,7 @@ def _gates(outcome: MapOutcome) -> str:
     if not rows:
         return ""
     head = ("figure", "value", "what it says")
-    title = "<summary>Figures of the placement by GPS</summary>"
-    return f"<details>{title}{table(head, rows)}</details>"
+    return f"<details><summary>Figures of the placement by GPS</summary>{table(head, rows)}</details>"
 
 
 def _cameras(outcome: MapOutcome) -> str:
@@ -180,40 +179,33 @@ def _stages(report: IngestReport) -> str:
     if not report.stages:
         return ""
     longest = max(stage.seconds for stage in report.stages) or 1.0
-    rows = ""
-    for stage in report.stages:
-        reused = f"{stage.reused} of {stage.total} from an earlier run" if stage.reused else ""
-        rows += (
-            f'<tr><td>{escape(stage.name)}</td><td class="n">{stage.seconds:.1f} s</td>'
-            f'<td class="track"><div class="bar" style="width:{100 * stage.seconds / longest:.1f}%"></div>'
-            f'</td><td class="soft">{reused}</td></tr>'
+    rows = [
+        (
+            stage.name,
+            f"{stage.seconds:.1f} s",
+            f'<div class="bar" style="width:{100 * stage.seconds / longest:.1f}%"></div>',
+            f"{stage.reused} of {stage.total} from an earlier run" if stage.reused else "",
         )
+        for stage in report.stages
+    ]
     pairs = f"{report.verified_pairs} of {report.pairs} pairs of photos have verified matches."
-    return f'<h2>Time</h2><section><table>{rows}</table><p class="soft">{pairs}</p></section>'
+    bars = table((), rows, numbers=(1,), html=(2,))
+    return f'<h2>Time</h2><section class="bars">{bars}<p class="soft">{pairs}</p></section>'
 
 
 def _files(report: IngestReport) -> str:
-    head = (
-        "file",
-        "outcome",
-        "why, and remarks",
-        "size",
-        "features",
-        "matches",
-        "observations",
-        "error, px",
-        "GPS off by, m",
+    head = ("file", "outcome", "why, and remarks", "size", "features", "matches", "observations", "error, px")
+    rows = table(
+        (*head, "GPS off by, m"),
+        (_file_row(photo) for photo in report.photos),
+        numbers=(4, 5, 6, 7, 8),
+        names=(0,),
+        html=(1, 2, 8),
     )
-    numbers = (4, 5, 6, 7, 8)
-    cells = "".join(f'<th class="{"n" if i in numbers else ""}">{h}</th>' for i, h in enumerate(head))
-    rows = "".join(_file_row(photo) for photo in report.photos)
-    return (
-        f'<h2>All {len(report.photos)} files</h2><section class="wide"><table><thead><tr>{cells}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></section>"
-    )
+    return f'<h2>All {len(report.photos)} files</h2><section class="wide">{rows}</section>'
 
 
-def _file_row(photo: PhotoOutcome) -> str:
+def _file_row(photo: PhotoOutcome) -> tuple[str, ...]:
     remarks = [escape(photo.reason)] if photo.reason else []
     remarks += [f'<span class="soft">{escape(warning)}</span>' for warning in photo.warnings]
     residual = ""
@@ -224,24 +216,15 @@ def _file_row(photo: PhotoOutcome) -> str:
             remarks.append("its GPS was not used: it contradicts the others'")
     elif photo.status != "skipped" and not photo.has_gps:
         remarks.append('<span class="soft">no GPS</span>')
-    figures = (
-        _count(photo.features),
-        _count(photo.matches),
-        _count(photo.observations),
+    return (
+        photo.name,
+        pill(*_FILE_PILLS[photo.status]),
+        "<br>".join(remarks),
+        f"{photo.width}x{photo.height}" if photo.width else "",
+        *(number(count, "{:,}") for count in (photo.features, photo.matches, photo.observations)),
         number(photo.reprojection_px, "{:.2f}"),
         residual,
     )
-    size = f"{photo.width}x{photo.height}" if photo.width else ""
-    return (
-        f'<tr><td class="name">{escape(photo.name)}</td><td>{pill(*_FILE_PILLS[photo.status])}</td>'
-        f"<td>{'<br>'.join(remarks)}</td><td>{size}</td>"
-        + "".join(f'<td class="n">{figure}</td>' for figure in figures)
-        + "</tr>"
-    )
-
-
-def _count(value: int | None) -> str:
-    return "" if value is None else f"{value:,}"
 
 
 def figure_rows(figures: Mapping[str, Any]) -> list[tuple[str, str, str]]:

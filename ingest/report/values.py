@@ -38,7 +38,6 @@ class StageTiming:
     """How long a stage took.
 
     Attributes:
-        name: scan, extract, match ...
         seconds: wall time.
         reused: results taken over from an earlier run, of `total`.
     """
@@ -54,18 +53,12 @@ class PhotoOutcome:
     """One file of the folder and what happened to it.
 
     Attributes:
-        name: path within the folder.
         status: registered (part of a map), unplaced (part of a map without a place), not_registered (usable,
             but in no map), skipped (not usable).
         reason_code, reason: why it is in no map; "" where it is.
         width, height: pixels as stored, 0 where unknown.
-        camera_key: its camera, "" where unknown.
-        capture_time: or None.
-        has_gps: whether it says where it was taken.
         features: found in it, or None where it did not come so far.
         matches: verified with other photos.
-        observations: of map points.
-        map_id: its map, "" for none.
         reprojection_px: mean reprojection error of the points that it observes, in all their photos.
         gps_residual_m: GPS position minus its place in the map along UTM's axes (east, north, up),
             metres; up is NaN without a height.
@@ -98,7 +91,6 @@ class CameraOutcome:
 
     Attributes:
         name: its EXIF key, or the photo's name.
-        photos: how many photos share it.
         focal_before_px: from EXIF, None where that says nothing.
         focal_after_px: as refined with the map.
     """
@@ -126,10 +118,8 @@ class MapOutcome:
         residual_rms_m: of the GPS positions that were used.
         place: what holds 95 % of the errors of its placement; None where it has none.
         picture_shear: `ingest.colmap.picture_shear.PictureShear.size`; 0 where it was not measured.
-        descriptors: observations with descriptors.
         errors_px: (n,) mean reprojection error of each point; track_lengths: (n,) photos that see it.
         plan: None where the map has no place.
-        control: the placement by control points, where there are some.
     """
 
     map_id: str
@@ -196,11 +186,8 @@ class IngestReport:
         started: timezone-aware.
         options: of every stage, JSON-able; versions: of this program and the libraries.
         pairs: tried, verified_pairs: with enough verified matches.
-        stages: in order.
         photos: every file of the folder, sorted by name.
         maps: largest first.
-        films: whose keyframes the photos are.
-        warnings: about the ingest as a whole.
     """
 
     job_id: str

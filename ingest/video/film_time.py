@@ -24,7 +24,6 @@ class FilmTime:
     """What is known of a film's beginning.
 
     Attributes:
-        name: of the film, for messages.
         duration_s: of the film; created: what its file says, or None.
         told_s: what a person says: seconds of `Telemetry.times_s` at the film's time 0; or None.
     """

@@ -24,7 +24,6 @@ class Films:
     """Keyframes of films, in one folder.
 
     Attributes:
-        folder: with a folder for each film that is used.
         outcomes: every film, in order; keyframes by their names within the folder.
         heights: what the heights of positions count from; more than one where films differ.
     """

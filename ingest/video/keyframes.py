@@ -47,7 +47,6 @@ class KeyframeChoice:
     """The chosen frames.
 
     Attributes:
-        index: of the frames, rising. time_s: theirs.
         shot: number of the one that each lies in.
         step: that was used for each shot.
     """

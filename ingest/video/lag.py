@@ -23,7 +23,6 @@ class Lag(NamedTuple):
 
     Attributes:
         late_s: telemetry shown at t + late_s is that of the picture at t; None: not known.
-        message: for people.
     """
 
     late_s: float | None

@@ -76,10 +76,7 @@ class _Curve(NamedTuple):
 
 
 def match_movement(
-    motion: Motion,
-    telemetry: Telemetry,
-    range_s: tuple[float, float],
-    least_s: float = LEAST_S,
+    motion: Motion, telemetry: Telemetry, range_s: tuple[float, float], least_s: float = LEAST_S
 ) -> Match | None:
     """Compare at all lags of a range; None where picture or receiver have too few samples for their speeds.
 
@@ -183,11 +180,7 @@ def _places(telemetry: Telemetry) -> tuple[FloatArray, FloatArray, FloatArray]:
     held = np.floor((times - begun) / _HELD_S)
     rows = moved | (np.diff(held, prepend=0.0) > 0)
     east = np.unwrap(longitude[rows], period=360.0) * _EARTH_M_PER_DEG
-    return (
-        times[rows],
-        east * np.cos(np.radians(np.median(latitude))),
-        latitude[rows] * _EARTH_M_PER_DEG,
-    )
+    return (times[rows], east * np.cos(np.radians(np.median(latitude))), latitude[rows] * _EARTH_M_PER_DEG)
 
 
 def _slid(

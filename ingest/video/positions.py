@@ -27,12 +27,7 @@ RELATIVE_HEIGHTS = "above the place of take-off"
 
 
 def lateness(
-    motion: Motion,
-    telemetry: Telemetry,
-    film: FilmTime,
-    told_late_s: float | None,
-    *,
-    needed: bool,
+    motion: Motion, telemetry: Telemetry, film: FilmTime, told_late_s: float | None, *, needed: bool
 ) -> tuple[float | None, tuple[str, ...]]:
     """The telemetry's time that belongs to the film's time 0, and what there is to say of it.
 

@@ -30,13 +30,7 @@ from ingest.video.clocks import check_overlap
 from ingest.video.film_time import FilmTime
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes, shots_of
 from ingest.video.motion import FrameKind, Motion, measure_motion
-from ingest.video.positions import (
-    GimbalAngles,
-    Position,
-    digest_of_telemetry,
-    lateness,
-    places_at,
-)
+from ingest.video.positions import GimbalAngles, Position, digest_of_telemetry, lateness, places_at
 from ingest.workspace import write_json
 
 _DONE = "film.json"
@@ -150,7 +144,6 @@ def clean_keyframes(folder: Path, choice: KeyframeChoice, side_px: int) -> dict[
 
 
 def _paint_over(file: Path, mask: NDArray[np.bool_]) -> None:
-    """Paint over a keyframe's mask."""
     with Image.open(file) as picture:
         rgb, exif, xmp = np.asarray(picture.convert("RGB")), picture.getexif(), picture.info.get("xmp", b"")
     size = (rgb.shape[1], rgb.shape[0])
@@ -169,7 +162,6 @@ class StillsOptions:
     """From a film to photos.
 
     Attributes:
-        start_s, end_s: the stretch of the film; None: all of it.
         telemetry_late_s: telemetry that is shown at t belongs to t minus this; None: estimated (`lag.py`),
             and 0 where that says nothing.
         film_start_s: where the film begins in telemetry that has a clock of its own (`film_time.film_start`);
@@ -191,12 +183,10 @@ class Stills:
     """What was made of a film.
 
     Attributes:
-        folder: of the photos.
         shots: with the file names of their keyframes; a film of titles alone has none of them.
         positions: photos with a position. heights: what their heights count from, for people.
         late_s: the telemetry's time that belongs to the film's time 0: how late it is, or where in the log
             the film begins; None where that is not known, and no photo has a position.
-        notes: what was found of the film and its telemetry, and what was wrong with them.
     """
 
     folder: Path

@@ -221,7 +221,7 @@ def _write(folder: Path, world: SceneSource, photos: Sequence[PlannedPhoto], num
     target = folder / photo.shot.name
     part = target.with_suffix(f".{os.getpid()}.part")
     image = edited(_picture(_scene(world, photo.scene), photo), photo.edits, photo.shot.seed)
-    part.write_bytes(jpeg_bytes(image, photo.quality, _exif(photo, image)))
+    part.write_bytes(jpeg_bytes(image, _exif(photo, image), photo.quality))
     part.replace(target)
 
 

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from featuredb.errors import ExportError
@@ -12,12 +13,8 @@ from featuredb.export.job import Told
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
 from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
 from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
-from featuredb.store.commits import apply_change
 from featuredb.store.database import Database
-from featuredb.store.decode import read_rows
-from featuredb.store.retry import retry_stale
-from featuredb.store.snapshot import MapSummary, UnplacedSummary
-from featuredb.store.tables import MAPS
+from featuredb.store.snapshot import MapSummary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,8 +26,6 @@ class Imported:
         present: ids of maps that the database had already, with the same content; they are left as they are.
         quarantined: active maps of the dataset that came in quarantine; with the ids of maps that placed them
             and are neither in the dataset nor in the database.
-        version: the database's newest version.
-        dry_run: nothing was written.
     """
 
     created: tuple[str, ...]
@@ -62,7 +57,6 @@ def import_dataset(
         trusted: you vouch for the dataset, and its photos count as your own; also for maps of it that an
             earlier import has left in quarantine.
         dry_run: read and check everything, write nothing.
-        told: called with the number of maps done and their total.
 
     Raises:
         ExportError: the folder is no sound dataset, or the database has another map of the same id; nothing
@@ -75,11 +69,7 @@ def import_dataset(
     rows = [*rows, *own]
     own_ids = {row["map_id"] for row in own}
     snapshot = database.snapshot()
-    everything: list[MapSummary | UnplacedSummary] = [
-        *snapshot.maps(include_retired=True),
-        *snapshot.unplaced_maps(include_retired=True),
-    ]
-    there = {m.map_id: m for m in everything}
+    there = {m.map_id: m for m in snapshot.any_maps(include_retired=True)}
     live = {map_id: m for map_id, m in there.items() if m.status != RETIRED}
     _check_rows(folder, rows, {map_id: m.content_digest for map_id, m in live.items()})
     missing = _missing_parents(
@@ -112,13 +102,8 @@ def _vouch_for(database: Database, rows: Sequence[Row], missing: Mapping[str, Se
     """Lift the mark of the dataset's maps that an earlier import has left in quarantine."""
     active = {row["map_id"] for row in rows if row["status"] == ACTIVE and row["map_id"] not in missing}
     reasons = {row["map_id"]: _vouched_reason(row, missing) for row in rows if row["status"] != RETIRED}
-
-    def attempt() -> int:
-        maps = database.table(MAPS)
-        change, changed = vouch_for(read_rows(maps), active, reasons)
-        return apply_change(maps, change, operation="vouch", changed=changed, reason=VOUCHED)
-
-    retry_stale("vouch for what was imported", attempt)
+    vouch = partial(vouch_for, active=active, reasons=reasons)
+    database.change_maps("vouch for what was imported", "vouch", VOUCHED, vouch)
 
 
 def _vouched_reason(row: Row, missing: Mapping[str, Sequence[str]]) -> str:
@@ -129,11 +114,10 @@ def _vouched_reason(row: Row, missing: Mapping[str, Sequence[str]]) -> str:
 
 
 def _commit(database: Database, feature_map: AnyMap, reason: str, missing: bool, trusted: bool) -> None:
-    if missing and isinstance(feature_map, FeatureMap):
+    new = not trusted and feature_map.status != RETIRED
+    if (missing or new) and isinstance(feature_map, FeatureMap):
         feature_map = feature_map.with_status("quarantined")
-    if not trusted and feature_map.status != RETIRED:
-        if isinstance(feature_map, FeatureMap):
-            feature_map = feature_map.with_status("quarantined")
+    if new:
         reason = IMPORTED  # not what the dataset says: reasons decide what growth does with a map
     if feature_map.status == RETIRED and not reason:
         reason = "it was retired where the dataset is from"

@@ -23,7 +23,6 @@ class Columns:
     repeating: tuple[str, ...]
 
 
-_DOUBLES = pa.list_(pa.field("element", pa.float64(), nullable=False))
 _STORE_ONLY = (
     *("write_id", "tiles", "zone", "tile", "cameras", "camera_keys"),
     *store.NO_PLACE_COLUMNS,  # a dataset has maps with a place only
@@ -162,20 +161,16 @@ def _columns(table: str | None, meaning: dict[str, str], more: list[pa.Field], *
     return Columns(schema=schema, meaning=meaning, repeating=repeating)
 
 
-def _required(name: str, kind: pa.DataType) -> pa.Field:
-    return pa.field(name, kind, nullable=False)
-
-
-_POINT_GEOMETRY = [_required(GEOMETRY, pa.binary()), _required(BBOX, POINT_BBOX)]
+_POINT_GEOMETRY = [*store.required(pa.binary(), GEOMETRY), *store.required(POINT_BBOX, BBOX)]
 
 MAPS = _columns(
     store.MAPS,
     _MAPS_MEANING,
     [
-        _required("lineage", pa.string()),
-        *(pa.field(f"{table}_file", pa.string()) for table in ("points", "images", "observations")),
-        _required(GEOMETRY, pa.binary()),
-        _required(BBOX, AREA_BBOX),
+        *store.required(pa.string(), "lineage"),
+        *store.nullable(pa.string(), "points_file", "images_file", "observations_file"),
+        *store.required(pa.binary(), GEOMETRY),
+        *store.required(AREA_BBOX, BBOX),
     ],
     "status", "height_datum", "method", "extractor_fingerprint", "licence", "points_file", "images_file",
     "observations_file",
@@ -184,25 +179,21 @@ CAMERAS = _columns(
     None,
     _CAMERAS_MEANING,
     [
-        _required("map_id", pa.string()),
-        _required("camera_id", pa.int32()),
-        _required("model", pa.string()),
-        _required("width", pa.int32()),
-        _required("height", pa.int32()),
-        _required("params", _DOUBLES),
-        pa.field("key", pa.string()),
+        *store.required(pa.string(), "map_id"),
+        *store.required(pa.int32(), "camera_id"),
+        *store.CAMERA,
+        *store.nullable(pa.string(), "key"),
     ],
 )
 IMAGES = _columns(
     store.IMAGES,
     _IMAGES_MEANING,
     [
-        _required("cam_from_utm_xyzw", _DOUBLES),
-        _required("latitude_deg", pa.float64()),
-        _required("longitude_deg", pa.float64()),
-        _required("geopose_xyzw", _DOUBLES),
-        *(_required(name, pa.float64()) for name in ("yaw_deg", "pitch_deg", "roll_deg")),
-        _required("earth_covariance", _DOUBLES),
+        *store.required(store.DOUBLES, "cam_from_utm_xyzw"),
+        *store.required(pa.float64(), "latitude_deg", "longitude_deg"),
+        *store.required(store.DOUBLES, "geopose_xyzw"),
+        *store.required(pa.float64(), "yaw_deg", "pitch_deg", "roll_deg"),
+        *store.required(store.DOUBLES, "earth_covariance"),
         *_POINT_GEOMETRY,
     ],
     "map_id", "owner", "licence",

@@ -62,19 +62,14 @@ def _footprint(lon_lat: FloatArray) -> Footprint:
     if east_of_it:
         lon_lat = lon_lat + (lon_lat[:, :1] < 0) * np.array([_TURN_DEG, 0.0])
     (west, south), (east, north) = lon_lat.min(axis=0).tolist(), lon_lat.max(axis=0).tolist()
+    geometry = {"type": "Polygon", "coordinates": [_ring(lon_lat)]}
     if len(lon_lat) == 1:
-        return Footprint(
-            geometry={"type": "Point", "coordinates": lon_lat[0].tolist()}, bbox=(west, south, east, north)
-        )
-    if not east_of_it:
-        return Footprint(
-            geometry={"type": "Polygon", "coordinates": [_ring(lon_lat)]}, bbox=(west, south, east, north)
-        )
-    parts = [_cut(lon_lat, east_side=False), _cut(lon_lat, east_side=True) - [_TURN_DEG, 0.0]]
-    return Footprint(
-        geometry={"type": "MultiPolygon", "coordinates": [[_ring(part)] for part in parts]},
-        bbox=(west, south, east - _TURN_DEG, north),
-    )
+        geometry = {"type": "Point", "coordinates": lon_lat[0].tolist()}
+    elif east_of_it:
+        parts = [_cut(lon_lat, east_side=False), _cut(lon_lat, east_side=True) - [_TURN_DEG, 0.0]]
+        geometry = {"type": "MultiPolygon", "coordinates": [[_ring(part)] for part in parts]}
+        east -= _TURN_DEG
+    return Footprint(geometry=geometry, bbox=(west, south, east, north))
 
 
 def _ring(corners: FloatArray) -> list[list[float]]:

@@ -25,12 +25,7 @@ _LONGEST_NAME = 80
 
 @dataclass(frozen=True, slots=True, order=True)
 class Partition:
-    """What one file's coordinates have in common, since a GeoParquet column has one CRS.
-
-    Attributes:
-        epsg: UTM zone, 326zz or 327zz.
-        height_datum: one of featuredb.geo.datum.HEIGHT_DATUMS.
-    """
+    """What one file's coordinates have in common, since a GeoParquet column has one CRS."""
 
     epsg: int
     height_datum: str

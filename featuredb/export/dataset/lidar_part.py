@@ -11,7 +11,6 @@ from featuredb.export.dataset import layout
 from featuredb.export.dataset.contents import Contents, MapEntry
 from featuredb.export.job import ExportJob, write_json
 from featuredb.export.selection import licence_is
-from featuredb.extras import require
 from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.geo.tiles import tile_bounds, tiles_touching
 from featuredb.geo.utm import geodetic_from_utm, utm_from_geodetic
@@ -37,9 +36,6 @@ def write_tile(database: Database, scan: ScanSummary, tile: str, path: Path) -> 
     Coordinates are rounded to a millimetre. Colours and intensities are 16 bits wide, as LAS has them; a
     point without colour in a scan with colours is black. The order is that of levels, coarsest first, then
     of nodes and coordinates: compaction of the store does not show in the file.
-
-    Args:
-        path: ends in .laz.
 
     Raises:
         StoreError: the points cannot be read.
@@ -94,15 +90,6 @@ def _points(
     return utm[order], columns, rgb if scan.colour else None
 
 
-def check_lidar() -> None:
-    """Refuse early where no tile could be written.
-
-    Raises:
-        MissingExtraError: laspy or its LAZ backend is not installed.
-    """
-    require("lidar", "A dataset with LiDAR tiles", "laspy", "lazrs")
-
-
 def write_scans(job: ExportJob, contents: Contents, folder: Path) -> list[dict[str, Any]]:
     """Write `lidar/SCAN/TILE.laz` of every tile that the box of a map's points touches, and
     `lidar/scans.json`.
@@ -116,12 +103,9 @@ def write_scans(job: ExportJob, contents: Contents, folder: Path) -> list[dict[s
     Raises:
         StoreError: a scan cannot be read.
     """
-
-    written = []
+    written, licences = [], job.selection.licences
     for scan in list_scans(job.database):
-        if job.selection.licences is not None and not any(
-            licence_is(scan.licence, wanted) for wanted in job.selection.licences
-        ):
+        if licences is not None and not any(licence_is(scan.licence, wanted) for wanted in licences):
             continue
         tiles = []
         for tile in sorted(touched_tiles(scan, contents.maps)):

@@ -7,18 +7,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.dataset as ds
 
 from featuredb.export.dataset.geoparquet import TableFile
 from featuredb.export.dataset.read import check_listed, decoded, read_table
 from featuredb.maps.unplaced_map import UnplacedMap
-from featuredb.store.encode import encode_map
-from featuredb.store.snapshot import UnplacedSummary
-from featuredb.store.tables import IMAGES, MAPS, OBSERVATIONS, POINTS, SPECS
+from featuredb.store.encode import encode_map, rows_table
+from featuredb.store.snapshot import MapSummary, UnplacedSummary
+from featuredb.store.tables import CHILD_TABLES, MAPS, SPECS
 
 FOLDER = "own_frame"
-_CHILDREN = (IMAGES, POINTS, OBSERVATIONS)
 
 
 def table_path(table: str) -> str:
@@ -34,12 +32,12 @@ class OwnFrameFiles:
         self._open: dict[str, TableFile] = {}
         self.rows: list[dict[str, Any]] = []
 
-    def add(self, unplaced: UnplacedMap, summary: UnplacedSummary) -> None:
+    def add(self, unplaced: UnplacedMap, summary: MapSummary | UnplacedSummary) -> None:
         """A map; a row group has rows of one map only."""
         encoded = encode_map(unplaced, "", summary.created_at)
         row = encoded.row | {"status_reason": summary.status_reason}
         self.rows.append(row)
-        tables = {MAPS: pa.Table.from_pylist([row], schema=SPECS[MAPS].schema), **encoded.children}
+        tables = {MAPS: rows_table(MAPS, [row]), **encoded.children}
         for table, rows in tables.items():
             if table not in self._open:
                 path = self._folder / table_path(table)
@@ -75,12 +73,12 @@ def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> Un
     Raises:
         ExportError: its rows cannot be read, or are not the map that was exported.
     """
-    for table in _CHILDREN:
+    for table in CHILD_TABLES:
         check_listed(table_path(table), listed, folder)
     only = ds.field("map_id") == row["map_id"]
     return decoded(
         folder,
         dict(row),
-        lambda: {t: read_table(folder / table_path(t), only=only).to_batches() for t in _CHILDREN},
+        lambda: {t: read_table(folder / table_path(t), only=only).to_batches() for t in CHILD_TABLES},
         UnplacedMap,
     )

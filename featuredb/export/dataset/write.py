@@ -1,12 +1,10 @@
 """A selection of maps as one self-describing folder, made to be published.
 
-Coordinates are in GeoParquet 1.1, whose columns have one reference system each. Maps of a database may lie in
-several UTM zones and have heights of several datums, so the rows of points and images are parted by both,
-and a file says so in its name: `points/32632-egm2008-0000.parquet`. Its CRS is the compound of the two where
-the datum is known, the zone in three dimensions for ellipsoidal heights, and the plain zone for unknown
-ones. Nothing is
-transformed: easting, northing and height are the stored float64. `maps.parquet`, with an area for each map,
-is in longitude and latitude.
+Coordinates are in GeoParquet 1.1, whose columns have one reference system each. So the rows of points and
+images are parted by UTM zone and height datum, and a file says so in its name:
+`points/32632-egm2008-0000.parquet`; its CRS is that of `utm_projjson`. Nothing is transformed: easting,
+northing and height are the stored float64. `maps.parquet`, with an area for each map, is in longitude and
+latitude.
 
 The same maps, selection and libraries give the same bytes: times are those of the snapshot and the photos,
 and names follow from ids.
@@ -14,6 +12,7 @@ and names follow from ids.
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -29,17 +28,18 @@ from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.contents import Contents, MapEntry, entry_of
 from featuredb.export.dataset.datasheet import write_datasheet
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, wkb_of
-from featuredb.export.dataset.lidar_part import check_lidar, write_scans
+from featuredb.export.dataset.lidar_part import write_scans
 from featuredb.export.dataset.own_frame import OwnFrameFiles
 from featuredb.export.dataset.partitions import PartitionFiles
 from featuredb.export.dataset.sums import write_sums
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_json
+from featuredb.extras import require
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store.encode import encode_map
-from featuredb.store.snapshot import MapSummary, UnplacedSummary
+from featuredb.store.snapshot import MapSummary
 
 # Of maps.parquet, in a row group.
 _ROWS_AT_ONCE = 256
@@ -161,8 +161,8 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
         MissingExtraError: with `with_lidar`, laspy (extra `lidar`) is missing.
         StoreError: the database cannot be read.
     """
-    if with_lidar:
-        check_lidar()
+    if with_lidar:  # refused early where no tile could be written
+        require("lidar", "A dataset with LiDAR tiles", "laspy", "lazrs")
     with whole_or_nothing(job.out) as folder:
         folder.mkdir()
         contents, own = _write_maps(job, folder)
@@ -185,7 +185,7 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
         for feature_map in job.any_maps():
             credits += attribution_of(feature_map)
             if isinstance(feature_map, UnplacedMap):
-                own.add(feature_map, _unplaced(job, feature_map.map_id))
+                own.add(feature_map, job.snapshot.get_any(feature_map.map_id))
                 continue
             row = _write_rows(feature_map, job.snapshot.get(feature_map.map_id), files)
             row["lineage"] = _lineage_json(lineages[feature_map.map_id])
@@ -202,12 +202,6 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
     with TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()) as file:
         file.write(pa.Table.from_pylist(cameras, schema=CAMERAS.schema))
     return contents, own
-
-
-def _unplaced(job: ExportJob, map_id: str) -> UnplacedSummary:
-    summary = job.snapshot.get_any(map_id)
-    assert isinstance(summary, UnplacedSummary)
-    return summary
 
 
 def _write_rows(feature_map: FeatureMap, summary: MapSummary, files: PartitionFiles) -> dict[str, Any]:
@@ -238,27 +232,14 @@ def _write_areas(maps: list[MapEntry], folder: Path) -> None:
 def _camera_rows(feature_map: FeatureMap) -> list[dict[str, Any]]:
     keys = feature_map.camera_keys or (None,) * len(feature_map.cameras)
     return [
-        {
-            "map_id": feature_map.map_id,
-            "camera_id": number,
-            "model": camera.model,
-            "width": camera.width,
-            "height": camera.height,
-            "params": list(camera.params),
-            "key": key,
-        }
+        {"map_id": feature_map.map_id, "camera_id": number, **asdict(camera), "key": key}
         for number, (camera, key) in enumerate(zip(feature_map.cameras, keys, strict=True))
     ]
 
 
 def _lineage_json(lineage: MapLineage) -> str:
-    document = {
-        "chain": list(lineage.chain),
-        "anchors": list(lineage.anchors),
-        "steps": lineage.steps,
-        "drift_m": lineage.drift_m,
-        "budget_m": lineage.budget_m,
-    }
+    document = asdict(lineage) | {"steps": lineage.steps}
+    del document["map_id"]
     return json.dumps(document, sort_keys=True)
 
 

@@ -31,9 +31,6 @@ def write_colmap(job: ExportJob, *, text: bool = False) -> Exported:
 
     Args:
         text: the model as COLMAP's text files instead of binary ones.
-
-    Raises:
-        ExportError: nothing is selected, or there is something at `job.out`.
     """
     return folder_for_each(job, job.any_maps(), partial(write_map, text=text))
 
@@ -71,8 +68,7 @@ class KeypointRows:
 def keypoint_rows(feature_map: AnyMap) -> KeypointRows:
     """The order of keypoints of every image."""
     seen = feature_map.observations
-    index_of = {image.image_id: k for k, image in enumerate(feature_map.images)}
-    image = np.array([index_of[i] for i in seen.image_id.tolist()], dtype=np.int64)
+    image = feature_map.image_rows(seen.image_id)
     order = np.lexsort((np.arange(len(seen)), ~seen.has_descriptor, image))
     counts = np.bincount(image, minlength=len(feature_map.images))
     rows = np.split(order, np.cumsum(counts)[:-1]) if len(counts) else []

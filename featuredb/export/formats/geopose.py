@@ -20,9 +20,6 @@ BASIC, SERIES, MANIFEST = "basic_ypr", "series.json", "manifest.json"
 def write_geopose(job: ExportJob) -> Exported:
     """Write `job.out`/<map>/basic_ypr/<photo>.json for every photo, and series.json of those whose time is
     known.
-
-    Raises:
-        ExportError: nothing is selected, or there is something at `job.out`.
     """
     return folder_for_each(job, job.maps(), _write_map)
 

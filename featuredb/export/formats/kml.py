@@ -15,9 +15,6 @@ def write_kml(job: ExportJob) -> Exported:
 
     KML counts `absolute` altitudes from mean sea level (EGM96). Heights above the ellipsoid are converted
     where the geoid's grid is installed; the description of each folder says what the altitudes are.
-
-    Raises:
-        ExportError: nothing is selected, or there is something at `job.out`.
     """
     with whole_or_nothing(job.out) as part:
         with part.open("w", encoding="utf-8", newline="\n") as out:

@@ -22,8 +22,7 @@ def write_las_files(job: ExportJob, *, compressed: bool) -> Exported:
     """Write the points to `job.out`/epsgNNNNN_DATUM.las (or .laz), with maps.csv and attribution.csv.
 
     Raises:
-        ExportError: nothing is selected, no points, or there is something at `job.out`.
-        InvalidValueError: maps of one zone too far apart for one file. MissingExtraError: no laspy.
+        ExportError, MissingExtraError, InvalidValueError: maps of one zone too far apart for one file.
     """
     zones, maps = zones_of(job.summaries()), MapList()
     ending = ".laz" if compressed else ".las"

@@ -8,8 +8,6 @@ import json
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
-
 from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.formats.colmap import image_names
 from featuredb.export.formats.opensfm_camera import opensfm_camera
@@ -89,22 +87,15 @@ def _write_tracks(out: IO[str], feature_map: FeatureMap, names: list[str]) -> No
     """Image, track, keypoint, x, y, size in normalised coordinates, and the point's colour."""
     out.write(_TRACKS_VERSION + "\n")
     seen = feature_map.observations
-    name_of = {image.image_id: name for image, name in zip(feature_map.images, names, strict=True)}
-    size_of = {
-        image.image_id: (
-            feature_map.cameras[image.camera_id].width,
-            feature_map.cameras[image.camera_id].height,
-        )
-        for image in feature_map.images
-    }
-    sizes = np.array([size_of[i] for i in seen.image_id.tolist()], dtype=np.float64).reshape(-1, 2)
+    images = feature_map.image_rows(seen.image_id)
+    sizes = feature_map.image_sizes()[images]
     longer = sizes.max(axis=1, initial=1.0)
     xy = (seen.xy - sizes / 2.0) / longer[:, None]
-    for row, (image, point) in enumerate(zip(seen.image_id.tolist(), seen.point_index.tolist(), strict=True)):
+    for row, (image, point) in enumerate(zip(images.tolist(), seen.point_index.tolist(), strict=True)):
         x, y, scale = float(xy[row, 0]), float(xy[row, 1]), float(seen.scale[row]) / float(longer[row])
         red, green, blue = feature_map.points.rgb[point].tolist()
         out.write(
-            f"{name_of[image]}\t{point}\t{row}\t{x:.10g}\t{y:.10g}\t{scale:.8g}\t{red}\t{green}\t{blue}\n"
+            f"{names[image]}\t{point}\t{row}\t{x:.10g}\t{y:.10g}\t{scale:.8g}\t{red}\t{green}\t{blue}\n"
         )
 
 

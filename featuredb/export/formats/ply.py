@@ -34,9 +34,6 @@ def write_ply_files(job: ExportJob) -> Exported:
     """Write the points to `job.out`/epsgNNNNN_DATUM.ply, its .wkt beside it, maps.csv and attribution.csv.
 
     The points of a map without a place go to own_frame_MAP.ply.
-
-    Raises:
-        ExportError: nothing is selected, no points, or there is something at `job.out`.
     """
     placed = [m for m in job.any_summaries() if isinstance(m, MapSummary)]
     zones, maps = zones_of(placed) if placed else {}, MapList()
@@ -72,7 +69,6 @@ def _body(folder: Path, zone: Zone) -> Path:
 
 
 def _write_own(folder: Path, unplaced: UnplacedMap, maps: MapList) -> None:
-    """A map without a place, in its own frame."""
     file = f"own_frame_{folder_name(unplaced.map_id)}.ply"
     index = maps.add(unplaced, file)
     if not len(unplaced.points):

@@ -47,11 +47,8 @@ class ScanCrs:
         source: where it was taken from: "--crs", "WKT" or "GeoTIFF keys".
         is_3d: heights are a coordinate of the CRS itself and go with it to WGS84.
         horizontal_unit: name of the unit of X and Y.
-        vertical_name: name of the vertical CRS, "" where the file has none.
         height_datum: one of featuredb.geo.datum.HEIGHT_DATUMS.
-        height_unit: name of the unit of Z.
         height_unit_m: metres per unit of Z.
-        height_unit_reason: why that unit was taken.
         notes: what a person should know: contradictions, assumptions.
     """
 
@@ -82,8 +79,6 @@ def scan_crs(
         wkt: the file's WKT record, if any.
         geo_keys: the file's GeoTIFF keys, if any; used where there is no WKT.
         override: `--crs`: an EPSG code ("EPSG:2949", "EPSG:6556+5703"), WKT or PROJ string.
-        height_unit: `--height-unit`: one of HEIGHT_UNITS.
-        height_datum: `--height-datum`: one of HEIGHT_DATUMS.
 
     Raises:
         GeodesyError: there is none, it is broken, names no place on Earth, or has heights that point down.
@@ -93,11 +88,7 @@ def scan_crs(
     vertical = None
     if crs.is_compound:
         crs, vertical = crs.sub_crs_list[0], crs.sub_crs_list[1]
-    if (
-        crs.is_vertical
-        or crs.is_engineering
-        or not (crs.is_projected or crs.is_geographic or crs.is_geocentric)
-    ):
+    if not (crs.is_projected or crs.is_geographic or crs.is_geocentric):
         raise GeodesyError(
             f"expected a projected, geographic or geocentric CRS, found {crs.type_name} {crs.name!r} "
             f"({source}), which names no place on Earth; {DEMAND}"
@@ -159,12 +150,7 @@ def _chosen_crs(
 
 def _check_axes(crs: CRS, source: str) -> None:
     directions = {axis.direction.lower() for axis in crs.axis_info[:2]}
-    if (
-        crs.is_projected
-        and directions & {"south", "west"}
-        and directions != {"south"}
-        and directions != {"north"}
-    ):
+    if crs.is_projected and directions & {"south", "west"} and directions != {"south"}:
         raise GeodesyError(
             f"the CRS {crs.name!r} ({source}) counts towards {' and '.join(sorted(directions))}; scans are "
             "read as easting and northing only: transform the file first"
@@ -172,11 +158,7 @@ def _check_axes(crs: CRS, source: str) -> None:
 
 
 def height_unit_of(
-    crs: CRS,
-    vertical: CRS | None,
-    is_3d: bool,
-    stated: str | None = None,
-    geo_keys: GeoKeys | None = None,
+    crs: CRS, vertical: CRS | None, is_3d: bool, stated: str | None = None, geo_keys: GeoKeys | None = None
 ) -> tuple[str, float, str]:
     """Name of the unit of Z, metres per unit, and why.
 
@@ -206,20 +188,12 @@ def height_unit_of(
     if crs.is_projected and axis.unit_conversion_factor != 1.0:
         # LAStools, PDAL's reader and the surveyors' habit agree: what names no vertical CRS has one unit
         # throughout.
-        return (
-            axis.unit_name,
-            axis.unit_conversion_factor,
-            "no vertical CRS is named: taken to be the horizontal unit; "
-            "--height-unit m, ft or us-ft says otherwise",
-        )
+        why = "no vertical CRS is named: taken to be the horizontal unit; --height-unit m, ft or us-ft says "
+        return axis.unit_name, axis.unit_conversion_factor, why + "otherwise"
     return "metre", 1.0, "no vertical CRS is named: taken to be metres; --height-unit says otherwise"
 
 
-_UNIT_CODES = {
-    9001: ("metre", 1.0),
-    9002: ("foot", FOOT_M),
-    9003: ("US survey foot", US_SURVEY_FOOT_M),
-}
+_UNIT_CODES = {9001: ("metre", 1.0), 9002: ("foot", FOOT_M), 9003: ("US survey foot", US_SURVEY_FOOT_M)}
 
 
 def height_datum_of(vertical: CRS | None, is_3d: bool) -> HeightDatum:

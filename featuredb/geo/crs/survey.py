@@ -28,8 +28,6 @@ class SurveyCrs:
     """A reference system of survey coordinates.
 
     Attributes:
-        definition: what PROJ understands.
-        name: for people.
         geographic: x, y are longitude, latitude in degrees.
         height_unit_m: metres per unit of height: the vertical system's, else that of the plane's axes.
         height_datum: what heights are counted from, "unknown" where the system does not say.

@@ -32,11 +32,9 @@ class UtmTransform:
     """The way from a scan's coordinates to UTM on WGS84, one and the same for all its points.
 
     Attributes:
-        epsg: zone of the result.
         description: PROJ's name of the operation, e.g. "NAD83(HARN) to WGS 84 (3)".
         accuracy_m: its stated accuracy, or None where none is stated.
         z_scale: by which Z is multiplied first.
-        notes: what a person should know.
     """
 
     epsg: int
@@ -58,10 +56,8 @@ class UtmTransform:
         if self._transformer is None or not len(utm):
             return utm
         try:
-            if self.with_heights:
-                utm[:, 0], utm[:, 1], utm[:, 2] = self._transformer.transform(utm[:, 0], utm[:, 1], utm[:, 2])
-            else:
-                utm[:, 0], utm[:, 1] = self._transformer.transform(utm[:, 0], utm[:, 1])
+            columns = 3 if self.with_heights else 2
+            utm[:, :columns] = np.stack(self._transformer.transform(*utm.T[:columns]), axis=1)
         except ProjError as error:
             raise GeodesyError(f"PROJ cannot transform the scan to EPSG:{self.epsg}: {error}") from error
         bad = ~np.isfinite(utm).all(axis=1)
@@ -167,11 +163,7 @@ def raster_from_utm(wkt: str, epsg: int, place: FloatArray) -> Callable[[FloatAr
 def _operations(
     source: CRS, target: CRS, box: tuple[float, float, float, float], advice: str
 ) -> TransformerGroup:
-    """What PROJ knows between two systems in a box of degrees, best stated accuracy first.
-
-    Raises:
-        GeodesyError: nothing; with the advice.
-    """
+    """What PROJ knows between two systems in a box of degrees, best stated accuracy first."""
     west, south, east, north = box
     area: Any = AreaOfInterest(west, max(south, -90.0), east, min(north, 90.0))
     with warnings.catch_warnings():
@@ -200,9 +192,8 @@ def _geographic_box(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            to_degrees = Transformer.from_crs(
-                source, CRS.from_epsg(4979 if crs.is_3d else 4326), always_xy=True
-            )
+            wgs84 = CRS.from_epsg(4979 if crs.is_3d else 4326)
+            to_degrees = Transformer.from_crs(source, wgs84, always_xy=True)
         columns = 3 if crs.is_3d else 2
         degrees = np.array(to_degrees.transform(*corners[:, :columns].T))[:2].T
     except ProjError as error:

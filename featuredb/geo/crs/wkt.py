@@ -15,10 +15,6 @@ _ELLIPSOID = 'VERT_CS["Ellipsoid (metre)",VERT_DATUM["Ellipsoid",2002],UNIT["met
 def utm_wkt(epsg: int, height_datum: str) -> str:
     """WKT 1 of a UTM zone with its vertical datum; of the zone alone where the datum is unknown.
 
-    Args:
-        epsg: 326zz or 327zz.
-        height_datum: one of featuredb.geo.datum.HEIGHT_DATUMS.
-
     Raises:
         GeodesyError: not a UTM code.
         InvalidValueError: not a datum's name.
@@ -33,10 +29,6 @@ def utm_projjson(epsg: int, height_datum: str) -> dict[str, Any]:
 
     A compound system with EGM96, EGM2008 or NAVD88; a projected 3D system for heights above the ellipsoid;
     the zone alone, in which z has no reference, where the datum is unknown.
-
-    Args:
-        epsg: 326zz or 327zz.
-        height_datum: one of featuredb.geo.datum.HEIGHT_DATUMS.
 
     Raises:
         GeodesyError: not a UTM code.

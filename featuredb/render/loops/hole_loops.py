@@ -217,13 +217,7 @@ def _change(
 
 @compiled
 def _closes(
-    own: float,
-    found: float,
-    apart: float,
-    level: float,
-    radius: int,
-    focal: float,
-    reach: float,
+    own: float, found: float, apart: float, level: float, radius: int, focal: float, reach: float
 ) -> bool:
     """Whether a surface may close a pixel: its points are far enough apart for the closing, and the pixel
     does not show the surface itself."""

@@ -74,8 +74,7 @@ def moving_cars(scene: Scene, moment: int, time_s: float = 0.0) -> Faces:
 
 def photo_bytes(scene: Scene, shot: Shot, sensor: SensorOptions) -> bytes:
     """The JPEG file of a shot."""
-    exif: Image.Exif | None = exif_of(shot, gps_geodetic(scene, shot))
-    return jpeg_bytes(take_photo(scene, shot, sensor), sensor.jpeg_quality, exif)
+    return jpeg_bytes(take_photo(scene, shot, sensor), exif_of(shot, gps_geodetic(scene, shot)))
 
 
 def gps_geodetic(scene: Scene, shot: Shot) -> tuple[float, float, float] | None:

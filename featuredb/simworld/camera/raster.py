@@ -86,7 +86,6 @@ def render(
 
     Args:
         faces, ellipsoids: in the local frame, metres.
-        cam_from_local: pose of the camera.
         supersample: rays per pixel and direction.
     """
     job = _Job(
@@ -199,10 +198,7 @@ def _write_geometry(
     y0, x0 = row - row % n, column - column % n
     y1, x1 = -(-(row + height) // n) * n, -(-(column + width) // n) * n
     inner = slice(y0, y1), slice(x0, x1)
-    rays = (
-        slice(part[0].start + y0, part[0].start + y1),
-        slice(part[1].start + x0, part[1].start + x1),
-    )
+    rays = (slice(part[0].start + y0, part[0].start + y1), slice(part[1].start + x0, part[1].start + x1))
     k, mask = k[inner], mask[inner]
     cv2.copyTo(k, mask, tile.inverse_depth[rays])
     cv2.copyTo(np.full(k.shape, object_id, np.int32), mask, tile.object_id[rays])

@@ -23,7 +23,6 @@ class SensorOptions:
         white_balance_sigma: spread of the red and blue gains between photos.
         read_noise: standard deviation in grey levels, independent of the light.
         shot_noise: standard deviation in grey levels at mid grey (128), growing with the root of the light.
-        jpeg_quality: 1..95.
     """
 
     blur_px: float = 0.55  # a sharp lens over a Bayer pattern
@@ -32,7 +31,6 @@ class SensorOptions:
     white_balance_sigma: float = 0.03
     read_noise: float = 1.0
     shot_noise: float = 2.2
-    jpeg_quality: int = 90
 
 
 def expose(rgb: Image8, rng: np.random.Generator, options: SensorOptions) -> Image8:
@@ -57,7 +55,7 @@ def _vignette(height: int, width: int, loss: float) -> NDArray[np.float32]:
     return np.asarray(1.0 - loss * r2, dtype=np.float32)
 
 
-def jpeg_bytes(photo: Image8, quality: int, exif: Image.Exif | None = None) -> bytes:
+def jpeg_bytes(photo: Image8, exif: Image.Exif | None = None, quality: int = 90) -> bytes:
     """The photo as JPEG, 4:2:0, with the EXIF block if given."""
     buffer = io.BytesIO()
     extra = {"exif": exif} if exif is not None else {}

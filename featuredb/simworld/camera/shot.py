@@ -16,7 +16,6 @@ class Device:
     """A camera that people buy.
 
     Attributes:
-        make, model: as in EXIF.
         camera: true intrinsics, for the picture as stored.
         focal_mm, focal_35mm: as in EXIF; 35 mm equivalents are whole numbers there and so a little wrong.
     """
@@ -34,8 +33,6 @@ class Shot:
 
     Attributes:
         name: path within the world's folder, with forward slashes.
-        device: with what.
-        cam_from_local: from where.
         time: timezone-aware.
         seed: of everything that differs from photo to photo: moving cars, waves, noise, exposure.
         gps_enu: (3,) metres, what the receiver believes in the local frame, or None without GPS.

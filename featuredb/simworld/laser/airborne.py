@@ -1,6 +1,7 @@
 """The town scanned by a laser from an aircraft: strips, several returns, classes, outliers, exact truth."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,8 @@ from featuredb.simworld.camera.photograph import moving_cars
 from featuredb.simworld.laser.beams import NOTHING, Beams, Hits, cross_ellipsoids, hit_faces
 from featuredb.simworld.laser.echoes import Echoes, echoes_of, return_numbers
 from featuredb.simworld.town.days import DayOptions, another_day
-from featuredb.simworld.town.reflectance import LEAVES, Reflectance, scene_reflectance
-from featuredb.simworld.town.scene import TEXTURES, Faces, Scene
+from featuredb.simworld.town.reflectance import Reflectance, scene_reflectance
+from featuredb.simworld.town.scene import REFLECTANCE, Faces, Scene, texture_index
 from featuredb.simworld.town.town import BRIDGE_ID, BUILDING_ID, GROUND_ID, TREE_ID, WATER_ID
 
 _SPEED_M_S = 55.0
@@ -35,17 +36,14 @@ class AirborneScanOptions:
     """An airborne scan. The same options and scene give the same points.
 
     Attributes:
-        seed: of everything random.
         height_m: of the flight over the town's origin.
         max_scan_angle_deg: to either side.
         overlap: share of a swath that the neighbouring strip covers too.
         heading_deg: of the first strip, clockwise from north; None draws it.
         density_per_m2: pulses of one strip per square metre of its swath; overlaps have twice that.
-        margin_m: how far the scan reaches beyond the town.
         range_noise_m: standard deviation along the beam.
         strip_shift_m: standard deviation of each strip's displacement from their mean, per axis; half of it
             in height.
-        divergence_mrad: full angle of the beam.
         sway_deg: amplitude of the aircraft's roll and pitch; they are known, and only unsettle the pattern.
         birds, multipath: shares of pulses whose only return is above the town, or below its ground.
         noise_labelled: share of these that carry a class of noise; the rest is unclassified.
@@ -70,7 +68,7 @@ class AirborneScanOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Strip:
+class _Strip:
     """What the steps of one strip share: faces and its displacement `shift` (3,) in the local frame."""
 
     scene: Scene
@@ -81,16 +79,16 @@ class Strip:
     shift: FloatArray
 
 
-def answered(
-    strip: Strip, echoes: Echoes, angle_deg: FloatArray, rng: np.random.Generator
+def _answered(
+    strip: _Strip, echoes: Echoes, angle_deg: FloatArray, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
     """Which echoes there are: calm water is a mirror, and throws most beams away."""
-    on_water = (echoes.face != NOTHING) & (strip.faces.texture[echoes.face] == TEXTURES.index("water"))
+    on_water = (echoes.face != NOTHING) & (strip.faces.texture[echoes.face] == texture_index("water"))
     seen = (np.abs(angle_deg[echoes.beam]) < _MIRROR_DEG) | (rng.random(len(echoes)) < _WATER_SEEN)
     return np.asarray(~on_water | seen, dtype=bool)
 
 
-def with_outliers(
+def _with_outliers(
     echoes: Echoes, hits: Hits, options: AirborneScanOptions, rng: np.random.Generator
 ) -> tuple[Echoes, NDArray[np.bool_]]:
     """Some beams' echoes replaced by one bird or one echo that took a detour; which rows these are."""
@@ -105,18 +103,13 @@ def with_outliers(
     replaced = np.where(is_bird, ground - rng.uniform(25, 160, n), ground + rng.uniform(1.5, 12.0, n))
     outlier &= np.isfinite(ground)
     none = np.full(n, NOTHING, dtype=np.int32)
-    changed = replace(
-        echoes,
-        distance=np.where(outlier, replaced, echoes.distance),
-        energy=np.where(outlier, 1.0, echoes.energy),
-        face=np.where(outlier, none, echoes.face),
-        ellipsoid=np.where(outlier, none, echoes.ellipsoid),
-    )
-    return changed, outlier
+    odd_ones: dict[str, Any] = {"distance": replaced, "energy": 1.0, "face": none, "ellipsoid": none}
+    changed = {name: np.where(outlier, value, getattr(echoes, name)) for name, value in odd_ones.items()}
+    return replace(echoes, **changed), outlier
 
 
-def received_light(
-    strip: Strip,
+def _received_light(
+    strip: _Strip,
     echoes: Echoes,
     outlier: NDArray[np.bool_],
     xyz: FloatArray,
@@ -128,27 +121,27 @@ def received_light(
     normal = np.cross(faces.edge_s, faces.edge_t)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     # Leaves hang at all angles.
-    share = LEAVES * rng.uniform(0.5, 1.1, len(echoes))
+    share = REFLECTANCE["leaves"] * rng.uniform(0.5, 1.1, len(echoes))
     hard = np.flatnonzero(echoes.face != NOTHING)
     on = echoes.face[hard]
     cosine = np.clip(-np.einsum("ij,ij->i", normal[on], direction[hard]), 0.0, 1.0)
     texture = faces.texture[on]
     share[hard] = cosine * strip.reflectance.at(strip.scene, xyz[hard], texture, faces.object_id[on])
-    mirror = (texture == TEXTURES.index("water")) & (cosine > np.cos(np.radians(_MIRROR_DEG)))
+    mirror = (texture == texture_index("water")) & (cosine > np.cos(np.radians(_MIRROR_DEG)))
     share[hard[mirror]] *= rng.exponential(8.0, int(mirror.sum()))
     share[outlier] = rng.uniform(0.02, 0.35, int(outlier.sum()))
     spread = (strip.options.height_m / echoes.distance) ** 2
     return np.asarray(share * echoes.energy * spread, dtype=np.float64)
 
 
-def objects_hit(strip: Strip, echoes: Echoes, outlier: NDArray[np.bool_]) -> NDArray[np.int32]:
+def _objects_hit(strip: _Strip, echoes: Echoes, outlier: NDArray[np.bool_]) -> NDArray[np.int32]:
     leaf = strip.scene.ellipsoids.object_id[echoes.ellipsoid] if len(strip.scene.ellipsoids) else NOTHING
     ids = np.where(echoes.face != NOTHING, strip.faces.object_id[echoes.face], leaf)
     return np.where(outlier, NOTHING, ids).astype(np.int32)
 
 
-def classes_of(
-    strip: Strip,
+def _classes_of(
+    strip: _Strip,
     object_id: NDArray[np.int32],
     xyz: FloatArray,
     outlier: NDArray[np.bool_],
@@ -228,7 +221,7 @@ def scan_town(scene: Scene, options: AirborneScanOptions | None = None) -> Airbo
     for i, (flight_from_local, track_y, reach_x) in enumerate(strips):
         moment = 1000 * options.seed + i
         faces = Faces.concatenate([today.faces, moving_cars(today, moment)])
-        strip = Strip(
+        strip = _Strip(
             scene=today, faces=faces, reflectance=reflectance, options=options, number=i + 1, shift=shifts[i]
         )
         columns.append(_scan_strip(strip, flight_from_local, track_y, reach_x, rng))
@@ -280,8 +273,7 @@ def _beams(options: AirborneScanOptions, reach: tuple[float, float], rng: np.ran
 
 def _directions(roll: FloatArray, pitch: FloatArray) -> FloatArray:
     """Unit vectors (rows, columns, 3) of angles to the left of and ahead of the nadir, rad."""
-    along, left = np.tan(pitch), np.tan(roll)
-    direction = np.stack([np.broadcast_to(along, left.shape), left, np.full_like(left, -1.0)], axis=-1)
+    direction = np.stack([np.tan(pitch), np.tan(roll), np.full_like(roll, -1.0)], axis=-1)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     return direction
 
@@ -295,7 +287,7 @@ def _aside(beams: Beams, divergence_rad: float, rng: np.random.Generator) -> Bea
 
 
 def _scan_strip(
-    strip: Strip,
+    strip: _Strip,
     flight_from_local: FloatArray,
     track_y: float,
     reach_x: tuple[float, float],
@@ -312,12 +304,12 @@ def _scan_strip(
     crossings = cross_ellipsoids(beams, crowns, crowns.center @ flight_from_local.T + to_track)
     echoes = echoes_of(hits, aside, crossings, rng)
     angle_deg = np.degrees(np.tile(beams.angles, beams.shape[0]))
-    echoes = echoes.take(answered(strip, echoes, angle_deg, rng))
-    echoes, outlier = with_outliers(echoes, hits, options, rng)
+    echoes = echoes.take(_answered(strip, echoes, angle_deg, rng))
+    echoes, outlier = _with_outliers(echoes, hits, options, rng)
 
     start, direction = _rays(beams, echoes.beam, flight_from_local, to_track)
     true_xyz = start + direction * echoes.distance[:, None]
-    strength = received_light(strip, echoes, outlier, true_xyz, direction, rng)
+    strength = _received_light(strip, echoes, outlier, true_xyz, direction, rng)
     inside = _inside(strip.scene, true_xyz, options.margin_m) & (strength > _DETECTED)
     echoes, outlier, strength = echoes.take(inside), outlier[inside], strength[inside]
     direction, true_xyz = direction[inside], true_xyz[inside]
@@ -327,11 +319,11 @@ def _scan_strip(
     counts = _COUNTS * rng.normal(1.0, 0.03) * strength * rng.normal(1.0, 0.05, len(echoes))
     counts += rng.normal(0, 12.0, len(echoes))
     row = echoes.beam / beams.shape[1]
-    object_id = objects_hit(strip, echoes, outlier)
+    object_id = _objects_hit(strip, echoes, outlier)
     return {
         "xyz": true_xyz + direction * noise[:, None] + strip.shift,
         "intensity": np.clip(np.round(counts), 1, 65_535).astype(np.uint16),
-        "classification": classes_of(strip, object_id, true_xyz, outlier, rng),
+        "classification": _classes_of(strip, object_id, true_xyz, outlier, rng),
         "return_number": number,
         "number_of_returns": returns,
         "scan_angle_deg": angle_deg[echoes.beam].astype(np.float32),

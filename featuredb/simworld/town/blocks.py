@@ -100,16 +100,9 @@ def terraces(layout: Layout, rect: Rect) -> None:
     layout.gardens.append((x0 + 1, y0 + 10, x1 - 1, y1 - 10))
     for row_y, yaw in ((y0 + 5.5, 0.0), (y1 - 5.5, 180.0)):
         for i in range(n):
+            x = start + 6.0 * (i + 0.5)
             layout.add_building(
-                start + 6.0 * (i + 0.5),
-                row_y,
-                (6.0, 9.0),
-                2,
-                yaw_deg=yaw,
-                ridge=3.4,
-                facade=facade,
-                roof=roof,
-                look=look,
+                x, row_y, (6.0, 9.0), 2, yaw_deg=yaw, ridge=3.4, facade=facade, roof=roof, look=look
             )
     for i in range(n):  # sheds and fences between the gardens
         x = start + 6.0 * i
@@ -204,16 +197,8 @@ def park(layout: Layout, rect: Rect) -> None:
             layout.trees.append((x, y, float(rng.uniform(1.3, 3.2))))
     for x in np.arange(x0 + 4, x1 - 3, 7.0):
         layout.add_box(x, 0.5 * (y0 + y1) + 2.0, (1.8, 0.6, 0.6), texture="wood", detail=(x, 0.0))
-    layout.add_building(
-        0.5 * (x0 + x1) + 8,
-        0.5 * (y0 + y1) + 8,
-        (6, 6),
-        1.2,
-        yaw_deg=20,
-        ridge=2.0,
-        facade="facade_stone",
-        roof="roof_slate",
-    )
+    x, y = 0.5 * (x0 + x1) + 8, 0.5 * (y0 + y1) + 8
+    layout.add_building(x, y, (6, 6), 1.2, yaw_deg=20, ridge=2.0, facade="facade_stone", roof="roof_slate")
 
 
 def square(layout: Layout, rect: Rect) -> None:
@@ -273,11 +258,10 @@ def _roof_machines(layout: Layout, b: Building, n: int) -> None:
     for _ in range(n):
         x = b.x + float(layout.rng.uniform(-0.42, 0.42)) * b.width
         y = b.y + float(layout.rng.uniform(-0.36, 0.36)) * b.depth
-        size = (
-            float(layout.rng.uniform(0.8, 2.6)),
-            float(layout.rng.uniform(0.8, 2.0)),
-            float(layout.rng.uniform(0.5, 1.6)),
+        a, c, up = (
+            float(layout.rng.uniform(low, high)) for low, high in ((0.8, 2.6), (0.8, 2.0), (0.5, 1.6))
         )
+        size = (a, c, up)
         layout.small.append(
             box(x, y, b.eaves, size, layout.new_id(), texture="plain", detail=(x, y), tint=(0.8,) * 3)
         )

@@ -9,19 +9,21 @@ from featuredb.simworld.town.noise import fractal
 from featuredb.simworld.town.scene import Building, GroundPlan
 from featuredb.simworld.town.texture import Texture
 
-# label: colour, strength of the 1/f noise, strength of the fine noise
+# Label: colour, and reflectance at 1064 nm; each with the strength of its 1/f noise and of its fine noise.
+# In the infrared grass outshines stone, and asphalt is dark.
 _KINDS = {
-    "grass": ((98, 116, 62), 0.18, 0.10),
-    "asphalt": ((98, 98, 100), 0.06, 0.055),
-    "pavement": ((156, 150, 142), 0.07, 0.05),
-    "gravel": ((164, 152, 132), 0.10, 0.20),
-    "soil": ((116, 92, 66), 0.22, 0.16),
-    "cobbles": ((134, 122, 112), 0.10, 0.10),
-    "bank": ((124, 116, 96), 0.20, 0.22),
+    "grass": ((98, 116, 62, 0.18, 0.10), (0.46, 0.14, 0.10)),
+    "asphalt": ((98, 98, 100, 0.06, 0.055), (0.11, 0.10, 0.05)),
+    "pavement": ((156, 150, 142, 0.07, 0.05), (0.27, 0.06, 0.05)),
+    "gravel": ((164, 152, 132, 0.10, 0.20), (0.30, 0.08, 0.12)),
+    "soil": ((116, 92, 66, 0.22, 0.16), (0.24, 0.18, 0.12)),
+    "cobbles": ((134, 122, 112, 0.10, 0.10), (0.20, 0.08, 0.08)),
+    "bank": ((124, 116, 96, 0.20, 0.22), (0.34, 0.20, 0.14)),
 }
 _LABEL = {name: i for i, name in enumerate(_KINDS)}
 SIDEWALK_M = 2.2
 _SHADOW = 0.5  # light left in the shade
+_PAINT_GAMMA = 1.5  # what is painted over a material differs from it in the infrared more than in light
 
 
 class _Painter:
@@ -65,19 +67,6 @@ def paint_ground(plan: GroundPlan, texel_m: float) -> Texture:
     return Texture.from_image(_with_shadows(painter, image), texel_m)
 
 
-# Reflectance at 1064 nm, strength of its coarse and its fine noise: grass outshines stone, asphalt is dark.
-_INFRARED = {
-    "grass": (0.46, 0.14, 0.10),
-    "asphalt": (0.11, 0.10, 0.05),
-    "pavement": (0.27, 0.06, 0.05),
-    "gravel": (0.30, 0.08, 0.12),
-    "soil": (0.24, 0.18, 0.12),
-    "cobbles": (0.20, 0.08, 0.08),
-    "bank": (0.34, 0.20, 0.14),
-}
-_PAINT_GAMMA = 1.5  # what is painted over a material differs from it in the infrared more than in light
-
-
 def paint_infrared(plan: GroundPlan, texel_m: float) -> NDArray[np.float32]:
     """Reflectance (h, w) float32 of the ground in the near infrared, texel for texel that of `paint_ground`.
 
@@ -88,9 +77,9 @@ def paint_infrared(plan: GroundPlan, texel_m: float) -> NDArray[np.float32]:
     _paint_labels(painter)
     _colours(painter)  # for its random numbers, which come before those of the markings
     greys, levels = np.zeros(256, np.uint8), np.zeros((3, 256), np.float32)
-    for name, label in _LABEL.items():
-        greys[label] = round(sum(_KINDS[name][0]) / 3)
-        levels[:, label] = _INFRARED[name]
+    for label, (colour, infrared) in enumerate(_KINDS.values()):
+        greys[label] = round(sum(colour[:3]) / 3)
+        levels[:, label] = infrared
     before = cv2.LUT(painter.labels, greys)
     image = cv2.merge([before] * 3)
     _paint_marks(painter, image)
@@ -139,8 +128,8 @@ def _colours(p: _Painter) -> NDArray[np.uint8]:
     """Base colour of each label times (1 + noise)."""
     h, w = p.shape
     tables = np.zeros((5, 256), np.float32)  # red, green, blue, coarse, fine of each label
-    for name, (rgb, coarse, fine) in _KINDS.items():
-        tables[:, _LABEL[name]] = (*rgb, coarse, fine)
+    for label, (colour, _) in enumerate(_KINDS.values()):
+        tables[:, label] = colour
     low, high = fractal(h, w, p.rng, octaves=8, gain=1.35), p.rng.standard_normal((h, w), dtype=np.float32)
     hue = cv2.resize(fractal(h // 8 + 1, w // 8 + 1, p.rng, octaves=6, gain=1.8), (w, h))
     image = np.empty((h, w, 3), np.uint8)

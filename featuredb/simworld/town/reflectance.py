@@ -1,7 +1,6 @@
 """What the town's materials throw back at a laser's near infrared: another picture than the one in light.
 
-Plants are bright, asphalt, slate and bitumen dark, water is black; there are no shadows. Values are typical
-shares of the light that materials return at 1064 nm.
+Plants are bright, asphalt, slate and bitumen dark, water is black; there are no shadows.
 """
 
 from dataclasses import dataclass
@@ -14,30 +13,8 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.town.ground import paint_infrared
 from featuredb.simworld.town.noise import periodic
-from featuredb.simworld.town.scene import TEXTURES, GroundPlan, Scene
+from featuredb.simworld.town.scene import REFLECTANCE, GroundPlan, Scene, texture_index
 
-Float32 = NDArray[np.float32]
-
-LEAVES = 0.50
-_OF_TEXTURE = {
-    "ground": 0.25,  # replaced by the painted map
-    "fields": 0.42,
-    "water": 0.015,
-    "facade_brick": 0.36,
-    "facade_plaster": 0.52,
-    "facade_ochre": 0.48,
-    "facade_panel": 0.40,
-    "facade_stone": 0.38,
-    "roof_red": 0.44,
-    "roof_brown": 0.30,
-    "roof_slate": 0.13,
-    "roof_bitumen": 0.09,
-    "roof_metal": 0.55,
-    "plain": 0.40,
-    "wood": 0.46,
-    "car": 0.28,
-    "leaves": LEAVES,
-}
 _PATCHES = 0.10  # relative strength of weathering, patches of decimetres to metres
 _PATCH_TEXEL_M = 0.12
 _OBJECT_SPREAD = 0.13  # two roofs of one material differ by about as much
@@ -49,38 +26,29 @@ class Reflectance:
     """Reflectance of a scene in the near infrared.
 
     Attributes:
-        of_texture: (k,) float64 by index of TEXTURES.
         ground: (h, w) float32 of the painted rectangle, rows to the north in town axes.
-        ground_texel_m: size of its texels.
         patches: (p, p) float32 periodic factors.
     """
 
-    of_texture: FloatArray
-    ground: Float32
+    ground: NDArray[np.float32]
     ground_texel_m: float
-    patches: Float32
+    patches: NDArray[np.float32]
 
     def at(
-        self,
-        scene: Scene,
-        xyz: FloatArray,
-        texture: NDArray[np.integer],
-        object_id: NDArray[np.integer],
+        self, scene: Scene, xyz: FloatArray, texture: NDArray[np.integer], object_id: NDArray[np.integer]
     ) -> FloatArray:
         """Reflectance (n,) at points (n, 3) of the local frame on faces of these textures and objects."""
-        value = self.of_texture[texture]
+        value = np.array(list(REFLECTANCE.values()))[texture]
         town = xyz @ scene.enu_from_town
-        painted = texture == TEXTURES.index("ground")
+        painted = texture == texture_index("ground")
         size = np.asarray(scene.plan.size)
         cell = np.floor((town[painted, :2] + 0.5 * size) / self.ground_texel_m).astype(np.int64)
         column, row = (cell[:, k].clip(0, self.ground.shape[1 - k] - 1) for k in (0, 1))
         value[painted] = self.ground[row, column]
         # Each object has its own age and make, by its number.
         of_object = np.random.default_rng((scene.seed, 91)).standard_normal(65_536)[object_id % 65_536]
-        car = texture == TEXTURES.index("car")
-        value = np.where(
-            painted, value, value * np.exp(np.where(car, _CAR_SPREAD, _OBJECT_SPREAD) * of_object)
-        )
+        spread = np.where(texture == texture_index("car"), _CAR_SPREAD, _OBJECT_SPREAD)
+        value = np.where(painted, value, value * np.exp(spread * of_object))
         patch = np.floor(town[:, :2] / _PATCH_TEXEL_M).astype(np.int64) % len(self.patches)
         return np.asarray(value * self.patches[patch[:, 1], patch[:, 0]], dtype=np.float64)
 
@@ -99,7 +67,6 @@ def _painted(seed: int, plan: GroundPlan, texel_m: float) -> Reflectance:
     ground = cv2.resize(fine[: h * shrink, : w * shrink], (w, h), interpolation=cv2.INTER_AREA)
     patches = 1.0 + _PATCHES * periodic(1024, np.random.default_rng((seed, 92)), exponent=0.8, low=4)
     return Reflectance(
-        of_texture=np.array([_OF_TEXTURE[name] for name in TEXTURES]),
         ground=np.asarray(ground, dtype=np.float32),
         ground_texel_m=texel_m * shrink,
         patches=np.clip(patches, 0.4, 1.8).astype(np.float32),

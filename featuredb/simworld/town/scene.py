@@ -14,26 +14,28 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray, freeze
 
-# Names of textures; a face holds the index. The painters in `materials` and `ground` know what they mean.
-TEXTURES = (
-    "ground",
-    "fields",
-    "water",
-    "facade_brick",
-    "facade_plaster",
-    "facade_ochre",
-    "facade_panel",
-    "facade_stone",
-    "roof_red",
-    "roof_brown",
-    "roof_slate",
-    "roof_bitumen",
-    "roof_metal",
-    "plain",
-    "wood",
-    "car",
-    "leaves",
-)
+# What each texture throws back of a laser's light at 1064 nm. A face holds the index of its texture; the
+# painters in `materials` and `ground` know what the names mean.
+REFLECTANCE = {
+    "ground": 0.25,  # replaced by the painted map
+    "fields": 0.42,
+    "water": 0.015,
+    "facade_brick": 0.36,
+    "facade_plaster": 0.52,
+    "facade_ochre": 0.48,
+    "facade_panel": 0.40,
+    "facade_stone": 0.38,
+    "roof_red": 0.44,
+    "roof_brown": 0.30,
+    "roof_slate": 0.13,
+    "roof_bitumen": 0.09,
+    "roof_metal": 0.55,
+    "plain": 0.40,
+    "wood": 0.46,
+    "car": 0.28,
+    "leaves": 0.50,
+}
+TEXTURES = tuple(REFLECTANCE)
 SKY_ID = -1
 
 
@@ -108,8 +110,7 @@ class Faces:
         """Lambert's light (n,) from the unit vector `to_sun`, between 0.55 and 1.1."""
         normal = np.cross(self.edge_s, self.edge_t)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        light = 0.55 + (1.1 - 0.55) * np.clip(normal @ np.asarray(to_sun), 0.0, 1.0)
-        return np.asarray(light, dtype=np.float64)
+        return np.asarray(0.55 + (1.1 - 0.55) * np.clip(normal @ np.asarray(to_sun), 0.0, 1.0))
 
 
 _FACE_COLUMNS: tuple[tuple[str, int, Any], ...] = (
@@ -153,12 +154,11 @@ class Ellipsoids:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Building:
-    """A box with a roof, in the town's own axes.
+    """A box with a roof, in the town's own axes, metres.
 
     Attributes:
-        x, y: centre, metres. yaw_deg: counter-clockwise turn of its width from the town's x axis.
-        width, depth: metres. base, eaves: heights of the lowest ground and of the eaves, metres.
-        ridge: height of the ridge over the eaves, 0 for a flat roof.
+        x, y, width, depth: centre and sizes. yaw_deg: counter-clockwise turn of its width from the x axis.
+        base, eaves: heights of the lowest ground and of the eaves. ridge: over the eaves, 0 for a flat roof.
         facade, roof: names of textures.
         facade_u, detail_u, roof_u: where its pieces of the textures start, metres; equal numbers make
             equal looks.
@@ -208,7 +208,6 @@ class GroundPlan:
     """What the ground painter needs, in town axes, metres.
 
     Attributes:
-        seed: of all randomness in the paint.
         size: width (x) and height (y) of the painted rectangle, centred on the origin.
         streets, buildings: as laid out. plazas, car_parks, gardens: rectangles (x0, y0, x1, y1).
         trees: (n, 3) x, y, crown radius, for their shadows.

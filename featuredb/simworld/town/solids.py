@@ -1,6 +1,7 @@
 """Faces of simple solids: boxes, houses, walls. All functions are pure and give `Faces` in town axes."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -130,19 +131,9 @@ def _gabled_roof(b: Building, top: FloatArray, ground: float, object_id: int) ->
 
 def car(x: float, y: float, base: float, yaw_deg: float, tint: Sequence[float], object_id: int) -> Faces:
     """A car of 4.4 x 1.8 x 1.45 m: body and cabin."""
-    body = box(
-        x,
-        y,
-        base + 0.2,
-        (4.4, 1.8, 0.65),
-        object_id,
-        yaw_deg=yaw_deg,
-        texture="car",
-        tint=tint,
-        detail=(0, 0),
-    )
-    dark = tuple(0.35 * t for t in tint)
-    cabin = box(x, y, base + 0.85, (2.3, 1.6, 0.6), object_id, yaw_deg=yaw_deg, texture="car", tint=dark)
+    paint = partial(box, x, y, object_id=object_id, yaw_deg=yaw_deg, texture="car")
+    body = paint(base + 0.2, (4.4, 1.8, 0.65), tint=tint, detail=(0, 0))
+    cabin = paint(base + 0.85, (2.3, 1.6, 0.6), tint=tuple(0.35 * t for t in tint))
     a = np.radians(yaw_deg)
     top = np.array([np.cos(a), np.sin(a), 0.0]), np.array([-np.sin(a), np.cos(a), 0.0])
     corner = np.array([x, y, base + 1.46]) - 0.9 * top[0] - 0.75 * top[1]

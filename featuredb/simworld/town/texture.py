@@ -19,7 +19,6 @@ class Texture:
     Row and column run with v and u; texel (row i, column j) of level 0 covers u in [j, j+1) * texel_m.
 
     Attributes:
-        levels: level 0 first.
         texel_m: size of a texel of level 0, metres.
     """
 

@@ -11,14 +11,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.town.blocks import FILLINGS, Layout
 from featuredb.simworld.town.ground import SIDEWALK_M
 from featuredb.simworld.town.materials import FACADE_LENGTH_M, ROOF_LENGTH_M
-from featuredb.simworld.town.scene import (
-    Building,
-    Ellipsoids,
-    Faces,
-    GroundPlan,
-    Scene,
-    Street,
-)
+from featuredb.simworld.town.scene import Building, Ellipsoids, Faces, GroundPlan, Scene, Street
 from featuredb.simworld.town.solids import box, face, house
 
 # Upper Bavaria, 2.4 degrees east of zone 32's meridian: convergence 1.8 degrees.
@@ -48,7 +41,6 @@ def make_town(
     Args:
         place: latitude and longitude in degrees, ellipsoidal height in metres of the local frame's
             origin, EPSG code of the UTM zone for answers.
-        texel_m: resolution of the painted ground, metres.
         pieces: of walls and tiled roofs. With one, buildings of a material share every brick and curtain;
             with more, only those that are meant to be identical (terraces, slabs) do.
 
@@ -106,7 +98,17 @@ def _lay_out(seed: int, rng: np.random.Generator, size: tuple[float, float]) -> 
     """Streets, river, terrain, and what stands on the blocks."""
     w, h = size
     river = (-0.30 * h, -0.30 * h + 15.0)
-    profile = _terrain(h, river)
+    profile = (  # knots (y, height): flat, a river bed, then two slopes
+        (-_LAND_M, 0.0),
+        (river[0], 0.0),
+        (river[0] + 4, -3.0),
+        (river[1] - 4, -3.0),
+        (river[1], 0.0),
+        (0.0, 1.5),
+        (0.25 * h, 6.5),
+        (0.5 * h, 7.5),
+        (_LAND_M, 8.5),
+    )
     knots = np.asarray(profile)
 
     def height(y: float) -> float:
@@ -142,21 +144,6 @@ def _lay_out(seed: int, rng: np.random.Generator, size: tuple[float, float]) -> 
         to_sun=(-0.42, -0.52, 0.744),
     )
     return plan, layout
-
-
-def _terrain(h: float, river: tuple[float, float]) -> tuple[tuple[float, float], ...]:
-    """Knots (y, height): flat, a river bed, then two slopes."""
-    return (
-        (-_LAND_M, 0.0),
-        (river[0], 0.0),
-        (river[0] + 4, -3.0),
-        (river[1] - 4, -3.0),
-        (river[1], 0.0),
-        (0.0, 1.5),
-        (0.25 * h, 6.5),
-        (0.5 * h, 7.5),
-        (_LAND_M, 8.5),
-    )
 
 
 def _cuts(rng: np.random.Generator, low: float, high: float, step: tuple[float, float]) -> list[float]:
@@ -223,33 +210,15 @@ def _ground_faces(plan: GroundPlan) -> Faces:
 def _water_and_bridges(plan: GroundPlan) -> Faces:
     w, h = plan.size
     y0, y1 = plan.river
-    level = WATER_LEVEL_M
-    parts = [
-        face(
-            (-_LAND_M, y0, level),
-            (2 * _LAND_M, 0, 0),
-            (0, y1 - y0, 0),
-            "water",
-            WATER_ID,
-            uv=(0, 0, 2 * _LAND_M, 0, 0, y1 - y0),
-        )
-    ]
+    across, uv = (2 * _LAND_M, 0, 0), (0.0, 0.0, 2 * _LAND_M, 0.0, 0.0, y1 - y0)
+    parts = [face((-_LAND_M, y0, WATER_LEVEL_M), across, (0, y1 - y0, 0), "water", WATER_ID, uv=uv)]
     for s in plan.streets:
         if s.along != "y":
             continue
         x0, x1 = s.at - 0.5 * s.width - SIDEWALK_M, s.at + 0.5 * s.width + SIDEWALK_M
         uv = (x0 + 0.5 * w, y0 - 1 + 0.5 * h, x1 - x0, 0.0, 0.0, y1 - y0 + 2)
-        parts.append(
-            face(
-                (x0, y0 - 1, 0.03),
-                (x1 - x0, 0, 0),
-                (0, y1 - y0 + 2, 0),
-                "ground",
-                BRIDGE_ID,
-                uv=uv,
-                detail=uv[:2],
-            )
-        )
+        edges = (x1 - x0, 0, 0), (0, y1 - y0 + 2, 0)
+        parts.append(face((x0, y0 - 1, 0.03), *edges, "ground", BRIDGE_ID, uv=uv, detail=uv[:2]))
         for x in (x0, x1):
             look = {"texture": "facade_stone", "top": "plain", "detail": (x, 0.0), "tint": (0.9, 0.88, 0.85)}
             parts.append(box(x, 0.5 * (y0 + y1), -1.0, (0.4, y1 - y0 + 2, 2.0), BRIDGE_ID, **look))  # type: ignore[arg-type]
@@ -262,16 +231,9 @@ def _chimney(b: Building, object_id: int) -> Faces:
     along, across = 0.27 * b.width, -0.12 * b.depth
     x = b.x + along * np.cos(a) - across * np.sin(a)
     y = b.y + along * np.sin(a) + across * np.cos(a)
+    base, size, detail = b.eaves + 0.4 * b.ridge, (0.7, 0.7, 0.6 * b.ridge + 0.8), (b.roof_u, 1.0)
     return box(
-        x,
-        y,
-        b.eaves + 0.4 * b.ridge,
-        (0.7, 0.7, 0.6 * b.ridge + 0.8),
-        object_id,
-        yaw_deg=b.yaw_deg,
-        texture="roof_brown",
-        top="plain",
-        detail=(b.roof_u, 1.0),
+        x, y, base, size, object_id, yaw_deg=b.yaw_deg, texture="roof_brown", top="plain", detail=detail
     )
 
 

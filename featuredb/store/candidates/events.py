@@ -20,9 +20,6 @@ def read_events(
 
     Args:
         answers: also what the server answered, the longest column by far.
-
-    Raises:
-        StoreError: they cannot be read.
     """
     if not database.has(CANDIDATES):
         return []

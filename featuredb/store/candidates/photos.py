@@ -35,7 +35,6 @@ from featuredb.store.candidates.states import (
     candidate_of,
     owner_of,
     request_column,
-    standing_of,
 )
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
@@ -51,8 +50,6 @@ class InboxCounts:
     """How much there is.
 
     Attributes:
-        by_state: number of candidates in each state that occurs.
-        waiting_by_owner: number of waiting candidates of each (first) owner.
         stored_bytes: of all images that are kept: those that are not withdrawn.
     """
 
@@ -70,8 +67,6 @@ class WithdrawReport:
     """What a withdrawal did.
 
     Attributes:
-        candidates: ids of the photos whose bytes are gone now.
-        files: data files that were removed from the disk or bucket.
         used_by: living maps that were built with one of them; they keep its features, not its pixels.
     """
 
@@ -180,29 +175,24 @@ def delete_images(database: Database, candidate_ids: Iterable[str]) -> list[str]
 
 def list_candidates(database: Database, *, state: CandidateState | None = None) -> list[Candidate]:
     """The contributed photos, or only those in one state, oldest first."""
-    live = live_maps(database)
-    found = [
-        candidate_of(events, live) for events in by_candidate(read_events(database, answers=True)).values()
-    ]
-    wanted = [c for c in found if state is None or c.state == state]
+    wanted = [c for c in _candidates(database, answers=True) if state is None or c.state == state]
     return sorted(wanted, key=lambda c: (c.received_at, c.candidate_id))
 
 
 def count_candidates(database: Database) -> InboxCounts:
     """How many there are in each state, how many wait of each owner, and how many bytes they take."""
+    found = _candidates(database, answers=False)
+    return InboxCounts(
+        by_state=dict(Counter(c.state for c in found)),
+        waiting_by_owner=dict(Counter(c.owner for c in found if c.state == "waiting")),
+        stored_bytes=sum(c.size_bytes for c in found if c.state != "withdrawn"),
+    )
+
+
+def _candidates(database: Database, *, answers: bool) -> list[Candidate]:
     live = live_maps(database)
-    states: Counter[str] = Counter()
-    owners: Counter[str] = Counter()
-    stored = 0
-    for events in by_candidate(read_events(database)).values():
-        given = next(e for e in events if e["event"] == CONTRIBUTED)
-        state = standing_of(events, live).state
-        states[state] += 1
-        if state == "waiting":
-            owners[owner_of(given)] += 1
-        if state != "withdrawn":
-            stored += given["size_bytes"]
-    return InboxCounts(by_state=dict(states), waiting_by_owner=dict(owners), stored_bytes=stored)
+    events = by_candidate(read_events(database, answers=answers))
+    return [candidate_of(own, live) for own in events.values()]
 
 
 def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tuple[str, bytes]]:

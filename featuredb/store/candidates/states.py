@@ -38,12 +38,9 @@ class Contribution:
     """A photo that someone gives, with the query it came with and the answer it got.
 
     Attributes:
-        image: bytes of the image file.
         width, height: of the stored picture, pixels.
         owner: the name by which who gives it was authenticated; ANONYMOUS where nobody was.
         credit, licence: whom to name with it, as the sender says, and under what terms; never empty.
-        client_id: what the sender calls itself, "" where it does not.
-        received_at: aware time.
         request: camera, prior, options and EXIF of the query; JSON-able.
         answer: summary of the answer (status, reason, pose, accuracy, maps), JSON-able.
         snapshot: version of the database that answered.
@@ -97,8 +94,6 @@ class CandidateStanding:
     """What has become of a candidate.
 
     Attributes:
-        state: waiting, used (by a map that lives), refused or withdrawn.
-        used_by: the living maps that use it.
         reason_code, reason: why it was refused or withdrawn; "" otherwise.
     """
 
@@ -114,9 +109,7 @@ class Candidate(CandidateStanding):
 
     Attributes:
         candidate_id: first 32 hex digits of `sha256`.
-        sha256: of the image file's bytes.
         contributors: the first one first; later ones gave the same bytes again.
-        received_at: of the first contribution.
         request, answer, snapshot: of the first contribution; see `Contribution`.
     """
 
@@ -162,10 +155,6 @@ def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidat
 
     The latest refusal or withdrawal decides, unless it was used after it: then it is used while one
     of those maps lives, and waits again when none does. Only giving a withdrawn photo again opens it.
-
-    Args:
-        events: of one candidate, in order.
-        live_maps: ids of the maps that are not retired.
     """
     latest: Row | None = None
     used: list[str] = []
@@ -226,7 +215,10 @@ def _contributor_of(event: "Row") -> Contributor:
 
 
 def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidate:
-    """A candidate out of all its events, in order, among them at least one contribution."""
+    """A candidate out of all its events, in order, among them at least one contribution.
+
+    Its `answer` is empty where the events were read without answers.
+    """
     given = contributions_of(events)
     first = given[0]
     request: dict[str, Any] = json.loads(first["request"] or "{}")
@@ -236,5 +228,5 @@ def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candida
         **{name: first[name] for name in _AS_GIVEN},
         contributors=tuple(map(_contributor_of, given)),
         request=request,
-        answer=json.loads(first["answer"] or "{}"),
+        answer=json.loads(first.get("answer") or "{}"),
     )

@@ -29,7 +29,7 @@ from featuredb.store.durable.copies import (
     others_at_work,
     superfluous,
 )
-from featuredb.store.durable.filesystem import store_errors
+from featuredb.store.durable.filesystem import sha256_of, store_errors
 from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_name, whole_entry
 from featuredb.store.retry import StaleVersionError, retry_stale
 from featuredb.store.tables import CHILDREN, MAPS
@@ -40,8 +40,6 @@ class CopyReport:
     """What a backup or a restore did.
 
     Attributes:
-        version: of `maps` in the copy.
-        files, bytes: that were copied.
         kept: files that were there already.
         removed: files of the backup before that this one does not need.
     """
@@ -80,7 +78,6 @@ def restore(source: str, target: Database, storage_options: Mapping[str, str] | 
 
     Args:
         source: URL of the backup; `storage_options` are its.
-        target: where the database shall be; not one that exists.
 
     Raises:
         StoreError: there is no whole backup, one of its files is lost or damaged, the target is not empty, or
@@ -126,11 +123,7 @@ def _back_up(database: Database, source: CopyPlace, place: CopyPlace, before: Co
 
 
 def _consistent(database: Database) -> Iterator[Table]:
-    """All tables that there are, each at a version: children that hold what the table above them names.
-
-    Raises:
-        StaleVersionError: others have committed while they were looked at.
-    """
+    """All tables that there are, each at a version: children that hold what the table above them names."""
     for name, children in reversed(CHILDREN.items()):
         if name != MAPS and not database.has(name):
             continue
@@ -157,11 +150,7 @@ def _files_of(table: Table) -> dict[str, str | None]:
 
 
 def _list_of(place: CopyPlace, purpose: str, source: str) -> CopyList:
-    """What is at a place where a copy shall be made: nothing, or an earlier copy.
-
-    Raises:
-        StoreError: something else.
-    """
+    """What is at a place where a copy shall be made: nothing, or an earlier copy."""
     found = place.read_list()
     if found is not None and found.purpose == purpose:
         return found
@@ -236,7 +225,7 @@ def _there(
     if place.local or known is None or known.size_bytes != sizes[path]:
         if expected is None:
             return None
-        known = CopiedFile(size_bytes=sizes[path], sha256=place.sha256(path))
+        known = CopiedFile(size_bytes=sizes[path], sha256=sha256_of(place.files, path))
     return known if expected == known.sha256 else None
 
 
@@ -245,9 +234,6 @@ def _check_same_history(same: Collection[str], place: CopyPlace, sizes: Iterable
 
     Args:
         same: files that are the source's, or were when they were copied.
-
-    Raises:
-        StoreError: the place has a log entry that is not the source's.
     """
     for path in sorted(sizes):
         if f"/{LOG}/" in path and path.endswith(".json") and path not in same:

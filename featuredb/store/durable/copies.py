@@ -16,7 +16,7 @@ from typing import Any
 import pyarrow.fs as fs
 
 from featuredb.errors import StoreError
-from featuredb.store.durable.filesystem import blocks_of, object_writer, one_line, sha256_of, table_files
+from featuredb.store.durable.filesystem import blocks_of, object_writer, one_line, table_files
 from featuredb.store.durable.log import ACKNOWLEDGED
 from featuredb.store.durable.publish import flush, make_folder
 from featuredb.store.tables import SPECS
@@ -43,7 +43,6 @@ class CopyList:
     """What a copy of a database holds.
 
     Attributes:
-        purpose: "backup" or "restore".
         source: URL of what was copied.
         began: when, UTC.
         attempt: a name of the run that makes the copy.
@@ -72,10 +71,6 @@ class CopyPlace:
         """The bytes of each file, by path; none where the place does not exist."""
         found = self.files.get_file_info(fs.FileSelector("", recursive=True, allow_not_found=True))
         return {info.path: info.size for info in found if info.type == fs.FileType.File}
-
-    def sha256(self, path: str) -> str:
-        """Of a file's bytes, in hex digits."""
-        return sha256_of(self.files, path)
 
     def take(self, path: str, source: "CopyPlace", expected: str | None) -> CopiedFile:
         """Copy a file from another place.

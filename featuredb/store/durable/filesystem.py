@@ -51,10 +51,8 @@ def sha256_of(files: fs.FileSystem, path: str) -> str:
     Raises:
         OSError: it cannot be read.
     """
-    digest = hashlib.sha256()
-    for block in blocks_of(files, path):
-        digest.update(block)
-    return digest.hexdigest()
+    with files.open_input_file(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def object_writer(files: fs.PyFileSystem, path: str) -> Any:

@@ -11,13 +11,7 @@ from deltalake import DeltaTable
 from deltalake.exceptions import DeltaError
 
 from featuredb.store.durable.log import LOG, Action
-from featuredb.store.durable.publish import (
-    links_of_log,
-    make_folder,
-    publish,
-    publish_checkpoint,
-    scratch,
-)
+from featuredb.store.durable.publish import links_of_log, make_folder, publish, publish_checkpoint, scratch
 
 T = TypeVar("T")
 

@@ -27,8 +27,6 @@ class RepairStep:
     """One damage, and what is done about it.
 
     Attributes:
-        where: table and file.
-        what: what is wrong with it.
         action: what `repair` does (or has done with `apply`); "" where it does nothing.
         advice: what the person can do where it does nothing.
     """
@@ -45,7 +43,6 @@ def repair(database: Database, *, apply: bool = False, give_up_lost: bool = Fals
     Files are moved to `_set_aside` in their table. The database need not be one that can be opened.
 
     Args:
-        apply: do it, not only say it.
         give_up_lost: also where the newest entries were acknowledged and are missing or damaged: what they
             said is lost, and the database goes back to the state before them.
 

@@ -50,7 +50,6 @@ def decide_order(
     """The order of unnamed coordinates of one dialect in one file.
 
     Args:
-        origin: the file's name, for messages.
         fixes: (n, 2) degrees as written, NaN where there was no fix.
         homes: (n, 2) the place of take-off as written in the same samples, NaN where there is none.
         distances_m: (n,) written horizontal distance from take-off, NaN where there is none.

@@ -34,9 +34,6 @@ def read_telemetry(path: Path) -> Telemetry:
 
     What it is, is told by its contents; the suffix counts where they do not tell.
 
-    Args:
-        path: the file.
-
     Raises:
         TelemetryError: it cannot be read, is none of these, or holds no position.
     """

@@ -30,7 +30,6 @@ class TelemetryTracks:
     Attributes:
         gpmf: packets of each GPMF track by the index of its stream.
         subtitles: blocks of each track of subtitles likewise.
-        damage: what could not be read.
         hints: what else was found and may interest those who miss telemetry.
     """
 

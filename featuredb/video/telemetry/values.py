@@ -77,7 +77,6 @@ class Telemetry(TelemetrySamples):
         height_datum: what `height_m` is counted from; drones that do not say are "unknown".
         clock: what `clock_s` shows: "utc", "local" (the time of day on somebody's wall, zone not known), or
             "none". Local time is never taken for UTC.
-        in_video_time: whether `times_s` is time of the video.
         source: format and dialect.
         origin: the file and, where it holds several things, what in it.
         warnings: what was wrong or had to be decided, for people.

@@ -79,9 +79,6 @@ def _times_of(
 
     Args:
         cells: texts of the columns by their index.
-
-    Raises:
-        TelemetryError: no column can be read as times.
     """
     elapsed: FloatArray | None = None
     in_film = False
@@ -113,11 +110,7 @@ def _times_of(
 
 
 def _time_columns(header: list[str], origin: str) -> list[_TimeColumn]:
-    """The columns of a line of names that are times by them.
-
-    Raises:
-        TelemetryError: a time in a unit that is none.
-    """
+    """The columns of a line of names that are times by them."""
     found = []
     for index, cell in enumerate(header):
         name = column_name(cell)
@@ -256,11 +249,7 @@ def _known_columns(header: list[str], origin: str) -> dict[str, tuple[int, float
 
 
 def _cells(rows: Iterator[list[str]], indices: list[int], width: int, origin: str) -> dict[int, list[str]]:
-    """The texts of the columns that count, column by column; short rows are filled with "".
-
-    Raises:
-        TelemetryError: most rows have more cells than there are names, so that none can be trusted.
-    """
+    """The texts of the columns that count, column by column; short rows are filled with ""."""
     cells: dict[int, list[str]] = {index: [] for index in indices}
     count = wide = 0
     for count, row in enumerate(rows, start=1):

@@ -117,8 +117,6 @@ class Decoded:
     Attributes:
         columns: (n,) arrays as `assemble` takes them, without times; the same in all packets of a reader.
         clock_at_start_s: UTC of the packet's first sample where the samples have no clock of their own.
-        datum: of the heights.
-        warnings: what was found odd.
     """
 
     columns: dict[str, FloatArray]

@@ -113,12 +113,7 @@ class _Reader:
             )
         clock, latitude, longitude, height = np.array(self._rows).T
         return assemble(
-            {
-                "clock_s": clock,
-                "latitude_deg": latitude,
-                "longitude_deg": longitude,
-                "height_m": height,
-            },
+            {"clock_s": clock, "latitude_deg": latitude, "longitude_deg": longitude, "height_m": height},
             source="GPX",
             origin=self._origin,
             clock="utc",

@@ -36,12 +36,9 @@ class Klv:
     """One entry.
 
     Attributes:
-        key: four characters.
         type: one character, "" for nested entries.
         size: bytes of one sample.
-        count: number of samples.
         data: size times count bytes.
-        children: the entries of a nested one.
     """
 
     key: str

@@ -29,7 +29,6 @@ def read_srt(data: bytes, origin: str = "subtitles") -> Telemetry:
 
     Args:
         data: the file's bytes, UTF-8 or UTF-16, any line ends.
-        origin: its name, for messages.
 
     Raises:
         TelemetryError: no subtitles, no telemetry in them, no position, or an order of coordinates that

@@ -47,8 +47,6 @@ class BlockFields:
         row: named values, by the columns that `assemble` takes.
         pair: unnamed coordinates in degrees, in the order written; NaN without a fix.
         home: the same of the place of take-off.
-        third: what follows the pair.
-        third_value: its number.
         distance_m: horizontal distance from take-off.
         decimals: digits after the point of the coordinates, -1 without any.
         altitude_unnamed: the height is called "altitude" without saying above what.
