@@ -101,7 +101,7 @@ class Camera:
     @property
     def tan_of_fold(self) -> float:
         """Tangent of the angle off the axis from which on `project` answers NaN; infinity for most lenses."""
-        return _tan_of_fold(self.model, self.params)
+        return _tan_of_fold(self.model, self.params[_FIRST_RADIAL.get(self.model, len(self.params)) :])
 
     def with_focal(self, focal_px: float) -> "Camera":
         """The same camera with every focal length scaled so that their mean is `focal_px`."""
@@ -135,7 +135,7 @@ class Camera:
         """
         points = _rows("Camera.project", points_cam, 3)
         pixels = np.asarray(self.to_pycolmap().img_from_cam(points), dtype=np.float64)
-        limit = _tan_of_fold(self.model, self.params[_FIRST_RADIAL.get(self.model, len(self.params)) :])
+        limit = self.tan_of_fold
         if np.isfinite(limit):
             pixels[np.hypot(points[:, 0], points[:, 1]) >= limit * points[:, 2]] = np.nan
         return pixels
