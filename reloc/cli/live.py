@@ -72,7 +72,7 @@ def run_live(args: argparse.Namespace) -> int:
     from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.client.client import Client
     from reloc.client.film import stream_film
-    from reloc.tracking.trajectory.outputs import check_outputs, exit_code, write_outputs
+    from reloc.tracking.trajectory.files import check_outputs, exit_code, write_outputs
 
     sys.setswitchinterval(_SWITCH_S)
     check_outputs(args.out)

@@ -1,7 +1,7 @@
-"""What a track stands on: points of maps, or of a scan, in one local frame; how a frame is found there."""
+"""What a track stands on, points of maps or of a scan in one local frame, and what it says of a frame."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,3 +92,34 @@ class Unmatched:
 
     reason: str
     detail: str
+
+
+TrackState = Literal["tracking", "relocalised", "lost"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedFrame:
+    """What is known of one frame.
+
+    Attributes:
+        index, time_s: of the frame.
+        state: tracking; relocalised, on the first frame after the track was lost or begun; lost: no pose.
+        cam_from_local: pose in the ground's frame, None where the track is lost.
+        covariance: (6, 6), see `FittedPose`; None with the pose.
+        camera: intrinsics in use; None with the pose. ground: in whose frame the pose is.
+        inliers: landmarks that agree with it. pixels: (k, 2) of them; rows: (k,) of the ground's
+            points.
+        detail: why there is no pose.
+    """
+
+    index: int
+    time_s: float
+    state: TrackState
+    cam_from_local: Rigid3 | None = None
+    covariance: FloatArray | None = None
+    camera: Camera | None = None
+    ground: Ground | None = None
+    inliers: int = 0
+    pixels: FloatArray | None = None
+    rows: NDArray[np.int64] | None = None
+    detail: str = ""

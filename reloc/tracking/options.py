@@ -31,15 +31,11 @@ class TrackOptions:
     Attributes:
         landmarks: that are followed; more sharpen the pose as their root, and cost in proportion.
         columns, rows: of the grid over which they are spread.
-        min_landmarks: that agree with a pose; fewer are a lost track. On the simulated flights the mean error
-            grew from 0.04 m with 150 and more to 0.4 m with 60 to 80 and 0.5 m with 40 to 60; the three
-            frames with 20 to 30 were off by 0.5 to 1.2 m, with bounds that said 1 m.
+        min_landmarks: that agree with a pose; fewer are a lost track. Simulated frames with 20 to 30 were off
+            by 0.5 to 1.2 m, with bounds that said 1 m.
         least_share: of those that the flow followed, that agree. least_kept: of those that should be in view
-            of the next frame; a film that is cut to a look-alike keeps a few. On the simulated flights smooth
-            frames keep 99 %, turns on the spot of 95 degrees in 0.8 s 68 % and more; cuts to a town of the
-            same plan kept 10 %, and back 43 %.
-        keyframe_every: frames from one that is matched against the map to the next. On a simulated flight of
-            40 s every 18th, 20th and 24th gave means of 0.049, 0.051 and 0.064 m.
+            of the next frame; simulated turns on the spot keep 68 % and more, cuts to look-alikes 10 to 43 %.
+        keyframe_every: frames from one that is matched against the map to the next.
         keyframe_soonest: so many frames, where landmarks run out: fewer than `few_landmarks` of those wanted.
         answer_after: frames after which the answer to a keyframe is waited for: so the same film gives
             the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
@@ -54,11 +50,8 @@ class TrackOptions:
             that was found is carried to the one at hand while a client waits; more are left to the thread.
         min_matches: of a keyframe with the map. max_unconfirmed: keyframes in a row without them; then the
             track is lost, however well its old landmarks agree with each other.
-        keyframes: features of a keyframe, whose pose is known to some pixels. As many as a query's took twice
-            the time, for which the film waited (50 instead of 72 frames a second), and gave 0.045 m. From
-            480 to 800 pixels a side the means were alike: 0.046 to 0.051 m smooth, 0.061 to 0.075 jerky.
-        fine_keyframes: the same where landmarks run out, as over water: on a jerky flight the 95th
-            percentile went from 0.21 to 0.18 m, lost frames from 15 to 6.
+        keyframes: features of a keyframe, whose pose is known to some pixels: as many as a query's take twice
+            the time, and place it hardly better. fine_keyframes: where landmarks run out, as over water.
         localise: how a lost track is found again.
     """
 

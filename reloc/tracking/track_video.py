@@ -24,15 +24,13 @@ from featuredb.video.opening import Source
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.film_end import until_it_ends
-from reloc.tracking.ground import Finder
+from reloc.tracking.ground import Finder, TrackedFrame
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 
 # Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
 _READ_ON = 4
-
 # Of pictures that wait, for their greys and, as 4:2:0, their colours: at 3840x2160 ten frames.
 _MOST_BYTES = 1 << 27
 
@@ -52,21 +50,12 @@ def draw_frame(rgb: NDArray[np.uint8], frame: TrackedFrame, point: TrajectoryPoi
             cv2.circle(picture, (round(x), round(y)), max(1, round(scale)), _OTHER_RGB, -1, cv2.LINE_AA)
         for x, y in frame.pixels if frame.pixels is not None else ():
             cv2.circle(picture, (round(x), round(y)), round(4 * scale) + 1, _LANDMARK_RGB, 1, cv2.LINE_AA)
-    words = _words(point)
+    words, colour = _words(point), _STATE_RGB[point.state]
     box = picture[: round((14 + 26 * len(words)) * scale), : round(640 * scale)]
     box //= 3
     for row, text in enumerate(words):
         place = (round(12 * scale), round((28 + 26 * row) * scale))
-        cv2.putText(
-            picture,
-            text,
-            place,
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.6 * scale,
-            _STATE_RGB[point.state],
-            1,
-            cv2.LINE_AA,
-        )
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6 * scale, colour, 1, cv2.LINE_AA)
     return picture
 
 
@@ -307,15 +296,14 @@ def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None
 
 
 def _with_film(request: LocaliseRequest, info: VideoInfo, source: Source) -> LocaliseRequest:
-    """What is known of the frames, with what the film says of its camera where nothing else was said."""
+    """What is known of the frames, with what the film says of its camera where nothing else was said.
+
+    Maps know a film that does not name its camera by the file's digest.
+    """
     if request.camera_key is not None or request.exif_focal_px is not None:
         return request
     focal_px = None if info.focal_px is None else info.focal_px * info.frame_width / info.width
     named = bool(info.camera_key or info.make or info.model)
-    film = None if named or not isinstance(source, str | Path) else _digest(Path(source))
+    file = Path(source) if isinstance(source, str | Path) and not named else None
+    film = unnamed_model(file_sha256(file)) if file is not None and file.is_file() else None
     return replace(request, camera_key=info.camera_key or None, film=film, exif_focal_px=focal_px)
-
-
-def _digest(film: Path) -> str | None:
-    """By which maps of a film know it; None for what is no file."""
-    return unnamed_model(file_sha256(film)) if film.is_file() else None

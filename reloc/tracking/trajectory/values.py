@@ -11,8 +11,7 @@ from itertools import groupby
 
 from featuredb.errors import InvalidValueError
 from reloc.localise.result import OwnPose
-from reloc.tracking.ground import EarthPose
-from reloc.tracking.tracked_frame import TrackedFrame, TrackState
+from reloc.tracking.ground import EarthPose, TrackedFrame, TrackState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
