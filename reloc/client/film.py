@@ -3,9 +3,9 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -54,65 +54,51 @@ class StreamedFilm:
     complaints: tuple[str, ...]
 
 
-@dataclass(slots=True)
 class _Answers:
-    """Poses so far, taken as they come by a thread of their own: a camera's next frame does not hold them up.
+    """Poses so far, taken as they come by a thread: a camera's next frame does not hold them up."""
 
-    Attributes:
-        taking: that thread; it ends with the session.
-    """
-
-    live: LiveTrack
-    on_pose: OnPose | None
-    points: list[TrajectoryPoint] = field(default_factory=list)
-    latency_ms: list[float] = field(default_factory=list)
-    taking: "Future[None]" = field(default_factory=Future)
-    _changed: threading.Condition = field(default_factory=threading.Condition)
-
-    def start(self, pool: ThreadPoolExecutor) -> None:
-        """Take poses from now on."""
-        self.taking = pool.submit(self._run)
-        self.taking.add_done_callback(self._tell)
+    def __init__(self, live: LiveTrack, on_pose: OnPose | None, pool: ThreadPoolExecutor) -> None:
+        self.live, self._on_pose = live, on_pose
+        self.points: list[TrajectoryPoint] = []
+        self.latency_ms: list[float] = []
+        self._changed = threading.Condition()
+        self._taking = pool.submit(self._take_all)  # ends with the session
+        self._taking.add_done_callback(self._tell)
 
     def check(self) -> None:
         """Raise what has ended the thread before its time."""
-        if self.taking.done():
-            self.taking.result()
+        if self._taking.done():
+            self._taking.result()
 
     def await_frame(self, index: int) -> None:
         """Wait for the pose of the frame that was sent last, -1: none; the server never drops it."""
         with self._changed:
             self._changed.wait_for(
-                lambda: self.taking.done() or index < 0 or (self.points and self.points[-1].index >= index),
+                lambda: self._taking.done() or index < 0 or (self.points and self.points[-1].index >= index),
                 _LAST_WAIT_S,
             )
         self.check()
 
-    def _run(self) -> None:
+    def _take_all(self) -> None:
         for pose in self.live:
-            self._take(pose)
+            latency_ms = self.live.latency_ms(pose.sequence)
+            if self._on_pose is not None:
+                self._on_pose(pose, latency_ms)
+            if latency_ms is not None:
+                self.latency_ms.append(latency_ms)
+            self.points.append(point_of_message(pose))
+            self._tell()
 
-    def _tell(self, _: object) -> None:
+    def _tell(self, *_: object) -> None:
         with self._changed:
             self._changed.notify_all()
-
-    def _take(self, pose: TrackPose) -> None:
-        latency_ms = self.live.latency_ms(pose.sequence)
-        if self.on_pose is not None:
-            self.on_pose(pose, latency_ms)
-        if latency_ms is not None:
-            self.latency_ms.append(latency_ms)
-        self.points.append(point_of_message(pose))
-        self._tell(pose)
 
 
 @contextmanager
 def _answered(live: LiveTrack, on_pose: OnPose | None) -> Iterator[_Answers]:
     """An open session whose poses are taken; both end with the block."""
-    answers = _Answers(live, on_pose)
     with ThreadPoolExecutor(1, "poses") as pool, live:
-        answers.start(pool)
-        yield answers
+        yield _Answers(live, on_pose, pool)
 
 
 def stream_film(
@@ -166,11 +152,7 @@ def stream_film(
     if last < 0:
         raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
     return StreamedFilm(
-        trajectory=Trajectory(
-            source=info.name,
-            points=tuple(answers.points),
-            start=info.creation_time,
-        ),
+        trajectory=Trajectory(source=info.name, points=tuple(answers.points), start=info.creation_time),
         frames=last + 1,
         sent=sent,
         latency_ms=np.array(answers.latency_ms),
