@@ -14,12 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from featuredb.errors import (
-    FeatureDbError,
-    MapNotFoundError,
-    StoreError,
-    UnplacedBesideOthersError,
-)
+from featuredb.errors import FeatureDbError, MapNotFoundError, StoreError, UnplacedBesideOthersError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area, join_segments
@@ -34,7 +29,7 @@ from featuredb.store.tables import BOUNDS
 from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.localise.localise import localise
 from reloc.localise.options import LocaliseOptions
-from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult, PoseInMap
+from reloc.localise.result import LocaliseRequest, LocaliseResult, PoseInMap
 
 _LOG = logging.getLogger(__name__)
 # Maps whose boxes come this close belong to one area: a photo may see both.
@@ -55,13 +50,10 @@ def at_stand_in(unplaced: UnplacedMap) -> FeatureMap:
 
 def in_own_frame(result: LocaliseResult, unplaced: UnplacedMap) -> LocaliseResult:
     """The result of a search of `at_stand_in(unplaced)`, without anything that could be taken for a place."""
-    if result.pose is None:
+    pose = result.pose
+    if pose is None:
         return replace(result, runner_up=None)
-    return replace(result, pose=None, in_map=_pose(result.pose, unplaced), runner_up=None)
-
-
-def _pose(pose: LocalisedPose, unplaced: UnplacedMap) -> PoseInMap:
-    return PoseInMap(
+    in_map = PoseInMap(
         map_id=unplaced.map_id,
         frame=unplaced.frame,
         cam_from_map=pose.cam_from_local,
@@ -70,6 +62,7 @@ def _pose(pose: LocalisedPose, unplaced: UnplacedMap) -> PoseInMap:
         camera_source=pose.camera_source,
         residual_rms_px=pose.residual_rms_px,
     )
+    return replace(result, pose=None, in_map=in_map, runner_up=None)
 
 
 class OnDemand(Generic[_Value]):
@@ -301,24 +294,21 @@ def _load(
     Args:
         states: by write id; what is read now is added.
     """
-    new = [m for m in group if m.map_id not in instead and m.write_id not in states]
-    for m in new:
-        segment = files.get(m.write_id, partial(_laid_out, snapshot, m.map_id))
-        states[m.write_id] = snapshot.load_bare(m.map_id), segment
-    chosen = [
-        (instead[m.map_id].bare(), segment_of(instead[m.map_id]))
-        if m.map_id in instead
-        else states[m.write_id]
-        for m in group
-    ]
+
+    def state(summary: MapSummary) -> _State:
+        map_id, write_id = summary.map_id, summary.write_id
+        if map_id in instead:
+            return instead[map_id].bare(), segment_of(instead[map_id])
+        if write_id not in states:
+            segment = files.get(write_id, lambda: segment_of(snapshot.load_map(map_id)))
+            states[write_id] = snapshot.load_bare(map_id), segment
+        return states[write_id]
+
+    chosen = [state(m) for m in group]
     area = join_segments([bare for bare, _ in chosen], [segment for _, segment in chosen])
     points, images = len(area.points), len(area.image_map)
     _LOG.info("area of %d maps: %d points, %d images", len(group), points, images)
     return area
-
-
-def _laid_out(snapshot: Snapshot, map_id: str) -> Segment:
-    return segment_of(snapshot.load_map(map_id))
 
 
 def _load_alone(url: str, snapshot: Snapshot, summary: MapSummary) -> IndexedArea:
@@ -331,9 +321,8 @@ def _load_alone(url: str, snapshot: Snapshot, summary: MapSummary) -> IndexedAre
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:
     """Maps whose boxes come within _AREA_GAP_M of each other, directly or through others.
 
-    Maps of one group share an extractor and a height datum: heights of different datums do not mix.
-
-    Boxes are compared as spheres around their middles in one Cartesian frame, across zone borders.
+    Maps of one group share an extractor and a height datum: heights of different datums do not mix. Boxes are
+    compared as spheres around their middles in one Cartesian frame, across zone borders.
     """
     if not maps:
         return []

@@ -55,7 +55,8 @@ def draw_overlay(
     shrink = max(image.shape) / max(whole.shape)
     view, inliers_utm = AnsweredView.of_reply(reply), np.array(reply.inlier_points.utm).reshape(-1, 3)
     if other_points_utm is not None and len(other_points_utm):
-        others = _thinned(_without(other_points_utm, inliers_utm))
+        others = _without(other_points_utm, inliers_utm)
+        others = others[:: max(1, len(others) // _MAX_OTHER)]
         for x, y in _inside(view.project_utm(others), view.camera) * shrink:
             cv2.circle(image, (round(x), round(y)), 2, _OTHER_BGR, -1, cv2.LINE_AA)
     keypoints = np.array(reply.inlier_points.pixels).reshape(-1, 2)
@@ -111,20 +112,13 @@ def _without(points: FloatArray, taken: FloatArray) -> FloatArray:
     return points[~np.isfinite(distance)]
 
 
-def _thinned(points: FloatArray) -> FloatArray:
-    step = max(1, len(points) // _MAX_OTHER)
-    return points[::step]
-
-
 def _caption(image: NDArray[np.uint8], reply: LocaliseReply) -> None:
     assert reply.utm is not None
     text = (
         f"EPSG {reply.utm.epsg}  E {reply.utm.easting:.2f}  N {reply.utm.northing:.2f}  "
         f"H {reply.utm.height:.2f}  {reply.inliers} inliers"
     )
-    height = image.shape[0]
+    height, white = image.shape[0], (255, 255, 255)
     image[max(0, height - 46) :] //= 4  # a dark band, so that the text reads on any photo
     for up, line in ((28, text), (8, _LEGEND)):
-        cv2.putText(
-            image, line, (8, height - up), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
-        )
+        cv2.putText(image, line, (8, height - up), cv2.FONT_HERSHEY_SIMPLEX, 0.5, white, 1, cv2.LINE_AA)

@@ -139,11 +139,8 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
             excess[r] = problems[r].cost_of_pixels(found, camera) - alone[r]
         worst = max(rows, key=lambda r: excess[r])
         if excess[worst] <= _MAX_EXCESS:
-            return SharedLens(
-                camera=camera,
-                sigmas=_SIGMA_SCALE * np.sqrt(np.diag(covariance)),
-                agree=agree,
-            )
+            sigmas = _SIGMA_SCALE * np.sqrt(np.diag(covariance))
+            return SharedLens(camera=camera, sigmas=sigmas, agree=agree)
         agree[worst] = False
     return None
 
@@ -183,13 +180,11 @@ def _together(
         xy=np.concatenate([view.pixels for view in views]),
         sigma_px=np.repeat(noise_px, count),
     )
-    problem = Problem(block, Terms(keypoint_px=1.0, lenses=(_opencv(prior, start),), marks=marks))
+    by_lens = opencv_by_lens(prior.mean)  # the prior is of other parameters than OPENCV's own
+    known = LensPrior(
+        mean=with_lens(start, prior.mean),
+        covariance=by_lens @ np.diag(1.0 / prior.information) @ by_lens.T,
+    )
+    problem = Problem(block, Terms(keypoint_px=1.0, lenses=(known,), marks=marks))
     problem.solve(100, 1e-10)
     return problem.block(), problem.marginals().lens(0)
-
-
-def _opencv(prior: QueryLensPrior, camera: Camera) -> LensPrior:
-    """The prior as that of OPENCV's own parameters."""
-    by_lens = opencv_by_lens(prior.mean)
-    covariance = by_lens @ np.diag(1.0 / prior.information) @ by_lens.T
-    return LensPrior(mean=with_lens(camera, prior.mean), covariance=covariance)

@@ -1,9 +1,10 @@
 """Subcommands `query` and `localise`; `serve` and `live` have modules of their own."""
 
 import argparse
+import json
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -222,9 +223,9 @@ def _answer_all(
         try:
             data = path.read_bytes()
             reply = ask(data, lenses.get(path), False)
-            sys.stdout.write(
-                _as_json_line(path, reply, database) if args.json else describe(str(path), reply, database)
-            )
+            told = {"image": str(path), "database": database, **reply.model_dump(mode="json")}
+            text = json.dumps(told) + "\n" if args.json else describe(str(path), reply, database)
+            sys.stdout.write(text)
             sys.stdout.flush()
             if reply.status == "not_localised":
                 codes.add(_NOT_LOCALISED)
@@ -236,7 +237,7 @@ def _answer_all(
             elif args.overlay is not None:
                 from reloc.overlay import write_overlay
 
-                target = _overlay_path(args.overlay, path, args.image)
+                target = _overlay_path(args.overlay, path, len(args.image) > 1)
                 write_overlay(target, data, reply, other_points(reply))
                 sys.stderr.write(f"wrote {target}\n")
         except (OSError, FeatureDbError) as error:
@@ -284,13 +285,6 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
     return {p: lens for p, lens in zip(paths, asked_with, strict=True) if lens is not None}
 
 
-def _as_json_line(path: Path, reply: "LocaliseReply", database: str) -> str:
-    import json
-
-    return json.dumps({"image": str(path), "database": database, **reply.model_dump(mode="json")}) + "\n"
-
-
-def _overlay_path(overlay: Path, image: Path, images: Iterable[str]) -> Path:
-    if len(list(images)) == 1:
-        return overlay
-    return overlay.with_name(f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}")
+def _overlay_path(overlay: Path, image: Path, several: bool) -> Path:
+    name = f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}"
+    return overlay.with_name(name) if several else overlay

@@ -58,7 +58,7 @@ def _run(args: argparse.Namespace) -> int:
     from reloc.tracking.trajectory.read import read_trajectory_csv
     from reloc.viewer.page import DEFAULT_POINTS as STATIC_POINTS
     from reloc.viewer.page import write_static_page
-    from reloc.viewer.photos import Pictures
+    from reloc.viewer.photos import Pictures, Queries
     from reloc.viewer.scene import DEFAULT_POINTS, ViewerSceneOptions, build_scene
 
     if args.static is None:
@@ -80,7 +80,6 @@ def _run(args: argparse.Namespace) -> int:
         size = write_static_page(args.static, scene, pictures)
         sys.stdout.write(f"{args.static}: {size / 1e6:.1f} MB, of version {scene.document['snapshot']}\n")
         return 0
-    from reloc.viewer.query import Queries
     from reloc.viewer.server import create_app, serve
 
     serve(create_app(scene, pictures, Queries(database, scene)), args.port, browser=not args.no_browser)

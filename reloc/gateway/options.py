@@ -1,7 +1,7 @@
 """What a gateway may be told."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from featuredb.errors import InvalidValueError
@@ -55,19 +55,8 @@ class GatewayOptions:
     cors_origins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in (
-            "timeout_s",
-            "connect_timeout_s",
-            "workers",
-            "max_in_flight",
-            "max_body_bytes",
-            "max_image_bytes",
-            "max_buffered_bytes",
-            "body_timeout_s",
-            "prior_floor_m",
-            "prior_unknown_m",
-        ):
-            if not getattr(self, name) > 0:
+        for name in (field.name for field in fields(self) if field.type in (int, float)):
+            if name != "port" and not getattr(self, name) > 0:
                 raise InvalidValueError(f"GatewayOptions.{name}: expected > 0, found {getattr(self, name)}")
         if not 0 <= self.port <= 65_535:
             raise InvalidValueError(f"GatewayOptions.port: expected 0..65535, found {self.port}")

@@ -16,7 +16,6 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.lineage import MapLineage, describe_lineage
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store import MapSummary, UnplacedSummary
-from reloc.viewer.places import Spot
 from reloc.viewer.points import DrawnPoints, drawn_points, sampled
 from reloc.viewer.poses import drawn_pose, worded_place, worded_sigmas
 
@@ -115,12 +114,6 @@ def coverage(points: DrawnPoints) -> dict[str, Any]:
         "cells": cells[count >= _LEAST_POINTS].tolist(),
         "hull": np.round(_hull(inside), 3).tolist(),
     }
-
-
-def spot_of_map(summary: MapSummary, feature_map: FeatureMap) -> Spot:
-    """Where a map without points lies: at its frame's origin."""
-    e, n, h = feature_map.frame.utm_from_enu(np.zeros(3), summary.epsg)
-    return Spot(easting=float(e), northing=float(n), height=float(h), epsg=summary.epsg)
 
 
 def _hull(plan: FloatArray) -> FloatArray:

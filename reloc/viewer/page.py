@@ -13,8 +13,7 @@ from importlib import resources
 from pathlib import Path
 
 from featuredb.export.job import whole_or_nothing
-from reloc.viewer.photos import THUMBNAIL_PX, Pictures
-from reloc.viewer.query import data_url
+from reloc.viewer.photos import THUMBNAIL_PX, Pictures, data_url
 from reloc.viewer.scene import ViewerScene
 
 _MEDIA_TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "json": "application/json"}

@@ -5,7 +5,6 @@ far from each other get one each, and the page shows one place at a time.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -22,24 +21,13 @@ _TOGETHER_M = 20_000.0
 SCAN_MARGIN_M = 50.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Spot:
-    """Where something lies: UTM easting, northing, height in metres, and the zone."""
-
-    easting: float
-    northing: float
-    height: float
-    epsg: int
+Spot = tuple[FloatArray, int]  # where something lies: (3,) easting, northing, height in metres; the zone
 
 
 def spot_of(box: UtmBox, epsg: int) -> Spot:
     """The middle of a box in plan, at its foot."""
-    return Spot(
-        easting=(box.min_easting + box.max_easting) / 2.0,
-        northing=(box.min_northing + box.max_northing) / 2.0,
-        height=box.min_height,
-        epsg=epsg,
-    )
+    easting, northing = (box.min_easting + box.max_easting) / 2.0, (box.min_northing + box.max_northing) / 2.0
+    return np.array([easting, northing, box.min_height]), epsg
 
 
 def group(spots: Sequence[Spot]) -> list[tuple[LocalFrame, list[int]]]:
@@ -49,9 +37,9 @@ def group(spots: Sequence[Spot]) -> list[tuple[LocalFrame, list[int]]]:
     """
     if not spots:
         return []
-    first = spots[0]
-    frame = LocalFrame.from_utm(first.easting, first.northing, first.height, first.epsg)
-    enu = np.array([frame.enu_from_utm((s.easting, s.northing, s.height), s.epsg) for s in spots])
+    (easting, northing, height), epsg = spots[0]
+    frame = LocalFrame.from_utm(float(easting), float(northing), float(height), epsg)
+    enu = np.array([frame.enu_from_utm(utm, epsg) for utm, epsg in spots])
     near = cKDTree(enu).query_pairs(_TOGETHER_M, output_type="ndarray")
     links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(spots), len(spots)))
     count, label = connected_components(links, directed=False)

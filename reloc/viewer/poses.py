@@ -126,8 +126,7 @@ def spot_of_trajectory(trajectory: Trajectory) -> Spot:
         raise InvalidValueError(
             f"{trajectory.source}: all {len(trajectory.points)} frames are lost, there is nothing to show"
         )
-    easting, northing, height = pose.utm.tolist()
-    return Spot(easting=easting, northing=northing, height=height, epsg=pose.epsg)
+    return pose.utm, pose.epsg
 
 
 def describe_trajectory(trajectory: Trajectory, frame: LocalFrame) -> dict[str, Any]:

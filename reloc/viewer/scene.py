@@ -26,7 +26,6 @@ from reloc.viewer.map_layer import (
     describe_photos,
     own_points,
     picks_command,
-    spot_of_map,
 )
 from reloc.viewer.places import Spot, group, scan_box, spot_of
 from reloc.viewer.points import DrawnPoints, map_points, scan_points_in, shares
@@ -127,7 +126,7 @@ class _Builder:
                 continue
             place, data = self._place(len(places), frame, here, beside)
             # Of what there is first: the zone in which spots of this place are told.
-            place["epsg"] = spots[rows[0]].epsg
+            place["epsg"] = spots[rows[0]][1]
             place["trajectories"] = [describe_trajectory(t, frame) for t in played]
             places.append(place)
             points.append(data)
@@ -157,10 +156,11 @@ class _Builder:
         self._tell()
         if unplaced is None:
             return
-        buffers, drawn = _Buffers(), own_points(unplaced, self._options.points)
+        drawn = own_points(unplaced, self._options.points)
+        (buffer,), data = _packed([drawn])
         command = picks_command(self._database.url, summary.map_id, self._options.photos)
-        places.append(describe_own_place(summary, unplaced, drawn, buffers.add(drawn), command))
-        points.append(buffers.data())
+        places.append(describe_own_place(summary, unplaced, drawn, buffer, command))
+        points.append(data)
         self._images |= {(summary.map_id, image.image_id): image for image in unplaced.images}
 
     def _tell(self) -> None:
@@ -184,7 +184,8 @@ class _Builder:
     def _spot(self, summary: MapSummary) -> Spot:
         if summary.box is not None:
             return spot_of(summary.box, summary.epsg)
-        return spot_of_map(summary, self._snapshot.load_map(summary.map_id))
+        frame = self._snapshot.load_map(summary.map_id).frame  # it has no points
+        return frame.utm_from_enu(np.zeros(3), summary.epsg), summary.epsg
 
     def _place(
         self, number: int, frame: LocalFrame, maps: list[MapSummary], scans: list[ScanSummary]
@@ -200,14 +201,14 @@ class _Builder:
             for s, box in zip(scans, boxes, strict=True)
         ]
         for_maps, for_scans = _budget(sum(len(drawn) for _, drawn in shown), sum(of_scans), limit)
-        buffers = _Buffers()
-        described_maps = []
-        for (told, drawn), count in zip(shown, shares([len(d) for _, d in shown], for_maps), strict=True):
-            described_maps.append({**told, "buffer": buffers.add(drawn.first(int(count)))})
-        described_scans = []
-        for scan, box, count in zip(scans, boxes, shares(of_scans, for_scans), strict=True):
-            drawn = scan_points_in(self._database, scan, frame, box, int(count))
-            described_scans.append(_describe_scan(scan, drawn, buffers.add(drawn)))
+        counts = shares([len(drawn) for _, drawn in shown], for_maps)
+        drawn = [one.first(int(count)) for (_, one), count in zip(shown, counts, strict=True)]
+        drawn += [
+            scan_points_in(self._database, scan, frame, box, int(count))
+            for scan, box, count in zip(scans, boxes, shares(of_scans, for_scans), strict=True)
+        ]
+        buffers, data = _packed(drawn)
+        of_scan = slice(len(shown), None)
         place = {
             "name": f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}",
             "frame": {
@@ -216,10 +217,13 @@ class _Builder:
                 "height_m": frame.height_m,
             },
             "height_datums": sorted({m.height_datum for m in maps} | {s.height_datum for s in scans}),
-            "maps": described_maps,
-            "scans": described_scans,
+            "maps": [{**told, "buffer": b} for (told, _), b in zip(shown, buffers, strict=False)],
+            "scans": [
+                _describe_scan(scan, one, buffer)
+                for scan, one, buffer in zip(scans, drawn[of_scan], buffers[of_scan], strict=True)
+            ],
         }
-        return place, buffers.data()
+        return place, data
 
     def _map(
         self, number: int, frame: LocalFrame, summary: MapSummary, wanted: int
@@ -247,28 +251,20 @@ class _Builder:
         return chain[1] if len(chain) > 1 and chain[1] in self._shown else None
 
 
-class _Buffers:
-    """Points of one place, one after the other."""
-
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-        self._size = 0
-
-    def add(self, drawn: DrawnPoints) -> dict[str, Any]:
-        """Append points; says where they are and how to read them."""
-        data = drawn.packed()
-        told = {
-            "origin": drawn.origin.tolist(),
-            "count": len(drawn),
-            "offset": self._size,
-            "box": np.round(drawn.box(), 3).tolist(),
-        }
-        self._parts.append(data)
-        self._size += len(data)
-        return told
-
-    def data(self) -> bytes:
-        return b"".join(self._parts)
+def _packed(parts: Sequence[DrawnPoints]) -> tuple[list[dict[str, Any]], bytes]:
+    """Points of one place, one part after the other, and for each where it is and how to read it."""
+    buffers, data = [], bytearray()
+    for drawn in parts:
+        buffers.append(
+            {
+                "origin": drawn.origin.tolist(),
+                "count": len(drawn),
+                "offset": len(data),
+                "box": np.round(drawn.box(), 3).tolist(),
+            }
+        )
+        data += drawn.packed()
+    return buffers, bytes(data)
 
 
 def _budget(of_maps: int, of_scans: int, limit: int) -> tuple[int, int]:

@@ -26,8 +26,7 @@ from starlette.responses import JSONResponse
 from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
 from featuredb.stop_signals import on_stop_signals
 from reloc.viewer.page import Asset, assets, content_policy, page
-from reloc.viewer.photos import PICTURE_PX, Pictures
-from reloc.viewer.query import LIMITS, Queries
+from reloc.viewer.photos import LIMITS, PICTURE_PX, Pictures, Queries
 from reloc.viewer.scene import ViewerScene
 from reloc.wire.query import ErrorCode
 

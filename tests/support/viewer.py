@@ -19,8 +19,7 @@ from featuredb.store import Database
 from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
-from reloc.viewer.photos import Pictures
-from reloc.viewer.query import Queries
+from reloc.viewer.photos import Pictures, Queries
 from reloc.viewer.scene import ViewerScene, build_scene
 from reloc.viewer.server import create_app, listen, uvicorn_server
 from tests.support.maps import random_map
