@@ -16,7 +16,6 @@ from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import decode_rgb
 from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from reloc.answered_view import AnsweredView
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.matching import visible_points
@@ -57,7 +56,10 @@ def draw_overlay(
     if other_points_utm is not None and len(other_points_utm):
         others = _without(other_points_utm, inliers_utm)
         others = others[:: max(1, len(others) // _MAX_OTHER)]
-        for x, y in _inside(view.project_utm(others), view.camera) * shrink:
+        pixels = view.project_utm(others)
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels < [view.camera.width, view.camera.height])).all(axis=1)
+        for x, y in pixels[inside] * shrink:
             cv2.circle(image, (round(x), round(y)), 2, _OTHER_BGR, -1, cv2.LINE_AA)
     keypoints = np.array(reply.inlier_points.pixels).reshape(-1, 2)
     projected = view.project_utm(inliers_utm)
@@ -96,12 +98,6 @@ def map_points_in_view(areas: Sequence[IndexedArea], view: AnsweredView) -> Floa
             rows = visible_points(area, area.searched_points(), view.camera, pose)
             return area.frame.utm_from_enu(area.points[rows], view.epsg)
     return np.empty((0, 3))
-
-
-def _inside(pixels: FloatArray, camera: Camera) -> FloatArray:
-    with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-    return pixels[inside]
 
 
 def _without(points: FloatArray, taken: FloatArray) -> FloatArray:

@@ -126,8 +126,13 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
     prior = priors.around(first, focal_px, priors.unknown_focal_rel)
     noise_px = 0.25 * PoseOptions().tolerance_px(first)
     noise = [measured_noise_px(v.pixels, v.points, v.cam_from_local, v.camera, noise_px) for v in views]
-    problems = [_problem(view, prior, noise_px, own) for view, own in zip(views, noise, strict=True)]
-    alone = np.array([_alone(p, v) for p, v in zip(problems, views, strict=True)])
+    problems, alone = [], []  # each photo's pixels, and what they cost with a lens of its own
+    for view, own_px in zip(views, noise, strict=True):
+        pixels, points, trust = view.pixels, view.points, (noise_px / own_px) ** 2
+        problem = LensProblem(pixels=pixels, points=points, noise_px=noise_px, trust=trust, prior=prior)
+        own = calibrate(pixels, points, view.cam_from_local, view.camera, prior, noise_px)
+        problems.append(problem)
+        alone.append(problem.cost_of_pixels(own.cam_from_local, own.camera))
     while agree.sum() >= _LEAST_PHOTOS:
         rows = [int(r) for r in np.flatnonzero(agree)]
         start = views[max(rows, key=lambda r: len(views[r].pixels))].camera
@@ -143,20 +148,6 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
             return SharedLens(camera=camera, sigmas=sigmas, agree=agree)
         agree[worst] = False
     return None
-
-
-def _problem(view: LensView, prior: QueryLensPrior, noise_px: float, own_px: float) -> LensProblem:
-    return LensProblem(
-        pixels=view.pixels, points=view.points, noise_px=noise_px, trust=(noise_px / own_px) ** 2, prior=prior
-    )
-
-
-def _alone(problem: LensProblem, view: LensView) -> float:
-    """What a photo's pixels cost with a lens of its own."""
-    own = calibrate(
-        view.pixels, view.points, view.cam_from_local, view.camera, problem.prior, problem.noise_px
-    )
-    return problem.cost_of_pixels(own.cam_from_local, own.camera)
 
 
 def _together(

@@ -107,8 +107,7 @@ def _serve(args: argparse.Namespace) -> int:
     import cv2
 
     from featuredb.stop_signals import end_process
-    from reloc.service.live.options import LiveOptions
-    from reloc.service.options import ServeOptions
+    from reloc.service.options import LiveOptions, ServeOptions
     from reloc.service.serve import serve
     from reloc.service.server import Server
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import ServiceError, VideoError
 from featuredb.geometry.arrays import FloatArray
@@ -142,7 +141,8 @@ def stream_film(
                 time.sleep(max(0.0, due - time.perf_counter()))
                 answers.check()
                 if time.perf_counter() - due <= _MAX_LATE_S:
-                    live.send(_jpeg(frame.gray), frame.time_s, frame.index)
+                    jpeg = cv2.imencode(".jpg", frame.gray, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+                    live.send(jpeg.tobytes(), frame.time_s, frame.index)
                     sent, last_sent = sent + 1, frame.index
             answers.await_frame(last_sent)
         except ServiceError as error:
@@ -159,9 +159,3 @@ def stream_film(
         refusals=refusals,
         complaints=complaints,
     )
-
-
-def _jpeg(gray: NDArray[np.uint8]) -> bytes:
-    done, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    assert done
-    return bytes(data)

@@ -21,7 +21,6 @@ from reloc.gateway.options import GatewayOptions
 from reloc.gateway.protocol import (
     MEDIA_TYPE,
     CameraReading,
-    GeolocationReading,
     GeoPoseAccuracy,
     GeoPoseBasicQuaternion,
     GeoPoseReq,
@@ -209,7 +208,9 @@ def _explained(error: ValidationError, whole: str) -> str:
 def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions) -> PriorRequest | None:
     """The position nearest in time to the picture; else the latest of the prior poses; else none."""
     taken = request.timestamp if picture.timestamp is None else picture.timestamp
-    places = [place for place in request.sensorReadings.geolocationReadings if not _is_unset(place)]
+    # Reference clients send their reading also before anybody has filled it in: all zeros.
+    readings = request.sensorReadings.geolocationReadings
+    places = [place for place in readings if place.latitude or place.longitude or place.accuracy]
     if places:
         place = min(places, key=lambda p: 0.0 if p.timestamp is None else abs(p.timestamp - taken))
         sigma_m = options.prior_unknown_m
@@ -229,11 +230,6 @@ def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions)
 
 def _prior_request(lat: float, lon: float, sigma_m: float, options: GatewayOptions) -> PriorRequest:
     return PriorRequest(lat=lat, lon=lon, sigma_m=min(max(sigma_m, options.prior_floor_m), 1e6))
-
-
-def _is_unset(place: GeolocationReading) -> bool:
-    """The reference clients' reading as they make it, before anybody has filled it in."""
-    return place.latitude == 0 and place.longitude == 0 and not place.accuracy
 
 
 def _wire_id(text: str) -> str | None:

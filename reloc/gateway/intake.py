@@ -90,18 +90,15 @@ class _MeteredBody:
         self.held_bytes += size
         self._intake.buffered_bytes += size
         if not (self.complete or message.get("more_body", False)):
-            self._take_place()
+            if self._intake.in_flight >= self._options.max_in_flight:
+                raise GatewayError(
+                    ErrorCode.BUSY,
+                    f"{self._intake.in_flight} photos are in hand, which is as many as are taken; try again "
+                    "in a second",
+                )
+            self.complete = True
+            self._intake.in_flight += 1
         return message
-
-    def _take_place(self) -> None:
-        if self._intake.in_flight >= self._options.max_in_flight:
-            raise GatewayError(
-                ErrorCode.BUSY,
-                f"{self._intake.in_flight} photos are in hand, which is as many as are taken; try again in a "
-                "second",
-            )
-        self.complete = True
-        self._intake.in_flight += 1
 
     def too_large(self) -> GatewayError:
         return GatewayError(

@@ -30,9 +30,10 @@ def follow(
     if len(pixels) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
     height, width = before.shape
-    window = _window(options, width, height)
+    enlarged = max(width, height) / options.reference_side_px
+    window = max(2 * round(0.5 * (options.window_px * enlarged - 1.0)) + 1, 5)  # odd
     settings: dict[str, Any] = {
-        "winSize": window,
+        "winSize": (window, window),
         "maxLevel": options.levels,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, options.iterations, 0.01),
         "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -44,15 +45,8 @@ def follow(
     # The way back starts from as far off as the way there did.
     back_guess = there + (start - aimed)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, back_guess, **settings)
-    limit = options.max_back_px * max(width, height) / options.reference_side_px
     good = (found.reshape(-1) == 1) & (found_back.reshape(-1) == 1)
-    good &= np.linalg.norm(back - start, axis=1) < limit
+    good &= np.linalg.norm(back - start, axis=1) < options.max_back_px * enlarged
     result = there.astype(np.float64) + _HALF_PX
     inside = (result >= 0).all(axis=1) & (result[:, 0] < width) & (result[:, 1] < height)
     return result, np.asarray(good & inside)
-
-
-def _window(options: FlowOptions, width: int, height: int) -> tuple[int, int]:
-    side = options.window_px * max(width, height) / options.reference_side_px
-    odd = 2 * round(0.5 * (side - 1.0)) + 1
-    return max(odd, 5), max(odd, 5)

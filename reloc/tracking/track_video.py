@@ -89,14 +89,14 @@ class ReadAhead:
     """
 
     def __init__(self, video: Video, most: int = 24) -> None:
-        """
-        Args:
-            most: frames that are decoded before they are used; fewer of large films, for their memory.
-        """
+        """`most`: frames that are decoded before they are used; fewer of large films, for their memory."""
         if most < 1:
             raise InvalidValueError(f"most: expected 1 frame or more to be read ahead, found {most}")
+        info = video.info
+        bytes_each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
         self._frames: Iterator[VideoFrame] | None = None
-        self._video, self._most = video, 0 if video.info.live else min(most, _fitting(video.info))
+        self._video = video
+        self._most = 0 if info.live else min(most, max(1, _MOST_BYTES // bytes_each))
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="decoding")
         self._ahead: deque[Future[VideoFrame | None]] = deque()
         self._seconds = 0.0
@@ -140,12 +140,6 @@ class ReadAhead:
             return next(self._frames, None)
         finally:
             self._seconds += time.perf_counter() - began
-
-
-def _fitting(info: VideoInfo) -> int:
-    """Frames that fit into the memory that they may take, one at least."""
-    each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
-    return max(1, _MOST_BYTES // each)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

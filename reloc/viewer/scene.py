@@ -200,7 +200,10 @@ class _Builder:
             sum(count_points(self._database, s, level, box) for level in range(len(s.level_points)))
             for s, box in zip(scans, boxes, strict=True)
         ]
-        for_maps, for_scans = _budget(sum(len(drawn) for _, drawn in shown), sum(of_scans), limit)
+        # All points, or half for maps and half for scans, and what the one leaves the other takes.
+        of_maps = sum(len(drawn) for _, drawn in shown)
+        for_maps = min(of_maps, max(limit - limit // 2, limit - sum(of_scans)))
+        for_scans = min(sum(of_scans), limit - for_maps)
         counts = shares([len(drawn) for _, drawn in shown], for_maps)
         drawn = [one.first(int(count)) for (_, one), count in zip(shown, counts, strict=True)]
         drawn += [
@@ -237,18 +240,16 @@ class _Builder:
         self._place_of_map[summary.map_id] = number
         for image in feature_map.images:
             self._images[summary.map_id, image.image_id] = image
+        # In the tree it stands under the next map on its chain to an anchor.
+        lineage = self._lineages[summary.map_id]
+        under = next((m for m in lineage.chain[1:2] if m in self._shown), None)
         told = {
-            **describe_map(summary, self._lineages[summary.map_id], self._under(summary.map_id)),
+            **describe_map(summary, lineage, under),
             "points": len(feature_map.points),
             "photos": describe_photos(feature_map, frame),
             "coverage": coverage(drawn),
         }
         return told, drawn
-
-    def _under(self, map_id: str) -> str | None:
-        """The map under which it stands in the tree: the next one on its chain to an anchor."""
-        chain = self._lineages[map_id].chain
-        return chain[1] if len(chain) > 1 and chain[1] in self._shown else None
 
 
 def _packed(parts: Sequence[DrawnPoints]) -> tuple[list[dict[str, Any]], bytes]:
@@ -265,12 +266,6 @@ def _packed(parts: Sequence[DrawnPoints]) -> tuple[list[dict[str, Any]], bytes]:
         )
         data += drawn.packed()
     return buffers, bytes(data)
-
-
-def _budget(of_maps: int, of_scans: int, limit: int) -> tuple[int, int]:
-    """How many points maps and scans may draw: all, or half each, and what the one leaves the other takes."""
-    for_maps = min(of_maps, max(limit - limit // 2, limit - of_scans))
-    return for_maps, min(of_scans, limit - for_maps)
 
 
 def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]) -> dict[str, Any]:

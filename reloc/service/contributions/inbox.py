@@ -12,9 +12,8 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Any
 
-from featuredb.features.exif.read import ExifInfo, read_exif
+from featuredb.features.exif.read import read_exif
 from featuredb.features.image_header import read_header
 from featuredb.store.candidates.photos import InboxCounts
 from featuredb.store.candidates.states import Contribution
@@ -42,6 +41,8 @@ def contribution_of(
     `owner`: the name by which the client was authenticated, ANONYMOUS where it was not.
     """
     header = read_header(data)
+    exif = {k: v for k, v in asdict(read_exif(data, header)).items() if v not in (None, "", ())}
+    exif = {k: v.isoformat() if isinstance(v, datetime) else v for k, v in exif.items()}
     asked = request.model_dump(mode="json", include={"request_id", "camera", "prior", "options"})
     return Contribution(
         image=data,
@@ -52,16 +53,10 @@ def contribution_of(
         licence=request.licence or "",
         client_id=request.client_id or "",
         received_at=received_at,
-        request={**asked, "exif": _told(read_exif(data, header))},
+        request={**asked, "exif": exif},
         answer=reply.model_dump(mode="json", include=_ANSWER),
         snapshot=reply.snapshot,
     )
-
-
-def _told(exif: ExifInfo) -> dict[str, Any]:
-    """What the photo says about itself, without what it does not say."""
-    told = {name: value for name, value in asdict(exif).items() if value not in (None, "", ())}
-    return {name: value.isoformat() if isinstance(value, datetime) else value for name, value in told.items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,7 +213,12 @@ class Inbox:
         while (batch := self._next()) is not None:
             if batch:
                 self._write(batch)
-            self._refresh_if_old()
+            with self._changed:
+                due = time.monotonic() - self._counted_at >= self._options.refresh_s
+                # The counts matter to those who were refused by them, and while the store was failing.
+                wanted = self._limited or self._error is not None or self._written > 0
+            if due and wanted:
+                self._refresh()
 
     def _next(self) -> "list[tuple[Ticket, Callable[[], Contribution]]] | None":
         """What waits, at most a batch; nothing when counts are due; None once closed and empty."""
@@ -268,14 +268,6 @@ class Inbox:
                 return True
         _lost(len(contributions), "the store does not take them")
         return False
-
-    def _refresh_if_old(self) -> None:
-        with self._changed:
-            due = time.monotonic() - self._counted_at >= self._options.refresh_s
-            # The counts matter to those who were refused by them, and while the store was failing.
-            wanted = self._limited or self._error is not None or self._written > 0
-        if due and wanted:
-            self._refresh()
 
     def _refresh(self) -> None:
         """Take new counts; a store that answers again is trusted again."""
