@@ -99,10 +99,7 @@ class PhotoAsker:
     """Answers photos from a snapshot; its index is kept between calls. Threads may share it."""
 
     def __init__(self, database: Database, as_of: int | None = None) -> None:
-        """
-        Args:
-            as_of: answer from this snapshot for ever; None: from the newest.
-        """
+        """`as_of`: answer from this snapshot for ever; None: from the newest."""
         self._database, self._as_of = database, as_of
         self.name = wire_name_of(database.url)  # as a server calls it
         self._lock = threading.Lock()

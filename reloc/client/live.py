@@ -44,13 +44,7 @@ class LiveTrack:
         prior: PriorRequest | None = None,
         timeout_s: float = 10.0,
     ) -> None:
-        """
-        Args:
-            keys: of the database on the wire. client: the name of this client.
-            camera: intrinsics of the frames, of any size of the same picture; None: estimated.
-            prior: where the first frame may have been taken (degrees, metres).
-            timeout_s: the longest wait for the session to open.
-        """
+        """`keys`: of the database on the wire; `client`: the name of this client; see `Client.track`."""
         self.name = uuid.uuid4().hex
         self.refusals: deque[TrackEvent] = deque(maxlen=_KEPT_REFUSALS)
         self._session, self._keys = session, keys

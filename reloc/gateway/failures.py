@@ -54,8 +54,3 @@ class ErrorBody(BaseModel):
         default=None, description="of NOT_LOCALISED: the wire's reason", examples=["TOO_FEW_INLIERS"]
     )
     id: str | None = Field(default=None, description="of NOT_LOCALISED: the GeoPoseReq's id")
-
-
-def status_of(code: str) -> int:
-    """The HTTP status of a code; a code that a newer server has invented is its error, not the client's."""
-    return STATUS_OF.get(code, 502)

@@ -24,13 +24,7 @@ from reloc.localise.lens_prior import QueryLensPrior, known_within
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
-from reloc.wire.query import (
-    CameraRequest,
-    ErrorCode,
-    LocaliseReply,
-    LocaliseWireRequest,
-    RequestError,
-)
+from reloc.wire.query import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, RequestError
 
 
 def answer_query(
@@ -44,8 +38,6 @@ def answer_query(
 
     Args:
         wire_request: what the client says about it; without a request id it gets one.
-        data: bytes of the image file.
-        localiser: answers from one snapshot.
         limits: bytes and pixels allowed.
 
     Raises:

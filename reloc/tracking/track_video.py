@@ -120,11 +120,7 @@ class ReadAhead:
             self._ahead.append(self._pool.submit(self._next))
 
     def __iter__(self) -> Iterator[VideoFrame]:
-        """The film's frames; once, as of the film itself.
-
-        Raises:
-            VideoError, InvalidValueError: see `Video.__iter__`.
-        """
+        """The film's frames; once, and with the errors of `Video.__iter__`."""
         self._frames = iter(self._video)
         while True:
             # Nothing is decoded elsewhere where nothing is waited for: frames stay in order.

@@ -34,10 +34,10 @@ class _Sent:
     """
 
     index: int
-    due: int
-    due_s: float
-    slow: bool
-    answer: "Future[Answer]"
+    answer: "Future[Any]"  # Answer
+    due: int = _FAR
+    due_s: float = float("inf")
+    slow: bool = False
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -310,7 +310,7 @@ class Tracker:
         steps, most = len(since) - 1, self._options.live_steps
         if most < steps < self._behind:
             self._behind = steps
-            self._hand_over(since[-1].index, self._pool.submit(carried, track, since))
+            self._sent = _Sent(index=since[-1].index, answer=self._pool.submit(carried, track, since))
             return None
         self._behind = _FAR
         rows = np.linspace(0, steps, min(steps, most) + 1).round().astype(np.int64)
@@ -330,8 +330,8 @@ class Tracker:
             return
         self._behind, options = _FAR, self._options
         answer = self._pool.submit(self._finder.find, now.gray.copy(), self._request_now(), options)
-        due = (now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s)
-        self._hand_over(now.index, answer, due, slow=True)
+        due, due_s = now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s
+        self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s, slow=True)
 
     def _send_keyframe(self, now: RecentFrame, fitted: FittedPose, track: FlowTrack) -> None:
         """Have this frame matched against the ground, if it is time for a keyframe and the thread is free."""
@@ -348,20 +348,10 @@ class Tracker:
         answer = self._pool.submit(
             track.ground.match, now.gray.copy(), track.camera, fitted.cam_from_local, options
         )
-        due = (now.index + options.answer_after, now.time_s + options.answer_after_s)
-        self._hand_over(now.index, answer, due, slow=few)
+        due, due_s = now.index + options.answer_after, now.time_s + options.answer_after_s
+        self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s, slow=few)
         self._next_keyframe = now.index + options.keyframe_every
         self._next_keyframe_s = now.time_s + options.keyframe_every_s
-
-    def _hand_over(
-        self,
-        index: int,
-        answer: "Future[Any]",
-        due: tuple[int, float] = (_FAR, float("inf")),
-        *,
-        slow: bool = False,
-    ) -> None:
-        self._sent = _Sent(index=index, due=due[0], due_s=due[1], slow=slow, answer=answer)
 
     def _request_now(self) -> LocaliseRequest:
         if not self._found:

@@ -29,33 +29,26 @@ def describe_map(summary: MapSummary, lineage: MapLineage, drawn_under: str | No
     Args:
         drawn_under: the map under which it stands in the tree, or None.
     """
+    same = ("method", "generation", "residual_rms_m", "points", "epsg", "height_datum")
     return {
         **as_stored(summary),
-        "method": summary.method,
-        "generation": summary.generation,
+        **{name: getattr(summary, name) for name in same},
         "parents": list(summary.parents),
         "under": drawn_under,
         "chain": list(lineage.chain),
         "lineage": describe_lineage(lineage),
         "drift_m": lineage.drift_m,
         "budget_m": lineage.budget_m,
-        "residual_rms_m": summary.residual_rms_m,
-        "points": summary.points,
-        "epsg": summary.epsg,
-        "height_datum": summary.height_datum,
     }
 
 
 def as_stored(summary: MapSummary | UnplacedSummary) -> dict[str, Any]:
     """What the store knows of every map, with a place or without."""
+    same = ("name", "status", "status_reason", "source", "licence")
     return {
         "id": summary.map_id,
-        "name": summary.name,
-        "status": summary.status,
-        "status_reason": summary.status_reason,
         "created_at": summary.created_at.isoformat(timespec="seconds"),
-        "source": summary.source,
-        "licence": summary.licence,
+        **{name: getattr(summary, name) for name in same},
     }
 
 

@@ -200,10 +200,7 @@ class _Builder:
             sum(count_points(self._database, s, level, box) for level in range(len(s.level_points)))
             for s, box in zip(scans, boxes, strict=True)
         ]
-        # All points, or half for maps and half for scans, and what the one leaves the other takes.
-        of_maps = sum(len(drawn) for _, drawn in shown)
-        for_maps = min(of_maps, max(limit - limit // 2, limit - sum(of_scans)))
-        for_scans = min(sum(of_scans), limit - for_maps)
+        for_maps, for_scans = _budget(sum(len(drawn) for _, drawn in shown), sum(of_scans), limit)
         counts = shares([len(drawn) for _, drawn in shown], for_maps)
         drawn = [one.first(int(count)) for (_, one), count in zip(shown, counts, strict=True)]
         drawn += [
@@ -268,16 +265,18 @@ def _packed(parts: Sequence[DrawnPoints]) -> tuple[list[dict[str, Any]], bytes]:
     return buffers, bytes(data)
 
 
+def _budget(of_maps: int, of_scans: int, limit: int) -> tuple[int, int]:
+    """How many points maps and scans may draw: all, or half each, and what the one leaves the other takes."""
+    for_maps = min(of_maps, max(limit - limit // 2, limit - of_scans))
+    return for_maps, min(of_scans, limit - for_maps)
+
+
 def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]) -> dict[str, Any]:
+    same = ("name", "points", "spacing_m", "epsg", "height_datum", "licence")
     return {
         "id": scan.scan_id,
-        "name": scan.name,
-        "points": scan.points,
         "points_here": drawn.of,
-        "spacing_m": scan.spacing_m,
         "colour": scan.colour or ("intensity" if scan.has_intensity else "none"),
-        "epsg": scan.epsg,
-        "height_datum": scan.height_datum,
-        "licence": scan.licence,
         "buffer": buffer,
+        **{name: getattr(scan, name) for name in same},
     }

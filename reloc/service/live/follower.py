@@ -37,11 +37,7 @@ class Arrival:
 
 
 class FrameError(RequestError):
-    """A frame cannot be used.
-
-    Attributes:
-        sequence: its number, where it could be read.
-    """
+    """A frame cannot be used; `sequence`: its number, where it could be read."""
 
     def __init__(self, code: ErrorCode, message: str, sequence: int | None) -> None:
         super().__init__(code, message)

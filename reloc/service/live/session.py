@@ -148,8 +148,6 @@ class LiveSession:
         logger.info("live session ended", extra=fields("live_ended", **said))
 
     def _event(self, kind: str, code: str, message: str, sequence: int | None) -> None:
-        fields = {"type": kind, "session": self.name, "code": code, "message": message}
-        event = TrackEvent.model_validate(
-            {**fields, "sequence": sequence, "time": datetime.now(UTC).isoformat()}
-        )
-        self._publish("events", event)
+        said = {"type": kind, "code": code, "message": message, "sequence": sequence}
+        now = datetime.now(UTC).isoformat()
+        self._publish("events", TrackEvent.model_validate({**said, "session": self.name, "time": now}))
