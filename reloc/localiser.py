@@ -167,10 +167,10 @@ class Localiser:
         placed = [m for m in snapshot.maps() if served(m)]
         taken = [m for m in placed if m.status == "active" or m.map_id in also]
         active = [m for m in taken if m.descriptors and m.box]
-        known = previous._loaded if previous else {}
+        before = previous or cls({}, options, 0, {}, {}, {})
+        known, states = before._loaded, dict(before._states)
         loaded: dict[tuple[str, ...], Area] = {}
         trial = instead or {}
-        states = dict(previous._states) if previous else {}
         files = SegmentFiles(database.url)
         for group in _group(active):
             key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
@@ -179,13 +179,13 @@ class Localiser:
                 loaded[key] = known[key].area
             else:
                 loaded[key] = _load(files, snapshot, group, states, trial)
-        had = {d.write_id: d for d in previous._unplaced.values()} if previous else {}
+        had = {d.write_id: d for d in before._unplaced.values()}
         unplaced = {
             m.map_id: had.get(m.write_id) or OnDemand(m.write_id, partial(_own_area, snapshot, m.map_id))
             for m in snapshot.unplaced_maps()
             if m.descriptors
         }
-        held = {d.write_id: d for d in previous._provisional.values()} if previous else {}
+        held = {d.write_id: d for d in before._provisional.values()}
         provisional = {
             m.map_id: held.get(m.write_id)
             or OnDemand(m.write_id, partial(_load_alone, database.url, snapshot, m))
@@ -193,8 +193,7 @@ class Localiser:
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
         files.prune()
-        before = previous.areas if previous else ()
-        indexed = dict(zip(loaded, indexed_together(list(loaded.values()), before), strict=True))
+        indexed = dict(zip(loaded, indexed_together(list(loaded.values()), before.areas), strict=True))
         made = cls(indexed, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
         made._states = {m.write_id: states[m.write_id] for m in active if m.write_id in states}
         return made

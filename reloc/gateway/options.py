@@ -21,16 +21,14 @@ class GatewayOptions:
         insecure: listen also where other machines reach it, without TLS and without knowing who asks.
         prefix: stands before every path, such as "/vps".
         timeout_s: the longest wait for the server's answer to one photo; Zenoh's own default.
-        connect_timeout_s: the longest wait for a server to be there; who asks hears soon that none is.
-        workers: questions to the server at a time; the server's own queue takes 32 and refuses the rest.
+        connect_timeout_s: the longest wait for a server to be there.
+        workers: questions to the server at a time.
         max_in_flight: photos in hand at a time, from the end of their bodies on.
         max_body_bytes: of one request; the server takes images of 64 MiB, which are 85.4 MiB as base64.
         max_image_bytes: of one image after base64, as the server takes them.
-        max_buffered_bytes: of all bodies in hand together, so that they cannot fill the memory.
-        body_timeout_s: a body that takes longer to arrive is given up.
+        max_buffered_bytes: of all bodies in hand together. body_timeout_s: for a body to arrive.
         prior_floor_m: no position of a client is trusted more closely (one standard deviation): phones
-            between houses are off by tens of metres and claim three, and an answer 4.3 sigmas away is
-            refused.
+            between houses are off by tens of metres and claim three.
         prior_unknown_m: the same for positions that come without an accuracy.
         cors_origins: web pages of these origins may ask; "*" is all.
     """

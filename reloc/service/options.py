@@ -23,9 +23,9 @@ class LiveOptions:
             about a core, so two fill the reference machine.
         idle_timeout_s: a session without a usable frame for so long ends; a client that dies is noticed at
             once, one whose network breaks is not.
-        limits: bytes and pixels of a frame; 8 MiB and 16 million hold a 4K frame of any quality.
+        limits: of a frame; 8 MiB and 16 million pixels hold a 4K frame of any quality.
         max_side_px: larger frames are made smaller for tracking, as those of films are.
-        track: the tracker's settings; its localisation is that of the server's queries.
+        track: its localisation is that of the server's queries.
     """
 
     max_sessions: int = 2
@@ -59,26 +59,21 @@ class ServeOptions:
         bbox: west, south, east and north in degrees: only maps that touch it are served; None: all.
         metrics_port: of this machine, where Prometheus finds the server's figures; 0 takes a free one, None:
             there is no such page.
-        workers: queries localised at a time, each in a process of its own; two fill the reference machine's
-            two cores.
-        threads_per_worker: of OpenCV and BLAS within one query. All cores, so that a lone query, the common
-            case of a robot or a phone, is answered soonest; workers that run at once share them.
+        workers: queries localised at a time, each in a process of its own.
+        threads_per_worker: of OpenCV and BLAS within one query: all cores, so that a lone query is answered
+            soonest; workers that run at once share them.
         query_memory_bytes: what one query, or a frame of a live session, may take of memory, beyond the maps.
             The largest pictures that `limits` lets in take 1.5 GiB.
-        max_queue: queries that may wait; the next gets BUSY. At 0.25 s a query and two workers, 32
-            waiting ones are answered within 4 s, half of the deadline.
-        max_queued_bytes: of all waiting payloads together, so that the queue cannot fill the memory.
-        deadline_s: from receipt to answer; under Zenoh's default query timeout of 10 s, so that the
-            client hears of it. A worker has half of it for a query, so that those who wait behind the
-            slowest are still answered.
+        max_queue: queries that may wait; the next gets BUSY. At 0.25 s a query and two workers, 32 are
+            answered within 4 s, half of the deadline.
+        max_queued_bytes: of all waiting payloads together.
+        deadline_s: from receipt to answer; under Zenoh's default timeout of 10 s, so that the client hears of
+            it. A worker has half of it for a query, so that those behind the slowest are still answered.
         poll_interval_s: how often the store is asked for a newer version; also the delay of a hot reload.
         shutdown_grace_s: how long queries in hand may take when the server stops.
         limits: bytes and pixels of a query image.
-        contributions: take photos that clients contribute. On: only photos whose senders say whose they are
-            and under what terms are kept, in a bounded inbox, and nothing of them answers queries before
-            growth has checked them.
-        inbox: its bounds.
-        live: sessions that follow a stream of frames.
+        contributions: take photos that clients contribute, with credit and licence, into a bounded inbox;
+            nothing of them answers queries before growth has checked them.
     """
 
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)

@@ -36,10 +36,7 @@ class RecentFrames:
     """
 
     def __init__(self, capacity: int) -> None:
-        """
-        Args:
-            capacity: frames that are kept at most, at least 3.
-        """
+        """`capacity`: frames that are kept at most, at least 3."""
         self._capacity = max(capacity, 3)
         self._frames: list[RecentFrame] = []
 

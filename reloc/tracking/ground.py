@@ -102,14 +102,11 @@ class TrackedFrame:
     """What is known of one frame.
 
     Attributes:
-        index, time_s: of the frame.
-        state: tracking; relocalised, on the first frame after the track was lost or begun; lost: no pose.
-        cam_from_local: pose in the ground's frame, None where the track is lost.
-        covariance: (6, 6), see `FittedPose`; None with the pose.
-        camera: intrinsics in use; None with the pose. ground: in whose frame the pose is.
-        inliers: landmarks that agree with it. pixels: (k, 2) of them; rows: (k,) of the ground's
-            points.
-        detail: why there is no pose.
+        state: tracking; relocalised, on the first frame after the track was lost or begun; lost: no pose, and
+            `detail` says why.
+        cam_from_local: pose in the frame of `ground`. covariance: (6, 6), see `FittedPose`.
+        camera: intrinsics in use.
+        inliers: landmarks that agree with it. pixels: (k, 2) of them. rows: (k,) of the ground's points.
     """
 
     index: int

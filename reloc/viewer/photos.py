@@ -37,11 +37,7 @@ class Pictures:
     """Where pictures come from; threads may share it."""
 
     def __init__(self, folder: Path | None) -> None:
-        """Without a folder there are none, and the page says so.
-
-        Raises:
-            InvalidValueError: no such folder.
-        """
+        """Without a folder there are none, and the page says so. InvalidValueError: no such folder."""
         if folder is not None and not folder.is_dir():
             raise InvalidValueError(f"--photos {folder}: expected the folder of the photos, found none")
         self._folder = None if folder is None else PhotoFolder(folder)

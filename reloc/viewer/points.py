@@ -28,13 +28,11 @@ _MOST_READ = 20_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrawnPoints:
-    """Points of one map or scan.
+    """Points of one map or scan, `of` so many that there are.
 
     Attributes:
         origin: (3,) float64, of the offsets, metres in the place's frame.
-        offsets: (n, 3) float32 metres; any first k of them are a sample of all.
-        rgb: (n, 3) uint8.
-        of: how many points there are.
+        offsets: (n, 3) float32 metres; any first k of them are a sample of all. rgb: (n, 3) uint8.
     """
 
     origin: FloatArray

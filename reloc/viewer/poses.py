@@ -63,13 +63,9 @@ def worded_place(geopose: GeoPose, utm: FloatArray, epsg: int, height_datum: str
         geopose: its height in the same datum as that of `utm`, (3,) easting, northing, height.
     """
     heading, pitch, roll = geopose.heading_pitch_roll_deg
+    easting, northing, height = _rounded(utm, 4)
     return {
-        "utm": {
-            "epsg": epsg,
-            "easting": round(float(utm[0]), 4),
-            "northing": round(float(utm[1]), 4),
-            "height": round(float(utm[2]), 4),
-        },
+        "utm": {"epsg": epsg, "easting": easting, "northing": northing, "height": height},
         "height_datum": height_datum,
         "latitude_deg": round(geopose.latitude_deg, 10),
         "longitude_deg": round(geopose.longitude_deg, 10),
@@ -135,11 +131,7 @@ def describe_trajectory(trajectory: Trajectory, frame: LocalFrame) -> dict[str, 
         "name": trajectory.source,
         "frames": [
             {
-                "index": point.index,
-                "time_s": point.time_s,
-                "state": point.state,
-                "inliers": point.inliers,
-                "detail": point.detail,
+                **{name: getattr(point, name) for name in ("index", "time_s", "state", "inliers", "detail")},
                 "pose": None if point.pose is None else _pose(point.pose, frame),
             }
             for point in trajectory.points

@@ -1,8 +1,7 @@
 """Contributed photos on their way from a query to the database: a bounded queue and one thread that writes.
 
 A query never waits for the store: a place in the queue is reserved before the answer is sent and used after
-it.
-What cannot be taken is refused with a reason, and the query is answered all the same.
+it. What cannot be taken is refused with a reason, and the query is answered all the same.
 """
 
 import logging
@@ -64,13 +63,11 @@ class InboxOptions:
     """Bounds of the inbox.
 
     Attributes:
-        max_queue: photos that wait for the writing thread. It writes them together, in less than a second on
-            a disk; two workers answer some eight queries a second.
-        max_queued_bytes: of these photos, so that they cannot fill the memory.
-        max_owner_photos: photos of one owner (an identity; all who have none are one) that wait for growth; a
-            day's walk has some hundreds, and one owner cannot crowd out the others.
-        max_photos: photos of all owners that wait for growth.
-        max_stored_bytes: of all stored photos, whatever has become of them; some thousands of a drone's.
+        max_queue, max_queued_bytes: photos that wait for the writing thread.
+        max_owner_photos: of one owner (an identity; all who have none are one) that wait for growth; a day's
+            walk has some hundreds, and one owner cannot crowd out the others.
+        max_photos: of all owners that wait for growth.
+        max_stored_bytes: of all stored photos, whatever has become of them.
         batch: photos that are written in one commit.
         refresh_s: how old the counts may be by which the last three are judged.
         retry_s: pauses before a failed write is tried again; after the last its photos are given up.
