@@ -27,12 +27,10 @@ class AnsweredView:
 
     Attributes:
         frame: true east, north, up at the camera's centre, or near it.
-        camera: intrinsics of the photo's stored pixels.
-        cam_from_local: `frame` to camera axes, metres.
+        camera: of the photo's stored pixels. cam_from_local: `frame` to camera axes, metres.
         covariance: (6 + n, 6 + n) of the pose as LocalisedPose has it, then of the n camera parameters; n = 0
             where the lens is exact.
-        epsg: UTM zone of the answer. height_datum: of its heights.
-        map_ids: maps that answered.
+        epsg: UTM zone of the answer. height_datum: of its heights. map_ids: maps that answered.
     """
 
     frame: LocalFrame

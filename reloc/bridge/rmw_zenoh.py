@@ -36,8 +36,7 @@ class RmwZenohNode:
     """A node that publishes the messages of poses; a context manager.
 
     Args:
-        connect: Zenoh endpoint of ROS 2's router, tcp/HOST:7447.
-        domain: ROS_DOMAIN_ID.
+        connect: Zenoh endpoint of ROS 2's router, tcp/HOST:7447. domain: ROS_DOMAIN_ID.
 
     Raises:
         InvalidValueError: nobody is at the endpoint, or it is none; raised when the block begins.

@@ -182,7 +182,7 @@ def answered_view(
 
     data = Path(args.image).read_bytes()
     asker, ask = asking_here(args, lambda: database)
-    reply = ask(data, None, False)
+    reply, _ = ask(data, None, False)
     if reply.status != "localised":
         sys.stderr.write(describe(args.image, reply, asker.name))
         return None, asker.localiser()

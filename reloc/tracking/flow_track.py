@@ -129,9 +129,7 @@ class FlowTrack:
     """Landmarks on a ground with the last poses; used from one thread at a time.
 
     Attributes:
-        ground: that the landmarks are of.
-        landmarks: as the last frame shows them.
-        why: the last thing that went wrong, in words.
+        landmarks: of `ground`, as the last frame shows them. why: the last thing that went wrong, in words.
     """
 
     def __init__(

@@ -29,12 +29,7 @@ _MOST_LOOKED_AT = 20_000
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapGround:
-    """The maps of an area, or a map without a place.
-
-    Attributes:
-        area: its local frame is the map's own where this has no place.
-        own: the frame of that map; None where the maps are placed.
-    """
+    """The maps of an area, or a map without a place, whose `own` frame is the area's local frame."""
 
     area: Area
     own: OwnFrame | None = None

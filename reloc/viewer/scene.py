@@ -41,8 +41,7 @@ class ViewerSceneOptions:
     Attributes:
         selection: of maps; of their photos where it names licences.
         points: at most so many in each place, of maps and scans together.
-        photos: folder of the photos, for the command that places a map without a place.
-        told: is called with the number of maps read and their total.
+        photos: folder, for the command that places a map. told: called with maps read and their total.
     """
 
     selection: Selection = field(default_factory=lambda: Selection(statuses=(*MAP_STATUSES, "unplaced")))

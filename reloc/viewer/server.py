@@ -6,8 +6,6 @@ media type that a browser does not send to another site unasked.
 """
 
 import asyncio
-import logging
-import socket
 import sys
 import webbrowser
 from collections.abc import Awaitable, Callable, Mapping
@@ -15,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
-import uvicorn
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
@@ -24,7 +21,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 
 from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
-from featuredb.stop_signals import on_stop_signals
+from reloc.listening import listen, run, uvicorn_server
 from reloc.viewer.page import Asset, assets, content_policy, page
 from reloc.viewer.photos import LIMITS, PICTURE_PX, Pictures, Queries
 from reloc.viewer.scene import ViewerScene
@@ -39,11 +36,6 @@ _STATUS = {
     ErrorCode.INCOMPATIBLE_EXTRACTOR.value: 409,
 }
 _CLIENT_GONE = 499
-_LAST_PORT = 65_535
-
-
-class ViewerStartError(FeatureDbError):
-    """The viewer cannot listen."""
 
 
 def create_app(scene: ViewerScene, pictures: Pictures, queries: Queries) -> FastAPI:
@@ -119,42 +111,6 @@ def local_app(
     return app, in_thread
 
 
-def listen(port: int) -> socket.socket:
-    """A listening socket on this machine; port 0 takes a free one.
-
-    Raises:
-        ViewerStartError: the port is taken or none.
-    """
-    if not 0 <= port <= _LAST_PORT:
-        raise ViewerStartError(f"--port: expected 0 to {_LAST_PORT}, found {port}")
-    try:
-        bound = socket.create_server((HOST, port))
-        # Without it the body of an answer waits for the acknowledgement of its head.
-        bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return bound
-    except OSError as error:
-        raise ViewerStartError(
-            f"cannot listen on {HOST}:{port}: {error.strerror or error}; choose another with --port, "
-            "0 takes a free one"
-        ) from error
-
-
-def uvicorn_server(app: FastAPI) -> uvicorn.Server:
-    """The server, not yet running; `run(sockets=[listen(port)])` runs it."""
-    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
-    return uvicorn.Server(
-        uvicorn.Config(
-            app,
-            log_config=None,
-            access_log=False,
-            server_header=False,
-            ws="none",
-            http="h11",
-            timeout_graceful_shutdown=2,
-        )
-    )
-
-
 def serve(app: FastAPI, port: int, *, browser: bool, path: str = "") -> None:
     """Serve until SIGINT or SIGTERM, after printing the address; call from the main thread.
 
@@ -162,18 +118,17 @@ def serve(app: FastAPI, port: int, *, browser: bool, path: str = "") -> None:
         browser: also open the page. path: of the page, below the address.
 
     Raises:
-        ViewerStartError: cannot listen.
+        ListenError: cannot listen.
     """
-    server = uvicorn_server(app)
-    # uvicorn handles these while it runs, and then raises them again; one that comes before counts as well.
-    with on_stop_signals(partial(setattr, server, "should_exit", True)), listen(port) as bound:
-        url = f"http://{HOST}:{bound.getsockname()[1]}/{path}"
-        sys.stdout.write(f"{url}; stop with Ctrl-C\n")
+
+    def announce(url: str) -> None:
+        sys.stdout.write(f"{url}/{path}; stop with Ctrl-C\n")
         sys.stdout.flush()
-        # Connections wait in the socket until the server runs.
-        if browser and not webbrowser.open(url):
+        if browser and not webbrowser.open(f"{url}/{path}"):
             sys.stderr.write("no browser was found; open the address by hand\n")
-        server.run(sockets=[bound])
+
+    server = uvicorn_server(app, http="h11", timeout_graceful_shutdown=2)
+    run(server, partial(listen, HOST, port), announce)
 
 
 async def _photo(request: Request) -> bytes:

@@ -29,9 +29,7 @@ _AT_ONCE = (EndReason.CLIENT_GONE, EndReason.MADE_ROOM)
 class LiveSession:
     """Begins with `start` and ends by itself (idle, a defect), or by `end`; never more than one frame waits.
 
-    Attributes:
-        name: of the session on the wire.
-        asker: who shares the server with others, as of a query.
+    `name`: of the session on the wire. `asker`: who shares the server with others, as of a query.
     """
 
     def __init__(

@@ -45,16 +45,11 @@ class TrajectoryPoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trajectory:
-    """The frames of one video, in order.
+    """The frames of one video, in order."""
 
-    Attributes:
-        source: name of the video.
-        start: when the film's clock showed 0, timezone-aware; None: not known.
-    """
-
-    source: str
+    source: str  # the video's name
     points: tuple[TrajectoryPoint, ...]
-    start: datetime | None = None
+    start: datetime | None = None  # when the film's clock showed 0, timezone-aware; None: not known
 
     @property
     def is_in_map(self) -> bool:
