@@ -13,6 +13,7 @@ from featuredb.errors import FeatureDbError
 from featuredb.stop_signals import on_stop_signals
 
 _BACKLOG = 128
+_LAST_PORT = 65_535
 
 
 class ListenError(FeatureDbError):
@@ -25,6 +26,8 @@ def listen(host: str, port: int) -> socket.socket:
     Raises:
         ListenError: the port is taken or none, or the host is not this machine's.
     """
+    if not 0 <= port <= _LAST_PORT:
+        raise ListenError(f"--port: expected 0 to {_LAST_PORT}, found {port}")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         bound = socket.create_server((host, port), family=family, backlog=_BACKLOG)
@@ -32,10 +35,10 @@ def listen(host: str, port: int) -> socket.socket:
         # the acknowledgement of its head: 40 ms on a connection that is kept.
         bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return bound
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
+    except OSError as error:
         raise ListenError(
-            f"cannot listen on {host}:{port}: {reason}; choose another with --port, 0 takes a free one"
+            f"cannot listen on {host}:{port}: {error.strerror or error}; choose another with --port, 0 takes "
+            "a free one"
         ) from error
 
 

@@ -45,16 +45,11 @@ class LensView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SharedLens:
-    """A lens that photos agree on.
+    """A lens that photos agree on."""
 
-    Attributes:
-        camera: OPENCV. sigmas: (8,) one standard deviation of each of its parameters, in their order.
-        agree: (n,) which of the photos.
-    """
-
-    camera: Camera
-    sigmas: FloatArray
-    agree: NDArray[np.bool_]
+    camera: Camera  # OPENCV
+    sigmas: FloatArray  # (8,) one standard deviation of each of its parameters, in their order
+    agree: NDArray[np.bool_]  # (n,) which of the photos
 
     def as_request(self) -> CameraRequest:
         """As a query takes it."""

@@ -35,22 +35,14 @@ _LAST_WAIT_S = 2.0  # for the pose of the last frame
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StreamedFilm:
-    """What came of a stream.
+    """What came of a stream."""
 
-    Attributes:
-        trajectory: the frames that were answered.
-        frames: of the film. sent: of them.
-        latency_ms: (n,) from sending a frame to its pose, of the answered ones.
-        refusals: why frames could not be used, the latest. complaints: what was wrong with the film, and
-            why the session ended before it.
-    """
-
-    trajectory: Trajectory
-    frames: int
-    sent: int
-    latency_ms: FloatArray
-    refusals: tuple[str, ...]
-    complaints: tuple[str, ...]
+    trajectory: Trajectory  # the frames that were answered
+    frames: int  # of the film
+    sent: int  # of them
+    latency_ms: FloatArray  # (n,) from sending a frame to its pose, of the answered ones
+    refusals: tuple[str, ...]  # why frames could not be used, the latest
+    complaints: tuple[str, ...]  # what was wrong with the film, and why the session ended before it
 
 
 class _Answers:

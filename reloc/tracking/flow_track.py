@@ -75,19 +75,12 @@ class RecentFrames:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Landmarks:
-    """Known points with the pixels in which the last frame shows them.
+    """Known points with the pixels in which the last frame shows them."""
 
-    Attributes:
-        rows: (n,) of the area's points, none twice.
-        points: (n, 3) metres in the area's frame.
-        pixels: (n, 2) in the last frame.
-        born: (n,) number of the keyframe that matched them.
-    """
-
-    rows: NDArray[np.int64]
-    points: FloatArray
-    pixels: FloatArray
-    born: NDArray[np.int64]
+    rows: NDArray[np.int64]  # (n,) of the area's points, none twice
+    points: FloatArray  # (n, 3) metres in the area's frame
+    pixels: FloatArray  # (n, 2) in the last frame
+    born: NDArray[np.int64]  # (n,) number of the keyframe that matched them
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -159,20 +159,14 @@ class TrackVideoOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedVideo:
-    """What came of a video.
-
-    Attributes:
-        camera: intrinsics of the frames as they were tracked; None where nothing was localised.
-        seconds: where the time went: `total`; of it `tracking` and `drawing`, the rest is waiting for frames;
-            `decoding`, also of frames that were decoded beside the tracking; `longest_gap` between the poses
-            of two frames.
-        complaints: what was wrong with the film, for people.
-    """
+    """What came of a video."""
 
     trajectory: Trajectory
-    camera: Camera | None
+    camera: Camera | None  # of the frames as they were tracked; None where nothing was localised
+    # `total`; of it `tracking` and `drawing`, the rest is waiting for frames; `decoding`, also beside the
+    # tracking; `longest_gap` between the poses of two frames.
     seconds: dict[str, float]
-    complaints: tuple[str, ...]
+    complaints: tuple[str, ...]  # what was wrong with the film, for people
 
 
 def track_video(

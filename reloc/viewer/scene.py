@@ -36,18 +36,15 @@ DEFAULT_POINTS = 1_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewerSceneOptions:
-    """What is shown.
+    """What is shown."""
 
-    Attributes:
-        selection: of maps; of their photos where it names licences.
-        points: at most so many in each place, of maps and scans together.
-        photos: folder, for the command that places a map. told: called with maps read and their total.
-    """
-
+    # Of maps; of their photos where it names licences.
     selection: Selection = field(default_factory=lambda: Selection(statuses=(*MAP_STATUSES, "unplaced")))
-    points: int = DEFAULT_POINTS
-    photos: Path | None = None
-    told: Callable[[int, int], None] = lambda done, total: None
+    points: int = DEFAULT_POINTS  # at most so many in each place, of maps and scans together
+    photos: Path | None = None  # their folder, for the command that places a map without a place
+    told: Callable[[int, int], None] = lambda done, total: (
+        None
+    )  # with the number of maps read and their total
 
     def __post_init__(self) -> None:
         if self.points < 0:
@@ -56,21 +53,13 @@ class ViewerSceneOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewerScene:
-    """Everything that the page shows.
+    """Everything that the page shows."""
 
-    Attributes:
-        document: ready for JSON; each map and scan names its part of its place's points by `buffer`.
-        points: of each place, the buffers of its maps and scans one after the other.
-        images: by map id and image id.
-        frames: of each place on Earth; maps without a place come after them, each a place of the page.
-        place_of_map: row of the place, by map id.
-    """
-
-    document: dict[str, Any]
-    points: tuple[bytes, ...]
-    images: Mapping[tuple[str, int], MapImage]
-    frames: tuple[LocalFrame, ...]
-    place_of_map: Mapping[str, int]
+    document: dict[str, Any]  # ready for JSON; maps and scans name their part of the points by `buffer`
+    points: tuple[bytes, ...]  # of each place, the buffers of its maps and scans one after the other
+    images: Mapping[tuple[str, int], MapImage]  # by map id and image id
+    frames: tuple[LocalFrame, ...]  # of each place on Earth; places of maps without one come after them
+    place_of_map: Mapping[str, int]  # row of the place, by map id
 
 
 def build_scene(

@@ -60,27 +60,18 @@ def contribution_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InboxOptions:
-    """Bounds of the inbox.
+    """Bounds of the inbox."""
 
-    Attributes:
-        max_queue, max_queued_bytes: photos that wait for the writing thread.
-        max_owner_photos: of one owner (an identity; all who have none are one) that wait for growth; a day's
-            walk has some hundreds, and one owner cannot crowd out the others.
-        max_photos: of all owners that wait for growth.
-        max_stored_bytes: of all stored photos, whatever has become of them.
-        batch: photos that are written in one commit.
-        refresh_s: how old the counts may be by which the last three are judged.
-        retry_s: pauses before a failed write is tried again; after the last its photos are given up.
-    """
-
-    max_queue: int = 32
+    max_queue: int = 32  # photos that wait for the writing thread
     max_queued_bytes: int = 256 * 2**20
+    # Photos of one owner (an identity; all who have none are one) that wait for growth; a day's walk has some
+    # hundreds, and one owner cannot crowd out the others.
     max_owner_photos: int = 2_000
-    max_photos: int = 20_000
-    max_stored_bytes: int = 40 * 2**30
-    batch: int = 8
-    refresh_s: float = 30.0
-    retry_s: tuple[float, ...] = (0.5, 2.0, 8.0, 30.0)
+    max_photos: int = 20_000  # of all owners that wait for growth
+    max_stored_bytes: int = 40 * 2**30  # of all stored photos, whatever has become of them
+    batch: int = 8  # photos that are written in one commit
+    refresh_s: float = 30.0  # how old the counts may be by which these limits of what is stored are judged
+    retry_s: tuple[float, ...] = (0.5, 2.0, 8.0, 30.0)  # pauses before a failed write is tried again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,19 +21,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrival:
-    """A frame as it came.
+    """A frame as it came."""
 
-    Attributes:
-        header: its attachment. payload: the image file's bytes; empty where `size` is over the limit.
-        size: bytes that were sent.
-        received: `time.perf_counter` at receipt. received_at: the same by the clock.
-    """
-
-    header: bytes
-    payload: bytes
-    size: int
-    received: float
-    received_at: datetime
+    header: bytes  # its attachment
+    payload: bytes  # the image file's bytes; empty where `size` is over the limit
+    size: int  # bytes that were sent
+    received: float  # `time.perf_counter` at receipt
+    received_at: datetime  # the same by the clock
 
 
 class FrameError(RequestError):

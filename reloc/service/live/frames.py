@@ -32,17 +32,12 @@ _YIELDING = 10  # niceness: a ninth of the processor that a query gets beside it
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameAsk:
-    """A frame whose header is in order; the image's bytes follow.
-
-    Attributes:
-        sequence, time_s: later than those of the frame before. dropped: frames before it that were not looked
-            at. received_at: ISO 8601.
-    """
+    """A frame whose header is in order; the image's bytes follow."""
 
     sequence: int
     time_s: float
-    dropped: int
-    received_at: str
+    dropped: int  # frames before it that were not looked at
+    received_at: str  # ISO 8601
 
 
 class FrameAnswerer:
