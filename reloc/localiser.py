@@ -288,11 +288,7 @@ def _load(
     states: dict[str, _State],
     instead: Mapping[str, FeatureMap],
 ) -> Area:
-    """The area of some maps; what was laid out before is not again.
-
-    Args:
-        states: by write id; what is read now is added.
-    """
+    """The area of some maps; `states`, by write id: what was laid out before, and what is now, too."""
 
     def state(summary: MapSummary) -> _State:
         map_id, write_id = summary.map_id, summary.write_id

@@ -36,7 +36,6 @@ def draw_overlay(
     """The photo with the projected map, (h, w, 3) uint8 BGR, longer side at most 1600 px.
 
     Args:
-        photo: bytes of the query's image file.
         reply: localised, with `inlier_points` (ask for them).
         other_points_utm: (n, 3) further points of the map, easting, northing, height in the reply's zone.
 
@@ -89,8 +88,7 @@ def write_overlay(
 def map_points_in_view(areas: Sequence[IndexedArea], view: AnsweredView) -> FloatArray:
     """Points (n, 3) of the answering area that the photo should show: easting, northing, height in its zone.
 
-    Args:
-        areas: those of the localiser that gave the answer.
+    `areas`: those of the localiser that gave the answer.
     """
     for area in (indexed.area for indexed in areas):
         if view.map_ids[0] in {feature_map.map_id for feature_map in area.maps}:

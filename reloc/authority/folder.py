@@ -48,9 +48,7 @@ _ALL = [
 def access_control(server: str, clients: Iterable[str]) -> Section:
     """The section `access_control` of a server's Zenoh configuration: what no rule allows is dropped.
 
-    Args:
-        server: name in the certificates of other servers, which may do all.
-        clients: names in those of clients; each may ask, and has live sessions of its own.
+    By names in certificates: other servers may do all, each client may ask, and has live sessions of its own.
     """
     serve, common = _rule("serve", [_IN, _OUT], _ALL, [_KEYS.of("**")]), _rules_of_all()
     rules, policies = [serve, *common], [_policy(server, [serve])]
@@ -301,11 +299,7 @@ def _as_authority_error(folder: Path) -> Iterator[None]:
 
 
 def _write_new(path: Path, text: str) -> None:
-    """Write a file that only its owner may read.
-
-    Raises:
-        FileExistsError
-    """
+    """Write a file that only its owner may read; FileExistsError where there is one."""
     path.parent.mkdir(mode=0o700, exist_ok=True)
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
         file.write(text)

@@ -12,12 +12,11 @@ from typing import Self
 import zenoh
 
 from reloc.service.contributions.inbox import Inbox
-from reloc.service.live.follower import Follower
+from reloc.service.live.session import Follower
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
-from reloc.service.pending import PendingQuery
-from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
+from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import (
     ServiceStartError,
     authenticates,

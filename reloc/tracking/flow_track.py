@@ -197,13 +197,9 @@ class FlowTrack:
         good: NDArray[np.bool_] | None,
         predicted: Rigid3,
         time_s: float,
-        in_view: int = 0,
+        in_view: int = 0,  # that should be in the picture, of which some may not have been followed
     ) -> FittedPose | None:
-        """The pose of the landmarks that were followed (None: all); what agrees with it stays.
-
-        Args:
-            in_view: how many should be in the picture, of which some may not have been followed.
-        """
+        """The pose of the landmarks that were followed (None: all); what agrees with it stays."""
         options, followed = self._options, marks if good is None else marks.take(np.flatnonzero(good))
         if len(followed) < options.min_landmarks:
             self.why = f"{len(followed)} of {len(marks)} landmarks are found again"

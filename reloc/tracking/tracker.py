@@ -27,17 +27,13 @@ _PACE_S, _LAST_PACE_S, _LAST_FRAMES = 0.05, 0.02, 4
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Sent:
-    """What the thread has in hand: its frame, and the frame or the film's time at which it is waited for.
-
-    Attributes:
-        slow: whether it takes longer than the frames until then.
-    """
+    """What the thread has in hand: its frame, and the frame or the film's time at which it is waited for."""
 
     index: int
     answer: "Future[Any]"  # Answer
     due: int = _FAR
     due_s: float = float("inf")
-    slow: bool = False
+    slow: bool = False  # it takes longer than the frames until then
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -232,8 +228,7 @@ class Tracker:
     ) -> FittedPose | None:
         """The pose of the frame at hand by what was found of frame `index`; None: it says nothing of it.
 
-        Args:
-            track: as it is at the frame at hand; None: it is lost, and begins again at what was found.
+        `track`: as it is at the frame at hand; None: it is lost, and begins again at what was found.
         """
         since = self._frames.since(index)
         if not since:

@@ -24,11 +24,7 @@ _LEAST_POINTS = 2  # in a cell that counts as covered; a single one is often wro
 
 
 def describe_map(summary: MapSummary, lineage: MapLineage, drawn_under: str | None) -> dict[str, Any]:
-    """What the store knows of a map, without loading it.
-
-    Args:
-        drawn_under: the map under which it stands in the tree, or None.
-    """
+    """What the store knows of a map, without loading it, and the map under which it stands in the tree."""
     same = ("method", "generation", "residual_rms_m", "points", "epsg", "height_datum")
     return {
         **as_stored(summary),
@@ -137,8 +133,7 @@ def describe_own_place(
 ) -> dict[str, Any]:
     """The map as a place of the page with no place on Earth: `frame`, `epsg` and what hangs on them are None.
 
-    Args:
-        command: that opens the page of picks.
+    `command` opens the page of picks.
     """
     frame, why = unplaced.frame, unplaced.no_place
     told = {

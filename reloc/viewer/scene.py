@@ -42,9 +42,7 @@ class ViewerSceneOptions:
     selection: Selection = field(default_factory=lambda: Selection(statuses=(*MAP_STATUSES, "unplaced")))
     points: int = DEFAULT_POINTS  # at most so many in each place, of maps and scans together
     photos: Path | None = None  # their folder, for the command that places a map without a place
-    told: Callable[[int, int], None] = lambda done, total: (
-        None
-    )  # with the number of maps read and their total
+    told: Callable[[int, int], None] = lambda done, total: None  # with maps read, and their total
 
     def __post_init__(self) -> None:
         if self.points < 0:

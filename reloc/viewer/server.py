@@ -22,7 +22,7 @@ from starlette.responses import JSONResponse
 
 from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
 from reloc.listening import listen, run, uvicorn_server
-from reloc.viewer.page import Asset, assets, content_policy, page
+from reloc.viewer.page import assets, content_policy, media_type_of, page
 from reloc.viewer.photos import LIMITS, PICTURE_PX, Pictures, Queries
 from reloc.viewer.scene import ViewerScene
 from reloc.wire.query import ErrorCode
@@ -39,11 +39,7 @@ _CLIENT_GONE = 499
 
 
 def create_app(scene: ViewerScene, pictures: Pictures, queries: Queries) -> FastAPI:
-    """The application.
-
-    Args:
-        queries: answers photos that are dropped on the page.
-    """
+    """The application; `queries` answers photos that are dropped on the page."""
     # Pictures and queries are decoded beside the event loop; a query takes its own turn inside.
     app, in_thread = local_app("featuredb viewer", page(), content_policy(), assets())
     document = {**scene.document, "queries": True}
@@ -82,7 +78,7 @@ def create_app(scene: ViewerScene, pictures: Pictures, queries: Queries) -> Fast
 
 
 def local_app(
-    title: str, html: str, policy: str, files: Mapping[str, Asset], prefix: str = ""
+    title: str, html: str, policy: str, files: Mapping[str, bytes], prefix: str = ""
 ) -> tuple[FastAPI, Callable[[Callable[[], Any]], Awaitable[Any]]]:
     """An application for this machine, and what runs a function beside its event loop.
 
@@ -105,7 +101,7 @@ def local_app(
     async def asset(name: str) -> Response:
         if name not in files:
             raise HTTPException(404, f"no file {name[:100]!r}")
-        return Response(files[name].data, media_type=files[name].media_type)
+        return Response(files[name], media_type=media_type_of(name))
 
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
     return app, in_thread
@@ -132,11 +128,7 @@ def serve(app: FastAPI, port: int, *, browser: bool, path: str = "") -> None:
 
 
 async def _photo(request: Request) -> bytes:
-    """The body, counted while it streams.
-
-    Raises:
-        HTTPException: another media type, or too large.
-    """
+    """The body, counted while it streams. Raises HTTPException: another media type, or too large."""
     found = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if found != PHOTO_TYPE:  # which a browser does not send for another site unasked
         raise HTTPException(415, f"Content-Type: expected {PHOTO_TYPE}, found {found[:100]!r}")
@@ -149,11 +141,7 @@ async def _photo(request: Request) -> bytes:
 
 
 def _where(scene: ViewerScene, place: int, east: float, north: float, up: float) -> dict[str, Any]:
-    """UTM and geographic coordinates of a spot in a place's frame.
-
-    Raises:
-        HTTPException: no such place. GeodesyError, InvalidValueError: no such spot.
-    """
+    """UTM and geographic coordinates of a spot in a place's frame. Raises HTTPException: no such place."""
     if not 0 <= place < len(scene.frames):
         own = 0 <= place < len(scene.points)
         raise HTTPException(404, f"place {place} is no place on Earth" if own else f"no place {place}")

@@ -14,12 +14,11 @@ from zenoh.handlers import Callback
 
 from featuredb.errors import IncompatibleExtractorError
 from reloc.localise.candidates import usable_areas
-from reloc.service.live.follower import Arrival, Follower
 from reloc.service.live.frames import FrameAnswerer
-from reloc.service.live.session import LiveSession
+from reloc.service.live.session import Arrival, Follower, LiveSession
 from reloc.service.logs import fields
 from reloc.service.options import LiveOptions
-from reloc.service.pending import session_of
+from reloc.service.queueing import session_of
 from reloc.service.source import ServedArea
 from reloc.service.tally import Tally
 from reloc.wire.keys import NAME_EXPECTED, Keys, is_name

@@ -132,11 +132,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _write(value: object, file: IO[bytes], key_of: Callable[[object], int]) -> None:
-    """Arrays as they are, then the rest pickled, then where each of them lies.
-
-    Args:
-        key_of: of what is within and is a file of its own, an area for example.
-    """
+    """Arrays, then the rest pickled, then where each lies; `key_of` what within has a file of its own."""
     stream, buffers = io.BytesIO(), list[pickle.PickleBuffer]()
     _Pickler(stream, buffers, value, key_of).dump(value)
     places = []

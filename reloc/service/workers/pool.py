@@ -14,8 +14,7 @@ from reloc.service.contributions.inbox import Inbox, contribution_of
 from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
-from reloc.service.pending import PendingQuery
-from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
+from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
 from reloc.service.workers.area_files import AreaFiles
