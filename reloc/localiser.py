@@ -103,26 +103,17 @@ _State = tuple[FeatureMap, Segment]  # a bare map, and what is laid out of it
 
 
 class Localiser:
-    """Answers queries from one snapshot, which never changes; threads may share it.
-
-    Attributes:
-        options: settings by which it answers. snapshot: version of the database that it answers from.
-    """
+    """Answers queries from one snapshot of a database, which never changes; threads may share it."""
 
     def __init__(
         self,
-        loaded: Mapping[tuple[str, ...], IndexedArea],
+        loaded: Mapping[tuple[str, ...], IndexedArea],  # by what they are made of, sorted write ids of maps
         options: LocaliseOptions,
         snapshot: int,
-        lineages: Mapping[str, MapLineage],
+        lineages: Mapping[str, MapLineage],  # by map id, as are the others
         unplaced: Mapping[str, OnDemand[_OwnArea]],
         provisional: Mapping[str, OnDemand[IndexedArea]],
     ) -> None:
-        """
-        Args:
-            loaded: areas by what they are made of, the sorted write ids of their maps.
-            lineages, unplaced, provisional: by map id.
-        """
         self._loaded = loaded
         self.options, self.snapshot = options, snapshot
         # Of the snapshot, not of an area: an area that is taken over may hang on maps that have changed.

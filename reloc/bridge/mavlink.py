@@ -131,10 +131,7 @@ class MavlinkSender:
 
 
 class UdpLink:
-    """Sends packets to `udpout:HOST:PORT`; a context manager.
-
-    Attributes:
-        lost: packets that the network did not take; the first is logged.
+    """Sends packets to `udpout:HOST:PORT`; a context manager. `lost`: what the network did not take.
 
     Raises:
         InvalidValueError: not such an address, or no such host.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from featuredb.cli.common import add_command, open_database
 from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
+from reloc.wire.keys import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from featuredb.geometry.arrays import FloatArray

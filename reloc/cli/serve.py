@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.cli.common import add_command, open_database
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
+from reloc.wire.keys import DEFAULT_ENDPOINT
 
 logger = logging.getLogger(__name__)
 

@@ -24,8 +24,7 @@ from reloc.client.connection import (
 )
 from reloc.client.fleet import ANY, WHOLE, Fleet, best_supported
 from reloc.client.live import LiveTrack
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
-from reloc.wire.keys import ANONYMOUS, Keys
+from reloc.wire.keys import ANONYMOUS, DEFAULT_ENDPOINT, Keys
 from reloc.wire.query import (
     CameraRequest,
     ErrorCode,

@@ -29,10 +29,7 @@ class LiveTrack:
 
     Frames are sent from one thread, and may be received in another. A frame that comes while the server has
     another one in hand waits for it, until a newer one takes its place: it is dropped then and has no pose.
-
-    Attributes:
-        name: of the session on the wire.
-        refusals: why frames could not be used, the latest hundred.
+    `refusals` says why frames could not be used, the latest hundred.
     """
 
     def __init__(
@@ -45,7 +42,7 @@ class LiveTrack:
         timeout_s: float = 10.0,
     ) -> None:
         """`keys`: of the database on the wire; `client`: the name of this client; see `Client.track`."""
-        self.name = uuid.uuid4().hex
+        self.name = uuid.uuid4().hex  # of the session on the wire
         self.refusals: deque[TrackEvent] = deque(maxlen=_KEPT_REFUSALS)
         self._session, self._keys = session, keys
         self._key = keys.track(client, self.name)

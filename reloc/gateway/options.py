@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from featuredb.errors import InvalidValueError
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
+from reloc.wire.keys import DEFAULT_ENDPOINT
 
 _PREFIX = re.compile(r"(/[A-Za-z0-9._~-]+)*")
 

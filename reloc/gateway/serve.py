@@ -11,7 +11,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from reloc import listening
 from reloc.gateway.app import create_app
 from reloc.gateway.options import GatewayOptions
-from reloc.wire.endpoints import is_loopback
+from reloc.wire.keys import is_loopback
 
 # Connections, idle ones with them; who needs more stands behind a proxy that holds them.
 _MAX_CONNECTIONS = 512

@@ -10,8 +10,7 @@ from featuredb.features.decode import DecodeLimits
 from reloc.service.contributions.inbox import InboxOptions
 from reloc.service.workers.answering import WorkerLimits
 from reloc.tracking.options import TrackOptions
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
-from reloc.wire.keys import NAME_EXPECTED, is_name
+from reloc.wire.keys import DEFAULT_ENDPOINT, NAME_EXPECTED, is_name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -31,12 +31,6 @@ class PendingQuery:
 
     A worker, the deadline watch and the shutdown may all want to answer; the first one does. Answering
     drops the Zenoh query, without which the client would wait for its timeout.
-
-    Attributes:
-        identity: name of the client, where the server authenticates its clients.
-        asker: who shares the server with others: the identity, else the session that the query came from as
-            it says itself.
-        answered: whether it was, or refused.
     """
 
     def __init__(
@@ -46,15 +40,15 @@ class PendingQuery:
         deadline_s: float,
         tally: Tally,
         *,
-        identity: str | None,
+        identity: str | None,  # name of the client, where the server authenticates its clients
     ) -> None:
         self.identity = identity
-        self.asker = identity or session_of(query)
+        self.asker = identity or session_of(query)  # who shares the server with others
         self._query = query
         self._key = key
         self._tally = tally
         self._lock = threading.Lock()
-        self.answered = False
+        self.answered = False  # or refused
         self.received = time.perf_counter()
         self.deadline = self.received + deadline_s
         self.request_id = uuid.uuid4().hex

@@ -9,7 +9,7 @@ from typing import Any
 import zenoh
 
 from featuredb.errors import FeatureDbError
-from reloc.wire.endpoints import DEFAULT_ENDPOINT, is_loopback
+from reloc.wire.keys import DEFAULT_ENDPOINT, is_loopback
 
 _THIS_MACHINE = ("unixsock-stream", "unixpipe")
 

@@ -128,17 +128,11 @@ class FlowTrack:
     def __init__(
         self,
         keyframe: Keyframe,
-        frame: RecentFrame,
+        frame: RecentFrame,  # the keyframe's own, at which the track begins
         camera: Camera,
         options: TrackOptions,
-        lens: LensWalk | None = None,
+        lens: LensWalk | None = None,  # the camera as it is known so far, to be estimated; None: it is given
     ) -> None:
-        """
-        Args:
-            frame: the keyframe's own, at which the track begins.
-            camera: intrinsics of the frames. lens: the same as it is known so far, to be estimated with the
-                poses; None: it is given.
-        """
         self.ground = keyframe.ground
         self.why = ""
         self._given, self._options, self._lens = camera, options, lens

@@ -87,15 +87,10 @@ class Inbox:
 
     def __init__(
         self,
-        write: Callable[[list[Contribution]], object],
-        count: Callable[[], InboxCounts],
+        write: Callable[[list[Contribution]], object],  # in one append; may take seconds, and fail
+        count: Callable[[], InboxCounts],  # how much is stored; likewise
         options: InboxOptions | None = None,
     ) -> None:
-        """
-        Args:
-            write: stores contributions in one append, may take seconds, and fail.
-            count: how much is stored; likewise.
-        """
         self._store, self._count = write, count
         self._options = options or InboxOptions()
         self._changed = threading.Condition()

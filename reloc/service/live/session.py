@@ -57,14 +57,9 @@ class Follower:
     def __init__(
         self,
         answerer: FrameAnswerer,
-        options: ServeOptions,
-        files: Callable[[], LocaliserFiles],
+        options: ServeOptions,  # a frame has the limits of a query
+        files: Callable[[], LocaliserFiles],  # the area in service, maybe another one from frame to frame
     ) -> None:
-        """
-        Args:
-            options: of the server; a frame has the limits of a query.
-            files: the area in service, which may be another one from frame to frame.
-        """
         self._answerer, self._files = answerer, files
         self._limits, self._frame_s = options.worker_limits, options.work_s
         self._max_bytes = options.live.limits.max_bytes
@@ -197,8 +192,6 @@ class Follower:
             )
 
 
-logger = logging.getLogger(__name__)
-
 _END_TEXT = {
     EndReason.CLIENT_GONE: "the client has closed the session, or is gone",
     EndReason.MADE_ROOM: "another client asks for a session, and this one's has several",
@@ -222,15 +215,10 @@ class LiveSession:
         follower: Follower,
         *,
         idle_timeout_s: float,
-        publish: Callable[[str, BaseModel], None],
+        publish: Callable[[str, BaseModel], None],  # under a leaf of its key; never waits for the client
         tally: Tally,
-        on_end: Callable[[], None],
+        on_end: Callable[[], None],  # by the session's thread when nothing is left of it, before it says so
     ) -> None:
-        """
-        Args:
-            publish: sends a message under a leaf of the session's key; never waits for the client.
-            on_end: called by the session's thread when nothing is left of it, before it says so.
-        """
         self.name, self.asker = name, asker
         self._follower = follower
         self._idle_timeout_s = idle_timeout_s

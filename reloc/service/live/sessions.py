@@ -56,18 +56,13 @@ class LiveSessions:
         self,
         session: zenoh.Session,
         keys: Keys,
-        area: Callable[[], ServedArea],
+        area: Callable[[], ServedArea],  # in service now
         follower: Callable[[FrameAnswerer], Follower],
         options: LiveOptions,
         server_id: str,
         *,
-        authenticates: bool,
+        authenticates: bool,  # clients' names are proven; else who asks is the session it says it is
     ) -> None:
-        """
-        Args:
-            area: gives the area in service. follower: has a session's frames answered.
-            authenticates: whether clients' names are proven; else who asks is the session it says it is.
-        """
         self._session, self._keys, self._area, self._follower = session, keys, area, follower
         self._options, self._server_id, self._authenticates = options, server_id, authenticates
         self._tally = Tally()

@@ -24,11 +24,7 @@ _LENGTH_BYTES = 8
 
 
 class AreaFile:
-    """A file without a name in any folder, closed with its last user.
-
-    Attributes:
-        key: names it, once and for all. file: open.
-    """
+    """A file without a name in any folder, closed with its last user; its key names it once and for all."""
 
     def __init__(self, key: int) -> None:
         self.key = key

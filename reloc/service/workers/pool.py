@@ -37,9 +37,6 @@ class WorkerPool:
     """Takes queries from the queue and answers each from the area in service at that moment.
 
     A process that is still at a query when its time is over, or that ends before its answer, is replaced.
-
-    Attributes:
-        published: the area that is answered from.
     """
 
     def __init__(
