@@ -160,11 +160,8 @@ def _image_bytes(image: Image) -> tuple[bytes, str]:
     if isinstance(image, str | Path):
         return Path(image).read_bytes(), str(image)
     pixels = np.asarray(image)
-    if (
-        pixels.dtype != np.uint8
-        or not pixels.size
-        or not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3))
-    ):
+    is_picture = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
+    if pixels.dtype != np.uint8 or not pixels.size or not is_picture:
         raise ImageError(
             f"image: expected pixels (h, w) or (h, w, 3) uint8, found {pixels.shape} {pixels.dtype}"
         )

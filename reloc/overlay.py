@@ -1,8 +1,4 @@
-"""A picture that shows how well the map sits on the photo.
-
-Green circles are keypoints that agree with the pose, the short line leads to where their map point
-projects; small blue dots are other points of the map that should be visible.
-"""
+"""A picture that shows how well the map sits on the photo: keypoints, and where they should lie."""
 
 from collections.abc import Sequence
 from pathlib import Path

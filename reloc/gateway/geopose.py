@@ -176,11 +176,9 @@ def _image_file(data: bytes, picture: CameraReading, size: tuple[int, int] | Non
             f"imageBytes: expected an image file, or width x height x {channels} bytes of "
             f"{picture.imageFormat} of size {size}, found {len(data)} bytes",
         )
-    mode = "L" if channels == 1 else "RGBA"
     out = io.BytesIO()
-    Image.frombytes(mode, size, data).convert("L" if mode == "L" else "RGB").save(
-        out, "PNG", compress_level=1
-    )
+    mode, stored = ("L", "L") if channels == 1 else ("RGBA", "RGB")
+    Image.frombytes(mode, size, data).convert(stored).save(out, "PNG", compress_level=1)
     return out.getvalue()
 
 

@@ -49,13 +49,7 @@ _JSON = zenoh.Encoding.APPLICATION_JSON
 
 
 class Server:
-    """A running server; `start` makes one, `close` (or leaving the `with` block) ends it.
-
-    Attributes:
-        database: name on the wire.
-        server_id: the Zenoh id of its session.
-        endpoints: where it listens; empty where only the configuration file knows.
-    """
+    """A running server; `start` makes one, `close` (or leaving the `with` block) ends it."""
 
     def __init__(
         self,
@@ -69,8 +63,8 @@ class Server:
         inbox: Inbox | None,
         authenticates: bool,
     ) -> None:
-        self.database = database
-        self.endpoints = endpoints
+        self.database = database  # its name on the wire
+        self.endpoints = endpoints  # where it listens; empty where only the configuration file knows
         self.server_id = str(session.zid())
         self._session = session
         self._options = options
@@ -112,8 +106,7 @@ class Server:
     ) -> Self:
         """Load the area, then listen; when this returns, queries are answered.
 
-        Args:
-            inbox: takes contributed photos, and is started and closed by the server; None: it takes none.
+        Without an inbox, which the server starts and closes, it takes no contributed photos.
 
         Raises:
             ServiceStartError: cannot listen, or strangers could reach it and `insecure` is not set.

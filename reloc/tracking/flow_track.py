@@ -119,11 +119,7 @@ class Landmarks:
 
 
 class FlowTrack:
-    """Landmarks on a ground with the last poses; used from one thread at a time.
-
-    Attributes:
-        landmarks: of `ground`, as the last frame shows them. why: the last thing that went wrong, in words.
-    """
+    """Landmarks on a ground, as the last frame shows them, with the last poses; of one thread at a time."""
 
     def __init__(
         self,
@@ -134,7 +130,7 @@ class FlowTrack:
         lens: LensWalk | None = None,  # the camera as it is known so far, to be estimated; None: it is given
     ) -> None:
         self.ground = keyframe.ground
-        self.why = ""
+        self.why = ""  # the last thing that went wrong, in words
         self._given, self._options, self._lens = camera, options, lens
         self.landmarks = self._spread(_landmarks_of(keyframe, frame.index), frame.gray)
         self._poses: deque[tuple[float, Rigid3]] = deque([(frame.time_s, keyframe.cam_from_local)], maxlen=2)

@@ -48,15 +48,10 @@ def fit_pose(
     camera: Camera,
     pixels: FloatArray,
     points: FloatArray,
-    start: Rigid3,
-    doubt: LensSigmas = GIVEN,
+    start: Rigid3,  # a pose within some degrees and a few per cent of the distance
+    doubt: LensSigmas = GIVEN,  # what is not known of the camera
 ) -> FittedPose | None:
-    """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it.
-
-    Args:
-        start: a pose within some degrees and a few per cent of the distance.
-        doubt: what is not known of the camera.
-    """
+    """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it."""
     if len(pixels) < 4:
         return None
     focal_rel = doubt.focal_rel

@@ -99,18 +99,13 @@ class ReadAhead:
         self._most = 0 if info.live else min(most, max(1, _MOST_BYTES // bytes_each))
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="decoding")
         self._ahead: deque[Future[VideoFrame | None]] = deque()
-        self._seconds = 0.0
+        self.seconds = 0.0  # that decoding has taken, ahead or not
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *failed: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
-
-    @property
-    def seconds(self) -> float:
-        """That decoding has taken, ahead or not."""
-        return self._seconds
 
     def read_on(self, frames: int) -> None:
         """Decode so many more frames in the background, up to `most` not yet used; none before the first."""
@@ -135,7 +130,7 @@ class ReadAhead:
         try:
             return next(self._frames, None)
         finally:
-            self._seconds += time.perf_counter() - began
+            self.seconds += time.perf_counter() - began
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

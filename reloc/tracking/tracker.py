@@ -55,18 +55,12 @@ class Tracker:
 
     def __init__(
         self,
-        finder: Finder,
+        finder: Finder,  # of the first frame, and of the track again where it was lost
         camera: Camera | None = None,
         options: TrackOptions | None = None,
-        request: LocaliseRequest | None = None,
+        request: LocaliseRequest | None = None,  # what else is known of the first frame
     ) -> None:
-        """
-        Args:
-            finder: finds the first frame, and the track again where it was lost.
-            camera: intrinsics of the frames; None: estimated with the poses, and anew where the track was
-                lost, since a film may be cut together of several cameras.
-            request: what else is known of the first frame.
-        """
+        """Without a camera it is estimated with the poses, and anew where the track was lost: films are cut."""
         self._finder, self._options = finder, options or TrackOptions()
         self._request = replace(request or LocaliseRequest(), camera=camera)
         self._given = self._camera = camera

@@ -145,7 +145,7 @@ def describe_own_place(
         "chain": [summary.map_id],
         "lineage": "",
         "points": len(unplaced.points),
-        "photos": _photos(unplaced),
+        "photos": [_own_photo(image, unplaced) for image in unplaced.images],
         "coverage": coverage(drawn),
         "buffer": buffer,
     }
@@ -167,11 +167,8 @@ def picks_command(url: str, map_id: str, photos: Path | None) -> str:
     return f"featuredb anchor {shlex.quote(url)} {shlex.quote(map_id)} --photos {folder} --page"
 
 
-def _photos(unplaced: UnplacedMap) -> list[dict[str, Any]]:
-    """The photos, poses in the own frame."""
-    photos = []
-    for image in unplaced.images:
-        pose, camera = image.cam_from_local, unplaced.cameras[image.camera_id]
-        drawn = drawn_pose(pose.center, np.asarray(pose.rotation.T), camera)
-        photos.append(described_photo(image, unplaced, {**drawn, "utm": None, "ellipse": None}))
-    return photos
+def _own_photo(image: MapImage, unplaced: UnplacedMap) -> dict[str, Any]:
+    """A photo with its pose in the own frame."""
+    pose, camera = image.cam_from_local, unplaced.cameras[image.camera_id]
+    drawn = drawn_pose(pose.center, np.asarray(pose.rotation.T), camera)
+    return described_photo(image, unplaced, {**drawn, "utm": None, "ellipse": None})

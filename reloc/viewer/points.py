@@ -86,13 +86,10 @@ def scan_points_in(
     database: Database,
     scan: ScanSummary,
     frame: LocalFrame,
-    box: tuple[float, float, float, float] | None,
+    box: tuple[float, float, float, float] | None,  # (e0, n0, e1, n1), metres in its zone; None for all
     wanted: int,
 ) -> DrawnPoints:
     """At most `wanted` points of a scan: its coarsest levels of detail, of the last one a part.
-
-    Args:
-        box: (e0, n0, e1, n1), metres in the scan's zone; None for all of it.
 
     Raises:
         StoreError: the points cannot be read.

@@ -22,13 +22,9 @@ _WIDEST = 10.0
 
 
 def ellipse_95(covariance: FloatArray) -> dict[str, float]:
-    """The ellipse in plan that holds 95 % of the positions.
+    """The ellipse in plan that holds 95 % of positions of a covariance (2, 2), east and north, square metres.
 
-    Args:
-        covariance: (2, 2) along east and north, square metres.
-
-    Returns:
-        `major_m`, `minor_m`: half axes; `azimuth_deg`: of the major one, clockwise from north, in [0, 180).
+    Its half axes, and the azimuth of the major one, clockwise from north, in [0, 180).
     """
     values, vectors = np.linalg.eigh(covariance)
     minor, major = _RADIUS_95 * np.sqrt(np.maximum(values, 0.0))
@@ -40,13 +36,11 @@ def ellipse_95(covariance: FloatArray) -> dict[str, float]:
 def drawn_pose(center: FloatArray, local_from_cam: FloatArray, camera: Camera | None) -> dict[str, Any]:
     """A camera in the place's frame.
 
+    `forward` is a unit vector, `corners` are rays to the image's at unit depth, clockwise from top left.
+
     Args:
         center: (3,) metres. local_from_cam: (3, 3) from x right, y down, z forward.
         camera: None: a lens of 60 by 45 degrees is drawn.
-
-    Returns:
-        `center`; `forward`: unit vector; `corners`: rays to the image's corners at unit depth, top left, top
-        right, bottom right, bottom left.
     """
     rays = _corner_rays(camera)
     return {

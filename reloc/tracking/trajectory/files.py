@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -211,40 +212,31 @@ def geojson_text(trajectory: Trajectory) -> str:
     features = []
     for number, stretch in enumerate(trajectory.stretches()):
         if len(stretch) > 1:
-            features.append(
-                {
-                    "type": "Feature",
-                    "geometry": {"type": "LineString", "coordinates": [_place(pose) for _, pose in stretch]},
-                    "properties": {
-                        "stretch": number,
-                        "from_s": stretch[0][0].time_s,
-                        "to_s": stretch[-1][0].time_s,
-                        "source": trajectory.source,
-                    },
-                }
-            )
+            said = {"stretch": number, "from_s": stretch[0][0].time_s, "to_s": stretch[-1][0].time_s}
+            line = [_place(pose) for _, pose in stretch]
+            features.append(_feature("LineString", line, {**said, "source": trajectory.source}))
         for point, pose in stretch:
             heading, pitch, roll = pose.geopose.heading_pitch_roll_deg
             sigma = np.sqrt(np.diag(pose.covariance)[3:])
-            features.append(
-                {
-                    "type": "Feature",
-                    "geometry": {"type": "Point", "coordinates": _place(pose)},
-                    "properties": {
-                        "frame": point.index,
-                        "time_s": round(point.time_s, 6),
-                        "state": point.state,
-                        "heading_deg": round(heading, 4),
-                        "pitch_deg": round(pitch, 4),
-                        "roll_deg": round(roll, 4),
-                        "sigma_enu_m": [round(float(v), 4) for v in sigma],
-                        "height_datum": pose.height_datum,
-                        "map_id": pose.map_id,
-                        "geopose": pose.geopose.to_json(),
-                    },
-                }
-            )
+            properties = {
+                "frame": point.index,
+                "time_s": round(point.time_s, 6),
+                "state": point.state,
+                "heading_deg": round(heading, 4),
+                "pitch_deg": round(pitch, 4),
+                "roll_deg": round(roll, 4),
+                "sigma_enu_m": [round(float(v), 4) for v in sigma],
+                "height_datum": pose.height_datum,
+                "map_id": pose.map_id,
+                "geopose": pose.geopose.to_json(),
+            }
+            features.append(_feature("Point", _place(pose), properties))
     return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
+
+
+def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> dict[str, Any]:
+    geometry = {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
 def kml_text(trajectory: Trajectory) -> str:
@@ -307,8 +299,5 @@ def _known(
 
 
 def _place(pose: EarthPose) -> list[float]:
-    return [
-        round(pose.geopose.longitude_deg, 10),
-        round(pose.geopose.latitude_deg, 10),
-        round(float(pose.utm[2]), 4),
-    ]
+    longitude, latitude = pose.geopose.longitude_deg, pose.geopose.latitude_deg
+    return [round(longitude, 10), round(latitude, 10), round(float(pose.utm[2]), 4)]
