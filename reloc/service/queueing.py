@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from reloc.service.logs import fields
-from reloc.service.tally import Tally
+from reloc.service.logs import Tally, fields
 from reloc.wire.query import ErrorCode, ErrorReply, LocaliseReply, RequestError, encode
 
 logger = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ import zenoh
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.live.session import Follower
 from reloc.service.live.sessions import LiveSessions
-from reloc.service.logs import fields
+from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
 from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import (
@@ -26,7 +26,6 @@ from reloc.service.session import (
     server_config,
 )
 from reloc.service.source import AreaWatcher, DatabaseSource, ServedArea
-from reloc.service.tally import Tally
 from reloc.service.workers.pool import WorkerPool
 from reloc.service.workers.process import prepare_workers
 from reloc.wire.keys import Keys, client_of, is_addressed

@@ -60,7 +60,7 @@ class Tracker:
         options: TrackOptions | None = None,
         request: LocaliseRequest | None = None,  # what else is known of the first frame
     ) -> None:
-        """Without a camera it is estimated with the poses, and anew where the track was lost: films are cut."""
+        """Without a camera it is estimated with the poses, and anew where the track was lost."""
         self._finder, self._options = finder, options or TrackOptions()
         self._request = replace(request or LocaliseRequest(), camera=camera)
         self._given = self._camera = camera

@@ -13,9 +13,8 @@ from pydantic import BaseModel
 
 from featuredb.stage_clock import StageClock
 from reloc.service.live.frames import FrameAnswerer, FrameAsk
-from reloc.service.logs import fields
+from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
-from reloc.service.tally import Tally
 from reloc.service.workers.area_files import LocaliserFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
 from reloc.wire.query import ErrorCode, RequestError, parse_attachment

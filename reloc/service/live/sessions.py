@@ -16,11 +16,10 @@ from featuredb.errors import IncompatibleExtractorError
 from reloc.localise.candidates import usable_areas
 from reloc.service.live.frames import FrameAnswerer
 from reloc.service.live.session import Arrival, Follower, LiveSession
-from reloc.service.logs import fields
+from reloc.service.logs import Tally, fields
 from reloc.service.options import LiveOptions
 from reloc.service.queueing import session_of
 from reloc.service.source import ServedArea
-from reloc.service.tally import Tally
 from reloc.wire.keys import NAME_EXPECTED, Keys, is_name
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
