@@ -267,21 +267,12 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
 def _add_failures(app: FastAPI) -> None:
     """Every way to fail ends in an ErrorBody; what went wrong inside stays in the log."""
 
-    @app.exception_handler(NotLocalisedError)
-    async def not_localised(request: Request, error: NotLocalisedError) -> Response:
-        return _failed(
-            ErrorBody(
-                code=error.code,
-                message=error.message,
-                request_id=error.request_id,
-                reason=error.reply.reason,
-                id=error.geopose_id,
-            )
-        )
-
     @app.exception_handler(ServiceError)
     async def service_error(request: Request, error: ServiceError) -> Response:
-        return _failed(ErrorBody(code=error.code, message=error.message, request_id=error.request_id))
+        body = ErrorBody(code=error.code, message=error.message, request_id=error.request_id)
+        if isinstance(error, NotLocalisedError):
+            body = body.model_copy(update={"reason": error.reply.reason, "id": error.geopose_id})
+        return _failed(body)
 
     @app.exception_handler(InvalidValueError)
     async def invalid(request: Request, error: InvalidValueError) -> Response:

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -12,7 +11,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import matrix_from_quaternion
 from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.values import Trajectory
-from reloc.viewer.places import Spot
 
 # Half axes of the ellipse that holds 95 % of a plane normal distribution, in standard deviations:
 # the root of the chi-square quantile with two degrees of freedom, -2 ln(0.05).
@@ -103,20 +101,6 @@ def _corner_rays(camera: Camera | None) -> FloatArray:
 
 def _rounded(vector: FloatArray, digits: int) -> list[float]:
     return [round(float(v), digits) for v in vector]
-
-
-def spot_of_trajectory(trajectory: Trajectory) -> Spot:
-    """Where the first known pose lies.
-
-    Raises:
-        InvalidValueError: all frames are lost.
-    """
-    pose = next((point.pose for point in trajectory.points if point.pose is not None), None)
-    if pose is None:
-        raise InvalidValueError(
-            f"{trajectory.source}: all {len(trajectory.points)} frames are lost, there is nothing to show"
-        )
-    return pose.utm, pose.epsg
 
 
 def describe_trajectory(trajectory: Trajectory, frame: LocalFrame) -> dict[str, Any]:

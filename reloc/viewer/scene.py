@@ -2,7 +2,7 @@
 
 `build_scene` reads everything once; after it the database is needed for queries only. What is in
 `ViewerScene.document` goes into JSON as it is; coordinates are metres east, north, up in the frame of their
-place.
+place: such a frame is level at its origin only, so maps that are far from each other get one each.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,12 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from featuredb.errors import InvalidValueError
 from featuredb.export.selection import Selection, licence_is, licensed, selected_any
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import MAP_STATUSES, MapImage
-from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
+from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary, UtmBox
 from featuredb.store.scans import ScanSummary, count_points, list_scans
 from reloc.tracking.trajectory.values import Trajectory
 from reloc.viewer.map_layer import (
@@ -27,11 +31,17 @@ from reloc.viewer.map_layer import (
     own_points,
     picks_command,
 )
-from reloc.viewer.places import Spot, group, scan_box, spot_of
 from reloc.viewer.points import DrawnPoints, map_points, scan_points_in, shares
-from reloc.viewer.poses import describe_trajectory, spot_of_trajectory
+from reloc.viewer.poses import describe_trajectory
 
 DEFAULT_POINTS = 1_000_000
+# Over this distance the vertical turns by 0.18 degrees and the ground falls away by 31 m.
+_TOGETHER_M = 20_000.0
+# Of a scan that is larger than the maps, this much is shown around them.
+SCAN_MARGIN_M = 50.0
+
+
+Spot = tuple[FloatArray, int]  # where something lies: (3,) easting, northing, height in metres; the zone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -266,3 +276,69 @@ def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]
         "buffer": buffer,
         **{name: getattr(scan, name) for name in same},
     }
+
+
+def spot_of_trajectory(trajectory: Trajectory) -> Spot:
+    """Where the first known pose lies.
+
+    Raises:
+        InvalidValueError: all frames are lost.
+    """
+    pose = next((point.pose for point in trajectory.points if point.pose is not None), None)
+    if pose is None:
+        raise InvalidValueError(
+            f"{trajectory.source}: all {len(trajectory.points)} frames are lost, there is nothing to show"
+        )
+    return pose.utm, pose.epsg
+
+
+def spot_of(box: UtmBox, epsg: int) -> Spot:
+    """The middle of a box in plan, at its foot."""
+    easting, northing = (box.min_easting + box.max_easting) / 2.0, (box.min_northing + box.max_northing) / 2.0
+    return np.array([easting, northing, box.min_height]), epsg
+
+
+def group(spots: Sequence[Spot]) -> list[tuple[LocalFrame, list[int]]]:
+    """Places, the one with most spots first: frame at the middle of the spots, and their rows.
+
+    Spots within 20 km of each other, directly or through others, are one place.
+    """
+    if not spots:
+        return []
+    (easting, northing, height), epsg = spots[0]
+    frame = LocalFrame.from_utm(float(easting), float(northing), float(height), epsg)
+    enu = np.array([frame.enu_from_utm(utm, epsg) for utm, epsg in spots])
+    near = cKDTree(enu).query_pairs(_TOGETHER_M, output_type="ndarray")
+    links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(spots), len(spots)))
+    count, label = connected_components(links, directed=False)
+    places = [np.flatnonzero(label == k) for k in range(count)]
+    places.sort(key=lambda rows: (-len(rows), int(rows[0])))
+    return [(_frame_at(frame, enu[rows].mean(axis=0)), rows.tolist()) for rows in places]
+
+
+def scan_box(
+    frame: LocalFrame, boxes: Sequence[FloatArray], epsg: int
+) -> tuple[float, float, float, float] | None:
+    """(e0, n0, e1, n1) in the zone of a scan of what is shown of it: 50 m around the maps.
+
+    Args:
+        boxes: corners (2, 3) of each map's points in the place's frame; without any all of the scan is shown.
+    """
+    if not boxes:
+        return None
+    (e0, n0, up), (e1, n1, _) = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+    around = [
+        (e, n, up)
+        for e in (e0 - SCAN_MARGIN_M, e1 + SCAN_MARGIN_M)
+        for n in (n0 - SCAN_MARGIN_M, n1 + SCAN_MARGIN_M)
+    ]
+    utm = frame.utm_from_enu(np.array(around), epsg)
+    low, high = utm.min(axis=0), utm.max(axis=0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _frame_at(frame: LocalFrame, enu: FloatArray) -> LocalFrame:
+    latitude, longitude, height = frame.geodetic_from_enu(enu)
+    return LocalFrame(
+        latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=round(float(height), 3)
+    )

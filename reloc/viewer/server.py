@@ -162,17 +162,12 @@ def _add_failures(app: FastAPI) -> None:
     def failed(status: int, code: str, message: str) -> Response:
         return JSONResponse({"code": code, "message": message}, status)
 
-    @app.exception_handler(ServiceError)
-    async def service_error(request: Request, error: ServiceError) -> Response:
-        return failed(_STATUS.get(error.code, 500), error.code, error.message)
-
-    @app.exception_handler(InvalidValueError)
-    @app.exception_handler(GeodesyError)
-    async def refused(request: Request, error: FeatureDbError) -> Response:
-        return failed(400, ErrorCode.BAD_REQUEST.value, str(error))
-
     @app.exception_handler(FeatureDbError)
-    async def broken(request: Request, error: FeatureDbError) -> Response:
+    async def failure(request: Request, error: FeatureDbError) -> Response:
+        if isinstance(error, ServiceError):
+            return failed(_STATUS.get(error.code, 500), error.code, error.message)
+        if isinstance(error, InvalidValueError | GeodesyError):
+            return failed(400, ErrorCode.BAD_REQUEST.value, str(error))
         return failed(500, ErrorCode.INTERNAL.value, str(error))  # the database is gone, for example
 
     @app.exception_handler(RequestValidationError)

@@ -173,23 +173,14 @@ class WorkerPool:
         except WorkerEndedError as error:
             with self._changed:
                 self._up.discard(process)
-            item.refuse(
-                RequestError(
-                    ErrorCode.INTERNAL,
-                    f"{error} on this query, which concerns no other; the server's log has it under request "
-                    f"id {item.request_id}",
-                )
-            )
+            what = f"{error} on this query, which concerns no other; the server's log has it"
+            item.refuse(RequestError(ErrorCode.INTERNAL, f"{what} under request id {item.request_id}"))
         except Exception as error:
             trace = {"trace": str(error)} if isinstance(error, WorkerDefectError) else {}
             told = fields("internal", request_id=item.request_id, **trace)
             logger.exception("query failed", extra=told)
-            item.refuse(
-                RequestError(
-                    ErrorCode.INTERNAL,
-                    f"the server failed on this query; its log says why under request id {item.request_id}",
-                )
-            )
+            what = "the server failed on this query; its log says why"
+            item.refuse(RequestError(ErrorCode.INTERNAL, f"{what} under request id {item.request_id}"))
 
     def _localise(self, item: PendingQuery, process: WorkerProcess) -> None:
         clock = StageClock(start=item.received)
