@@ -42,10 +42,6 @@ class FrameError(RequestError):
         self.sequence = sequence
 
 
-class FollowerStoppedError(Exception):
-    """The follower was told to stop."""
-
-
 class Follower:
     """Answers the frames of one session, in their order, from one thread but for `stop`. A context manager.
 
@@ -69,12 +65,11 @@ class Follower:
         self._stopped = False
 
     def __enter__(self) -> Self:
-        """Raises WorkerEndedError: no process comes up; FollowerStoppedError: as told."""
+        """Raises WorkerEndedError: no process comes up, or as told."""
         try:
             self._ready()
-        except WorkerEndedError as error:
+        except WorkerEndedError:
             self._close()
-            self._check_not_stopped(error)
             raise
         return self
 
@@ -93,8 +88,7 @@ class Follower:
 
         Raises:
             FrameError: a header that is none or goes back, what `FrameAnswerer.answer` refuses, or a frame
-                that is beyond the limits or ends the process.
-            FollowerStoppedError: as told.
+                that is beyond the limits or ends the process. WorkerEndedError: it was told to stop.
         """
         clock = StageClock(start=arrival.received)
         sequence: int | None = None
@@ -115,7 +109,8 @@ class Follower:
             raise FrameError(ErrorCode(error.code), error.message, sequence) from error
         except (WorkerEndedError, WorkerDefectError) as error:
             self._close()
-            self._check_not_stopped(error)
+            if self._stopped:
+                raise
             logger.exception("a frame failed", extra=fields("frame_failed"))
             how = error if isinstance(error, WorkerEndedError) else "a defect"
             raise FrameError(
@@ -157,10 +152,6 @@ class Follower:
                 self._process.kill()
         self._process.open(self._files())
         return self._process
-
-    def _check_not_stopped(self, error: Exception) -> None:
-        if self._stopped:
-            raise FollowerStoppedError from error
 
     def _close(self) -> None:
         if self._process is not None:
@@ -227,6 +218,7 @@ class LiveSession:
         self._waiting: Arrival | None = None
         self._reason: EndReason | None = None
         self._changed = threading.Condition()  # the two above
+        self._cut_off = False  # its process was ended, whatever it was at
         self._states: Counter[str] = Counter()
         self._thread = threading.Thread(target=self._run, name=f"live-{name}", daemon=True)
 
@@ -253,6 +245,7 @@ class LiveSession:
             self._reason = self._reason or reason
             self._changed.notify()
         if reason in _AT_ONCE:
+            self._cut_off = True
             self._follower.stop()
 
     @property
@@ -268,11 +261,10 @@ class LiveSession:
         try:
             with self._follower:
                 self._answer_frames()
-        except FollowerStoppedError:
-            pass
         except Exception:
-            logger.exception("live session failed", extra=fields("internal", session=self.name))
-            self.end(EndReason.INTERNAL)
+            if not self._cut_off:
+                logger.exception("live session failed", extra=fields("internal", session=self.name))
+                self.end(EndReason.INTERNAL)
         self._on_end()
         self._say_ended()
 
