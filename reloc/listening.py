@@ -52,13 +52,9 @@ def uvicorn_server(app: FastAPI, **options: Any) -> uvicorn.Server:
 def run(
     server: uvicorn.Server, listening: Callable[[], socket.socket], on_ready: Callable[[str], None]
 ) -> None:
-    """Serve until SIGINT or SIGTERM; call from the main thread.
-
-    Args:
-        on_ready: is told the address; connections wait in the socket until the server runs.
-    """
+    """Serve until SIGINT or SIGTERM; call from the main thread. `on_ready` is told the address."""
     # uvicorn handles these while it runs, and then raises them again; one that comes before counts as well.
     with on_stop_signals(partial(setattr, server, "should_exit", True)), listening() as bound:
         host, port = bound.getsockname()[:2]
         on_ready(f"http://{f'[{host}]' if ':' in host else host}:{port}")
-        server.run(sockets=[bound])
+        server.run(sockets=[bound])  # until then connections wait in the socket

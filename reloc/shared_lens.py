@@ -107,8 +107,7 @@ def lenses_of_cameras(
 def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
     """The lens that most views agree on, without those that do not; None where too few are left.
 
-    Args:
-        views: of pictures of one size; any camera of OPENCV's or SIMPLE_RADIAL's model.
+    Views are of pictures of one size, with cameras of OPENCV's or SIMPLE_RADIAL's model.
     """
     priors = LensPriors()
     agree = np.ones(len(views), dtype=np.bool_)

@@ -63,9 +63,6 @@ class Client:
 
     Methods raise ServiceError; its `code` is one of reloc.wire.query.ErrorCode, or NO_SERVER (nobody
     answers), TIMEOUT (no answer in time), BAD_REPLY (an answer that is none).
-
-    Attributes:
-        name: of this client on the wire; its configuration says it.
     """
 
     def __init__(
@@ -82,7 +79,7 @@ class Client:
         self._connect_timeout_s = connect_timeout_s
         self._open_session: zenoh.Session | None = None
         self._fleet = Fleet(self.statuses)
-        self.name = ANONYMOUS
+        self.name = ANONYMOUS  # on the wire; its configuration says it
 
     def __enter__(self) -> Self:
         self.open()

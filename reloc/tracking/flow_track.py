@@ -28,10 +28,7 @@ def follow(
     guess: FloatArray,
     options: FlowOptions,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Where patches around `pixels` (n, 2) of one frame (h, w) lie in another.
-
-    Args:
-        guess: (n, 2) about there.
+    """Where patches around pixels (n, 2) of one frame (h, w) lie in another, about at the guess (n, 2).
 
     Returns:
         Pixels (n, 2) float64, and which (n,) of them are to be trusted.

@@ -100,11 +100,7 @@ class MapGround:
 
 
 class MapFinder:
-    """Finds frames as queries are found, on the maps of some areas.
-
-    Args:
-        own: frame of the map without a place that is the only area.
-    """
+    """Finds frames as queries are found, on maps of areas, or one without a place and its own frame."""
 
     def __init__(self, areas: Sequence[IndexedArea], own: OwnFrame | None = None) -> None:
         self._areas, self._own = tuple(areas), own

@@ -82,8 +82,7 @@ class MappedAreas:
     def localiser(self, keys: Sequence[int], receive: Callable[[], int]) -> Any:
         """The localiser of some files, by key in the order of `LocaliserFiles`; known ones are kept.
 
-        Args:
-            receive: the descriptor of the next file, which is closed here: one is open at a time.
+        `receive` gives the descriptor of the next file, which is closed here: one is open at a time.
         """
         found: dict[int, object] = {}
         localiser: object = None
