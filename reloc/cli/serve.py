@@ -119,13 +119,9 @@ def _serve(args: argparse.Namespace) -> int:
         listen=listen,
         connect=tuple(args.connect or ()),
         config_path=args.config,
-        insecure=args.insecure,
-        name=args.name,
-        bbox=args.bbox,
-        metrics_port=args.metrics_port,
         contributions=args.contributions == "on",
         live=LiveOptions(**given("max_sessions", "idle_timeout_s")),
-        **given("workers", "max_queue", "deadline_s"),
+        **given("insecure", "name", "bbox", "metrics_port", "workers", "max_queue", "deadline_s"),
     )
     # Its decoders tell stderr about each hostile file; the refusal in our log says it once.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -118,10 +118,7 @@ def stream_film(
     options = options or VideoOptions(max_side_px=SENT_SIDE_PX)
     trouble: list[str] = []
     sent, last, last_sent = 0, -1, -1
-    with (
-        open_video(source, options) as video,
-        _answered(client.track(camera, prior), on_pose) as answers,
-    ):
+    with open_video(source, options) as video, _answered(client.track(camera, prior), on_pose) as answers:
         live, info = answers.live, video.info
         begun: float | None = None
         try:

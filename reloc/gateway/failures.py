@@ -44,6 +44,11 @@ class GatewayError(ServiceError):
     """Ends a request with the status of its code."""
 
 
+def bad_request(message: str) -> GatewayError:
+    """The request is not what it should be, as the message says."""
+    return GatewayError(ErrorCode.BAD_REQUEST, message)
+
+
 class ErrorBody(BaseModel):
     """Body of every answer that is not 2xx."""
 

@@ -319,7 +319,7 @@ def group(spots: Sequence[Spot]) -> list[tuple[LocalFrame, list[int]]]:
 def scan_box(
     frame: LocalFrame, boxes: Sequence[FloatArray], epsg: int
 ) -> tuple[float, float, float, float] | None:
-    """(e0, n0, e1, n1) in a scan's zone of what is shown of it: 50 m around boxes (2, 3) of maps in `frame`."""
+    """(e0, n0, e1, n1) in a scan's zone of what is shown: 50 m around the maps' boxes (2, 3) in `frame`."""
     if not boxes:
         return None  # all of it is shown
     (e0, n0, up), (e1, n1, _) = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
