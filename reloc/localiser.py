@@ -131,24 +131,16 @@ class Localiser:
         cls,
         database: Database,
         options: LocaliseOptions | None = None,
-        as_of: int | datetime | None = None,
+        as_of: int | datetime | None = None,  # None: the newest
         *,
-        previous: "Localiser | None" = None,
-        served: Callable[[MapSummary], bool] = lambda summary: True,
-        also: Collection[str] = (),
-        instead: Mapping[str, FeatureMap] | None = None,
+        previous: "Localiser | None" = None,  # areas that have not changed since are taken over from it
+        served: Callable[[MapSummary], bool] = lambda summary: True,  # which maps with a place are there
+        also: Collection[str] = (),  # quarantined maps that take part as if they were active: a trial
+        instead: Mapping[str, FeatureMap] | None = None,  # by id, states not yet committed: a trial, too
     ) -> "Localiser":
         """Load and index the active maps of a snapshot.
 
         Maps in quarantine that are placed by positions alone answer where they are named.
-
-        Args:
-            as_of: snapshot number or time; None: the newest.
-            previous: areas that have not changed since are taken over from it.
-            served: of the maps with a place, which are there at all.
-            also: quarantined maps that take part as if they were active: a trial before they are.
-            instead: states of maps, by id, that take part in the place of those in the database: a trial
-                before they are committed.
 
         Raises:
             StoreError: the database cannot be read.

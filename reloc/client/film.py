@@ -96,20 +96,14 @@ def stream_film(
     client: Client,
     source: Source,
     *,
-    camera: CameraRequest | None = None,
-    prior: PriorRequest | None = None,
+    camera: CameraRequest | None = None,  # of the film's frames, of any size; None: estimated
+    prior: PriorRequest | None = None,  # where the film begins
     options: VideoOptions | None = None,
-    on_pose: OnPose | None = None,
+    on_pose: OnPose | None = None,  # told each pose, and how many ms it took, in a thread of its own
 ) -> StreamedFilm:
     """Send the frames of a film when they are due, those of a camera as they come, and collect the poses.
 
     Ctrl-C ends the stream, and what came until then is the result; so does the end of the session.
-
-    Args:
-        source: see `featuredb.video.frames.open_video`.
-        camera: intrinsics of the film's frames, of any size; None: estimated.
-        prior: where the film begins. options: how it is read.
-        on_pose: called with each pose, and the milliseconds from sending its frame, in a thread of its own.
 
     Raises:
         VideoError: the film cannot be read at all, or has no frames.

@@ -28,17 +28,13 @@ from reloc.wire.query import CameraRequest, ErrorCode, LocaliseReply, LocaliseWi
 
 
 def answer_query(
-    wire_request: LocaliseWireRequest,
+    wire_request: LocaliseWireRequest,  # without a request id it gets one
     data: bytes,
     localiser: Localiser,
     *,
     limits: DecodeLimits = DEFAULT_LIMITS,
 ) -> LocaliseReply:
     """Localise the image file in `data`.
-
-    Args:
-        wire_request: what the client says about it; without a request id it gets one.
-        limits: bytes and pixels allowed.
 
     Raises:
         RequestError: why the query has no answer.

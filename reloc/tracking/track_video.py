@@ -166,23 +166,17 @@ class TrackedVideo:
 
 def track_video(
     source: Source,
-    finder: Finder,
+    finder: Finder,  # of the first frame, on maps or on a scan
     *,
-    camera: Camera | None = None,
-    request: LocaliseRequest | None = None,
-    overlay: Path | None = None,
+    camera: Camera | None = None,  # of upright frames of any size; None: of the first frame that is found
+    request: LocaliseRequest | None = None,  # what else is known of the first frame
+    overlay: Path | None = None,  # an mp4 to be written
     options: TrackVideoOptions | None = None,
 ) -> TrackedVideo:
     """Track every frame of a film.
 
     The overlay shows frames as they were known when they were shown; the trajectory has those that were found
     a little later, too.
-
-    Args:
-        finder: finds the first frame, on maps or on a scan.
-        camera: intrinsics of the film's frames, upright, of any size; None: of the first frame that is found.
-        request: what else is known of the first frame.
-        overlay: an mp4 to be written.
 
     Raises:
         VideoError: the film cannot be read at all, or has no frames; the overlay cannot be written. Where it
