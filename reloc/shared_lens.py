@@ -83,10 +83,8 @@ def lenses_of_cameras(
 ) -> tuple[dict[str, SharedLens], list[CameraRequest | None]]:
     """The lens of each camera whose photos agree on one, and what each photo (n) is to be asked with.
 
-    A photo that contradicts its camera's lens, or whose lens is known already, is asked with none.
-
-    Args:
-        keys: (n) of the photos' cameras. views: (n) see `views_of`.
+    A photo that contradicts its camera's lens, or whose lens is known already, is asked with none. `keys`:
+    (n) of the photos' cameras. `views`: (n), see `views_of`.
     """
     rows: dict[str, list[int]] = {}
     for row, (key, view) in enumerate(zip(keys, views, strict=True)):
@@ -167,8 +165,7 @@ def _together(
     )
     by_lens = opencv_by_lens(prior.mean)  # the prior is of other parameters than OPENCV's own
     known = LensPrior(
-        mean=with_lens(start, prior.mean),
-        covariance=by_lens @ np.diag(1.0 / prior.information) @ by_lens.T,
+        mean=with_lens(start, prior.mean), covariance=by_lens @ np.diag(1.0 / prior.information) @ by_lens.T
     )
     problem = Problem(block, Terms(keypoint_px=1.0, lenses=(known,), marks=marks))
     problem.solve(100, 1e-10)

@@ -96,9 +96,7 @@ def read_answers(
 ) -> Iterator[tuple[RobotPose, LocalFrame]]:
     """Poses of answers and their local frame; one JSON object a line, those without a pose are passed over.
 
-    Args:
-        clock: gives Unix time in seconds, as time.time.
-        origin: of the local frame; None: where the first pose is.
+    `clock` gives Unix time in seconds; without an origin the local frame is where the first pose is.
 
     Raises:
         InvalidValueError: a line is no answer.

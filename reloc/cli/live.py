@@ -63,11 +63,7 @@ def add_film_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_live(args: argparse.Namespace) -> int:
-    """Stream, print, write; 0, 1 where no frame was localised, 2 where a file could not be written.
-
-    Raises:
-        InvalidValueError, VideoError, ServiceError
-    """
+    """Stream, print, write; 0, 1 where no frame was localised, 2 where a file could not be written."""
     from featuredb.video.film import VideoOptions
     from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.client.client import Client

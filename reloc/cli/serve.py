@@ -55,11 +55,7 @@ def register(subparsers: Any) -> None:
     serve.add_argument("--workers", type=int, help="queries localised at a time; default 2")
     serve.add_argument("--max-queue", type=int, help="queries that may wait; default 32")
     serve.add_argument(
-        "--deadline",
-        type=float,
-        dest="deadline_s",
-        metavar="SECONDS",
-        help="per query; default 8",
+        "--deadline", type=float, dest="deadline_s", metavar="SECONDS", help="per query; default 8"
     )
     serve.add_argument(
         "--contributions",

@@ -271,22 +271,18 @@ class Client:
 
     def track(
         self,
-        camera: CameraRequest | None = None,
-        prior: PriorRequest | None = None,
+        camera: CameraRequest
+        | None = None,  # of the frames, of any size of the same picture; None: estimated
+        prior: PriorRequest | None = None,  # where the first frame may have been taken
         *,
-        timeout_s: float = _TIMEOUT_S,
+        timeout_s: float = _TIMEOUT_S,  # the longest wait for the session to open
     ) -> LiveTrack:
         """A live session, to be used in a `with` block: frames are sent, and poses come.
 
-            with client.track() as live:
-                for jpeg, time_s in frames:
-                    live.send(jpeg, time_s)
-                    pose = live.next(timeout_s=0.1)
-
-        Args:
-            camera: intrinsics of the frames, of any size of the same picture; None: estimated.
-            prior: where the first frame may have been taken (degrees, metres).
-            timeout_s: the longest wait for the session to open.
+        with client.track() as live:
+            for jpeg, time_s in frames:
+                live.send(jpeg, time_s)
+                pose = live.next(timeout_s=0.1)
         """
         return LiveTrack(self._session(), self._keys, self.name, camera, prior, timeout_s)
 

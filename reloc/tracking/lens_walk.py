@@ -55,9 +55,7 @@ class LensWalk:
             return LensSigmas(focal_rel=self.before_rel)
         longer = max(self.camera.width, self.camera.height)
         return LensSigmas(
-            focal_rel=self.before_rel,
-            center_px=_PRIORS.center_rel * longer,
-            radial=_PRIORS.radial,
+            focal_rel=self.before_rel, center_px=_PRIORS.center_rel * longer, radial=_PRIORS.radial
         )
 
     def surprised(self, focal_px: float, focal_rel: float) -> bool:

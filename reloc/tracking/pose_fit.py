@@ -131,10 +131,8 @@ def _linearised(
 ) -> tuple[FloatArray, FloatArray]:
     """Residuals (2, n) in pixels and derivatives (count, 2, n) by the pose's left perturbation, and the zoom.
 
-    Points behind the camera have residuals of infinity and no derivatives.
-
-    Args:
-        seen: (n, 2) rays by the camera's focal length. zoom: logarithm of the true one over it.
+    Points behind the camera have residuals of infinity and no derivatives. `seen`: (n, 2) rays by the
+    camera's focal length; `zoom`: logarithm of the true one over it.
     """
     x, y, z = pose.act(points).T
     front = z > 1e-6

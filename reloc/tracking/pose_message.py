@@ -18,11 +18,9 @@ _PLACE = ("position", "quaternion", "height_datum", "utm", "covariance", "accura
 
 
 def pose_message(point: TrajectoryPoint, camera: Camera | None, **about: Any) -> TrackPose:
-    """A frame on Earth as the wire says it.
+    """A frame on Earth as the wire says it, with its camera as the client sent it where there is a pose.
 
-    Args:
-        camera: intrinsics of the frame as the client sent it; not None where there is a pose.
-        about: `session`, `sequence`, `snapshot`, `dropped`, `received_at`, `answered_at`, `timings_ms`.
+    `about`: `session`, `sequence`, `snapshot`, `dropped`, `received_at`, `answered_at`, `timings_ms`.
     """
     pose: dict[str, Any] = dict.fromkeys(_PLACE)
     if point.pose is not None:

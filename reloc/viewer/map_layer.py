@@ -125,11 +125,7 @@ def own_points(unplaced: UnplacedMap, wanted: int) -> DrawnPoints:
 
 
 def describe_own_place(
-    summary: UnplacedSummary,
-    unplaced: UnplacedMap,
-    drawn: DrawnPoints,
-    buffer: dict[str, Any],
-    command: str,
+    summary: UnplacedSummary, unplaced: UnplacedMap, drawn: DrawnPoints, buffer: dict[str, Any], command: str
 ) -> dict[str, Any]:
     """The map as a place of the page with no place on Earth: `frame`, `epsg` and what hangs on them are None.
 

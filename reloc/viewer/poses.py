@@ -49,11 +49,7 @@ def drawn_pose(center: FloatArray, local_from_cam: FloatArray, camera: Camera | 
 
 
 def worded_place(geopose: GeoPose, utm: FloatArray, epsg: int, height_datum: str) -> dict[str, Any]:
-    """UTM, GeoPose and angles of one pose.
-
-    Args:
-        geopose: its height in the same datum as that of `utm`, (3,) easting, northing, height.
-    """
+    """UTM (3,) easting, northing, height, GeoPose and angles of one pose; both heights are in one datum."""
     heading, pitch, roll = geopose.heading_pitch_roll_deg
     easting, northing, height = _rounded(utm, 4)
     return {

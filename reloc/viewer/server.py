@@ -82,9 +82,7 @@ def local_app(
 ) -> tuple[FastAPI, Callable[[Callable[[], Any]], Awaitable[Any]]]:
     """An application for this machine, and what runs a function beside its event loop.
 
-    Args:
-        html: the page, at `prefix`/, and `policy`, its Content-Security-Policy.
-        files: by their path below `prefix`/assets/.
+    The page is at `prefix`/, with `policy` as its Content-Security-Policy, files lie below `prefix`/assets/.
     """
     app = FastAPI(title=title, docs_url=None, redoc_url=None, openapi_url=None)
     threads = ThreadPoolExecutor(4, thread_name_prefix=title)
@@ -108,10 +106,7 @@ def local_app(
 
 
 def serve(app: FastAPI, port: int, *, browser: bool, path: str = "") -> None:
-    """Serve until SIGINT or SIGTERM, after printing the address; call from the main thread.
-
-    Args:
-        browser: also open the page. path: of the page, below the address.
+    """Serve until SIGINT or SIGTERM; call from the main thread. Prints the page's address, or opens it, too.
 
     Raises:
         ListenError: cannot listen.

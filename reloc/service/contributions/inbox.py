@@ -29,11 +29,7 @@ _ANSWER = {
 
 
 def contribution_of(
-    data: bytes,
-    request: LocaliseWireRequest,
-    reply: LocaliseReply,
-    received_at: datetime,
-    owner: str,
+    data: bytes, request: LocaliseWireRequest, reply: LocaliseReply, received_at: datetime, owner: str
 ) -> Contribution:
     """The row of a contributed photo out of its query, which has been answered and found valid.
 

@@ -40,11 +40,7 @@ class WorkerPool:
     """
 
     def __init__(
-        self,
-        queue: QueryQueue,
-        watch: DeadlineWatch,
-        options: ServeOptions,
-        inbox: Inbox | None = None,
+        self, queue: QueryQueue, watch: DeadlineWatch, options: ServeOptions, inbox: Inbox | None = None
     ) -> None:
         self._queue = queue
         self._watch = watch

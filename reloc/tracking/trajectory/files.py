@@ -106,10 +106,7 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
 
 
 def format_of(path: Path, own_map: str | None = None) -> Callable[[Trajectory], str]:
-    """What makes the text of a file with this suffix.
-
-    Args:
-        own_map: id of the map without a place in whose frame the poses are.
+    """What makes the text of a file with this suffix; `own_map`: id of the map in whose own frame poses are.
 
     Raises:
         InvalidValueError: there is no such format.
