@@ -25,8 +25,7 @@ _TURN_S = 1.0  # of waiting for a signal
 def metrics_page(port: int, status: Callable[[], StatusReply | None]) -> Iterator[int]:
     """Within the block `http://127.0.0.1:PORT/metrics` says what the server's status does; the port.
 
-    Args:
-        port: 0 takes a free one. status: None while the server does not answer yet.
+    Port 0 takes a free one. The status is None while the server does not answer yet.
 
     Raises:
         ServiceStartError: the port is taken.

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any
 
@@ -128,21 +128,13 @@ class Landmarks:
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Landmarks":
         """Some of them."""
-        return Landmarks(
-            rows=self.rows[chosen],
-            points=self.points[chosen],
-            pixels=self.pixels[chosen],
-            born=self.born[chosen],
-        )
+        return Landmarks(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
     def joined(self, newer: "Landmarks") -> "Landmarks":
         """Both; of a point that is in both the newer one, whose pixel is a fresh match."""
-        old = self.take(~np.isin(self.rows, newer.rows))
+        old, names = self.take(~np.isin(self.rows, newer.rows)), [field.name for field in fields(self)]
         return Landmarks(
-            rows=np.concatenate([newer.rows, old.rows]),
-            points=np.concatenate([newer.points, old.points]),
-            pixels=np.concatenate([newer.pixels, old.pixels]),
-            born=np.concatenate([newer.born, old.born]),
+            **{name: np.concatenate([getattr(newer, name), getattr(old, name)]) for name in names}
         )
 
     def spread(self, count: int, columns: int, rows: int, width: int, height: int) -> "Landmarks":
