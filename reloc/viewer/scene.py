@@ -40,7 +40,6 @@ _TOGETHER_M = 20_000.0
 # Of a scan that is larger than the maps, this much is shown around them.
 SCAN_MARGIN_M = 50.0
 
-
 Spot = tuple[FloatArray, int]  # where something lies: (3,) easting, northing, height in metres; the zone
 
 
