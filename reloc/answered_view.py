@@ -23,25 +23,17 @@ from reloc.wire.track import TrackPose
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AnsweredView:
-    """A camera on Earth.
+    """A camera on Earth."""
 
-    Attributes:
-        frame: true east, north, up at the camera's centre, or near it.
-        camera: intrinsics of the photo's stored pixels.
-        cam_from_local: `frame` to camera axes, metres.
-        covariance: (6 + n, 6 + n) of the pose as LocalisedPose has it, then of the n camera parameters; n = 0
-            where the lens is exact.
-        epsg: UTM zone of the answer. height_datum: of its heights.
-        map_ids: maps that answered.
-    """
-
-    frame: LocalFrame
-    camera: Camera
-    cam_from_local: Rigid3
+    frame: LocalFrame  # true east, north, up at the camera's centre, or near it
+    camera: Camera  # of the photo's stored pixels
+    cam_from_local: Rigid3  # `frame` to camera axes, metres
+    # (6 + n, 6 + n) of the pose as LocalisedPose has it, then of the n camera parameters; n = 0: the lens is
+    # exact.
     covariance: FloatArray
-    epsg: int
-    height_datum: str
-    map_ids: tuple[str, ...] = ()
+    epsg: int  # UTM zone of the answer
+    height_datum: str  # of its heights
+    map_ids: tuple[str, ...] = ()  # that answered
 
     def __post_init__(self) -> None:
         freeze(self, covariance=(None, None))

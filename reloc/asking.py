@@ -99,10 +99,7 @@ class PhotoAsker:
     """Answers photos from a snapshot; its index is kept between calls. Threads may share it."""
 
     def __init__(self, database: Database, as_of: int | None = None) -> None:
-        """
-        Args:
-            as_of: answer from this snapshot for ever; None: from the newest.
-        """
+        """`as_of`: answer from this snapshot for ever; None: from the newest."""
         self._database, self._as_of = database, as_of
         self.name = wire_name_of(database.url)  # as a server calls it
         self._lock = threading.Lock()
@@ -118,23 +115,15 @@ class PhotoAsker:
 
     def ask(
         self,
-        image: Image,
+        image: Image,  # path or bytes of a file, or pixels, (h, w) or (h, w, 3) uint8, red first
         *,
-        prior: PriorRequest | tuple[float, float, float] | None = None,
-        camera: CameraRequest | Camera | None = None,
-        exif_prior: bool = True,
-        maps: tuple[str, ...] | None = None,
-        inliers: bool = True,
+        prior: PriorRequest | tuple[float, float, float] | None = None,  # WGS84 degrees, sigma in metres
+        camera: CameraRequest | Camera | None = None,  # of any size; exact unless it gives sigmas
+        exif_prior: bool = True,  # the photo's EXIF position settles what is ambiguous without a prior
+        maps: tuple[str, ...] | None = None,  # ask only these
+        inliers: bool = True,  # the answer carries the matches that agree, which its pictures need
     ) -> PhotoAnswer:
         """Where was this photo taken?
-
-        Args:
-            image: path or bytes of an image file, or its pixels, (h, w) or (h, w, 3) uint8, red first.
-            prior: where it may have been taken: latitude, longitude (WGS84 degrees), standard deviation (m).
-            camera: intrinsics, for any size of the picture; exact unless a CameraRequest gives sigmas.
-            exif_prior: the position in the photo's EXIF settles what is ambiguous, where `prior` is None.
-            maps: ask only maps of these ids.
-            inliers: the answer carries the matches that agree, which its pictures need.
 
         Raises:
             ImageError, OSError: no usable image. InvalidValueError: a prior or camera that is none.
@@ -163,11 +152,8 @@ def _image_bytes(image: Image) -> tuple[bytes, str]:
     if isinstance(image, str | Path):
         return Path(image).read_bytes(), str(image)
     pixels = np.asarray(image)
-    if (
-        pixels.dtype != np.uint8
-        or not pixels.size
-        or not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3))
-    ):
+    is_picture = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
+    if pixels.dtype != np.uint8 or not pixels.size or not is_picture:
         raise ImageError(
             f"image: expected pixels (h, w) or (h, w, 3) uint8, found {pixels.shape} {pixels.dtype}"
         )

@@ -14,12 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from featuredb.errors import (
-    FeatureDbError,
-    MapNotFoundError,
-    StoreError,
-    UnplacedBesideOthersError,
-)
+from featuredb.errors import FeatureDbError, MapNotFoundError, StoreError, UnplacedBesideOthersError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area, join_segments
@@ -34,7 +29,7 @@ from featuredb.store.tables import BOUNDS
 from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.localise.localise import localise
 from reloc.localise.options import LocaliseOptions
-from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult, PoseInMap
+from reloc.localise.result import LocaliseRequest, LocaliseResult, PoseInMap
 
 _LOG = logging.getLogger(__name__)
 # Maps whose boxes come this close belong to one area: a photo may see both.
@@ -55,13 +50,10 @@ def at_stand_in(unplaced: UnplacedMap) -> FeatureMap:
 
 def in_own_frame(result: LocaliseResult, unplaced: UnplacedMap) -> LocaliseResult:
     """The result of a search of `at_stand_in(unplaced)`, without anything that could be taken for a place."""
-    if result.pose is None:
+    pose = result.pose
+    if pose is None:
         return replace(result, runner_up=None)
-    return replace(result, pose=None, in_map=_pose(result.pose, unplaced), runner_up=None)
-
-
-def _pose(pose: LocalisedPose, unplaced: UnplacedMap) -> PoseInMap:
-    return PoseInMap(
+    in_map = PoseInMap(
         map_id=unplaced.map_id,
         frame=unplaced.frame,
         cam_from_map=pose.cam_from_local,
@@ -70,6 +62,7 @@ def _pose(pose: LocalisedPose, unplaced: UnplacedMap) -> PoseInMap:
         camera_source=pose.camera_source,
         residual_rms_px=pose.residual_rms_px,
     )
+    return replace(result, pose=None, in_map=in_map, runner_up=None)
 
 
 class OnDemand(Generic[_Value]):
@@ -110,26 +103,17 @@ _State = tuple[FeatureMap, Segment]  # a bare map, and what is laid out of it
 
 
 class Localiser:
-    """Answers queries from one snapshot, which never changes; threads may share it.
-
-    Attributes:
-        options: settings by which it answers. snapshot: version of the database that it answers from.
-    """
+    """Answers queries from one snapshot of a database, which never changes; threads may share it."""
 
     def __init__(
         self,
-        loaded: Mapping[tuple[str, ...], IndexedArea],
+        loaded: Mapping[tuple[str, ...], IndexedArea],  # by what they are made of, sorted write ids of maps
         options: LocaliseOptions,
         snapshot: int,
-        lineages: Mapping[str, MapLineage],
+        lineages: Mapping[str, MapLineage],  # by map id, as are the others
         unplaced: Mapping[str, OnDemand[_OwnArea]],
         provisional: Mapping[str, OnDemand[IndexedArea]],
     ) -> None:
-        """
-        Args:
-            loaded: areas by what they are made of, the sorted write ids of their maps.
-            lineages, unplaced, provisional: by map id.
-        """
         self._loaded = loaded
         self.options, self.snapshot = options, snapshot
         # Of the snapshot, not of an area: an area that is taken over may hang on maps that have changed.
@@ -147,24 +131,16 @@ class Localiser:
         cls,
         database: Database,
         options: LocaliseOptions | None = None,
-        as_of: int | datetime | None = None,
+        as_of: int | datetime | None = None,  # None: the newest
         *,
-        previous: "Localiser | None" = None,
-        served: Callable[[MapSummary], bool] = lambda summary: True,
-        also: Collection[str] = (),
-        instead: Mapping[str, FeatureMap] | None = None,
+        previous: "Localiser | None" = None,  # areas that have not changed since are taken over from it
+        served: Callable[[MapSummary], bool] = lambda summary: True,  # which maps with a place are there
+        also: Collection[str] = (),  # quarantined maps that take part as if they were active: a trial
+        instead: Mapping[str, FeatureMap] | None = None,  # by id, states not yet committed: a trial, too
     ) -> "Localiser":
         """Load and index the active maps of a snapshot.
 
         Maps in quarantine that are placed by positions alone answer where they are named.
-
-        Args:
-            as_of: snapshot number or time; None: the newest.
-            previous: areas that have not changed since are taken over from it.
-            served: of the maps with a place, which are there at all.
-            also: quarantined maps that take part as if they were active: a trial before they are.
-            instead: states of maps, by id, that take part in the place of those in the database: a trial
-                before they are committed.
 
         Raises:
             StoreError: the database cannot be read.
@@ -174,10 +150,10 @@ class Localiser:
         placed = [m for m in snapshot.maps() if served(m)]
         taken = [m for m in placed if m.status == "active" or m.map_id in also]
         active = [m for m in taken if m.descriptors and m.box]
-        known = previous._loaded if previous else {}
+        before = previous or cls({}, options, 0, {}, {}, {})
+        known, states = before._loaded, dict(before._states)
         loaded: dict[tuple[str, ...], Area] = {}
         trial = instead or {}
-        states = dict(previous._states) if previous else {}
         files = SegmentFiles(database.url)
         for group in _group(active):
             key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
@@ -186,13 +162,13 @@ class Localiser:
                 loaded[key] = known[key].area
             else:
                 loaded[key] = _load(files, snapshot, group, states, trial)
-        had = {d.write_id: d for d in previous._unplaced.values()} if previous else {}
+        had = {d.write_id: d for d in before._unplaced.values()}
         unplaced = {
             m.map_id: had.get(m.write_id) or OnDemand(m.write_id, partial(_own_area, snapshot, m.map_id))
             for m in snapshot.unplaced_maps()
             if m.descriptors
         }
-        held = {d.write_id: d for d in previous._provisional.values()} if previous else {}
+        held = {d.write_id: d for d in before._provisional.values()}
         provisional = {
             m.map_id: held.get(m.write_id)
             or OnDemand(m.write_id, partial(_load_alone, database.url, snapshot, m))
@@ -200,8 +176,7 @@ class Localiser:
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
         files.prune()
-        before = previous.areas if previous else ()
-        indexed = dict(zip(loaded, indexed_together(list(loaded.values()), before), strict=True))
+        indexed = dict(zip(loaded, indexed_together(list(loaded.values()), before.areas), strict=True))
         made = cls(indexed, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
         made._states = {m.write_id: states[m.write_id] for m in active if m.write_id in states}
         return made
@@ -301,29 +276,22 @@ def _load(
     states: dict[str, _State],
     instead: Mapping[str, FeatureMap],
 ) -> Area:
-    """The area of some maps; what was laid out before is not again.
+    """The area of some maps; `states`, by write id: what was laid out before, and what is now, too."""
 
-    Args:
-        states: by write id; what is read now is added.
-    """
-    new = [m for m in group if m.map_id not in instead and m.write_id not in states]
-    for m in new:
-        segment = files.get(m.write_id, partial(_laid_out, snapshot, m.map_id))
-        states[m.write_id] = snapshot.load_bare(m.map_id), segment
-    chosen = [
-        (instead[m.map_id].bare(), segment_of(instead[m.map_id]))
-        if m.map_id in instead
-        else states[m.write_id]
-        for m in group
-    ]
+    def state(summary: MapSummary) -> _State:
+        map_id, write_id = summary.map_id, summary.write_id
+        if map_id in instead:
+            return instead[map_id].bare(), segment_of(instead[map_id])
+        if write_id not in states:
+            segment = files.get(write_id, lambda: segment_of(snapshot.load_map(map_id)))
+            states[write_id] = snapshot.load_bare(map_id), segment
+        return states[write_id]
+
+    chosen = [state(m) for m in group]
     area = join_segments([bare for bare, _ in chosen], [segment for _, segment in chosen])
     points, images = len(area.points), len(area.image_map)
     _LOG.info("area of %d maps: %d points, %d images", len(group), points, images)
     return area
-
-
-def _laid_out(snapshot: Snapshot, map_id: str) -> Segment:
-    return segment_of(snapshot.load_map(map_id))
 
 
 def _load_alone(url: str, snapshot: Snapshot, summary: MapSummary) -> IndexedArea:
@@ -336,9 +304,8 @@ def _load_alone(url: str, snapshot: Snapshot, summary: MapSummary) -> IndexedAre
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:
     """Maps whose boxes come within _AREA_GAP_M of each other, directly or through others.
 
-    Maps of one group share an extractor and a height datum: heights of different datums do not mix.
-
-    Boxes are compared as spheres around their middles in one Cartesian frame, across zone borders.
+    Maps of one group share an extractor and a height datum: heights of different datums do not mix. Boxes are
+    compared as spheres around their middles in one Cartesian frame, across zone borders.
     """
     if not maps:
         return []

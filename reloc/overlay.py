@@ -1,8 +1,4 @@
-"""A picture that shows how well the map sits on the photo.
-
-Green circles are keypoints that agree with the pose, the short line leads to where their map point
-projects; small blue dots are other points of the map that should be visible.
-"""
+"""A picture that shows how well the map sits on the photo: keypoints, and where they should lie."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +12,6 @@ from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import decode_rgb
 from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from reloc.answered_view import AnsweredView
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.matching import visible_points
@@ -37,7 +32,6 @@ def draw_overlay(
     """The photo with the projected map, (h, w, 3) uint8 BGR, longer side at most 1600 px.
 
     Args:
-        photo: bytes of the query's image file.
         reply: localised, with `inlier_points` (ask for them).
         other_points_utm: (n, 3) further points of the map, easting, northing, height in the reply's zone.
 
@@ -55,8 +49,12 @@ def draw_overlay(
     shrink = max(image.shape) / max(whole.shape)
     view, inliers_utm = AnsweredView.of_reply(reply), np.array(reply.inlier_points.utm).reshape(-1, 3)
     if other_points_utm is not None and len(other_points_utm):
-        others = _thinned(_without(other_points_utm, inliers_utm))
-        for x, y in _inside(view.project_utm(others), view.camera) * shrink:
+        others = _without(other_points_utm, inliers_utm)
+        others = others[:: max(1, len(others) // _MAX_OTHER)]
+        pixels = view.project_utm(others)
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels < [view.camera.width, view.camera.height])).all(axis=1)
+        for x, y in pixels[inside] * shrink:
             cv2.circle(image, (round(x), round(y)), 2, _OTHER_BGR, -1, cv2.LINE_AA)
     keypoints = np.array(reply.inlier_points.pixels).reshape(-1, 2)
     projected = view.project_utm(inliers_utm)
@@ -86,8 +84,7 @@ def write_overlay(
 def map_points_in_view(areas: Sequence[IndexedArea], view: AnsweredView) -> FloatArray:
     """Points (n, 3) of the answering area that the photo should show: easting, northing, height in its zone.
 
-    Args:
-        areas: those of the localiser that gave the answer.
+    `areas`: those of the localiser that gave the answer.
     """
     for area in (indexed.area for indexed in areas):
         if view.map_ids[0] in {feature_map.map_id for feature_map in area.maps}:
@@ -95,12 +92,6 @@ def map_points_in_view(areas: Sequence[IndexedArea], view: AnsweredView) -> Floa
             rows = visible_points(area, area.searched_points(), view.camera, pose)
             return area.frame.utm_from_enu(area.points[rows], view.epsg)
     return np.empty((0, 3))
-
-
-def _inside(pixels: FloatArray, camera: Camera) -> FloatArray:
-    with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-    return pixels[inside]
 
 
 def _without(points: FloatArray, taken: FloatArray) -> FloatArray:
@@ -111,20 +102,13 @@ def _without(points: FloatArray, taken: FloatArray) -> FloatArray:
     return points[~np.isfinite(distance)]
 
 
-def _thinned(points: FloatArray) -> FloatArray:
-    step = max(1, len(points) // _MAX_OTHER)
-    return points[::step]
-
-
 def _caption(image: NDArray[np.uint8], reply: LocaliseReply) -> None:
     assert reply.utm is not None
     text = (
         f"EPSG {reply.utm.epsg}  E {reply.utm.easting:.2f}  N {reply.utm.northing:.2f}  "
         f"H {reply.utm.height:.2f}  {reply.inliers} inliers"
     )
-    height = image.shape[0]
+    height, white = image.shape[0], (255, 255, 255)
     image[max(0, height - 46) :] //= 4  # a dark band, so that the text reads on any photo
     for up, line in ((28, text), (8, _LEGEND)):
-        cv2.putText(
-            image, line, (8, height - up), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
-        )
+        cv2.putText(image, line, (8, height - up), cv2.FONT_HERSHEY_SIMPLEX, 0.5, white, 1, cv2.LINE_AA)

@@ -33,13 +33,7 @@ def reply_from_result(
     if result.in_map is not None:
         fields = _NO_POSE | {"in_map": _in_map(result.in_map), "maps": (result.in_map.map_id,)}
     return LocaliseReply(
-        status=result.status,
-        reason=result.reason,
-        detail=result.detail,
-        confidence=result.confidence,
-        features=result.features,
-        matches=result.matches,
-        inliers=result.inliers,
+        **{name: getattr(result, name) for name in _SAME},
         runner_up=None
         if runner_up is None
         else RunnerUpPose(
@@ -49,8 +43,7 @@ def reply_from_result(
             lat=runner_up.latitude_deg,
             lon=runner_up.longitude_deg,
         ),
-        snapshot=result.snapshot,
-        exif_prior=None if own is None else OwnPositionUse(role=own.role, distance_m=own.distance_m),
+        exif_prior=None if own is None else OwnPositionUse(**asdict(own)),
         timings_ms=timings_ms,
         request_id=request_id,
         body_axes=BODY_AXES,
@@ -58,6 +51,8 @@ def reply_from_result(
     )
 
 
+# What a result and its reply call alike.
+_SAME = ("status", "reason", "detail", "confidence", "features", "matches", "inliers", "snapshot")
 _NO_POSE: dict[str, Any] = {
     **dict.fromkeys(("position", "quaternion", "height_datum", "utm", "covariance", "accuracy", "camera")),
     **dict.fromkeys(("residual_rms_px", "inlier_points")),

@@ -45,16 +45,11 @@ class LensView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SharedLens:
-    """A lens that photos agree on.
+    """A lens that photos agree on."""
 
-    Attributes:
-        camera: OPENCV. sigmas: (8,) one standard deviation of each of its parameters, in their order.
-        agree: (n,) which of the photos.
-    """
-
-    camera: Camera
-    sigmas: FloatArray
-    agree: NDArray[np.bool_]
+    camera: Camera  # OPENCV
+    sigmas: FloatArray  # (8,) one standard deviation of each of its parameters, in their order
+    agree: NDArray[np.bool_]  # (n,) which of the photos
 
     def as_request(self) -> CameraRequest:
         """As a query takes it."""
@@ -88,10 +83,8 @@ def lenses_of_cameras(
 ) -> tuple[dict[str, SharedLens], list[CameraRequest | None]]:
     """The lens of each camera whose photos agree on one, and what each photo (n) is to be asked with.
 
-    A photo that contradicts its camera's lens, or whose lens is known already, is asked with none.
-
-    Args:
-        keys: (n) of the photos' cameras. views: (n) see `views_of`.
+    A photo that contradicts its camera's lens, or whose lens is known already, is asked with none. `keys`:
+    (n) of the photos' cameras. `views`: (n), see `views_of`.
     """
     rows: dict[str, list[int]] = {}
     for row, (key, view) in enumerate(zip(keys, views, strict=True)):
@@ -112,8 +105,7 @@ def lenses_of_cameras(
 def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
     """The lens that most views agree on, without those that do not; None where too few are left.
 
-    Args:
-        views: of pictures of one size; any camera of OPENCV's or SIMPLE_RADIAL's model.
+    Views are of pictures of one size, with cameras of OPENCV's or SIMPLE_RADIAL's model.
     """
     priors = LensPriors()
     agree = np.ones(len(views), dtype=np.bool_)
@@ -126,8 +118,13 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
     prior = priors.around(first, focal_px, priors.unknown_focal_rel)
     noise_px = 0.25 * PoseOptions().tolerance_px(first)
     noise = [measured_noise_px(v.pixels, v.points, v.cam_from_local, v.camera, noise_px) for v in views]
-    problems = [_problem(view, prior, noise_px, own) for view, own in zip(views, noise, strict=True)]
-    alone = np.array([_alone(p, v) for p, v in zip(problems, views, strict=True)])
+    problems, alone = [], []  # each photo's pixels, and what they cost with a lens of its own
+    for view, own_px in zip(views, noise, strict=True):
+        pixels, points, trust = view.pixels, view.points, (noise_px / own_px) ** 2
+        problem = LensProblem(pixels=pixels, points=points, noise_px=noise_px, trust=trust, prior=prior)
+        own = calibrate(pixels, points, view.cam_from_local, view.camera, prior, noise_px)
+        problems.append(problem)
+        alone.append(problem.cost_of_pixels(own.cam_from_local, own.camera))
     while agree.sum() >= _LEAST_PHOTOS:
         rows = [int(r) for r in np.flatnonzero(agree)]
         start = views[max(rows, key=lambda r: len(views[r].pixels))].camera
@@ -139,27 +136,10 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
             excess[r] = problems[r].cost_of_pixels(found, camera) - alone[r]
         worst = max(rows, key=lambda r: excess[r])
         if excess[worst] <= _MAX_EXCESS:
-            return SharedLens(
-                camera=camera,
-                sigmas=_SIGMA_SCALE * np.sqrt(np.diag(covariance)),
-                agree=agree,
-            )
+            sigmas = _SIGMA_SCALE * np.sqrt(np.diag(covariance))
+            return SharedLens(camera=camera, sigmas=sigmas, agree=agree)
         agree[worst] = False
     return None
-
-
-def _problem(view: LensView, prior: QueryLensPrior, noise_px: float, own_px: float) -> LensProblem:
-    return LensProblem(
-        pixels=view.pixels, points=view.points, noise_px=noise_px, trust=(noise_px / own_px) ** 2, prior=prior
-    )
-
-
-def _alone(problem: LensProblem, view: LensView) -> float:
-    """What a photo's pixels cost with a lens of its own."""
-    own = calibrate(
-        view.pixels, view.points, view.cam_from_local, view.camera, problem.prior, problem.noise_px
-    )
-    return problem.cost_of_pixels(own.cam_from_local, own.camera)
 
 
 def _together(
@@ -183,13 +163,10 @@ def _together(
         xy=np.concatenate([view.pixels for view in views]),
         sigma_px=np.repeat(noise_px, count),
     )
-    problem = Problem(block, Terms(keypoint_px=1.0, lenses=(_opencv(prior, start),), marks=marks))
+    by_lens = opencv_by_lens(prior.mean)  # the prior is of other parameters than OPENCV's own
+    known = LensPrior(
+        mean=with_lens(start, prior.mean), covariance=by_lens @ np.diag(1.0 / prior.information) @ by_lens.T
+    )
+    problem = Problem(block, Terms(keypoint_px=1.0, lenses=(known,), marks=marks))
     problem.solve(100, 1e-10)
     return problem.block(), problem.marginals().lens(0)
-
-
-def _opencv(prior: QueryLensPrior, camera: Camera) -> LensPrior:
-    """The prior as that of OPENCV's own parameters."""
-    by_lens = opencv_by_lens(prior.mean)
-    covariance = by_lens @ np.diag(1.0 / prior.information) @ by_lens.T
-    return LensPrior(mean=with_lens(camera, prior.mean), covariance=covariance)

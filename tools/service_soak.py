@@ -22,7 +22,7 @@ from statistics import median
 from featuredb.errors import ServiceError
 from featuredb.store import Database
 from reloc.client import Client
-from reloc.client.replies import NO_SERVER, TIMEOUT
+from reloc.client.connection import NO_SERVER, TIMEOUT
 from tools.figures import say, write_figures
 from tools.service_world import (
     ATTACKER,

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from featuredb.errors import ServiceError
 from reloc.client import Client
-from reloc.client.replies import TIMEOUT
+from reloc.client.connection import TIMEOUT
 from tools.figures import write_figures
 from tools.serve_process import ServeProcess, children
 from tools.service_world import photos_of, service_parser

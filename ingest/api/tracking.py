@@ -14,8 +14,7 @@ from ingest.track.finders import FilmGround, finder_for
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, TrackVideoOptions, track_video
-from reloc.tracking.trajectory.files import check_format
-from reloc.tracking.trajectory.outputs import Outputs, check_outputs, write_outputs
+from reloc.tracking.trajectory.files import Outputs, check_outputs, format_of, write_outputs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,7 +95,7 @@ def track_film(
     finder = finder_for(database, ground or FilmGround(), camera, options.track)
     if isinstance(finder, MapFinder) and finder.own_map is not None:
         for file in out:
-            check_format(file, finder.own_map)
+            format_of(file, finder.own_map)
         if prior is not None:
             raise InvalidValueError(
                 f"--prior is a place on Earth, and map {finder.own_map} has none; leave it out"

@@ -73,7 +73,7 @@ def run_track(args: argparse.Namespace) -> int:
     from reloc.answered_view import camera_of, geo_prior
     from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.tracking.track_video import TrackVideoOptions
-    from reloc.tracking.trajectory.outputs import exit_code
+    from reloc.tracking.trajectory.files import exit_code
 
     camera, prior = parse_camera(args.camera), parse_prior(args.prior)
     done = track_film(

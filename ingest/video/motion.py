@@ -17,7 +17,7 @@ from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.film import VideoFrame
-from reloc.tracking.flow import follow
+from reloc.tracking.flow_track import follow
 from reloc.tracking.options import FlowOptions
 
 _FLOW = FlowOptions(levels=3, max_back_px=1.0)  # of the frames as they come

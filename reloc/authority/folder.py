@@ -35,7 +35,7 @@ _SERVER_HEAD = (
     + "// Each client that comes or goes: access_control is written anew, comments go, the rest stays.\n"
 )
 
-_Config = dict[str, Any]
+Section = dict[str, Any]  # of a Zenoh configuration, or all of it
 
 _KEYS = Keys(database="*")
 _IN, _OUT = "ingress", "egress"
@@ -44,15 +44,11 @@ _ALL = [
     *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
 ]
 
-Section = dict[str, Any]
-
 
 def access_control(server: str, clients: Iterable[str]) -> Section:
     """The section `access_control` of a server's Zenoh configuration: what no rule allows is dropped.
 
-    Args:
-        server: name in the certificates of other servers, which may do all.
-        clients: names in those of clients; each may ask, and has live sessions of its own.
+    By names in certificates: other servers may do all, each client may ask, and has live sessions of its own.
     """
     serve, common = _rule("serve", [_IN, _OUT], _ALL, [_KEYS.of("**")]), _rules_of_all()
     rules, policies = [serve, *common], [_policy(server, [serve])]
@@ -227,10 +223,10 @@ class Authority:
     def _revoked(self, name: str) -> Path:
         return self.folder / "revoked" / f"{name}.pem"
 
-    def _server(self) -> _Config:
+    def _server(self) -> Section:
         try:
             lines = self.server_config.read_text(encoding="utf-8").splitlines()
-            config: _Config = json.loads("\n".join(x for x in lines if not x.lstrip().startswith("//")))
+            config: Section = json.loads("\n".join(x for x in lines if not x.lstrip().startswith("//")))
             if not isinstance(config, dict):
                 raise ValueError("something else than an object")
         except (OSError, ValueError) as error:
@@ -239,7 +235,7 @@ class Authority:
             ) from error
         return config
 
-    def _write_rules(self, config: _Config, clients: list[str]) -> None:
+    def _write_rules(self, config: Section, clients: list[str]) -> None:
         config["access_control"] = access_control(_SERVER, clients)
         new = self.server_config.with_suffix(".new")
         new.unlink(missing_ok=True)
@@ -247,7 +243,7 @@ class Authority:
         new.replace(self.server_config)
 
 
-def _server(authority: Identity, server: Identity, hosts: tuple[str, ...], port: int) -> _Config:
+def _server(authority: Identity, server: Identity, hosts: tuple[str, ...], port: int) -> Section:
     reached = [f"tls/{f'[{host}]' if ':' in host else host}:{port}" for host in hosts or (_LOCALHOST,)]
     config = {
         # Not a peer: that would leave questions about liveliness to any client that calls itself a router.
@@ -261,7 +257,7 @@ def _server(authority: Identity, server: Identity, hosts: tuple[str, ...], port:
     return config
 
 
-def _client(name: str, authority: Identity, client: Identity, endpoints: list[str]) -> _Config:
+def _client(name: str, authority: Identity, client: Identity, endpoints: list[str]) -> Section:
     return {
         "mode": "client",
         "connect": {"endpoints": endpoints, "timeout_ms": _CONNECT_TIMEOUT_MS},
@@ -270,9 +266,9 @@ def _client(name: str, authority: Identity, client: Identity, endpoints: list[st
     }
 
 
-def _common(authority: Identity, shown: dict[str, Identity]) -> _Config:
+def _common(authority: Identity, shown: dict[str, Identity]) -> Section:
     """What both have: nobody is looked for, and both sides of a connection show a certificate."""
-    tls: _Config = {
+    tls: Section = {
         "enable_mtls": True,
         "verify_name_on_connect": True,
         "root_ca_certificate_base64": _base64(authority.certificate),
@@ -290,7 +286,7 @@ def _base64(pem: bytes) -> str:
     return base64.b64encode(pem).decode()
 
 
-def _text(config: _Config) -> str:
+def _text(config: Section) -> str:
     return json.dumps(config, indent=2) + "\n"
 
 
@@ -303,11 +299,7 @@ def _as_authority_error(folder: Path) -> Iterator[None]:
 
 
 def _write_new(path: Path, text: str) -> None:
-    """Write a file that only its owner may read.
-
-    Raises:
-        FileExistsError
-    """
+    """Write a file that only its owner may read; FileExistsError where there is one."""
     path.parent.mkdir(mode=0o700, exist_ok=True)
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
         file.write(text)

@@ -32,19 +32,14 @@ logger = logging.getLogger(__name__)
 class MavlinkSender:
     """Packs poses as MAVLink 2 messages.
 
-    Args:
-        geoid_m: height of the geoid over the ellipsoid, by which ellipsoidal heights become altitudes;
-            without it, and without a datum of sea level, GPS_INPUT says to ignore its altitude.
+    Without `geoid_m`, the geoid's height over the ellipsoid, GPS_INPUT says to ignore ellipsoidal altitudes.
 
     Raises:
         MissingExtraError: pymavlink is not installed.
     """
 
     def __init__(
-        self,
-        messages: Sequence[MavMessage] = ("odometry",),
-        *,
-        geoid_m: float | None = None,
+        self, messages: Sequence[MavMessage] = ("odometry",), *, geoid_m: float | None = None
     ) -> None:
         require("robots", "The MAVLink bridge", "pymavlink.dialects.v20.common")
         from pymavlink.dialects.v20 import common
@@ -131,10 +126,7 @@ class MavlinkSender:
 
 
 class UdpLink:
-    """Sends packets to `udpout:HOST:PORT`; a context manager.
-
-    Attributes:
-        lost: packets that the network did not take; the first is logged.
+    """Sends packets to `udpout:HOST:PORT`; a context manager. `lost`: what the network did not take.
 
     Raises:
         InvalidValueError: not such an address, or no such host.

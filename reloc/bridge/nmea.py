@@ -13,9 +13,7 @@ _ESTIMATED = 6  # quality of GGA: dead reckoning, as no satellites are behind it
 def sentences(pose: RobotPose, geoid_m: float | None = None) -> list[str]:
     """GGA and GST with their checksums, each ending in CR LF.
 
-    Args:
-        geoid_m: height of the geoid over the ellipsoid; without it, ellipsoidal heights and those without a
-            datum are left empty.
+    Without `geoid_m`, the geoid's height over the ellipsoid, ellipsoidal heights are left empty.
     """
     time = datetime.fromtimestamp(pose.time_s, UTC)
     clock = f"{time:%H%M%S}.{time.microsecond // 10_000:02d}"

@@ -33,11 +33,7 @@ _CONNECT_TIMEOUT_S = 5.0
 
 
 class RmwZenohNode:
-    """A node that publishes the messages of poses; a context manager.
-
-    Args:
-        connect: Zenoh endpoint of ROS 2's router, tcp/HOST:7447.
-        domain: ROS_DOMAIN_ID.
+    """A node that publishes the messages of poses, in ROS_DOMAIN_ID `domain`; a context manager.
 
     Raises:
         InvalidValueError: nobody is at the endpoint, or it is none; raised when the block begins.

@@ -31,22 +31,15 @@ FLU_FROM_FRD: FloatArray = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RobotPose:
-    """Where the camera is, and how the vehicle that carries it is turned.
+    """Where the camera is, and how the vehicle that carries it is turned."""
 
-    Attributes:
-        time_s: Unix time, UTC.
-        lat, lon: WGS84 degrees. height_m: in `height_datum`.
-        true_enu_from_body: (3, 3), body axes forward, left, up to true east, north, up at the position.
-        covariance: (6, 6) true east, north, up: displacement (m) before rotation (rad).
-    """
-
-    time_s: float
-    lat: float
+    time_s: float  # Unix time, UTC
+    lat: float  # WGS84 degrees
     lon: float
-    height_m: float
+    height_m: float  # in `height_datum`
     height_datum: str
-    true_enu_from_body: FloatArray
-    covariance: FloatArray
+    true_enu_from_body: FloatArray  # (3, 3), body axes forward, left, up to true east, north, up
+    covariance: FloatArray  # (6, 6) true east, north, up: displacement (m) before rotation (rad)
 
     @classmethod
     def of_answer(cls, answer: dict[str, Any], mount: Mount, now_s: float) -> Self | None:
@@ -103,9 +96,7 @@ def read_answers(
 ) -> Iterator[tuple[RobotPose, LocalFrame]]:
     """Poses of answers and their local frame; one JSON object a line, those without a pose are passed over.
 
-    Args:
-        clock: gives Unix time in seconds, as time.time.
-        origin: of the local frame; None: where the first pose is.
+    `clock` gives Unix time in seconds; without an origin the local frame is where the first pose is.
 
     Raises:
         InvalidValueError: a line is no answer.

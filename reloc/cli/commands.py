@@ -1,15 +1,16 @@
 """Subcommands `query` and `localise`; `serve` and `live` have modules of their own."""
 
 import argparse
+import json
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from featuredb.cli.common import add_command, open_database
 from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
+from reloc.wire.keys import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from featuredb.geometry.arrays import FloatArray
@@ -17,8 +18,9 @@ if TYPE_CHECKING:
     from reloc.asking import PhotoAsker
     from reloc.wire.query import CameraRequest, LocaliseReply
 
-    # A photo's bytes, its lens where it is known, and whether it is asked for the first time of two.
-    Ask = Callable[[bytes, CameraRequest | None, bool], LocaliseReply]
+    # A photo's bytes, its lens where it is known, and whether it is asked for the first time of two; the
+    # answer, and further points of the map that the photo should show (easting, northing, height).
+    Ask = Callable[[bytes, CameraRequest | None, bool], tuple[LocaliseReply, FloatArray | None]]
 
 
 _NOT_LOCALISED = 1  # exit code: everything worked, and the answer is no
@@ -138,8 +140,8 @@ def _query(args: argparse.Namespace) -> int:
     require_an_image(args.image)
     with Client(args.connect, args.database, config_path=args.config) as client:
 
-        def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
-            return client.localise(
+        def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "tuple[LocaliseReply, None]":
+            reply = client.localise(
                 data,
                 prior,
                 lens or camera,
@@ -151,22 +153,15 @@ def _query(args: argparse.Namespace) -> int:
                 credit=args.credit,
                 licence=args.licence,
             )
+            return reply, None
 
         return _answer_all(args, ask, client.database)
 
 
 def _localise(args: argparse.Namespace) -> int:
-    from reloc.answered_view import AnsweredView
-    from reloc.overlay import map_points_in_view
-
     require_an_image(args.image)
     asker, ask = asking_here(args, lambda: open_database(args), inliers=args.overlay is not None)
-    return _answer_all(
-        args,
-        ask,
-        asker.name,
-        lambda reply: map_points_in_view(asker.localiser().areas, AnsweredView.of_reply(reply)),
-    )
+    return _answer_all(args, ask, asker.name)
 
 
 def asking_here(
@@ -183,7 +178,9 @@ def asking_here(
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
     asker = PhotoAsker(database())
 
-    def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
+    def ask(
+        data: bytes, lens: "CameraRequest | None", first: bool
+    ) -> "tuple[LocaliseReply, FloatArray | None]":
         answer = asker.ask(
             data,
             prior=prior,
@@ -192,7 +189,7 @@ def asking_here(
             maps=tuple(args.map) if args.map else None,
             inliers=first or inliers,
         )
-        return answer.reply
+        return answer.reply, answer.other_points_utm
 
     return asker, ask
 
@@ -207,12 +204,7 @@ def require_an_image(paths: list[str]) -> None:
         raise InvalidValueError(f"{', '.join(paths)}: expected a photo, found no such file; check the path")
 
 
-def _answer_all(
-    args: argparse.Namespace,
-    ask: "Ask",
-    database: str,
-    other_points: Callable[["LocaliseReply"], "FloatArray | None"] = lambda reply: None,
-) -> int:
+def _answer_all(args: argparse.Namespace, ask: "Ask", database: str) -> int:
     """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
     from reloc.wording import describe
 
@@ -221,10 +213,10 @@ def _answer_all(
     for path in map(Path, args.image):
         try:
             data = path.read_bytes()
-            reply = ask(data, lenses.get(path), False)
-            sys.stdout.write(
-                _as_json_line(path, reply, database) if args.json else describe(str(path), reply, database)
-            )
+            reply, other_points = ask(data, lenses.get(path), False)
+            told = {"image": str(path), "database": database, **reply.model_dump(mode="json")}
+            text = json.dumps(told) + "\n" if args.json else describe(str(path), reply, database)
+            sys.stdout.write(text)
             sys.stdout.flush()
             if reply.status == "not_localised":
                 codes.add(_NOT_LOCALISED)
@@ -236,8 +228,8 @@ def _answer_all(
             elif args.overlay is not None:
                 from reloc.overlay import write_overlay
 
-                target = _overlay_path(args.overlay, path, args.image)
-                write_overlay(target, data, reply, other_points(reply))
+                target = _overlay_path(args.overlay, path, len(args.image) > 1)
+                write_overlay(target, data, reply, other_points)
                 sys.stderr.write(f"wrote {target}\n")
         except (OSError, FeatureDbError) as error:
             sys.stderr.write(f"featuredb: {path}: {getattr(error, 'strerror', None) or error}\n")
@@ -263,7 +255,7 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
     for path in map(Path, args.image):
         try:
             data = path.read_bytes()
-            reply = ask(data, None, True)
+            reply, _ = ask(data, None, True)
         except (OSError, FeatureDbError) as error:
             if isinstance(error, ServiceError) and error.code == "NO_SERVER":
                 break
@@ -284,13 +276,6 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
     return {p: lens for p, lens in zip(paths, asked_with, strict=True) if lens is not None}
 
 
-def _as_json_line(path: Path, reply: "LocaliseReply", database: str) -> str:
-    import json
-
-    return json.dumps({"image": str(path), "database": database, **reply.model_dump(mode="json")}) + "\n"
-
-
-def _overlay_path(overlay: Path, image: Path, images: Iterable[str]) -> Path:
-    if len(list(images)) == 1:
-        return overlay
-    return overlay.with_name(f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}")
+def _overlay_path(overlay: Path, image: Path, several: bool) -> Path:
+    name = f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}"
+    return overlay.with_name(name) if several else overlay

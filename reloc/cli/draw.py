@@ -9,10 +9,6 @@ from featuredb.cli.common import open_database
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from featuredb.geometry.camera import Camera
-    from featuredb.render.cloud import PointCloud
-    from featuredb.store import Database
-    from reloc.answered_view import AnsweredView
     from reloc.pixels.layer import Layer
 
 _NO_POSE = 1  # exit code: everything worked, and there is no pose
@@ -73,7 +69,14 @@ def _draw(args: argparse.Namespace) -> int:
     view, _ = answered_view(args, database)
     if view is None:
         return _NO_POSE
-    _check_shape(view.camera, rgb.shape[1], rgb.shape[0])
+    camera, (height, width) = view.camera, rgb.shape[:2]
+    try:
+        camera.scaled_to(width, height)
+    except InvalidValueError as error:
+        raise InvalidValueError(
+            f"draw: expected the picture that the answer is about, or a reduced one, of the shape of "
+            f"{camera.width}x{camera.height} pixels, found {width}x{height}"
+        ) from error
     surface = scan_surface(database, view)
     cloud = None if surface is None else surface.cloud
     picture = draw_layer(rgb, view, laid_on(layer, view.frame, cloud), cloud)
@@ -82,20 +85,10 @@ def _draw(args: argparse.Namespace) -> int:
     except cv2.error:
         done = False
     if not done:
-        raise InvalidValueError(f"--out: {suffix} cannot hold {rgb.shape[1]}x{rgb.shape[0]} pixels; try .png")
+        raise InvalidValueError(f"--out: {suffix} cannot hold {width}x{height} pixels; try .png")
     args.out.write_bytes(data.tobytes())
     sys.stderr.write(f"wrote {args.out}\n")
     return 0
-
-
-def _check_shape(camera: "Camera", width: int, height: int) -> None:
-    try:
-        camera.scaled_to(width, height)
-    except InvalidValueError as error:
-        raise InvalidValueError(
-            f"draw: expected the picture that the answer is about, or a reduced one, of the shape of "
-            f"{camera.width}x{camera.height} pixels, found {width}x{height}"
-        ) from error
 
 
 def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
@@ -107,6 +100,7 @@ def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
     from reloc.cli.query_arguments import parse_camera
     from reloc.pixels.draw import draw_layer
     from reloc.pixels.layer import laid_on
+    from reloc.pixels.surfaces import scan_surface
     from reloc.tracking.trajectory.read import read_trajectory_csv
 
     asked = parse_camera(args.camera)
@@ -133,7 +127,11 @@ def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
             for index, pose in poses.items()
         }
         first = next(iter(views.values()))
-        cloud = _cloud_along(open_database(args), first, list(views.values()))
+        # The scan along the track, in the frame of its first view.
+        places = np.array([view.seen_in(first.frame).cam_from_local.center[:2] for view in views.values()])
+        (e0, n0), (e1, n1) = places.min(axis=0) - _REACH_M, places.max(axis=0) + _REACH_M
+        surface = scan_surface(open_database(args), first, (float(e0), float(n0), float(e1), float(n1)))
+        cloud = None if surface is None else surface.cloud
         shapes = laid_on(layer, first.frame, cloud)
         width, height = video.info.width // 2 * 2, video.info.height // 2 * 2
         with VideoWriter(args.out, width=width, height=height, fps=None) as film:
@@ -145,17 +143,3 @@ def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
                 film.write(np.ascontiguousarray(rgb[:height, :width]), frame.time_s)
     sys.stderr.write(f"wrote {args.out}: {len(views)} frames with a pose\n")
     return 0
-
-
-def _cloud_along(
-    database: "Database", first: "AnsweredView", views: "list[AnsweredView]"
-) -> "PointCloud | None":
-    """The scan along a track, in the frame of its first view."""
-    import numpy as np
-
-    from reloc.pixels.surfaces import scan_surface
-
-    places = np.array([view.seen_in(first.frame).cam_from_local.center[:2] for view in views])
-    (e0, n0), (e1, n1) = places.min(axis=0) - _REACH_M, places.max(axis=0) + _REACH_M
-    surface = scan_surface(database, first, (float(e0), float(n0), float(e1), float(n1)))
-    return None if surface is None else surface.cloud

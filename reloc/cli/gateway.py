@@ -49,17 +49,12 @@ def _run(args: argparse.Namespace) -> int:
     from reloc.gateway.serve import serve
     from reloc.service.logs import log_to
 
+    same = ("connect", "database", "host", "insecure", "port", "prefix", "max_in_flight")
     options = GatewayOptions(
-        connect=args.connect,
         config_path=args.config,
-        database=args.database,
-        host=args.host,
-        insecure=args.insecure,
-        port=args.port,
-        prefix=args.prefix,
         timeout_s=args.timeout,
-        max_in_flight=args.max_in_flight,
         cors_origins=tuple(args.cors_origin),
+        **{name: getattr(args, name) for name in same},
     )
     log_to(sys.stderr)
 

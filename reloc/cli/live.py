@@ -63,16 +63,12 @@ def add_film_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_live(args: argparse.Namespace) -> int:
-    """Stream, print, write; 0, 1 where no frame was localised, 2 where a file could not be written.
-
-    Raises:
-        InvalidValueError, VideoError, ServiceError
-    """
+    """Stream, print, write; 0, 1 where no frame was localised, 2 where a file could not be written."""
     from featuredb.video.film import VideoOptions
     from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.client.client import Client
     from reloc.client.film import stream_film
-    from reloc.tracking.trajectory.outputs import check_outputs, exit_code, write_outputs
+    from reloc.tracking.trajectory.files import check_outputs, exit_code, write_outputs
 
     sys.setswitchinterval(_SWITCH_S)
     check_outputs(args.out)

@@ -86,14 +86,18 @@ def _locate(args: argparse.Namespace) -> int:
     import json
 
     from reloc.cli.commands import require_an_image
-    from reloc.pixels.boxes import as_json, geojson
+    from reloc.pixels.boxes import MarkedPixel, as_json, geojson
     from reloc.pixels.locate import locate
 
     if args.answer is None:
         require_an_image([args.image])
     if args.geojson is not None:
         check_output("--geojson", args.geojson, args.image)
-    marks = _marks(args)
+    marks = [MarkedPixel(pixel=_pixel(text)) for text in args.pixel]
+    if args.boxes is not None:
+        marks += _boxes(args)
+    if not marks:
+        raise InvalidValueError("locate: expected --pixel U,V or --boxes JSON, found neither")
     for name in ("pixel_sigma", "scan_sigma"):
         value = getattr(args, name)
         if value is not None and not 0.0 <= value < float("inf"):
@@ -112,17 +116,6 @@ def _locate(args: argparse.Namespace) -> int:
         args.geojson.write_text(json.dumps(geojson(places, marks, Path(args.image).name), indent=1) + "\n")
         sys.stderr.write(f"wrote {args.geojson}\n")
     return _NO_PLACE if any(place.utm is None for place in places) else 0
-
-
-def _marks(args: argparse.Namespace) -> Any:
-    from reloc.pixels.boxes import MarkedPixel
-
-    marks = [MarkedPixel(pixel=_pixel(text)) for text in args.pixel]
-    if args.boxes is not None:
-        marks += _boxes(args)
-    if not marks:
-        raise InvalidValueError("locate: expected --pixel U,V or --boxes JSON, found neither")
-    return marks
 
 
 def _boxes(args: argparse.Namespace) -> "list[MarkedPixel]":
@@ -182,7 +175,7 @@ def answered_view(
 
     data = Path(args.image).read_bytes()
     asker, ask = asking_here(args, lambda: database)
-    reply = ask(data, None, False)
+    reply, _ = ask(data, None, False)
     if reply.status != "localised":
         sys.stderr.write(describe(args.image, reply, asker.name))
         return None, asker.localiser()

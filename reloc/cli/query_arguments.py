@@ -28,10 +28,7 @@ def parse_camera(text: str | None, sigmas: str | None = None) -> CameraRequest |
     try:
         model, width, height, *params = text.split(",")
         camera = CameraRequest(
-            model=model.strip(),
-            width=int(width),
-            height=int(height),
-            params=tuple(float(p) for p in params),
+            model=model.strip(), width=int(width), height=int(height), params=tuple(float(p) for p in params)
         )
     except (ValueError, ValidationError) as error:
         raise InvalidValueError(

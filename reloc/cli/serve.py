@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.cli.common import add_command, open_database
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
+from reloc.wire.keys import DEFAULT_ENDPOINT
 
 logger = logging.getLogger(__name__)
 
@@ -55,11 +55,7 @@ def register(subparsers: Any) -> None:
     serve.add_argument("--workers", type=int, help="queries localised at a time; default 2")
     serve.add_argument("--max-queue", type=int, help="queries that may wait; default 32")
     serve.add_argument(
-        "--deadline",
-        type=float,
-        dest="deadline_s",
-        metavar="SECONDS",
-        help="per query; default 8",
+        "--deadline", type=float, dest="deadline_s", metavar="SECONDS", help="per query; default 8"
     )
     serve.add_argument(
         "--contributions",
@@ -107,8 +103,7 @@ def _serve(args: argparse.Namespace) -> int:
     import cv2
 
     from featuredb.stop_signals import end_process
-    from reloc.service.live.options import LiveOptions
-    from reloc.service.options import ServeOptions
+    from reloc.service.options import LiveOptions, ServeOptions
     from reloc.service.serve import serve
     from reloc.service.server import Server
 
@@ -120,13 +115,9 @@ def _serve(args: argparse.Namespace) -> int:
         listen=listen,
         connect=tuple(args.connect or ()),
         config_path=args.config,
-        insecure=args.insecure,
-        name=args.name,
-        bbox=args.bbox,
-        metrics_port=args.metrics_port,
         contributions=args.contributions == "on",
         live=LiveOptions(**given("max_sessions", "idle_timeout_s")),
-        **given("workers", "max_queue", "deadline_s"),
+        **given("insecure", "name", "bbox", "metrics_port", "workers", "max_queue", "deadline_s"),
     )
     # Its decoders tell stderr about each hostile file; the refusal in our log says it once.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -2,15 +2,13 @@
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from featuredb.cli.common import add_as_of_argument, add_command, open_database, progress_of_maps
 from featuredb.errors import ExportError
 from featuredb.extras import require
-
-if TYPE_CHECKING:
-    from featuredb.export.selection import Selection
 
 
 def register(subparsers: Any) -> None:
@@ -55,10 +53,11 @@ def register(subparsers: Any) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from featuredb.cli.export import selection_of
     from reloc.tracking.trajectory.read import read_trajectory_csv
     from reloc.viewer.page import DEFAULT_POINTS as STATIC_POINTS
     from reloc.viewer.page import write_static_page
-    from reloc.viewer.photos import Pictures
+    from reloc.viewer.photos import Pictures, Queries
     from reloc.viewer.scene import DEFAULT_POINTS, ViewerSceneOptions, build_scene
 
     if args.static is None:
@@ -67,9 +66,12 @@ def _run(args: argparse.Namespace) -> int:
         raise ExportError(f"{args.static}: expected a name that is free; nothing is overwritten")
     tracks = [read_trajectory_csv(path) for path in args.trajectory]
     pictures = Pictures(args.photos)
+    chosen = selection_of(args)
+    if not args.status:
+        chosen = replace(chosen, statuses=ViewerSceneOptions().selection.statuses)
     usual = DEFAULT_POINTS if args.static is None else STATIC_POINTS
     options = ViewerSceneOptions(
-        selection=_selection(args),
+        selection=chosen,
         points=usual if args.points is None else args.points,
         photos=None if args.photos is None else args.photos.absolute(),
         told=progress_of_maps(),
@@ -80,23 +82,7 @@ def _run(args: argparse.Namespace) -> int:
         size = write_static_page(args.static, scene, pictures)
         sys.stdout.write(f"{args.static}: {size / 1e6:.1f} MB, of version {scene.document['snapshot']}\n")
         return 0
-    from reloc.viewer.query import Queries
     from reloc.viewer.server import create_app, serve
 
     serve(create_app(scene, pictures, Queries(database, scene)), args.port, browser=not args.no_browser)
     return 0
-
-
-def _selection(args: argparse.Namespace) -> "Selection":
-    """As the arguments say; every status where they name none.
-
-    Raises:
-        ExportError, InvalidValueError: they contradict each other.
-    """
-    from dataclasses import replace
-
-    from featuredb.cli.export import selection_of
-    from reloc.viewer.scene import ViewerSceneOptions
-
-    chosen = selection_of(args)
-    return chosen if args.status else replace(chosen, statuses=ViewerSceneOptions().selection.statuses)

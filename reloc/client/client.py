@@ -2,7 +2,7 @@
 
 import random
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,13 +12,19 @@ import zenoh
 from pydantic import BaseModel, ValidationError
 
 from featuredb.errors import InvalidValueError, ServiceError
-from reloc.client.connection import client_config, name_in, wait_for_database
-from reloc.client.events import EventStream
+from reloc.client.connection import (
+    NO_SERVER,
+    TIMEOUT,
+    EventStream,
+    client_config,
+    first_reply,
+    name_in,
+    read_message,
+    wait_for_database,
+)
 from reloc.client.fleet import ANY, WHOLE, Fleet, best_supported
 from reloc.client.live import LiveTrack
-from reloc.client.replies import NO_SERVER, TIMEOUT, first_reply, read_message
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
-from reloc.wire.keys import ANONYMOUS, Keys
+from reloc.wire.keys import ANONYMOUS, DEFAULT_ENDPOINT, Keys
 from reloc.wire.query import (
     CameraRequest,
     ErrorCode,
@@ -57,9 +63,6 @@ class Client:
 
     Methods raise ServiceError; its `code` is one of reloc.wire.query.ErrorCode, or NO_SERVER (nobody
     answers), TIMEOUT (no answer in time), BAD_REPLY (an answer that is none).
-
-    Attributes:
-        name: of this client on the wire; its configuration says it.
     """
 
     def __init__(
@@ -76,7 +79,7 @@ class Client:
         self._connect_timeout_s = connect_timeout_s
         self._open_session: zenoh.Session | None = None
         self._fleet = Fleet(self.statuses)
-        self.name = ANONYMOUS
+        self.name = ANONYMOUS  # on the wire; its configuration says it
 
     def __enter__(self) -> Self:
         self.open()
@@ -179,17 +182,16 @@ class Client:
             return self._ask_part(first, data, request, end)
         # It is given once.
         again = request.model_copy(update={"contribute": False, "credit": None, "licence": None})
-        with ThreadPoolExecutor(len(others)) as pool:
-            asked = [pool.submit(self._ask_part, part, data, again, end) for part in others]
-            outcomes = [_outcome(lambda: self._ask_part(first, data, request, end))]
-            outcomes += [_outcome(one.result) for one in asked]
-        replies = [outcome for outcome in outcomes if isinstance(outcome, LocaliseReply)]
-        errors = [outcome for outcome in outcomes if isinstance(outcome, ServiceError)]
-        for error in errors:
+        with ThreadPoolExecutor(1 + len(others)) as pool:
+            asked = [pool.submit(self._ask_part, first, data, request, end)]
+            asked += [pool.submit(self._ask_part, part, data, again, end) for part in others]
+        replies = [one.result() for one in asked if one.exception() is None]
+        for error in (one.exception() for one in asked):
             # Maps that are another server's are none of this one. What a silent part shows, nobody knows.
-            if not (replies and error.code == ErrorCode.BAD_REQUEST and "options.maps" in error.message):
+            refused = isinstance(error, ServiceError) and error.code == ErrorCode.BAD_REQUEST
+            if error is not None and not (replies and refused and "options.maps" in str(error)):
                 raise error
-        given = outcomes[0].contribution if isinstance(outcomes[0], LocaliseReply) else None
+        given = asked[0].result().contribution if asked[0].exception() is None else None
         return best_supported(replies).model_copy(update={"contribution": given})
 
     def _ask_part(self, part: str, data: bytes, request: LocaliseWireRequest, end: float) -> LocaliseReply:
@@ -269,22 +271,18 @@ class Client:
 
     def track(
         self,
-        camera: CameraRequest | None = None,
-        prior: PriorRequest | None = None,
+        camera: CameraRequest
+        | None = None,  # of the frames, of any size of the same picture; None: estimated
+        prior: PriorRequest | None = None,  # where the first frame may have been taken
         *,
-        timeout_s: float = _TIMEOUT_S,
+        timeout_s: float = _TIMEOUT_S,  # the longest wait for the session to open
     ) -> LiveTrack:
         """A live session, to be used in a `with` block: frames are sent, and poses come.
 
-            with client.track() as live:
-                for jpeg, time_s in frames:
-                    live.send(jpeg, time_s)
-                    pose = live.next(timeout_s=0.1)
-
-        Args:
-            camera: intrinsics of the frames, of any size of the same picture; None: estimated.
-            prior: where the first frame may have been taken (degrees, metres).
-            timeout_s: the longest wait for the session to open.
+        with client.track() as live:
+            for jpeg, time_s in frames:
+                live.send(jpeg, time_s)
+                pose = live.next(timeout_s=0.1)
         """
         return LiveTrack(self._session(), self._keys, self.name, camera, prior, timeout_s)
 
@@ -358,13 +356,6 @@ class Client:
 def _status_s(left_s: float) -> float:
     """How long servers may take to say who they are, of the time that is left for an answer."""
     return min(_STATUS_S, max(0.3 * left_s, _LEAST_S))
-
-
-def _outcome(ask: Callable[[], LocaliseReply]) -> LocaliseReply | ServiceError:
-    try:
-        return ask()
-    except ServiceError as error:
-        return error
 
 
 def _deadline_ms(left_s: float) -> float:

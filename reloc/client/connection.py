@@ -1,15 +1,24 @@
-"""How a client finds the servers of a database."""
+"""How a client finds the servers of a database, and what they send, read."""
 
 import json
+import queue
 import time
+from typing import Any, TypeVar
 
 import zenoh
+from pydantic import BaseModel, ValidationError
 
 from featuredb.errors import ServiceError
-from reloc.client.replies import NO_SERVER
 from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, Keys
+from reloc.wire.query import ErrorReply
+from reloc.wire.server import Event
 
 _ASK_AGAIN_S = 0.05  # while no server is there yet
+_Message = TypeVar("_Message", bound=BaseModel)
+# Codes that no server sends; the client raises them itself.
+NO_SERVER = "NO_SERVER"
+TIMEOUT = "TIMEOUT"
+BAD_REPLY = "BAD_REPLY"
 
 
 def client_config(endpoint: str, timeout_s: float) -> zenoh.Config:
@@ -53,3 +62,66 @@ def wait_for_database(session: zenoh.Session, database: str | None, where: str, 
     if len(found) > 1:
         raise ServiceError(NO_SERVER, f"{where} serves {', '.join(sorted(found))}; name the database to ask")
     return found.pop()
+
+
+def first_reply(
+    session: zenoh.Session, key: str, model: type[_Message], timeout_s: float, **query: Any
+) -> _Message | None:
+    """The first answer to a query, or None where nobody answers; `query`: what else `session.get` is told.
+
+    Raises:
+        ServiceError: the answer is an error, or none.
+    """
+    source = zenoh.SourceInfo(session.id, 0)  # one client among others
+    for reply in session.get(key, timeout=timeout_s, source_info=source, **query):
+        if reply.ok is not None:
+            return read_message(reply.ok.payload.to_bytes(), model)
+        if reply.err is not None:
+            raise _service_error(reply.err.payload.to_bytes(), timeout_s)
+    return None
+
+
+def read_message(payload: bytes, model: type[_Message]) -> _Message:
+    """A message of the server.
+
+    Raises:
+        ServiceError: BAD_REPLY, it is none.
+    """
+    try:
+        return model.model_validate_json(payload)
+    except ValidationError as error:
+        raise ServiceError(
+            BAD_REPLY, f"expected a {model.__name__}, found {payload[:200]!r}: {error}"
+        ) from error
+
+
+def _service_error(payload: bytes, timeout_s: float) -> ServiceError:
+    """The error of a `reply_err`."""
+    try:
+        error = ErrorReply.model_validate_json(payload)
+    except ValidationError:  # not of the server: Zenoh itself gave up
+        if payload == b"Timeout":
+            return ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s")
+        return ServiceError(BAD_REPLY, f"expected an error as JSON, found {payload[:200]!r}")
+    return ServiceError(error.code, error.message, error.request_id)
+
+
+class EventStream:
+    """Events in the order in which they arrived."""
+
+    def __init__(self) -> None:
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+
+    def receive(self, sample: zenoh.Sample) -> None:
+        """Take one publication; what is no event is left out."""
+        try:
+            self._events.put(Event.model_validate_json(sample.payload.to_bytes()))
+        except ValidationError:
+            return
+
+    def next(self, timeout_s: float | None = None) -> Event | None:
+        """The next event; None when none came within the time."""
+        try:
+            return self._events.get(timeout=timeout_s)
+        except queue.Empty:
+            return None

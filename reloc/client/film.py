@@ -3,13 +3,12 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import ServiceError, VideoError
 from featuredb.geometry.arrays import FloatArray
@@ -36,103 +35,75 @@ _LAST_WAIT_S = 2.0  # for the pose of the last frame
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StreamedFilm:
-    """What came of a stream.
+    """What came of a stream."""
 
-    Attributes:
-        trajectory: the frames that were answered.
-        frames: of the film. sent: of them.
-        latency_ms: (n,) from sending a frame to its pose, of the answered ones.
-        refusals: why frames could not be used, the latest. complaints: what was wrong with the film, and
-            why the session ended before it.
-    """
-
-    trajectory: Trajectory
-    frames: int
-    sent: int
-    latency_ms: FloatArray
-    refusals: tuple[str, ...]
-    complaints: tuple[str, ...]
+    trajectory: Trajectory  # the frames that were answered
+    frames: int  # of the film
+    sent: int  # of them
+    latency_ms: FloatArray  # (n,) from sending a frame to its pose, of the answered ones
+    refusals: tuple[str, ...]  # why frames could not be used, the latest
+    complaints: tuple[str, ...]  # what was wrong with the film, and why the session ended before it
 
 
-@dataclass(slots=True)
 class _Answers:
-    """Poses so far, taken as they come by a thread of their own: a camera's next frame does not hold them up.
+    """Poses so far, taken as they come by a thread: a camera's next frame does not hold them up."""
 
-    Attributes:
-        taking: that thread; it ends with the session.
-    """
-
-    live: LiveTrack
-    on_pose: OnPose | None
-    points: list[TrajectoryPoint] = field(default_factory=list)
-    latency_ms: list[float] = field(default_factory=list)
-    taking: "Future[None]" = field(default_factory=Future)
-    _changed: threading.Condition = field(default_factory=threading.Condition)
-
-    def start(self, pool: ThreadPoolExecutor) -> None:
-        """Take poses from now on."""
-        self.taking = pool.submit(self._run)
-        self.taking.add_done_callback(self._tell)
+    def __init__(self, live: LiveTrack, on_pose: OnPose | None, pool: ThreadPoolExecutor) -> None:
+        self.live, self._on_pose = live, on_pose
+        self.points: list[TrajectoryPoint] = []
+        self.latency_ms: list[float] = []
+        self._changed = threading.Condition()
+        self._taking = pool.submit(self._take_all)  # ends with the session
+        self._taking.add_done_callback(self._tell)
 
     def check(self) -> None:
         """Raise what has ended the thread before its time."""
-        if self.taking.done():
-            self.taking.result()
+        if self._taking.done():
+            self._taking.result()
 
     def await_frame(self, index: int) -> None:
         """Wait for the pose of the frame that was sent last, -1: none; the server never drops it."""
         with self._changed:
             self._changed.wait_for(
-                lambda: self.taking.done() or index < 0 or (self.points and self.points[-1].index >= index),
+                lambda: self._taking.done() or index < 0 or (self.points and self.points[-1].index >= index),
                 _LAST_WAIT_S,
             )
         self.check()
 
-    def _run(self) -> None:
+    def _take_all(self) -> None:
         for pose in self.live:
-            self._take(pose)
+            latency_ms = self.live.latency_ms(pose.sequence)
+            if self._on_pose is not None:
+                self._on_pose(pose, latency_ms)
+            if latency_ms is not None:
+                self.latency_ms.append(latency_ms)
+            self.points.append(point_of_message(pose))
+            self._tell()
 
-    def _tell(self, _: object) -> None:
+    def _tell(self, *_: object) -> None:
         with self._changed:
             self._changed.notify_all()
-
-    def _take(self, pose: TrackPose) -> None:
-        latency_ms = self.live.latency_ms(pose.sequence)
-        if self.on_pose is not None:
-            self.on_pose(pose, latency_ms)
-        if latency_ms is not None:
-            self.latency_ms.append(latency_ms)
-        self.points.append(point_of_message(pose))
-        self._tell(pose)
 
 
 @contextmanager
 def _answered(live: LiveTrack, on_pose: OnPose | None) -> Iterator[_Answers]:
     """An open session whose poses are taken; both end with the block."""
-    answers = _Answers(live, on_pose)
     with ThreadPoolExecutor(1, "poses") as pool, live:
-        answers.start(pool)
-        yield answers
+        yield _Answers(live, on_pose, pool)
 
 
 def stream_film(
     client: Client,
     source: Source,
     *,
-    camera: CameraRequest | None = None,
-    prior: PriorRequest | None = None,
+    camera: CameraRequest | None = None,  # of the film's frames, of any size; None: estimated
+    prior: PriorRequest | None = None,  # where the film begins
     options: VideoOptions | None = None,
-    on_pose: OnPose | None = None,
+    on_pose: OnPose | None = None,  # told each pose, and how many ms it took, in a thread of its own
 ) -> StreamedFilm:
     """Send the frames of a film when they are due, those of a camera as they come, and collect the poses.
 
     Ctrl-C ends the stream, and what came until then is the result; so does the end of the session.
-
-    Args:
-        source: see `featuredb.video.frames.open_video`.
-        camera: intrinsics of the film's frames, of any size; None: estimated.
-        prior: where the film begins. options: how it is read.
-        on_pose: called with each pose, and the milliseconds from sending its frame, in a thread of its own.
 
     Raises:
         VideoError: the film cannot be read at all, or has no frames.
@@ -141,10 +112,7 @@ def stream_film(
     options = options or VideoOptions(max_side_px=SENT_SIDE_PX)
     trouble: list[str] = []
     sent, last, last_sent = 0, -1, -1
-    with (
-        open_video(source, options) as video,
-        _answered(client.track(camera, prior), on_pose) as answers,
-    ):
+    with open_video(source, options) as video, _answered(client.track(camera, prior), on_pose) as answers:
         live, info = answers.live, video.info
         begun: float | None = None
         try:
@@ -156,7 +124,8 @@ def stream_film(
                 time.sleep(max(0.0, due - time.perf_counter()))
                 answers.check()
                 if time.perf_counter() - due <= _MAX_LATE_S:
-                    live.send(_jpeg(frame.gray), frame.time_s, frame.index)
+                    jpeg = cv2.imencode(".jpg", frame.gray, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+                    live.send(jpeg.tobytes(), frame.time_s, frame.index)
                     sent, last_sent = sent + 1, frame.index
             answers.await_frame(last_sent)
         except ServiceError as error:
@@ -166,20 +135,10 @@ def stream_film(
     if last < 0:
         raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
     return StreamedFilm(
-        trajectory=Trajectory(
-            source=info.name,
-            points=tuple(answers.points),
-            start=info.creation_time,
-        ),
+        trajectory=Trajectory(source=info.name, points=tuple(answers.points), start=info.creation_time),
         frames=last + 1,
         sent=sent,
         latency_ms=np.array(answers.latency_ms),
         refusals=refusals,
         complaints=complaints,
     )
-
-
-def _jpeg(gray: NDArray[np.uint8]) -> bytes:
-    done, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    assert done
-    return bytes(data)

@@ -144,11 +144,8 @@ def _touches(bounds: BoundingBox, prior: PriorRequest) -> bool:
 def best_supported(replies: Sequence[LocaliseReply]) -> LocaliseReply:
     """The answer with most inliers; AMBIGUOUS where another reply has about as many and not the same pose.
 
-    What another server refused counts, too, as it would within one: only its inliers are known, so that it is
-    taken for another place.
-
-    Args:
-        replies: one of each part, at least one.
+    `replies`: one of each part, at least one. What another server refused counts, too, as it would within
+    one: only its inliers are known, so that it is taken for another place.
     """
     ranked = sorted(replies, key=lambda reply: (reply.inliers, reply.matches), reverse=True)
     found = [reply for reply in ranked if reply.status != "not_localised"]

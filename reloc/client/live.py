@@ -12,7 +12,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from featuredb.errors import ServiceError
-from reloc.client.replies import NO_SERVER, TIMEOUT, first_reply, read_message
+from reloc.client.connection import NO_SERVER, TIMEOUT, first_reply, read_message
 from reloc.wire.keys import Keys
 from reloc.wire.query import CameraRequest, PriorRequest, encode
 from reloc.wire.track import TrackEvent, TrackFrame, TrackOpened, TrackOpenRequest, TrackPose
@@ -29,10 +29,7 @@ class LiveTrack:
 
     Frames are sent from one thread, and may be received in another. A frame that comes while the server has
     another one in hand waits for it, until a newer one takes its place: it is dropped then and has no pose.
-
-    Attributes:
-        name: of the session on the wire.
-        refusals: why frames could not be used, the latest hundred.
+    `refusals` says why frames could not be used, the latest hundred.
     """
 
     def __init__(
@@ -44,14 +41,8 @@ class LiveTrack:
         prior: PriorRequest | None = None,
         timeout_s: float = 10.0,
     ) -> None:
-        """
-        Args:
-            keys: of the database on the wire. client: the name of this client.
-            camera: intrinsics of the frames, of any size of the same picture; None: estimated.
-            prior: where the first frame may have been taken (degrees, metres).
-            timeout_s: the longest wait for the session to open.
-        """
-        self.name = uuid.uuid4().hex
+        """`keys`: of the database on the wire; `client`: the name of this client; see `Client.track`."""
+        self.name = uuid.uuid4().hex  # of the session on the wire
         self.refusals: deque[TrackEvent] = deque(maxlen=_KEPT_REFUSALS)
         self._session, self._keys = session, keys
         self._key = keys.track(client, self.name)
@@ -87,7 +78,12 @@ class LiveTrack:
             declared(session.declare_subscriber(f"{self._key}/{leaf}", Callback(callback, indirect=False)))
         declared(session.liveliness().declare_token(f"{self._key}/client"))
         try:
-            self._opened = self._asked()
+            self._opened = first_reply(
+                session, self._key, TrackOpened, self._timeout_s, attachment=encode(self._request)
+            )
+            if self._opened is None:
+                where = f"within {self._timeout_s:g} s at {self._key}"
+                raise ServiceError(TIMEOUT, f"no server opened a live session {where}")
         except ServiceError:
             self.close()
             raise
@@ -180,15 +176,6 @@ class LiveTrack:
     def latency_ms(self, sequence: int) -> float | None:
         """From sending a frame to its pose, here; None where there is none, or long ago."""
         return self._latency_ms.get(sequence)
-
-    def _asked(self) -> TrackOpened:
-        attachment = encode(self._request)
-        opened = first_reply(self._session, self._key, TrackOpened, self._timeout_s, attachment=attachment)
-        if opened is not None:
-            return opened
-        raise ServiceError(
-            TIMEOUT, f"no server opened a live session within {self._timeout_s:g} s at {self._key}"
-        )
 
     def _check_server(self) -> None:
         """End the session when its server is not there any more."""

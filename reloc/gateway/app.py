@@ -14,7 +14,6 @@ from fastapi.exceptions import RequestValidationError
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4 as METRICS_TYPE
-from prometheus_client.registry import Collector
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
@@ -30,8 +29,8 @@ from reloc.gateway.failures import (
     NOT_FOUND,
     NOT_READY,
     RETRY_AFTER_S,
+    STATUS_OF,
     ErrorBody,
-    status_of,
 )
 from reloc.gateway.geopose import NotLocalisedError, check_version, parse, question_of, response_of
 from reloc.gateway.intake import Intake, read_form
@@ -43,7 +42,7 @@ from reloc.gateway.protocol import GeoPoseResp
 from reloc.service.logs import fields
 from reloc.wire.query import ErrorCode, LocaliseReply, LocaliseWireRequest
 from reloc.wire.server import MapsReply, StatusReply
-from reloc.wire.status_metrics import status_metrics
+from reloc.wire.status_metrics import Figures, status_metrics
 
 logger = logging.getLogger(__name__)
 
@@ -95,21 +94,15 @@ class GatewayMetrics:
 
     def text(self, in_flight: int, sessions: int, server: StatusReply | None) -> bytes:
         """The whole page; `server` is what the server says of itself, None if it does not answer."""
+
+        def now() -> Iterator[Metric]:
+            yield GaugeMetricFamily(f"{_NAME}in_flight", "Photos in hand.", value=in_flight)
+            yield CounterMetricFamily(f"{_NAME}sessions", "Zenoh sessions opened.", value=sessions)
+            yield from status_metrics(server)
+
         moment = CollectorRegistry()
-        moment.register(_Moment(in_flight, sessions, server))
+        moment.register(Figures(now))
         return generate_latest(self._registry) + generate_latest(moment)
-
-
-class _Moment(Collector):
-    """What is so when the page is asked for."""
-
-    def __init__(self, in_flight: int, sessions: int, server: StatusReply | None) -> None:
-        self._in_flight, self._sessions, self._server = in_flight, sessions, server
-
-    def collect(self) -> Iterator[Metric]:
-        yield GaugeMetricFamily(f"{_NAME}in_flight", "Photos in hand.", value=self._in_flight)
-        yield CounterMetricFamily(f"{_NAME}sessions", "Zenoh sessions opened.", value=self._sessions)
-        yield from status_metrics(self._server)
 
 
 def add_phone_page(app: FastAPI, prefix: str) -> None:
@@ -274,21 +267,12 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
 def _add_failures(app: FastAPI) -> None:
     """Every way to fail ends in an ErrorBody; what went wrong inside stays in the log."""
 
-    @app.exception_handler(NotLocalisedError)
-    async def not_localised(request: Request, error: NotLocalisedError) -> Response:
-        return _failed(
-            ErrorBody(
-                code=error.code,
-                message=error.message,
-                request_id=error.request_id,
-                reason=error.reply.reason,
-                id=error.geopose_id,
-            )
-        )
-
     @app.exception_handler(ServiceError)
     async def service_error(request: Request, error: ServiceError) -> Response:
-        return _failed(ErrorBody(code=error.code, message=error.message, request_id=error.request_id))
+        body = ErrorBody(code=error.code, message=error.message, request_id=error.request_id)
+        if isinstance(error, NotLocalisedError):
+            body = body.model_copy(update={"reason": error.reply.reason, "id": error.geopose_id})
+        return _failed(body)
 
     @app.exception_handler(InvalidValueError)
     async def invalid(request: Request, error: InvalidValueError) -> Response:
@@ -321,7 +305,8 @@ def _failed(body: ErrorBody, headers: dict[str, str] | None = None) -> Response:
     headers = headers or {}
     if body.code in RETRY_AFTER_S:
         headers["Retry-After"] = str(RETRY_AFTER_S[body.code])
-    return _json(body, status_of(body.code), headers)
+    # A code that a newer server has invented is its error, not the client's.
+    return _json(body, STATUS_OF.get(body.code, 502), headers)
 
 
 def _json(

@@ -44,6 +44,11 @@ class GatewayError(ServiceError):
     """Ends a request with the status of its code."""
 
 
+def bad_request(message: str) -> GatewayError:
+    """The request is not what it should be, as the message says."""
+    return GatewayError(ErrorCode.BAD_REQUEST, message)
+
+
 class ErrorBody(BaseModel):
     """Body of every answer that is not 2xx."""
 
@@ -54,8 +59,3 @@ class ErrorBody(BaseModel):
         default=None, description="of NOT_LOCALISED: the wire's reason", examples=["TOO_FEW_INLIERS"]
     )
     id: str | None = Field(default=None, description="of NOT_LOCALISED: the GeoPoseReq's id")
-
-
-def status_of(code: str) -> int:
-    """The HTTP status of a code; a code that a newer server has invented is its error, not the client's."""
-    return STATUS_OF.get(code, 502)

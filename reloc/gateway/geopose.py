@@ -16,12 +16,11 @@ from PIL import Image
 from pydantic import ValidationError
 
 from featuredb.geo.datum import HEIGHT_DATUMS, ellipsoidal_height
-from reloc.gateway.failures import NOT_ACCEPTABLE, NOT_LOCALISED, GatewayError
+from reloc.gateway.failures import NOT_ACCEPTABLE, NOT_LOCALISED, GatewayError, bad_request
 from reloc.gateway.options import GatewayOptions
 from reloc.gateway.protocol import (
     MEDIA_TYPE,
     CameraReading,
-    GeolocationReading,
     GeoPoseAccuracy,
     GeoPoseBasicQuaternion,
     GeoPoseReq,
@@ -60,7 +59,7 @@ def parse(body: bytes) -> GeoPoseReq:
     try:
         return GeoPoseReq.model_validate_json(body)
     except ValidationError as error:
-        raise GatewayError(ErrorCode.BAD_REQUEST, _explained(error, "body")) from error
+        raise bad_request(_explained(error, "body")) from error
 
 
 def check_version(accept: str) -> bool:
@@ -90,15 +89,13 @@ def question_of(request: GeoPoseReq, options: GatewayOptions) -> tuple[bytes, Lo
     readings = request.sensorReadings.cameraReadings
     pictures = [reading for reading in readings if reading.imageFormat.upper() != "DEPTH"]
     if not pictures:
-        raise GatewayError(
-            ErrorCode.BAD_REQUEST,
-            "sensorReadings.cameraReadings: expected a picture that is no depth image, found none",
+        raise bad_request(
+            "sensorReadings.cameraReadings: expected a picture that is no depth image, found none"
         )
     picture = pictures[0]
     if picture.imageOrientation is not None and picture.imageOrientation.mirrored:
-        raise GatewayError(
-            ErrorCode.BAD_REQUEST,
-            "imageOrientation.mirrored: expected false; mirror the picture back, since no camera sees it so",
+        raise bad_request(
+            "imageOrientation.mirrored: expected false; mirror the picture back, since no camera sees it so"
         )
     size = _size(picture)
     image = _image_file(_decoded(picture.imageBytes, options.max_image_bytes), picture, size)
@@ -146,9 +143,7 @@ def _decoded(text: str, max_bytes: int) -> bytes:
     try:
         data = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as error:
-        raise GatewayError(
-            ErrorCode.BAD_REQUEST, f"imageBytes: expected base64 without prefix or line breaks ({error})"
-        ) from error
+        raise bad_request(f"imageBytes: expected base64 without prefix or line breaks ({error})") from error
     if not data:
         raise GatewayError(ErrorCode.BAD_IMAGE, "imageBytes: expected an image file, found none")
     return data
@@ -160,9 +155,7 @@ def _size(picture: CameraReading) -> tuple[int, int] | None:
         return None
     width, height = picture.size
     if not all(side.is_integer() and 1 <= side <= 65_535 for side in (width, height)):
-        raise GatewayError(
-            ErrorCode.BAD_REQUEST, f"size: expected [width, height] in pixels, found {picture.size}"
-        )
+        raise bad_request(f"size: expected [width, height] in pixels, found {picture.size}")
     return int(width), int(height)
 
 
@@ -177,11 +170,9 @@ def _image_file(data: bytes, picture: CameraReading, size: tuple[int, int] | Non
             f"imageBytes: expected an image file, or width x height x {channels} bytes of "
             f"{picture.imageFormat} of size {size}, found {len(data)} bytes",
         )
-    mode = "L" if channels == 1 else "RGBA"
     out = io.BytesIO()
-    Image.frombytes(mode, size, data).convert("L" if mode == "L" else "RGB").save(
-        out, "PNG", compress_level=1
-    )
+    mode, stored = ("L", "L") if channels == 1 else ("RGBA", "RGB")
+    Image.frombytes(mode, size, data).convert(stored).save(out, "PNG", compress_level=1)
     return out.getvalue()
 
 
@@ -193,11 +184,11 @@ def _camera(picture: CameraReading, size: tuple[int, int] | None) -> CameraReque
     if model.startswith("UNKNOWN"):
         return None
     if size is None:
-        raise GatewayError(ErrorCode.BAD_REQUEST, "size: expected [width, height], to which params belong")
+        raise bad_request("size: expected [width, height], to which params belong")
     try:
         return CameraRequest(model=model, width=size[0], height=size[1], params=params.modelParams)
     except ValidationError as error:
-        raise GatewayError(ErrorCode.BAD_REQUEST, f"params.{_explained(error, '')}") from error
+        raise bad_request(f"params.{_explained(error, '')}") from error
 
 
 def _explained(error: ValidationError, whole: str) -> str:
@@ -209,7 +200,9 @@ def _explained(error: ValidationError, whole: str) -> str:
 def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions) -> PriorRequest | None:
     """The position nearest in time to the picture; else the latest of the prior poses; else none."""
     taken = request.timestamp if picture.timestamp is None else picture.timestamp
-    places = [place for place in request.sensorReadings.geolocationReadings if not _is_unset(place)]
+    # Reference clients send their reading also before anybody has filled it in: all zeros.
+    readings = request.sensorReadings.geolocationReadings
+    places = [place for place in readings if place.latitude or place.longitude or place.accuracy]
     if places:
         place = min(places, key=lambda p: 0.0 if p.timestamp is None else abs(p.timestamp - taken))
         sigma_m = options.prior_unknown_m
@@ -229,11 +222,6 @@ def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions)
 
 def _prior_request(lat: float, lon: float, sigma_m: float, options: GatewayOptions) -> PriorRequest:
     return PriorRequest(lat=lat, lon=lon, sigma_m=min(max(sigma_m, options.prior_floor_m), 1e6))
-
-
-def _is_unset(place: GeolocationReading) -> bool:
-    """The reference clients' reading as they make it, before anybody has filled it in."""
-    return place.latitude == 0 and place.longitude == 0 and not place.accuracy
 
 
 def _wire_id(text: str) -> str | None:

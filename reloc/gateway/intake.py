@@ -11,7 +11,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message, Receive
 
-from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE, GatewayError
+from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE, GatewayError, bad_request
 from reloc.gateway.options import GatewayOptions
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
@@ -90,18 +90,15 @@ class _MeteredBody:
         self.held_bytes += size
         self._intake.buffered_bytes += size
         if not (self.complete or message.get("more_body", False)):
-            self._take_place()
+            if self._intake.in_flight >= self._options.max_in_flight:
+                raise GatewayError(
+                    ErrorCode.BUSY,
+                    f"{self._intake.in_flight} photos are in hand, which is as many as are taken; try again "
+                    "in a second",
+                )
+            self.complete = True
+            self._intake.in_flight += 1
         return message
-
-    def _take_place(self) -> None:
-        if self._intake.in_flight >= self._options.max_in_flight:
-            raise GatewayError(
-                ErrorCode.BUSY,
-                f"{self._intake.in_flight} photos are in hand, which is as many as are taken; try again in a "
-                "second",
-            )
-        self.complete = True
-        self._intake.in_flight += 1
 
     def too_large(self) -> GatewayError:
         return GatewayError(
@@ -142,22 +139,15 @@ async def read_form(request: Request, options: GatewayOptions) -> tuple[bytes, L
         ) as form:
             for name, value in form.multi_items():
                 if name not in FIELDS or name in parts:
-                    raise GatewayError(
-                        ErrorCode.BAD_REQUEST,
-                        f"form: expected {', '.join(FIELDS)} once each, found {name[:100]!r}",
-                    )
+                    raise bad_request(f"form: expected {', '.join(FIELDS)} once each, found {name[:100]!r}")
                 if name == "image" and not isinstance(value, UploadFile):
-                    raise GatewayError(
-                        ErrorCode.BAD_REQUEST, "image: expected a file (a part with a filename)"
-                    )
+                    raise bad_request("image: expected a file (a part with a filename)")
                 parts[name] = await value.read() if isinstance(value, UploadFile) else value.encode()
     except HTTPException as error:  # Starlette's word for a form that cannot be read
-        raise GatewayError(ErrorCode.BAD_REQUEST, f"form: {error.detail}") from error
+        raise bad_request(f"form: {error.detail}") from error
     image = parts.get("image")
     if image is None:
-        raise GatewayError(
-            ErrorCode.BAD_REQUEST, "image: expected the bytes of an image file, found no such field"
-        )
+        raise bad_request("image: expected the bytes of an image file, found no such field")
     if len(image) > options.max_image_bytes:
         raise GatewayError(
             ErrorCode.TOO_LARGE,
@@ -178,7 +168,7 @@ def _json(name: str, model: type[_Field], parts: dict[str, bytes]) -> _Field | N
     try:
         return parse_attachment(model, parts[name])
     except RequestError as error:
-        raise GatewayError(ErrorCode.BAD_REQUEST, f"{name}: {error.message}") from error
+        raise bad_request(f"{name}: {error.message}") from error
 
 
 def _request_id(parts: dict[str, bytes]) -> str | None:
@@ -188,6 +178,4 @@ def _request_id(parts: dict[str, bytes]) -> str | None:
         text = parts["request_id"].decode()
         return LocaliseWireRequest(request_id=text).request_id
     except ValueError as error:
-        raise GatewayError(
-            ErrorCode.BAD_REQUEST, "request_id: expected 1 to 128 of A-Z a-z 0-9 . _ : -"
-        ) from error
+        raise bad_request("request_id: expected 1 to 128 of A-Z a-z 0-9 . _ : -") from error

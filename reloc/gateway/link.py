@@ -2,8 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -45,13 +44,11 @@ class Link:
             ServiceError: as of `reloc.client.Client`.
         """
         try:
-            with self._borrowed() as client:
-                return question(client)
+            return self._asked(question)
         except ServiceError as error:
             if error.code != NO_SERVER or self._refused() is not None:
                 raise
-        with self._borrowed() as client:
-            return question(client)
+        return self._asked(question)
 
     def close(self) -> None:
         """Close the session when its last user is done."""
@@ -61,11 +58,10 @@ class Link:
         if line is not None:
             self._retire(line)
 
-    @contextmanager
-    def _borrowed(self) -> Iterator[Client]:
+    def _asked(self, question: Callable[[Client], _T]) -> _T:
         line = self._take()
         try:
-            yield line.client
+            return question(line.client)
         except ServiceError as error:
             if error.code == NO_SERVER:
                 self._retire(line)

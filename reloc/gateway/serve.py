@@ -1,6 +1,5 @@
 """Run the gateway until told to stop."""
 
-import logging
 import socket
 from collections.abc import Callable
 from functools import partial
@@ -9,13 +8,11 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from featuredb.errors import FeatureDbError
-from featuredb.stop_signals import on_stop_signals
+from reloc import listening
 from reloc.gateway.app import create_app
 from reloc.gateway.options import GatewayOptions
-from reloc.wire.endpoints import is_loopback
+from reloc.wire.keys import is_loopback
 
-_BACKLOG = 128
 # Connections, idle ones with them; who needs more stands behind a proxy that holds them.
 _MAX_CONNECTIONS = 512
 _KEEP_ALIVE_S = 10
@@ -47,54 +44,32 @@ class _TimedHeads(H11Protocol):
             self.loop.call_later(_LOOK_S, self._look)
 
 
-class GatewayStartError(FeatureDbError):
-    """The gateway cannot listen."""
-
-
 def listen(options: GatewayOptions) -> socket.socket:
     """A listening socket.
 
     Raises:
-        GatewayStartError: the port is taken, the host is not this machine's, or other machines reach it
-            and `insecure` is not set.
+        ListenError: as `reloc.listening.listen`, or other machines reach it and `insecure` is not set.
     """
     if not (options.insecure or is_loopback(options.host)):
-        raise GatewayStartError(
+        raise listening.ListenError(
             f"{options.host} can be reached by other machines, and the gateway speaks no TLS and checks "
             "nobody; let it listen on 127.0.0.1 behind a proxy that does, or say --insecure"
         )
-    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
-    try:
-        bound = socket.create_server((options.host, options.port), family=family, backlog=_BACKLOG)
-        # asyncio does so only for sockets that it makes itself. Without it the body of an answer waits for
-        # the acknowledgement of its head: 40 ms on a connection that is kept.
-        bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return bound
-    except OSError as error:
-        raise GatewayStartError(
-            f"cannot listen on {options.host}:{options.port}: {error.strerror or error}; choose another with "
-            "--host and --port"
-        ) from error
+    return listening.listen(options.host, options.port)
 
 
 def uvicorn_server(options: GatewayOptions) -> uvicorn.Server:
     """The server of the application, not yet running; `run(sockets=[listen(options)])` runs it."""
-    return uvicorn.Server(
-        uvicorn.Config(
-            create_app(options),
-            log_config=None,
-            access_log=False,
-            server_header=False,
-            ws="none",
-            # Who sends too much is answered at once; this one then reads on and throws away until the
-            # keep-alive is over, so that the answer is not lost by a reset.
-            http=_TimedHeads,
-            lifespan="on",
-            limit_concurrency=_MAX_CONNECTIONS,
-            timeout_keep_alive=_KEEP_ALIVE_S,
-            # What is in hand is answered first, and it takes no longer than this.
-            timeout_graceful_shutdown=int(options.timeout_s) + 1,
-        )
+    return listening.uvicorn_server(
+        create_app(options),
+        # Who sends too much is answered at once; this one then reads on and throws away until the
+        # keep-alive is over, so that the answer is not lost by a reset.
+        http=_TimedHeads,
+        lifespan="on",
+        limit_concurrency=_MAX_CONNECTIONS,
+        timeout_keep_alive=_KEEP_ALIVE_S,
+        # What is in hand is answered first, and it takes no longer than this.
+        timeout_graceful_shutdown=int(options.timeout_s) + 1,
     )
 
 
@@ -102,12 +77,8 @@ def serve(options: GatewayOptions, on_ready: Callable[[str], None] = lambda url:
     """Serve until SIGINT or SIGTERM; call from the main thread.
 
     Raises:
-        GatewayStartError: cannot listen.
+        ListenError: cannot listen.
     """
-    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
-    server = uvicorn_server(options)
-    # uvicorn handles these while it runs, and then raises them again; one that comes before counts as well.
-    with on_stop_signals(partial(setattr, server, "should_exit", True)), listen(options) as bound:
-        host, port = bound.getsockname()[:2]
-        on_ready(f"http://{f'[{host}]' if ':' in host else host}:{port}{options.prefix}")
-        server.run(sockets=[bound])
+    listening.run(
+        uvicorn_server(options), partial(listen, options), lambda url: on_ready(url + options.prefix)
+    )

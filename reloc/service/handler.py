@@ -24,29 +24,17 @@ from reloc.localise.lens_prior import QueryLensPrior, known_within
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
-from reloc.wire.query import (
-    CameraRequest,
-    ErrorCode,
-    LocaliseReply,
-    LocaliseWireRequest,
-    RequestError,
-)
+from reloc.wire.query import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, RequestError
 
 
 def answer_query(
-    wire_request: LocaliseWireRequest,
+    wire_request: LocaliseWireRequest,  # without a request id it gets one
     data: bytes,
     localiser: Localiser,
     *,
     limits: DecodeLimits = DEFAULT_LIMITS,
 ) -> LocaliseReply:
     """Localise the image file in `data`.
-
-    Args:
-        wire_request: what the client says about it; without a request id it gets one.
-        data: bytes of the image file.
-        localiser: answers from one snapshot.
-        limits: bytes and pixels allowed.
 
     Raises:
         RequestError: why the query has no answer.

@@ -1,9 +1,50 @@
-"""Structured logs: one JSON object per line."""
+"""What a server writes down: events counted, with how long the latest took, and logs of JSON lines."""
 
 import json
 import logging
+import threading
+from collections import Counter, deque
 from datetime import UTC, datetime
 from typing import Any, TextIO
+
+import numpy as np
+
+_LATEST = 1000  # enough for a 99th percentile, forgets a slow start; half a minute of one live session
+
+
+class Tally:
+    """Events by kind and code; threads share it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._latency_ms: deque[float] = deque(maxlen=_LATEST)
+
+    def add(self, kind: str, code: str = "", latency_ms: float | None = None) -> None:
+        """One more event, and how long it took."""
+        with self._lock:
+            self._counts[kind, code] += 1
+            if latency_ms is not None:
+                self._latency_ms.append(latency_ms)
+
+    def count(self, kind: str) -> int:
+        """Events of a kind, of whatever code."""
+        return sum(self.by_code(kind).values())
+
+    def by_code(self, kind: str) -> dict[str, int]:
+        """Events of a kind by their code, sorted."""
+        with self._lock:
+            return {code: n for (of, code), n in sorted(self._counts.items()) if of == kind}
+
+    def latency(self, *percents: int) -> dict[str, Any]:
+        """`count`, percentiles such as `p50`, and `max` of the latest 1000, milliseconds; None before any."""
+        with self._lock:
+            values = np.array(self._latency_ms)
+        names = [*(f"p{percent}" for percent in percents), "max"]
+        if not len(values):
+            return {"count": 0, **dict.fromkeys(names)}
+        found = [*np.percentile(values, percents), values.max()]
+        return {"count": len(values)} | {n: round(float(v), 3) for n, v in zip(names, found, strict=True)}
 
 
 class JsonLinesFormatter(logging.Formatter):

@@ -8,63 +8,64 @@ from pathlib import Path
 from featuredb.errors import InvalidValueError
 from featuredb.features.decode import DecodeLimits
 from reloc.service.contributions.inbox import InboxOptions
-from reloc.service.live.options import LiveOptions
 from reloc.service.workers.answering import WorkerLimits
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
-from reloc.wire.keys import NAME_EXPECTED, is_name
+from reloc.tracking.options import TrackOptions
+from reloc.wire.keys import DEFAULT_ENDPOINT, NAME_EXPECTED, is_name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveOptions:
+    """Options of the live sessions of one server."""
+
+    # Open at a time; 0 takes none. Following 30 frames a second and matching keyframes take about a core.
+    max_sessions: int = 2
+    # A session without a usable frame for so long ends: a client that dies is noticed at once, one whose
+    # network breaks is not.
+    idle_timeout_s: float = 5.0
+    # Of a frame; they hold a 4K frame of any quality.
+    limits: DecodeLimits = field(
+        default_factory=lambda: DecodeLimits(
+            max_bytes=8 << 20, max_pixels=16_000_000, max_scan_pixels=160_000_000, max_side_px=8192
+        )
+    )
+    max_side_px: int = 1280  # larger frames are made smaller for tracking, as those of films are
+    track: TrackOptions = field(default_factory=lambda: TrackOptions(live=True))  # localises as queries are
+
+    def __post_init__(self) -> None:
+        if self.max_sessions < 0:
+            raise InvalidValueError(f"LiveOptions.max_sessions: expected >= 0, found {self.max_sessions}")
+        for name, value in (("idle_timeout_s", self.idle_timeout_s), ("max_side_px", self.max_side_px)):
+            if not value > 0:
+                raise InvalidValueError(f"LiveOptions.{name}: expected > 0, found {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServeOptions:
-    """Options of one server.
+    """Options of one server."""
 
-    Attributes:
-        listen: Zenoh endpoints to listen on; port 0 takes a free one. Empty where `config_path` says it.
-        connect: Zenoh endpoints of a router, or of another server, that clients connect to.
-        config_path: a Zenoh configuration (JSON5), in which `listen` and `connect` replace what it has.
-        insecure: start also where whoever reaches the server could answer in its place.
-        name: the database's name on the wire; "" takes the name of the database's folder.
-        bbox: west, south, east and north in degrees: only maps that touch it are served; None: all.
-        metrics_port: of this machine, where Prometheus finds the server's figures; 0 takes a free one, None:
-            there is no such page.
-        workers: queries localised at a time, each in a process of its own; two fill the reference machine's
-            two cores.
-        threads_per_worker: of OpenCV and BLAS within one query. All cores, so that a lone query, the common
-            case of a robot or a phone, is answered soonest; workers that run at once share them.
-        query_memory_bytes: what one query, or a frame of a live session, may take of memory, beyond the maps.
-            The largest pictures that `limits` lets in take 1.5 GiB.
-        max_queue: queries that may wait; the next gets BUSY. At 0.25 s a query and two workers, 32
-            waiting ones are answered within 4 s, half of the deadline.
-        max_queued_bytes: of all waiting payloads together, so that the queue cannot fill the memory.
-        deadline_s: from receipt to answer; under Zenoh's default query timeout of 10 s, so that the
-            client hears of it. A worker has half of it for a query, so that those who wait behind the
-            slowest are still answered.
-        poll_interval_s: how often the store is asked for a newer version; also the delay of a hot reload.
-        shutdown_grace_s: how long queries in hand may take when the server stops.
-        limits: bytes and pixels of a query image.
-        contributions: take photos that clients contribute. On: only photos whose senders say whose they are
-            and under what terms are kept, in a bounded inbox, and nothing of them answers queries before
-            growth has checked them.
-        inbox: its bounds.
-        live: sessions that follow a stream of frames.
-    """
-
-    listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
-    connect: tuple[str, ...] = ()
-    config_path: Path | None = None
-    insecure: bool = False
-    name: str = ""
-    bbox: tuple[float, float, float, float] | None = None
-    metrics_port: int | None = None
-    workers: int = 2
+    listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)  # Zenoh endpoints; port 0 takes a free one
+    connect: tuple[str, ...] = ()  # Zenoh endpoints of a router, or another server, that clients connect to
+    config_path: Path | None = None  # Zenoh configuration (JSON5); `listen` and `connect` replace what it has
+    insecure: bool = False  # start also where whoever reaches the server could answer in its place
+    name: str = ""  # of the database on the wire; "": that of its folder
+    bbox: tuple[float, float, float, float] | None = None  # W, S, E, N, degrees: only maps that touch it
+    metrics_port: int | None = None  # of this machine, for Prometheus; 0 takes a free one, None: no such page
+    workers: int = 2  # queries localised at a time, each in a process of its own
+    # Of OpenCV and BLAS within one query: all cores, so that a lone query is answered soonest.
     threads_per_worker: int = field(default_factory=lambda: os.cpu_count() or 1)
+    # Of one query, or a frame of a live session, beyond the maps; the largest pictures allowed take 1.5 GiB.
     query_memory_bytes: int = 3 * 2**30
+    # Queries that may wait; at 0.25 s a query and two workers these take 4 s, half of the deadline.
     max_queue: int = 32
-    max_queued_bytes: int = 512 * 2**20
+    max_queued_bytes: int = 512 * 2**20  # of all waiting payloads together
+    # From receipt to answer; under Zenoh's default timeout of 10 s, so that the client hears of it. A worker
+    # has half of it for a query, so that those behind the slowest are still answered.
     deadline_s: float = 8.0
-    poll_interval_s: float = 1.0
-    shutdown_grace_s: float = 10.0
-    limits: DecodeLimits = field(default_factory=DecodeLimits)
+    poll_interval_s: float = 1.0  # how often the store is asked for a newer version
+    shutdown_grace_s: float = 10.0  # for queries in hand when the server stops
+    limits: DecodeLimits = field(default_factory=DecodeLimits)  # of a query's image
+    # Take photos that clients give, with credit and licence, into a bounded inbox; nothing of them answers
+    # queries before growth has checked them.
     contributions: bool = True
     inbox: InboxOptions = field(default_factory=InboxOptions)
     live: LiveOptions = field(default_factory=LiveOptions)
@@ -84,17 +85,10 @@ class ServeOptions:
         )
 
     def __post_init__(self) -> None:
-        for name, value in (
-            ("workers", self.workers),
-            ("threads_per_worker", self.threads_per_worker),
-            ("query_memory_bytes", self.query_memory_bytes),
-            ("max_queue", self.max_queue),
-            ("max_queued_bytes", self.max_queued_bytes),
-            ("deadline_s", self.deadline_s),
-            ("poll_interval_s", self.poll_interval_s),
-        ):
-            if not value > 0:
-                raise InvalidValueError(f"ServeOptions.{name}: expected > 0, found {value}")
+        counts = ("workers", "threads_per_worker", "query_memory_bytes", "max_queue", "max_queued_bytes")
+        for name in (*counts, "deadline_s", "poll_interval_s"):
+            if not getattr(self, name) > 0:
+                raise InvalidValueError(f"ServeOptions.{name}: expected > 0, found {getattr(self, name)}")
         if self.metrics_port is not None and not 0 <= self.metrics_port < 65_536:
             raise InvalidValueError(
                 f"ServeOptions.metrics_port: expected 0..65535, found {self.metrics_port}"

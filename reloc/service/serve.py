@@ -6,8 +6,6 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 
 from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
-from prometheus_client.core import Metric
-from prometheus_client.registry import Collector
 
 from featuredb.stop_signals import on_stop_signals
 from featuredb.store import Database
@@ -18,7 +16,7 @@ from reloc.service.server import Server
 from reloc.service.session import ServiceStartError
 from reloc.service.source import DatabaseSource
 from reloc.wire.server import StatusReply
-from reloc.wire.status_metrics import status_metrics
+from reloc.wire.status_metrics import Figures, status_metrics
 
 _TURN_S = 1.0  # of waiting for a signal
 
@@ -27,15 +25,13 @@ _TURN_S = 1.0  # of waiting for a signal
 def metrics_page(port: int, status: Callable[[], StatusReply | None]) -> Iterator[int]:
     """Within the block `http://127.0.0.1:PORT/metrics` says what the server's status does; the port.
 
-    Args:
-        port: 0 takes a free one.
-        status: None while the server does not answer yet.
+    Port 0 takes a free one. The status is None while the server does not answer yet.
 
     Raises:
         ServiceStartError: the port is taken.
     """
     registry = CollectorRegistry()
-    registry.register(_Status(status))
+    registry.register(Figures(lambda: status_metrics(status())))
     ProcessCollector(registry=registry)
     try:
         server, thread = start_http_server(port, addr="127.0.0.1", registry=registry)
@@ -49,14 +45,6 @@ def metrics_page(port: int, status: Callable[[], StatusReply | None]) -> Iterato
         server.shutdown()
         server.server_close()
         thread.join()
-
-
-class _Status(Collector):
-    def __init__(self, status: Callable[[], StatusReply | None]) -> None:
-        self._status = status
-
-    def collect(self) -> Iterator[Metric]:
-        return status_metrics(self._status())
 
 
 def start_server(database: Database, options: ServeOptions | None = None) -> Server:

@@ -12,12 +12,11 @@ from typing import Self
 import zenoh
 
 from reloc.service.contributions.inbox import Inbox
-from reloc.service.live.follower import Follower
+from reloc.service.live.session import Follower
 from reloc.service.live.sessions import LiveSessions
-from reloc.service.logs import fields
+from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
-from reloc.service.pending import PendingQuery
-from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
+from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import (
     ServiceStartError,
     authenticates,
@@ -27,7 +26,6 @@ from reloc.service.session import (
     server_config,
 )
 from reloc.service.source import AreaWatcher, DatabaseSource, ServedArea
-from reloc.service.tally import Tally
 from reloc.service.workers.pool import WorkerPool
 from reloc.service.workers.process import prepare_workers
 from reloc.wire.keys import Keys, client_of, is_addressed
@@ -50,13 +48,7 @@ _JSON = zenoh.Encoding.APPLICATION_JSON
 
 
 class Server:
-    """A running server; `start` makes one, `close` (or leaving the `with` block) ends it.
-
-    Attributes:
-        database: name on the wire.
-        server_id: the Zenoh id of its session.
-        endpoints: where it listens; empty where only the configuration file knows.
-    """
+    """A running server; `start` makes one, `close` (or leaving the `with` block) ends it."""
 
     def __init__(
         self,
@@ -70,8 +62,8 @@ class Server:
         inbox: Inbox | None,
         authenticates: bool,
     ) -> None:
-        self.database = database
-        self.endpoints = endpoints
+        self.database = database  # its name on the wire
+        self.endpoints = endpoints  # where it listens; empty where only the configuration file knows
         self.server_id = str(session.zid())
         self._session = session
         self._options = options
@@ -113,8 +105,7 @@ class Server:
     ) -> Self:
         """Load the area, then listen; when this returns, queries are answered.
 
-        Args:
-            inbox: takes contributed photos, and is started and closed by the server; None: it takes none.
+        Without an inbox, which the server starts and closes, it takes no contributed photos.
 
         Raises:
             ServiceStartError: cannot listen, or strangers could reach it and `insecure` is not set.

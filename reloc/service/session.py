@@ -9,7 +9,7 @@ from typing import Any
 import zenoh
 
 from featuredb.errors import FeatureDbError
-from reloc.wire.endpoints import DEFAULT_ENDPOINT, is_loopback
+from reloc.wire.keys import DEFAULT_ENDPOINT, is_loopback
 
 _THIS_MACHINE = ("unixsock-stream", "unixpipe")
 
@@ -26,7 +26,12 @@ def server_config(
     Raises:
         ServiceStartError: the file cannot be read.
     """
-    config = _base_config(config_path)
+    try:
+        config = zenoh.Config() if config_path is None else zenoh.Config.from_file(str(config_path))
+    except zenoh.ZError as error:
+        raise ServiceStartError(
+            f"cannot read the Zenoh configuration {config_path}: {_first_sentence(error)}"
+        ) from error
     if config_path is None:
         config.insert_json5("mode", '"peer"')
         # Without a configuration file the server is where it says it is and searches for nobody.
@@ -75,17 +80,6 @@ def bind_free_port(endpoint: str) -> str:
             f"cannot listen on {endpoint}: {error}; expected endpoints like {DEFAULT_ENDPOINT}"
         ) from error
     return f"{match[1]}/{match[2]}:{port}{match[3] or ''}"
-
-
-def _base_config(config_path: Path | None) -> zenoh.Config:
-    if config_path is None:
-        return zenoh.Config()
-    try:
-        return zenoh.Config.from_file(str(config_path))
-    except zenoh.ZError as error:
-        raise ServiceStartError(
-            f"cannot read the Zenoh configuration {config_path}: {_first_sentence(error)}"
-        ) from error
 
 
 def _first_sentence(error: Exception) -> str:

@@ -20,12 +20,7 @@ _MAX_RETRY_S = 60.0  # a broken snapshot is tried again, ever less often up to t
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ServedArea:
-    """What one snapshot offers.
-
-    Attributes:
-        localiser: answers the queries.
-        maps: the maps it answers from.
-    """
+    """What one snapshot offers: what answers the queries, and the maps that it answers from."""
 
     localiser: Localiser
     maps: tuple[MapInfo, ...]
@@ -88,16 +83,9 @@ class DatabaseSource:
 
 def map_info(summary: MapSummary) -> MapInfo:
     """A map's summary as the wire says it."""
+    same = [name for name in MapInfo.model_fields if name not in ("bounds", "tiles")]
     return MapInfo(
-        map_id=summary.map_id,
-        content_digest=summary.content_digest,
-        name=summary.name,
-        epsg=summary.epsg,
-        height_datum=summary.height_datum,
-        method=summary.method,
-        generation=summary.generation,
-        images=summary.images,
-        points=summary.points,
+        **{name: getattr(summary, name) for name in same},
         bounds=_bounds(summary),
         tiles=tuple(f"{summary.epsg}-{tile}" for tile in summary.tiles),
     )

@@ -3,10 +3,12 @@
 import signal
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from typing import Self
 
 from featuredb.errors import VideoError
 from featuredb.video.film import VideoFrame
+
+_BY_HAND = "stopped by hand"
 
 
 def until_it_ends(film: Iterable[VideoFrame], trouble: list[str]) -> Iterator[VideoFrame]:
@@ -16,11 +18,12 @@ def until_it_ends(film: Iterable[VideoFrame], trouble: list[str]) -> Iterator[Vi
     the caller has in hand when Ctrl-C comes is the last one; a second Ctrl-C is not waited for.
     """
     frames, read = iter(film), 0
-    with _last_frame_by_sigint() as stop:
+    with _Stop() as stop:
         while not stop.asked:
             try:
-                with stop.at_once():
-                    frame = next(frames)
+                stop.at_once = True
+                frame = next(frames)
+                stop.at_once = False
             except StopIteration:
                 return
             except (VideoError, KeyboardInterrupt) as error:
@@ -33,40 +36,26 @@ def until_it_ends(film: Iterable[VideoFrame], trouble: list[str]) -> Iterator[Vi
     trouble.append(_BY_HAND)
 
 
-_BY_HAND = "stopped by hand"
-
-
 class _Stop:
-    """What Ctrl-C does. Attributes: asked: it was pressed."""
+    """Within it Ctrl-C is noted, and interrupts only where it is `at_once`, or `asked` already."""
 
     def __init__(self) -> None:
-        self.asked = self._at_once = False
+        self.asked = self.at_once = False
 
-    def __call__(self, *_: object) -> None:
-        if self._at_once or self.asked:
+    def __enter__(self) -> Self:
+        self._before = signal.getsignal(signal.SIGINT)
+        in_main = threading.current_thread() is threading.main_thread()
+        # Ctrl-C goes to the main thread, and not to what a shell has put into the background.
+        self._noted = in_main and self._before != signal.SIG_IGN
+        if self._noted:
+            signal.signal(signal.SIGINT, self._on_signal)
+        return self
+
+    def __exit__(self, *failed: object) -> None:
+        if self._noted:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _on_signal(self, *_: object) -> None:
+        if self.at_once or self.asked:
             raise KeyboardInterrupt
         self.asked = True
-
-    @contextmanager
-    def at_once(self) -> Iterator[None]:
-        """Within it Ctrl-C interrupts."""
-        self._at_once = True
-        try:
-            yield
-        finally:
-            self._at_once = False
-
-
-@contextmanager
-def _last_frame_by_sigint() -> Iterator[_Stop]:
-    stop = _Stop()
-    before = signal.getsignal(signal.SIGINT)
-    # Ctrl-C goes to the main thread, and not to what a shell has put into the background.
-    if threading.current_thread() is not threading.main_thread() or before == signal.SIG_IGN:
-        yield stop
-        return
-    signal.signal(signal.SIGINT, stop)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -1,62 +1,140 @@
-"""A track: known points carried from frame to frame by optical flow, and the poses that they give."""
+"""A track: known points carried by sparse optical flow through the frames that are kept, and their poses."""
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from reloc.tracking.flow import follow
 from reloc.tracking.ground import Keyframe, Unmatched
 from reloc.tracking.lens_walk import LensWalk
-from reloc.tracking.options import TrackOptions
+from reloc.tracking.options import FlowOptions, TrackOptions
 from reloc.tracking.pose_fit import FittedPose, fit_pose
-from reloc.tracking.recent import RecentFrame
+
+_HALF_PX = 0.5  # OpenCV's pixel (0, 0) is a centre, ours a corner
+
+
+def follow(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    pixels: FloatArray,
+    guess: FloatArray,
+    options: FlowOptions,
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Where patches around pixels (n, 2) of one frame (h, w) lie in another, about at the guess (n, 2).
+
+    Returns:
+        Pixels (n, 2) float64, and which (n,) of them are to be trusted.
+    """
+    if len(pixels) == 0:
+        return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
+    height, width = before.shape
+    enlarged = max(width, height) / options.reference_side_px
+    window = max(2 * round(0.5 * (options.window_px * enlarged - 1.0)) + 1, 5)  # odd
+    settings: dict[str, Any] = {
+        "winSize": (window, window),
+        "maxLevel": options.levels,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, options.iterations, 0.01),
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "minEigThreshold": 1e-4,
+    }
+    start = (pixels - _HALF_PX).astype(np.float32)
+    aimed = (guess - _HALF_PX).astype(np.float32)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, aimed.copy(), **settings)
+    # The way back starts from as far off as the way there did.
+    back_guess = there + (start - aimed)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, back_guess, **settings)
+    good = (found.reshape(-1) == 1) & (found_back.reshape(-1) == 1)
+    good &= np.linalg.norm(back - start, axis=1) < options.max_back_px * enlarged
+    result = there.astype(np.float64) + _HALF_PX
+    inside = (result >= 0).all(axis=1) & (result[:, 0] < width) & (result[:, 1] < height)
+    return result, np.asarray(good & inside)
+
 
 _INSTANT_S = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Landmarks:
-    """Known points with the pixels in which the last frame shows them.
+class RecentFrame:
+    """A frame: its number, its time on the film's clock, and its grey values (h, w) uint8."""
 
-    Attributes:
-        rows: (n,) of the area's points, none twice.
-        points: (n, 3) metres in the area's frame.
-        pixels: (n, 2) in the last frame.
-        born: (n,) number of the keyframe that matched them.
+    index: int
+    time_s: float
+    gray: NDArray[np.uint8]
+
+
+class RecentFrames:
+    """A bounded memory of frames.
+
+    However long an answer takes, its keyframe stays, and the frames since then get sparser, evenly.
     """
 
-    rows: NDArray[np.int64]
-    points: FloatArray
-    pixels: FloatArray
-    born: NDArray[np.int64]
+    def __init__(self, capacity: int) -> None:
+        """`capacity`: frames that are kept at most, at least 3."""
+        self._capacity = max(capacity, 3)
+        self._frames: list[RecentFrame] = []
+
+    @property
+    def last(self) -> RecentFrame | None:
+        """The frame that was added last."""
+        return self._frames[-1] if self._frames else None
+
+    def add(self, frame: RecentFrame, keep_from: int | None) -> None:
+        """Keep this frame, and of the others those from number `keep_from` on (None: none of them)."""
+        kept = [] if keep_from is None else [f for f in self._frames if f.index >= keep_from]
+        kept.append(frame)
+        if len(kept) > self._capacity:
+            # The frame goes whose neighbours are closest together; the first and the last stay.
+            gaps = [after.index - before.index for before, after in zip(kept, kept[2:], strict=False)]
+            del kept[1 + gaps.index(min(gaps))]
+        self._frames = kept
+
+    def since(self, index: int) -> list[RecentFrame]:
+        """The frames from number `index` on, in order; none where that one is not kept."""
+        found = [f for f in self._frames if f.index >= index]
+        return found if found and found[0].index == index else []
+
+    def before(self, index: int) -> list[RecentFrame]:
+        """The frames before number `index`, the last first, as far as none is missing between them."""
+        found: list[RecentFrame] = []
+        for frame in reversed([f for f in self._frames if f.index < index]):
+            if frame.index != index - 1 - len(found):
+                break
+            found.append(frame)
+        return found
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landmarks:
+    """Known points with the pixels in which the last frame shows them."""
+
+    rows: NDArray[np.int64]  # (n,) of the area's points, none twice
+    points: FloatArray  # (n, 3) metres in the area's frame
+    pixels: FloatArray  # (n, 2) in the last frame
+    born: NDArray[np.int64]  # (n,) number of the keyframe that matched them
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Landmarks":
         """Some of them."""
-        return Landmarks(
-            rows=self.rows[chosen],
-            points=self.points[chosen],
-            pixels=self.pixels[chosen],
-            born=self.born[chosen],
-        )
+        return Landmarks(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
     def joined(self, newer: "Landmarks") -> "Landmarks":
         """Both; of a point that is in both the newer one, whose pixel is a fresh match."""
-        old = self.take(~np.isin(self.rows, newer.rows))
+        old, names = self.take(~np.isin(self.rows, newer.rows)), [field.name for field in fields(self)]
         return Landmarks(
-            rows=np.concatenate([newer.rows, old.rows]),
-            points=np.concatenate([newer.points, old.points]),
-            pixels=np.concatenate([newer.pixels, old.pixels]),
-            born=np.concatenate([newer.born, old.born]),
+            **{name: np.concatenate([getattr(newer, name), getattr(old, name)]) for name in names}
         )
 
     def spread(self, count: int, columns: int, rows: int, width: int, height: int) -> "Landmarks":
@@ -74,30 +152,18 @@ class Landmarks:
 
 
 class FlowTrack:
-    """Landmarks on a ground with the last poses; used from one thread at a time.
-
-    Attributes:
-        ground: that the landmarks are of.
-        landmarks: as the last frame shows them.
-        why: the last thing that went wrong, in words.
-    """
+    """Landmarks on a ground, as the last frame shows them, with the last poses; of one thread at a time."""
 
     def __init__(
         self,
         keyframe: Keyframe,
-        frame: RecentFrame,
+        frame: RecentFrame,  # the keyframe's own, at which the track begins
         camera: Camera,
         options: TrackOptions,
-        lens: LensWalk | None = None,
+        lens: LensWalk | None = None,  # the camera as it is known so far, to be estimated; None: it is given
     ) -> None:
-        """
-        Args:
-            frame: the keyframe's own, at which the track begins.
-            camera: intrinsics of the frames. lens: the same as it is known so far, to be estimated with the
-                poses; None: it is given.
-        """
         self.ground = keyframe.ground
-        self.why = ""
+        self.why = ""  # the last thing that went wrong, in words
         self._given, self._options, self._lens = camera, options, lens
         self.landmarks = self._spread(_landmarks_of(keyframe, frame.index), frame.gray)
         self._poses: deque[tuple[float, Rigid3]] = deque([(frame.time_s, keyframe.cam_from_local)], maxlen=2)
@@ -154,13 +220,9 @@ class FlowTrack:
         good: NDArray[np.bool_] | None,
         predicted: Rigid3,
         time_s: float,
-        in_view: int = 0,
+        in_view: int = 0,  # that should be in the picture, of which some may not have been followed
     ) -> FittedPose | None:
-        """The pose of the landmarks that were followed (None: all); what agrees with it stays.
-
-        Args:
-            in_view: how many should be in the picture, of which some may not have been followed.
-        """
+        """The pose of the landmarks that were followed (None: all); what agrees with it stays."""
         options, followed = self._options, marks if good is None else marks.take(np.flatnonzero(good))
         if len(followed) < options.min_landmarks:
             self.why = f"{len(followed)} of {len(marks)} landmarks are found again"

@@ -1,7 +1,7 @@
-"""What a track stands on: points of maps, or of a scan, in one local frame; how a frame is found there."""
+"""What a track stands on, points of maps or of a scan in one local frame, and what it says of a frame."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,21 +68,14 @@ class Finder(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Keyframe:
-    """What the ground says of a frame.
+    """What the ground says of a frame."""
 
-    Attributes:
-        cam_from_local: pose in the ground's frame. ground: that it is of.
-        camera: intrinsics; the given ones, or estimated along. camera_source: whence they come.
-        pixels: (k, 2) of its inliers. points: (k, 3) that they see, metres in the ground's frame.
-        rows: (k,) numbers of the points, by which they are told apart.
-    """
-
-    cam_from_local: Rigid3
+    cam_from_local: Rigid3  # in the ground's frame
     ground: Ground
-    camera: Camera
-    pixels: FloatArray
-    points: FloatArray
-    rows: NDArray[np.int64]
+    camera: Camera  # the given one, or estimated along
+    pixels: FloatArray  # (k, 2) of its inliers
+    points: FloatArray  # (k, 3) that they see, metres in the ground's frame
+    rows: NDArray[np.int64]  # (k,) numbers of the points, by which they are told apart
     camera_source: CameraSource = "request"
 
 
@@ -92,3 +85,23 @@ class Unmatched:
 
     reason: str
     detail: str
+
+
+TrackState = Literal["tracking", "relocalised", "lost"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedFrame:
+    """What is known of one frame."""
+
+    index: int
+    time_s: float
+    state: TrackState  # relocalised: the first frame after the track was lost or begun; lost: no pose
+    cam_from_local: Rigid3 | None = None  # in the ground's frame
+    covariance: FloatArray | None = None  # (6, 6), see `FittedPose`
+    camera: Camera | None = None  # intrinsics in use
+    ground: Ground | None = None
+    inliers: int = 0  # landmarks that agree with the pose
+    pixels: FloatArray | None = None  # (k, 2) of them
+    rows: NDArray[np.int64] | None = None  # (k,) of the ground's points
+    detail: str = ""  # why there is no pose

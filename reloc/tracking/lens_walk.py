@@ -15,9 +15,7 @@ from reloc.tracking.pose_fit import LensSigmas
 
 # How a focal length is followed; shares of it are standard deviations of its logarithm.
 _ESTIMATED_REL = 0.2  # of a lens that the first frame was localised with
-_PRIORS = (
-    LensPriors()
-)  # of its principal point and first radial coefficient, as one frame tells little of them
+_PRIORS = LensPriors()  # of its principal point and first radial coefficient: one frame tells little of them
 # Of one that the map lends, whose points agree with it; and of many frames, which share their errors and do
 # not tell more than this.
 _FLOOR_REL = 0.001
@@ -31,17 +29,12 @@ STILL_S = 1.0  # a lens that has not changed for so long is not zooming
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class LensWalk:
-    """A lens as the last frame has it.
-
-    Attributes:
-        camera: intrinsics. rel: how sure its focal length is. zooming: whether it may change.
-        lent: by a map, whose points agree with its principal point and distortion.
-    """
+    """A lens as the last frame has it."""
 
     camera: Camera
-    rel: float
-    lent: bool
-    zooming: bool = False
+    rel: float  # how sure its focal length is
+    lent: bool  # by a map, whose points agree with its principal point and distortion
+    zooming: bool = False  # it may change
     _seen: deque[tuple[float, float, float]] = field(default_factory=deque)
 
     @classmethod
@@ -62,9 +55,7 @@ class LensWalk:
             return LensSigmas(focal_rel=self.before_rel)
         longer = max(self.camera.width, self.camera.height)
         return LensSigmas(
-            focal_rel=self.before_rel,
-            center_px=_PRIORS.center_rel * longer,
-            radial=_PRIORS.radial,
+            focal_rel=self.before_rel, center_px=_PRIORS.center_rel * longer, radial=_PRIORS.radial
         )
 
     def surprised(self, focal_px: float, focal_rel: float) -> bool:

@@ -29,12 +29,7 @@ _MOST_LOOKED_AT = 20_000
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapGround:
-    """The maps of an area, or a map without a place.
-
-    Attributes:
-        area: its local frame is the map's own where this has no place.
-        own: the frame of that map; None where the maps are placed.
-    """
+    """The maps of an area, or a map without a place, whose `own` frame is the area's local frame."""
 
     area: Area
     own: OwnFrame | None = None
@@ -105,11 +100,7 @@ class MapGround:
 
 
 class MapFinder:
-    """Finds frames as queries are found, on the maps of some areas.
-
-    Args:
-        own: frame of the map without a place that is the only area.
-    """
+    """Finds frames as queries are found, on maps of areas, or one without a place and its own frame."""
 
     def __init__(self, areas: Sequence[IndexedArea], own: OwnFrame | None = None) -> None:
         self._areas, self._own = tuple(areas), own

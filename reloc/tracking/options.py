@@ -9,88 +9,63 @@ from reloc.localise.options import LocaliseOptions
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlowOptions:
-    """Optical flow, at `reference_side_px`; lengths grow with the frames.
+    """Optical flow, at `reference_side_px`; lengths grow with the frames."""
 
-    Attributes:
-        window_px: side of the patches. levels: of the pyramid above the frame.
-        iterations: on each level. max_back_px: a patch that does not come back to where it was by more is
-            lost (Kalal, Mikolajczyk and Matas, Forward-Backward Error, 2010).
-    """
-
-    window_px: int = 17
-    levels: int = 2
-    iterations: int = 12
+    window_px: int = 17  # side of the patches
+    levels: int = 2  # of the pyramid above the frame
+    iterations: int = 12  # on each level
+    # A patch that does not come back to where it was by more is lost (Kalal, Mikolajczyk and Matas,
+    # Forward-Backward Error, 2010).
     max_back_px: float = 0.6
     reference_side_px: int = 1280
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackOptions:
-    """From frames to poses.
-
-    Attributes:
-        landmarks: that are followed; more sharpen the pose as their root, and cost in proportion.
-        columns, rows: of the grid over which they are spread.
-        min_landmarks: that agree with a pose; fewer are a lost track. On the simulated flights the mean error
-            grew from 0.04 m with 150 and more to 0.4 m with 60 to 80 and 0.5 m with 40 to 60; the three
-            frames with 20 to 30 were off by 0.5 to 1.2 m, with bounds that said 1 m.
-        least_share: of those that the flow followed, that agree. least_kept: of those that should be in view
-            of the next frame; a film that is cut to a look-alike keeps a few. On the simulated flights smooth
-            frames keep 99 %, turns on the spot of 95 degrees in 0.8 s 68 % and more; cuts to a town of the
-            same plan kept 10 %, and back 43 %.
-        keyframe_every: frames from one that is matched against the map to the next. On a simulated flight of
-            40 s every 18th, 20th and 24th gave means of 0.049, 0.051 and 0.064 m.
-        keyframe_soonest: so many frames, where landmarks run out: fewer than `few_landmarks` of those wanted.
-        answer_after: frames after which the answer to a keyframe is waited for: so the same film gives
-            the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
-        keyframe_every_s, answer_after_s, lost_answer_after_s: of the film, where that is sooner: pictures
-            that come one in a second are each looked for, and not one in twenty.
-        catch_up: frames by which a track that was found comes nearer to the frame at hand with each new one,
-            two or more. With all at once one frame waited for 0.18 s.
-        earlier: frames before one that is looked for that are kept, and followed backwards once it is found:
-            the first frames of a film may be harder to find than those two seconds on. Not live.
-        live: answers are taken as soon as they are there, and no frame waits for one. live_frames: that are
-            kept meanwhile; 60 are two seconds, and 55 MB at 1280x720. live_steps: frames by which a track
-            that was found is carried to the one at hand while a client waits; more are left to the thread.
-        min_matches: of a keyframe with the map. max_unconfirmed: keyframes in a row without them; then the
-            track is lost, however well its old landmarks agree with each other.
-        keyframes: features of a keyframe, whose pose is known to some pixels. As many as a query's took twice
-            the time, for which the film waited (50 instead of 72 frames a second), and gave 0.045 m. From
-            480 to 800 pixels a side the means were alike: 0.046 to 0.051 m smooth, 0.061 to 0.075 jerky.
-        fine_keyframes: the same where landmarks run out, as over water: on a jerky flight the 95th
-            percentile went from 0.21 to 0.18 m, lost frames from 15 to 6.
-        localise: how a lost track is found again.
-    """
+    """From frames to poses."""
 
     flow: FlowOptions = field(default_factory=FlowOptions)
-    landmarks: int = 220
-    columns: int = 16
+    landmarks: int = 220  # that are followed; more sharpen the pose as their root, and cost in proportion
+    columns: int = 16  # of the grid over which they are spread
     rows: int = 9
+    # That agree with a pose; fewer are a lost track. Simulated frames with 20 to 30 were off by 0.5 to 1.2 m,
+    # with bounds that said 1 m.
     min_landmarks: int = 30
-    least_share: float = 0.4
+    least_share: float = 0.4  # of those that the flow followed, that agree
+    # Of those that should be in view of the next frame; simulated turns on the spot keep 68 % and more, cuts
+    # to look-alikes 10 to 43 %.
     least_kept: float = 0.5
-    keyframe_every: int = 20
-    keyframe_soonest: int = 6
-    few_landmarks: float = 0.5
+    keyframe_every: int = 20  # frames from one that is matched against the map to the next
+    keyframe_soonest: int = 6  # so many frames, where landmarks run out:
+    few_landmarks: float = 0.5  # fewer than this share of those wanted
+    # Frames after which the answer to a keyframe is waited for, so that the same film gives the same poses,
+    # however busy the machine is; the second: while the track is lost.
     answer_after: int = 10
     lost_answer_after: int = 20
+    # Of the film, where that is sooner: pictures that come one in a second are each looked for.
     keyframe_every_s: float = 1.0
     answer_after_s: float = 0.6
     lost_answer_after_s: float = 1.0
+    # Frames by which a track that was found comes nearer to the frame at hand with each new one, two or more.
+    # With all at once one frame waited for 0.18 s.
     catch_up: int = 5
+    # Frames before one that is looked for that are followed backwards once it is found: the first frames of a
+    # film may be harder to find than those two seconds on. Not live.
     earlier: int = 60
-    live: bool = False
-    live_frames: int = 60
-    live_steps: int = 3
-    min_matches: int = 30
-    max_unconfirmed: int = 3
+    live: bool = False  # answers are taken as soon as they are there, and no frame waits for one
+    live_frames: int = 60  # that are kept meanwhile: two seconds, and 55 MB at 1280x720
+    live_steps: int = 3  # frames by which it is carried on while a client waits; the thread does more
+    min_matches: int = 30  # of a keyframe with the map
+    max_unconfirmed: int = 3  # keyframes in a row without them; then the track is lost
+    # Of a keyframe, whose pose is known to some pixels: as many as a query's take twice the time, and place
+    # it hardly better. The second: where landmarks run out, as over water.
     keyframes: ExtractorOptions = field(
         default_factory=lambda: ExtractorOptions(first_octave_px=1200, max_features=1500, oversample=1.0)
     )
     fine_keyframes: ExtractorOptions = field(
         default_factory=lambda: ExtractorOptions(first_octave_px=2000, max_features=6000, oversample=1.0)
     )
-    localise: LocaliseOptions = field(default_factory=LocaliseOptions)
+    localise: LocaliseOptions = field(default_factory=LocaliseOptions)  # how a lost track is found again
 
     def __post_init__(self) -> None:
         if self.catch_up < 2:

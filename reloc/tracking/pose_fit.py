@@ -21,35 +21,23 @@ _SINGULAR = 1e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FittedPose:
-    """A pose and how well it is known.
-
-    Attributes:
-        cam_from_local: the pose.
-        inlier: (n,) bool, pixels within the tolerance.
-        focal_px, focal_rel: focal length, and the standard deviation of its logarithm; 0 where it was given.
-        covariance: (6, 6) of the camera's rotation about the local axes (rad) before the displacement of its
-            centre (m), as in `reloc.localise.result`; of independent pixels, scaled by their residuals, and
-            of what they leave open of the focal length.
-    """
+    """A pose and how well it is known."""
 
     cam_from_local: Rigid3
-    inlier: NDArray[np.bool_]
+    inlier: NDArray[np.bool_]  # (n,) pixels within the tolerance
+    # (6, 6) of the camera's rotation about the local axes (rad) before the displacement of its centre (m); of
+    # independent pixels, scaled by their residuals, and of what they leave open of the lens.
     covariance: FloatArray
     focal_px: float
-    focal_rel: float
+    focal_rel: float  # standard deviation of the focal length's logarithm; 0 where it was given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensSigmas:
-    """Standard deviations of what is not known of a lens; all 0: it is given.
+    """Standard deviations of what is not known of a lens; all 0: it is given."""
 
-    Attributes:
-        focal_rel: of the focal length's logarithm, which is fitted with the pose.
-        center_px, radial: of the principal point and the first radial coefficient, which are not: what they
-            may be is in the pose's covariance.
-    """
-
-    focal_rel: float = 0.0
+    focal_rel: float = 0.0  # of the focal length's logarithm, which is fitted with the pose
+    # Of principal point and first radial coefficient, which are not: what they may be is in the covariance.
     center_px: float = 0.0
     radial: float = 0.0
 
@@ -61,15 +49,10 @@ def fit_pose(
     camera: Camera,
     pixels: FloatArray,
     points: FloatArray,
-    start: Rigid3,
-    doubt: LensSigmas = GIVEN,
+    start: Rigid3,  # a pose within some degrees and a few per cent of the distance
+    doubt: LensSigmas = GIVEN,  # what is not known of the camera
 ) -> FittedPose | None:
-    """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it.
-
-    Args:
-        start: a pose within some degrees and a few per cent of the distance.
-        doubt: what is not known of the camera.
-    """
+    """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it."""
     if len(pixels) < 4:
         return None
     focal_rel = doubt.focal_rel

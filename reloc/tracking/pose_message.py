@@ -14,20 +14,15 @@ from reloc.tracking.trajectory.values import TrajectoryPoint
 from reloc.wire.query import Intrinsics
 from reloc.wire.track import TrackPose
 
-_POSE_FIELDS = (
-    *("position", "quaternion", "height_datum", "utm"),
-    *("covariance", "accuracy", "camera", "map_id"),
-)
+_PLACE = ("position", "quaternion", "height_datum", "utm", "covariance", "accuracy", "camera", "map_id")
 
 
 def pose_message(point: TrajectoryPoint, camera: Camera | None, **about: Any) -> TrackPose:
-    """A frame on Earth as the wire says it.
+    """A frame on Earth as the wire says it, with its camera as the client sent it where there is a pose.
 
-    Args:
-        camera: intrinsics of the frame as the client sent it; not None where there is a pose.
-        about: `session`, `sequence`, `snapshot`, `dropped`, `received_at`, `answered_at`, `timings_ms`.
+    `about`: `session`, `sequence`, `snapshot`, `dropped`, `received_at`, `answered_at`, `timings_ms`.
     """
-    pose: dict[str, Any] = dict.fromkeys(_POSE_FIELDS)
+    pose: dict[str, Any] = dict.fromkeys(_PLACE)
     if point.pose is not None:
         assert camera is not None
         lens = Intrinsics(**asdict(camera))

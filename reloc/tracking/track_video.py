@@ -24,15 +24,13 @@ from featuredb.video.opening import Source
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.film_end import until_it_ends
-from reloc.tracking.ground import Finder
+from reloc.tracking.ground import Finder, TrackedFrame
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 
 # Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
 _READ_ON = 4
-
 # Of pictures that wait, for their greys and, as 4:2:0, their colours: at 3840x2160 ten frames.
 _MOST_BYTES = 1 << 27
 
@@ -52,21 +50,12 @@ def draw_frame(rgb: NDArray[np.uint8], frame: TrackedFrame, point: TrajectoryPoi
             cv2.circle(picture, (round(x), round(y)), max(1, round(scale)), _OTHER_RGB, -1, cv2.LINE_AA)
         for x, y in frame.pixels if frame.pixels is not None else ():
             cv2.circle(picture, (round(x), round(y)), round(4 * scale) + 1, _LANDMARK_RGB, 1, cv2.LINE_AA)
-    words = _words(point)
+    words, colour = _words(point), _STATE_RGB[point.state]
     box = picture[: round((14 + 26 * len(words)) * scale), : round(640 * scale)]
     box //= 3
     for row, text in enumerate(words):
         place = (round(12 * scale), round((28 + 26 * row) * scale))
-        cv2.putText(
-            picture,
-            text,
-            place,
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.6 * scale,
-            _STATE_RGB[point.state],
-            1,
-            cv2.LINE_AA,
-        )
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6 * scale, colour, 1, cv2.LINE_AA)
     return picture
 
 
@@ -100,28 +89,23 @@ class ReadAhead:
     """
 
     def __init__(self, video: Video, most: int = 24) -> None:
-        """
-        Args:
-            most: frames that are decoded before they are used; fewer of large films, for their memory.
-        """
+        """`most`: frames that are decoded before they are used; fewer of large films, for their memory."""
         if most < 1:
             raise InvalidValueError(f"most: expected 1 frame or more to be read ahead, found {most}")
+        info = video.info
+        bytes_each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
         self._frames: Iterator[VideoFrame] | None = None
-        self._video, self._most = video, 0 if video.info.live else min(most, _fitting(video.info))
+        self._video = video
+        self._most = 0 if info.live else min(most, max(1, _MOST_BYTES // bytes_each))
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="decoding")
         self._ahead: deque[Future[VideoFrame | None]] = deque()
-        self._seconds = 0.0
+        self.seconds = 0.0  # that decoding has taken, ahead or not
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *failed: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
-
-    @property
-    def seconds(self) -> float:
-        """That decoding has taken, ahead or not."""
-        return self._seconds
 
     def read_on(self, frames: int) -> None:
         """Decode so many more frames in the background, up to `most` not yet used; none before the first."""
@@ -131,11 +115,7 @@ class ReadAhead:
             self._ahead.append(self._pool.submit(self._next))
 
     def __iter__(self) -> Iterator[VideoFrame]:
-        """The film's frames; once, as of the film itself.
-
-        Raises:
-            VideoError, InvalidValueError: see `Video.__iter__`.
-        """
+        """The film's frames; once, and with the errors of `Video.__iter__`."""
         self._frames = iter(self._video)
         while True:
             # Nothing is decoded elsewhere where nothing is waited for: frames stay in order.
@@ -150,13 +130,7 @@ class ReadAhead:
         try:
             return next(self._frames, None)
         finally:
-            self._seconds += time.perf_counter() - began
-
-
-def _fitting(info: VideoInfo) -> int:
-    """Frames that fit into the memory that they may take, one at least."""
-    each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
-    return max(1, _MOST_BYTES // each)
+            self.seconds += time.perf_counter() - began
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,41 +154,29 @@ class TrackVideoOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedVideo:
-    """What came of a video.
-
-    Attributes:
-        camera: intrinsics of the frames as they were tracked; None where nothing was localised.
-        seconds: where the time went: `total`; of it `tracking` and `drawing`, the rest is waiting for frames;
-            `decoding`, also of frames that were decoded beside the tracking; `longest_gap` between the poses
-            of two frames.
-        complaints: what was wrong with the film, for people.
-    """
+    """What came of a video."""
 
     trajectory: Trajectory
-    camera: Camera | None
+    camera: Camera | None  # of the frames as they were tracked; None where nothing was localised
+    # `total`; of it `tracking` and `drawing`, the rest is waiting for frames; `decoding`, also beside the
+    # tracking; `longest_gap` between the poses of two frames.
     seconds: dict[str, float]
-    complaints: tuple[str, ...]
+    complaints: tuple[str, ...]  # what was wrong with the film, for people
 
 
 def track_video(
     source: Source,
-    finder: Finder,
+    finder: Finder,  # of the first frame, on maps or on a scan
     *,
-    camera: Camera | None = None,
-    request: LocaliseRequest | None = None,
-    overlay: Path | None = None,
+    camera: Camera | None = None,  # of upright frames of any size; None: of the first frame that is found
+    request: LocaliseRequest | None = None,  # what else is known of the first frame
+    overlay: Path | None = None,  # an mp4 to be written
     options: TrackVideoOptions | None = None,
 ) -> TrackedVideo:
     """Track every frame of a film.
 
     The overlay shows frames as they were known when they were shown; the trajectory has those that were found
     a little later, too.
-
-    Args:
-        finder: finds the first frame, on maps or on a scan.
-        camera: intrinsics of the film's frames, upright, of any size; None: of the first frame that is found.
-        request: what else is known of the first frame.
-        overlay: an mp4 to be written.
 
     Raises:
         VideoError: the film cannot be read at all, or has no frames; the overlay cannot be written. Where it
@@ -307,15 +269,14 @@ def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None
 
 
 def _with_film(request: LocaliseRequest, info: VideoInfo, source: Source) -> LocaliseRequest:
-    """What is known of the frames, with what the film says of its camera where nothing else was said."""
+    """What is known of the frames, with what the film says of its camera where nothing else was said.
+
+    Maps know a film that does not name its camera by the file's digest.
+    """
     if request.camera_key is not None or request.exif_focal_px is not None:
         return request
     focal_px = None if info.focal_px is None else info.focal_px * info.frame_width / info.width
     named = bool(info.camera_key or info.make or info.model)
-    film = None if named or not isinstance(source, str | Path) else _digest(Path(source))
+    file = Path(source) if isinstance(source, str | Path) and not named else None
+    film = unnamed_model(file_sha256(file)) if file is not None and file.is_file() else None
     return replace(request, camera_key=info.camera_key or None, film=film, exif_focal_px=focal_px)
-
-
-def _digest(film: Path) -> str | None:
-    """By which maps of a film know it; None for what is no file."""
-    return unnamed_model(file_sha256(film)) if film.is_file() else None

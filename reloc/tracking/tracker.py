@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
 from reloc.localise.result import LocaliseRequest
-from reloc.tracking.flow_track import FlowTrack, carried
-from reloc.tracking.ground import Finder, Keyframe, Unmatched
+from reloc.tracking.flow_track import FlowTrack, RecentFrame, RecentFrames, carried
+from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, TrackState, Unmatched
 from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose
-from reloc.tracking.recent import RecentFrame, RecentFrames
-from reloc.tracking.tracked_frame import TrackedFrame, TrackState
 
 Answer = Keyframe | FlowTrack | Unmatched
 _FAR = sys.maxsize
@@ -29,17 +27,13 @@ _PACE_S, _LAST_PACE_S, _LAST_FRAMES = 0.05, 0.02, 4
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Sent:
-    """What the thread has in hand: its frame, and the frame or the film's time at which it is waited for.
-
-    Attributes:
-        slow: whether it takes longer than the frames until then.
-    """
+    """What the thread has in hand: its frame, and the frame or the film's time at which it is waited for."""
 
     index: int
-    due: int
-    due_s: float
-    slow: bool
-    answer: "Future[Answer]"
+    answer: "Future[Any]"  # Answer
+    due: int = _FAR
+    due_s: float = float("inf")
+    slow: bool = False  # it takes longer than the frames until then
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -61,18 +55,12 @@ class Tracker:
 
     def __init__(
         self,
-        finder: Finder,
+        finder: Finder,  # of the first frame, and of the track again where it was lost
         camera: Camera | None = None,
         options: TrackOptions | None = None,
-        request: LocaliseRequest | None = None,
+        request: LocaliseRequest | None = None,  # what else is known of the first frame
     ) -> None:
-        """
-        Args:
-            finder: finds the first frame, and the track again where it was lost.
-            camera: intrinsics of the frames; None: estimated with the poses, and anew where the track was
-                lost, since a film may be cut together of several cameras.
-            request: what else is known of the first frame.
-        """
+        """Without a camera it is estimated with the poses, and anew where the track was lost."""
         self._finder, self._options = finder, options or TrackOptions()
         self._request = replace(request or LocaliseRequest(), camera=camera)
         self._given = self._camera = camera
@@ -234,8 +222,7 @@ class Tracker:
     ) -> FittedPose | None:
         """The pose of the frame at hand by what was found of frame `index`; None: it says nothing of it.
 
-        Args:
-            track: as it is at the frame at hand; None: it is lost, and begins again at what was found.
+        `track`: as it is at the frame at hand; None: it is lost, and begins again at what was found.
         """
         since = self._frames.since(index)
         if not since:
@@ -312,7 +299,7 @@ class Tracker:
         steps, most = len(since) - 1, self._options.live_steps
         if most < steps < self._behind:
             self._behind = steps
-            self._hand_over(since[-1].index, self._pool.submit(carried, track, since))
+            self._sent = _Sent(index=since[-1].index, answer=self._pool.submit(carried, track, since))
             return None
         self._behind = _FAR
         rows = np.linspace(0, steps, min(steps, most) + 1).round().astype(np.int64)
@@ -332,8 +319,8 @@ class Tracker:
             return
         self._behind, options = _FAR, self._options
         answer = self._pool.submit(self._finder.find, now.gray.copy(), self._request_now(), options)
-        due = (now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s)
-        self._hand_over(now.index, answer, due, slow=True)
+        due, due_s = now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s
+        self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s, slow=True)
 
     def _send_keyframe(self, now: RecentFrame, fitted: FittedPose, track: FlowTrack) -> None:
         """Have this frame matched against the ground, if it is time for a keyframe and the thread is free."""
@@ -350,20 +337,10 @@ class Tracker:
         answer = self._pool.submit(
             track.ground.match, now.gray.copy(), track.camera, fitted.cam_from_local, options
         )
-        due = (now.index + options.answer_after, now.time_s + options.answer_after_s)
-        self._hand_over(now.index, answer, due, slow=few)
+        due, due_s = now.index + options.answer_after, now.time_s + options.answer_after_s
+        self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s, slow=few)
         self._next_keyframe = now.index + options.keyframe_every
         self._next_keyframe_s = now.time_s + options.keyframe_every_s
-
-    def _hand_over(
-        self,
-        index: int,
-        answer: "Future[Any]",
-        due: tuple[int, float] = (_FAR, float("inf")),
-        *,
-        slow: bool = False,
-    ) -> None:
-        self._sent = _Sent(index=index, due=due[0], due_s=due[1], slow=slow, answer=answer)
 
     def _request_now(self) -> LocaliseRequest:
         if not self._found:

@@ -16,7 +16,6 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.lineage import MapLineage, describe_lineage
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store import MapSummary, UnplacedSummary
-from reloc.viewer.places import Spot
 from reloc.viewer.points import DrawnPoints, drawn_points, sampled
 from reloc.viewer.poses import drawn_pose, worded_place, worded_sigmas
 
@@ -25,38 +24,27 @@ _LEAST_POINTS = 2  # in a cell that counts as covered; a single one is often wro
 
 
 def describe_map(summary: MapSummary, lineage: MapLineage, drawn_under: str | None) -> dict[str, Any]:
-    """What the store knows of a map, without loading it.
-
-    Args:
-        drawn_under: the map under which it stands in the tree, or None.
-    """
+    """What the store knows of a map, without loading it, and the map under which it stands in the tree."""
+    same = ("method", "generation", "residual_rms_m", "points", "epsg", "height_datum")
     return {
         **as_stored(summary),
-        "method": summary.method,
-        "generation": summary.generation,
+        **{name: getattr(summary, name) for name in same},
         "parents": list(summary.parents),
         "under": drawn_under,
         "chain": list(lineage.chain),
         "lineage": describe_lineage(lineage),
         "drift_m": lineage.drift_m,
         "budget_m": lineage.budget_m,
-        "residual_rms_m": summary.residual_rms_m,
-        "points": summary.points,
-        "epsg": summary.epsg,
-        "height_datum": summary.height_datum,
     }
 
 
 def as_stored(summary: MapSummary | UnplacedSummary) -> dict[str, Any]:
     """What the store knows of every map, with a place or without."""
+    same = ("name", "status", "status_reason", "source", "licence")
     return {
         "id": summary.map_id,
-        "name": summary.name,
-        "status": summary.status,
-        "status_reason": summary.status_reason,
         "created_at": summary.created_at.isoformat(timespec="seconds"),
-        "source": summary.source,
-        "licence": summary.licence,
+        **{name: getattr(summary, name) for name in same},
     }
 
 
@@ -117,12 +105,6 @@ def coverage(points: DrawnPoints) -> dict[str, Any]:
     }
 
 
-def spot_of_map(summary: MapSummary, feature_map: FeatureMap) -> Spot:
-    """Where a map without points lies: at its frame's origin."""
-    e, n, h = feature_map.frame.utm_from_enu(np.zeros(3), summary.epsg)
-    return Spot(easting=float(e), northing=float(n), height=float(h), epsg=summary.epsg)
-
-
 def _hull(plan: FloatArray) -> FloatArray:
     try:
         return np.asarray(plan[ConvexHull(plan).vertices])
@@ -143,16 +125,11 @@ def own_points(unplaced: UnplacedMap, wanted: int) -> DrawnPoints:
 
 
 def describe_own_place(
-    summary: UnplacedSummary,
-    unplaced: UnplacedMap,
-    drawn: DrawnPoints,
-    buffer: dict[str, Any],
-    command: str,
+    summary: UnplacedSummary, unplaced: UnplacedMap, drawn: DrawnPoints, buffer: dict[str, Any], command: str
 ) -> dict[str, Any]:
     """The map as a place of the page with no place on Earth: `frame`, `epsg` and what hangs on them are None.
 
-    Args:
-        command: that opens the page of picks.
+    `command` opens the page of picks.
     """
     frame, why = unplaced.frame, unplaced.no_place
     told = {
@@ -164,7 +141,7 @@ def describe_own_place(
         "chain": [summary.map_id],
         "lineage": "",
         "points": len(unplaced.points),
-        "photos": _photos(unplaced),
+        "photos": [_own_photo(image, unplaced) for image in unplaced.images],
         "coverage": coverage(drawn),
         "buffer": buffer,
     }
@@ -186,11 +163,8 @@ def picks_command(url: str, map_id: str, photos: Path | None) -> str:
     return f"featuredb anchor {shlex.quote(url)} {shlex.quote(map_id)} --photos {folder} --page"
 
 
-def _photos(unplaced: UnplacedMap) -> list[dict[str, Any]]:
-    """The photos, poses in the own frame."""
-    photos = []
-    for image in unplaced.images:
-        pose, camera = image.cam_from_local, unplaced.cameras[image.camera_id]
-        drawn = drawn_pose(pose.center, np.asarray(pose.rotation.T), camera)
-        photos.append(described_photo(image, unplaced, {**drawn, "utm": None, "ellipse": None}))
-    return photos
+def _own_photo(image: MapImage, unplaced: UnplacedMap) -> dict[str, Any]:
+    """A photo with its pose in the own frame."""
+    pose, camera = image.cam_from_local, unplaced.cameras[image.camera_id]
+    drawn = drawn_pose(pose.center, np.asarray(pose.rotation.T), camera)
+    return described_photo(image, unplaced, {**drawn, "utm": None, "ellipse": None})

@@ -8,13 +8,11 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
 from featuredb.export.job import whole_or_nothing
-from reloc.viewer.photos import THUMBNAIL_PX, Pictures
-from reloc.viewer.query import data_url
+from reloc.viewer.photos import THUMBNAIL_PX, Pictures, data_url
 from reloc.viewer.scene import ViewerScene
 
 _MEDIA_TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "json": "application/json"}
@@ -29,30 +27,24 @@ _LIBRARIES = {
 _RELATIVE_CORE = b'"./three.core.min.js"'
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Asset:
-    """One file as it is sent."""
-
-    data: bytes
-    media_type: str
-
-
-def assets() -> dict[str, Asset]:
+def assets() -> dict[str, bytes]:
     """All files that the page loads, by their path below /assets/."""
     return assets_of("reloc.viewer", "", "js", "vendor")
 
 
-def assets_of(package: str, *folders: str) -> dict[str, Asset]:
+def media_type_of(file: str) -> str:
+    """What an asset of this name is sent as."""
+    return _MEDIA_TYPES[file.rsplit(".", 1)[-1]]
+
+
+def assets_of(package: str, *folders: str) -> dict[str, bytes]:
     """All files but the page in folders of a package's `assets`, by their path there."""
     root = resources.files(package) / "assets"
     found = {}
     for folder in folders:
         for file in (root / folder).iterdir():
             if file.is_file() and file.name != _TEMPLATE:
-                name = f"{folder}/{file.name}" if folder else file.name
-                found[name] = Asset(
-                    data=file.read_bytes(), media_type=_MEDIA_TYPES[file.name.rsplit(".", 1)[-1]]
-                )
+                found[f"{folder}/{file.name}" if folder else file.name] = file.read_bytes()
     return found
 
 
@@ -79,24 +71,20 @@ def content_policy() -> str:
 
 
 def page_in_one(values: Mapping[str, str]) -> str:
-    """The page with everything in it.
-
-    Args:
-        values: texts by id that the page finds in itself: JSON, or base64.
-    """
+    """The page with everything in it; `values`: texts by id that it finds in itself, JSON or base64."""
     files = assets()
     # A module in a data URL has no folder to look into, so the library's one relative import gets a name.
-    three = files[_LIBRARIES["three"]].data
+    three = files[_LIBRARIES["three"]]
     assert _RELATIVE_CORE in three
-    modules = {name: files[path].data for name, path in _LIBRARIES.items()}
+    modules = {name: files[path] for name, path in _LIBRARIES.items()}
     modules["three"] = three.replace(_RELATIVE_CORE, b'"three/core"')
-    modules |= {f"viewer/{n.removeprefix('js/')}": f.data for n, f in files.items() if n.startswith("js/")}
+    modules |= {f"viewer/{n.removeprefix('js/')}": data for n, data in files.items() if n.startswith("js/")}
     imports = {
         name: f"data:text/javascript;base64,{base64.b64encode(data).decode()}"
         for name, data in modules.items()
     }
-    style = f"<style>\n{files[_STYLE].data.decode()}</style>"
-    licence = files["vendor/LICENSE-three.txt"].data.decode()
+    style = f"<style>\n{files[_STYLE].decode()}</style>"
+    licence = files["vendor/LICENSE-three.txt"].decode()
     inside = "".join(
         f'<script type="text/plain" id="{name}">{text.replace("<", chr(92) + "u003c")}</script>\n'
         for name, text in values.items()

@@ -28,19 +28,12 @@ _MOST_READ = 20_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrawnPoints:
-    """Points of one map or scan.
+    """Points of one map or scan."""
 
-    Attributes:
-        origin: (3,) float64, of the offsets, metres in the place's frame.
-        offsets: (n, 3) float32 metres; any first k of them are a sample of all.
-        rgb: (n, 3) uint8.
-        of: how many points there are.
-    """
-
-    origin: FloatArray
-    offsets: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
-    of: int
+    origin: FloatArray  # (3,) of the offsets, metres in the place's frame
+    offsets: NDArray[np.float32]  # (n, 3) metres; any first k of them are a sample of all
+    rgb: NDArray[np.uint8]  # (n, 3)
+    of: int  # how many points there are
 
     def __len__(self) -> int:
         return len(self.offsets)
@@ -93,13 +86,10 @@ def scan_points_in(
     database: Database,
     scan: ScanSummary,
     frame: LocalFrame,
-    box: tuple[float, float, float, float] | None,
+    box: tuple[float, float, float, float] | None,  # (e0, n0, e1, n1), metres in its zone; None for all
     wanted: int,
 ) -> DrawnPoints:
     """At most `wanted` points of a scan: its coarsest levels of detail, of the last one a part.
-
-    Args:
-        box: (e0, n0, e1, n1), metres in the scan's zone; None for all of it.
 
     Raises:
         StoreError: the points cannot be read.

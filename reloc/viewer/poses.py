@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -12,7 +11,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import matrix_from_quaternion
 from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.values import Trajectory
-from reloc.viewer.places import Spot
 
 # Half axes of the ellipse that holds 95 % of a plane normal distribution, in standard deviations:
 # the root of the chi-square quantile with two degrees of freedom, -2 ln(0.05).
@@ -22,13 +20,9 @@ _WIDEST = 10.0
 
 
 def ellipse_95(covariance: FloatArray) -> dict[str, float]:
-    """The ellipse in plan that holds 95 % of the positions.
+    """The ellipse in plan that holds 95 % of positions of a covariance (2, 2), east and north, square metres.
 
-    Args:
-        covariance: (2, 2) along east and north, square metres.
-
-    Returns:
-        `major_m`, `minor_m`: half axes; `azimuth_deg`: of the major one, clockwise from north, in [0, 180).
+    Its half axes, and the azimuth of the major one, clockwise from north, in [0, 180).
     """
     values, vectors = np.linalg.eigh(covariance)
     minor, major = _RADIUS_95 * np.sqrt(np.maximum(values, 0.0))
@@ -40,13 +34,11 @@ def ellipse_95(covariance: FloatArray) -> dict[str, float]:
 def drawn_pose(center: FloatArray, local_from_cam: FloatArray, camera: Camera | None) -> dict[str, Any]:
     """A camera in the place's frame.
 
+    `forward` is a unit vector, `corners` are rays to the image's at unit depth, clockwise from top left.
+
     Args:
         center: (3,) metres. local_from_cam: (3, 3) from x right, y down, z forward.
         camera: None: a lens of 60 by 45 degrees is drawn.
-
-    Returns:
-        `center`; `forward`: unit vector; `corners`: rays to the image's corners at unit depth, top left, top
-        right, bottom right, bottom left.
     """
     rays = _corner_rays(camera)
     return {
@@ -57,19 +49,11 @@ def drawn_pose(center: FloatArray, local_from_cam: FloatArray, camera: Camera | 
 
 
 def worded_place(geopose: GeoPose, utm: FloatArray, epsg: int, height_datum: str) -> dict[str, Any]:
-    """UTM, GeoPose and angles of one pose.
-
-    Args:
-        geopose: its height in the same datum as that of `utm`, (3,) easting, northing, height.
-    """
+    """UTM (3,) easting, northing, height, GeoPose and angles of one pose; both heights are in one datum."""
     heading, pitch, roll = geopose.heading_pitch_roll_deg
+    easting, northing, height = _rounded(utm, 4)
     return {
-        "utm": {
-            "epsg": epsg,
-            "easting": round(float(utm[0]), 4),
-            "northing": round(float(utm[1]), 4),
-            "height": round(float(utm[2]), 4),
-        },
+        "utm": {"epsg": epsg, "easting": easting, "northing": northing, "height": height},
         "height_datum": height_datum,
         "latitude_deg": round(geopose.latitude_deg, 10),
         "longitude_deg": round(geopose.longitude_deg, 10),
@@ -115,32 +99,13 @@ def _rounded(vector: FloatArray, digits: int) -> list[float]:
     return [round(float(v), digits) for v in vector]
 
 
-def spot_of_trajectory(trajectory: Trajectory) -> Spot:
-    """Where the first known pose lies.
-
-    Raises:
-        InvalidValueError: all frames are lost.
-    """
-    pose = next((point.pose for point in trajectory.points if point.pose is not None), None)
-    if pose is None:
-        raise InvalidValueError(
-            f"{trajectory.source}: all {len(trajectory.points)} frames are lost, there is nothing to show"
-        )
-    easting, northing, height = pose.utm.tolist()
-    return Spot(easting=easting, northing=northing, height=height, epsg=pose.epsg)
-
-
 def describe_trajectory(trajectory: Trajectory, frame: LocalFrame) -> dict[str, Any]:
     """All frames, poses in the place's frame; `pose` is None where the track is lost."""
     return {
         "name": trajectory.source,
         "frames": [
             {
-                "index": point.index,
-                "time_s": point.time_s,
-                "state": point.state,
-                "inliers": point.inliers,
-                "detail": point.detail,
+                **{name: getattr(point, name) for name in ("index", "time_s", "state", "inliers", "detail")},
                 "pose": None if point.pose is None else _pose(point.pose, frame),
             }
             for point in trajectory.points

@@ -2,7 +2,7 @@
 
 `build_scene` reads everything once; after it the database is needed for queries only. What is in
 `ViewerScene.document` goes into JSON as it is; coordinates are metres east, north, up in the frame of their
-place.
+place: such a frame is level at its origin only, so maps that are far from each other get one each.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,12 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from featuredb.errors import InvalidValueError
 from featuredb.export.selection import Selection, licence_is, licensed, selected_any
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import MAP_STATUSES, MapImage
-from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
+from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary, UtmBox
 from featuredb.store.scans import ScanSummary, count_points, list_scans
 from reloc.tracking.trajectory.values import Trajectory
 from reloc.viewer.map_layer import (
@@ -26,30 +30,28 @@ from reloc.viewer.map_layer import (
     describe_photos,
     own_points,
     picks_command,
-    spot_of_map,
 )
-from reloc.viewer.places import Spot, group, scan_box, spot_of
 from reloc.viewer.points import DrawnPoints, map_points, scan_points_in, shares
-from reloc.viewer.poses import describe_trajectory, spot_of_trajectory
+from reloc.viewer.poses import describe_trajectory
 
 DEFAULT_POINTS = 1_000_000
+# Over this distance the vertical turns by 0.18 degrees and the ground falls away by 31 m.
+_TOGETHER_M = 20_000.0
+# Of a scan that is larger than the maps, this much is shown around them.
+SCAN_MARGIN_M = 50.0
+
+Spot = tuple[FloatArray, int]  # where something lies: (3,) easting, northing, height in metres; the zone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewerSceneOptions:
-    """What is shown.
+    """What is shown."""
 
-    Attributes:
-        selection: of maps; of their photos where it names licences.
-        points: at most so many in each place, of maps and scans together.
-        photos: folder of the photos, for the command that places a map without a place.
-        told: is called with the number of maps read and their total.
-    """
-
+    # Of maps; of their photos where it names licences.
     selection: Selection = field(default_factory=lambda: Selection(statuses=(*MAP_STATUSES, "unplaced")))
-    points: int = DEFAULT_POINTS
-    photos: Path | None = None
-    told: Callable[[int, int], None] = lambda done, total: None
+    points: int = DEFAULT_POINTS  # at most so many in each place, of maps and scans together
+    photos: Path | None = None  # their folder, for the command that places a map without a place
+    told: Callable[[int, int], None] = lambda done, total: None  # with maps read, and their total
 
     def __post_init__(self) -> None:
         if self.points < 0:
@@ -58,21 +60,13 @@ class ViewerSceneOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewerScene:
-    """Everything that the page shows.
+    """Everything that the page shows."""
 
-    Attributes:
-        document: ready for JSON; each map and scan names its part of its place's points by `buffer`.
-        points: of each place, the buffers of its maps and scans one after the other.
-        images: by map id and image id.
-        frames: of each place on Earth; maps without a place come after them, each a place of the page.
-        place_of_map: row of the place, by map id.
-    """
-
-    document: dict[str, Any]
-    points: tuple[bytes, ...]
-    images: Mapping[tuple[str, int], MapImage]
-    frames: tuple[LocalFrame, ...]
-    place_of_map: Mapping[str, int]
+    document: dict[str, Any]  # ready for JSON; maps and scans name their part of the points by `buffer`
+    points: tuple[bytes, ...]  # of each place, the buffers of its maps and scans one after the other
+    images: Mapping[tuple[str, int], MapImage]  # by map id and image id
+    frames: tuple[LocalFrame, ...]  # of each place on Earth; places of maps without one come after them
+    place_of_map: Mapping[str, int]  # row of the place, by map id
 
 
 def build_scene(
@@ -127,7 +121,7 @@ class _Builder:
                 continue
             place, data = self._place(len(places), frame, here, beside)
             # Of what there is first: the zone in which spots of this place are told.
-            place["epsg"] = spots[rows[0]].epsg
+            place["epsg"] = spots[rows[0]][1]
             place["trajectories"] = [describe_trajectory(t, frame) for t in played]
             places.append(place)
             points.append(data)
@@ -157,10 +151,11 @@ class _Builder:
         self._tell()
         if unplaced is None:
             return
-        buffers, drawn = _Buffers(), own_points(unplaced, self._options.points)
+        drawn = own_points(unplaced, self._options.points)
+        (buffer,), data = _packed([drawn])
         command = picks_command(self._database.url, summary.map_id, self._options.photos)
-        places.append(describe_own_place(summary, unplaced, drawn, buffers.add(drawn), command))
-        points.append(buffers.data())
+        places.append(describe_own_place(summary, unplaced, drawn, buffer, command))
+        points.append(data)
         self._images |= {(summary.map_id, image.image_id): image for image in unplaced.images}
 
     def _tell(self) -> None:
@@ -184,7 +179,8 @@ class _Builder:
     def _spot(self, summary: MapSummary) -> Spot:
         if summary.box is not None:
             return spot_of(summary.box, summary.epsg)
-        return spot_of_map(summary, self._snapshot.load_map(summary.map_id))
+        frame = self._snapshot.load_map(summary.map_id).frame  # it has no points
+        return frame.utm_from_enu(np.zeros(3), summary.epsg), summary.epsg
 
     def _place(
         self, number: int, frame: LocalFrame, maps: list[MapSummary], scans: list[ScanSummary]
@@ -200,14 +196,14 @@ class _Builder:
             for s, box in zip(scans, boxes, strict=True)
         ]
         for_maps, for_scans = _budget(sum(len(drawn) for _, drawn in shown), sum(of_scans), limit)
-        buffers = _Buffers()
-        described_maps = []
-        for (told, drawn), count in zip(shown, shares([len(d) for _, d in shown], for_maps), strict=True):
-            described_maps.append({**told, "buffer": buffers.add(drawn.first(int(count)))})
-        described_scans = []
-        for scan, box, count in zip(scans, boxes, shares(of_scans, for_scans), strict=True):
-            drawn = scan_points_in(self._database, scan, frame, box, int(count))
-            described_scans.append(_describe_scan(scan, drawn, buffers.add(drawn)))
+        counts = shares([len(drawn) for _, drawn in shown], for_maps)
+        drawn = [one.first(int(count)) for (_, one), count in zip(shown, counts, strict=True)]
+        drawn += [
+            scan_points_in(self._database, scan, frame, box, int(count))
+            for scan, box, count in zip(scans, boxes, shares(of_scans, for_scans), strict=True)
+        ]
+        buffers, data = _packed(drawn)
+        of_scan = slice(len(shown), None)
         place = {
             "name": f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}",
             "frame": {
@@ -216,10 +212,13 @@ class _Builder:
                 "height_m": frame.height_m,
             },
             "height_datums": sorted({m.height_datum for m in maps} | {s.height_datum for s in scans}),
-            "maps": described_maps,
-            "scans": described_scans,
+            "maps": [{**told, "buffer": b} for (told, _), b in zip(shown, buffers, strict=False)],
+            "scans": [
+                _describe_scan(scan, one, buffer)
+                for scan, one, buffer in zip(scans, drawn[of_scan], buffers[of_scan], strict=True)
+            ],
         }
-        return place, buffers.data()
+        return place, data
 
     def _map(
         self, number: int, frame: LocalFrame, summary: MapSummary, wanted: int
@@ -233,42 +232,32 @@ class _Builder:
         self._place_of_map[summary.map_id] = number
         for image in feature_map.images:
             self._images[summary.map_id, image.image_id] = image
+        # In the tree it stands under the next map on its chain to an anchor.
+        lineage = self._lineages[summary.map_id]
+        under = next((m for m in lineage.chain[1:2] if m in self._shown), None)
         told = {
-            **describe_map(summary, self._lineages[summary.map_id], self._under(summary.map_id)),
+            **describe_map(summary, lineage, under),
             "points": len(feature_map.points),
             "photos": describe_photos(feature_map, frame),
             "coverage": coverage(drawn),
         }
         return told, drawn
 
-    def _under(self, map_id: str) -> str | None:
-        """The map under which it stands in the tree: the next one on its chain to an anchor."""
-        chain = self._lineages[map_id].chain
-        return chain[1] if len(chain) > 1 and chain[1] in self._shown else None
 
-
-class _Buffers:
-    """Points of one place, one after the other."""
-
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-        self._size = 0
-
-    def add(self, drawn: DrawnPoints) -> dict[str, Any]:
-        """Append points; says where they are and how to read them."""
-        data = drawn.packed()
-        told = {
-            "origin": drawn.origin.tolist(),
-            "count": len(drawn),
-            "offset": self._size,
-            "box": np.round(drawn.box(), 3).tolist(),
-        }
-        self._parts.append(data)
-        self._size += len(data)
-        return told
-
-    def data(self) -> bytes:
-        return b"".join(self._parts)
+def _packed(parts: Sequence[DrawnPoints]) -> tuple[list[dict[str, Any]], bytes]:
+    """Points of one place, one part after the other, and for each where it is and how to read it."""
+    buffers, data = [], bytearray()
+    for drawn in parts:
+        buffers.append(
+            {
+                "origin": drawn.origin.tolist(),
+                "count": len(drawn),
+                "offset": len(data),
+                "box": np.round(drawn.box(), 3).tolist(),
+            }
+        )
+        data += drawn.packed()
+    return buffers, bytes(data)
 
 
 def _budget(of_maps: int, of_scans: int, limit: int) -> tuple[int, int]:
@@ -278,15 +267,73 @@ def _budget(of_maps: int, of_scans: int, limit: int) -> tuple[int, int]:
 
 
 def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]) -> dict[str, Any]:
+    same = ("name", "points", "spacing_m", "epsg", "height_datum", "licence")
     return {
         "id": scan.scan_id,
-        "name": scan.name,
-        "points": scan.points,
         "points_here": drawn.of,
-        "spacing_m": scan.spacing_m,
         "colour": scan.colour or ("intensity" if scan.has_intensity else "none"),
-        "epsg": scan.epsg,
-        "height_datum": scan.height_datum,
-        "licence": scan.licence,
         "buffer": buffer,
+        **{name: getattr(scan, name) for name in same},
     }
+
+
+def spot_of_trajectory(trajectory: Trajectory) -> Spot:
+    """Where the first known pose lies.
+
+    Raises:
+        InvalidValueError: all frames are lost.
+    """
+    pose = next((point.pose for point in trajectory.points if point.pose is not None), None)
+    if pose is None:
+        raise InvalidValueError(
+            f"{trajectory.source}: all {len(trajectory.points)} frames are lost, there is nothing to show"
+        )
+    return pose.utm, pose.epsg
+
+
+def spot_of(box: UtmBox, epsg: int) -> Spot:
+    """The middle of a box in plan, at its foot."""
+    easting, northing = (box.min_easting + box.max_easting) / 2.0, (box.min_northing + box.max_northing) / 2.0
+    return np.array([easting, northing, box.min_height]), epsg
+
+
+def group(spots: Sequence[Spot]) -> list[tuple[LocalFrame, list[int]]]:
+    """Places, the one with most spots first: frame at the middle of the spots, and their rows.
+
+    Spots within 20 km of each other, directly or through others, are one place.
+    """
+    if not spots:
+        return []
+    (easting, northing, height), epsg = spots[0]
+    frame = LocalFrame.from_utm(float(easting), float(northing), float(height), epsg)
+    enu = np.array([frame.enu_from_utm(utm, epsg) for utm, epsg in spots])
+    near = cKDTree(enu).query_pairs(_TOGETHER_M, output_type="ndarray")
+    links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(spots), len(spots)))
+    count, label = connected_components(links, directed=False)
+    places = [np.flatnonzero(label == k) for k in range(count)]
+    places.sort(key=lambda rows: (-len(rows), int(rows[0])))
+    return [(_frame_at(frame, enu[rows].mean(axis=0)), rows.tolist()) for rows in places]
+
+
+def scan_box(
+    frame: LocalFrame, boxes: Sequence[FloatArray], epsg: int
+) -> tuple[float, float, float, float] | None:
+    """(e0, n0, e1, n1) in a scan's zone of what is shown: 50 m around the maps' boxes (2, 3) in `frame`."""
+    if not boxes:
+        return None  # all of it is shown
+    (e0, n0, up), (e1, n1, _) = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+    around = [
+        (e, n, up)
+        for e in (e0 - SCAN_MARGIN_M, e1 + SCAN_MARGIN_M)
+        for n in (n0 - SCAN_MARGIN_M, n1 + SCAN_MARGIN_M)
+    ]
+    utm = frame.utm_from_enu(np.array(around), epsg)
+    low, high = utm.min(axis=0), utm.max(axis=0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _frame_at(frame: LocalFrame, enu: FloatArray) -> LocalFrame:
+    latitude, longitude, height = frame.geodetic_from_enu(enu)
+    return LocalFrame(
+        latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=round(float(height), 3)
+    )

@@ -6,8 +6,6 @@ media type that a browser does not send to another site unasked.
 """
 
 import asyncio
-import logging
-import socket
 import sys
 import webbrowser
 from collections.abc import Awaitable, Callable, Mapping
@@ -15,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
-import uvicorn
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
@@ -24,10 +21,9 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 
 from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
-from featuredb.stop_signals import on_stop_signals
-from reloc.viewer.page import Asset, assets, content_policy, page
-from reloc.viewer.photos import PICTURE_PX, Pictures
-from reloc.viewer.query import LIMITS, Queries
+from reloc.listening import listen, run, uvicorn_server
+from reloc.viewer.page import assets, content_policy, media_type_of, page
+from reloc.viewer.photos import LIMITS, PICTURE_PX, Pictures, Queries
 from reloc.viewer.scene import ViewerScene
 from reloc.wire.query import ErrorCode
 
@@ -40,19 +36,10 @@ _STATUS = {
     ErrorCode.INCOMPATIBLE_EXTRACTOR.value: 409,
 }
 _CLIENT_GONE = 499
-_LAST_PORT = 65_535
-
-
-class ViewerStartError(FeatureDbError):
-    """The viewer cannot listen."""
 
 
 def create_app(scene: ViewerScene, pictures: Pictures, queries: Queries) -> FastAPI:
-    """The application.
-
-    Args:
-        queries: answers photos that are dropped on the page.
-    """
+    """The application; `queries` answers photos that are dropped on the page."""
     # Pictures and queries are decoded beside the event loop; a query takes its own turn inside.
     app, in_thread = local_app("featuredb viewer", page(), content_policy(), assets())
     document = {**scene.document, "queries": True}
@@ -91,13 +78,11 @@ def create_app(scene: ViewerScene, pictures: Pictures, queries: Queries) -> Fast
 
 
 def local_app(
-    title: str, html: str, policy: str, files: Mapping[str, Asset], prefix: str = ""
+    title: str, html: str, policy: str, files: Mapping[str, bytes], prefix: str = ""
 ) -> tuple[FastAPI, Callable[[Callable[[], Any]], Awaitable[Any]]]:
     """An application for this machine, and what runs a function beside its event loop.
 
-    Args:
-        html: the page, at `prefix`/, and `policy`, its Content-Security-Policy.
-        files: by their path below `prefix`/assets/.
+    The page is at `prefix`/, with `policy` as its Content-Security-Policy, files lie below `prefix`/assets/.
     """
     app = FastAPI(title=title, docs_url=None, redoc_url=None, openapi_url=None)
     threads = ThreadPoolExecutor(4, thread_name_prefix=title)
@@ -114,75 +99,31 @@ def local_app(
     async def asset(name: str) -> Response:
         if name not in files:
             raise HTTPException(404, f"no file {name[:100]!r}")
-        return Response(files[name].data, media_type=files[name].media_type)
+        return Response(files[name], media_type=media_type_of(name))
 
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
     return app, in_thread
 
 
-def listen(port: int) -> socket.socket:
-    """A listening socket on this machine; port 0 takes a free one.
-
-    Raises:
-        ViewerStartError: the port is taken or none.
-    """
-    if not 0 <= port <= _LAST_PORT:
-        raise ViewerStartError(f"--port: expected 0 to {_LAST_PORT}, found {port}")
-    try:
-        bound = socket.create_server((HOST, port))
-        # Without it the body of an answer waits for the acknowledgement of its head.
-        bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return bound
-    except OSError as error:
-        raise ViewerStartError(
-            f"cannot listen on {HOST}:{port}: {error.strerror or error}; choose another with --port, "
-            "0 takes a free one"
-        ) from error
-
-
-def uvicorn_server(app: FastAPI) -> uvicorn.Server:
-    """The server, not yet running; `run(sockets=[listen(port)])` runs it."""
-    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
-    return uvicorn.Server(
-        uvicorn.Config(
-            app,
-            log_config=None,
-            access_log=False,
-            server_header=False,
-            ws="none",
-            http="h11",
-            timeout_graceful_shutdown=2,
-        )
-    )
-
-
 def serve(app: FastAPI, port: int, *, browser: bool, path: str = "") -> None:
-    """Serve until SIGINT or SIGTERM, after printing the address; call from the main thread.
-
-    Args:
-        browser: also open the page. path: of the page, below the address.
+    """Serve until SIGINT or SIGTERM; call from the main thread. Prints the page's address, or opens it, too.
 
     Raises:
-        ViewerStartError: cannot listen.
+        ListenError: cannot listen.
     """
-    server = uvicorn_server(app)
-    # uvicorn handles these while it runs, and then raises them again; one that comes before counts as well.
-    with on_stop_signals(partial(setattr, server, "should_exit", True)), listen(port) as bound:
-        url = f"http://{HOST}:{bound.getsockname()[1]}/{path}"
-        sys.stdout.write(f"{url}; stop with Ctrl-C\n")
+
+    def announce(url: str) -> None:
+        sys.stdout.write(f"{url}/{path}; stop with Ctrl-C\n")
         sys.stdout.flush()
-        # Connections wait in the socket until the server runs.
-        if browser and not webbrowser.open(url):
+        if browser and not webbrowser.open(f"{url}/{path}"):
             sys.stderr.write("no browser was found; open the address by hand\n")
-        server.run(sockets=[bound])
+
+    server = uvicorn_server(app, http="h11", timeout_graceful_shutdown=2)
+    run(server, partial(listen, HOST, port), announce)
 
 
 async def _photo(request: Request) -> bytes:
-    """The body, counted while it streams.
-
-    Raises:
-        HTTPException: another media type, or too large.
-    """
+    """The body, counted while it streams. Raises HTTPException: another media type, or too large."""
     found = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if found != PHOTO_TYPE:  # which a browser does not send for another site unasked
         raise HTTPException(415, f"Content-Type: expected {PHOTO_TYPE}, found {found[:100]!r}")
@@ -195,11 +136,7 @@ async def _photo(request: Request) -> bytes:
 
 
 def _where(scene: ViewerScene, place: int, east: float, north: float, up: float) -> dict[str, Any]:
-    """UTM and geographic coordinates of a spot in a place's frame.
-
-    Raises:
-        HTTPException: no such place. GeodesyError, InvalidValueError: no such spot.
-    """
+    """UTM and geographic coordinates of a spot in a place's frame. Raises HTTPException: no such place."""
     if not 0 <= place < len(scene.frames):
         own = 0 <= place < len(scene.points)
         raise HTTPException(404, f"place {place} is no place on Earth" if own else f"no place {place}")
@@ -220,17 +157,12 @@ def _add_failures(app: FastAPI) -> None:
     def failed(status: int, code: str, message: str) -> Response:
         return JSONResponse({"code": code, "message": message}, status)
 
-    @app.exception_handler(ServiceError)
-    async def service_error(request: Request, error: ServiceError) -> Response:
-        return failed(_STATUS.get(error.code, 500), error.code, error.message)
-
-    @app.exception_handler(InvalidValueError)
-    @app.exception_handler(GeodesyError)
-    async def refused(request: Request, error: FeatureDbError) -> Response:
-        return failed(400, ErrorCode.BAD_REQUEST.value, str(error))
-
     @app.exception_handler(FeatureDbError)
-    async def broken(request: Request, error: FeatureDbError) -> Response:
+    async def failure(request: Request, error: FeatureDbError) -> Response:
+        if isinstance(error, ServiceError):
+            return failed(_STATUS.get(error.code, 500), error.code, error.message)
+        if isinstance(error, InvalidValueError | GeodesyError):
+            return failed(400, ErrorCode.BAD_REQUEST.value, str(error))
         return failed(500, ErrorCode.INTERNAL.value, str(error))  # the database is gone, for example
 
     @app.exception_handler(RequestValidationError)

@@ -1,12 +1,14 @@
-"""The keys of a database on the wire. `docs/wire.md` lists them.
+"""Where servers listen, and the keys of a database on the wire. `docs/wire.md` lists them.
 
 `<client>` is the name that the server knows a client by: rules by certificate hold it to its own, so that a
 query's key says who asked. Where a server authenticates nobody it says nothing.
 """
 
+import ipaddress
 import re
 from dataclasses import dataclass
 
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only
 KEY_ROOT = "featuredb"
 # Of databases, clients and live sessions: one chunk of a key.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -40,6 +42,14 @@ class Keys:
     def tile_token(self, server_id: str, tile: str) -> str:
         """Liveliness token of a tile that a server answers for; the tile's slashes become dashes."""
         return self.of(f"tiles/{tile.replace('/', '-')}/{server_id}")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host name or address is reached by this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def client_of(key: str) -> str:

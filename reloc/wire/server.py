@@ -67,12 +67,7 @@ class BoundingBox(Answer):
 
 
 class StatusReply(Answer):
-    """Answer of `.../status`.
-
-    `part`: which part of the database it answers from, as `serve --bbox` has it; "" all of it. Servers of one
-    part can stand in for each other. `bounds`: around the maps that it answers from, null without any.
-    `addressable`: it can be asked by `localise/<client>/<server id>`.
-    """
+    """Answer of `.../status`."""
 
     database: str
     server_id: str
@@ -88,9 +83,11 @@ class StatusReply(Answer):
     limits: Limits
     contributions: ContributionStatus | None = None
     live: LiveStatus | None = None
+    # Which part of the database it answers from, as `serve --bbox` has it; "" all of it. Servers of one part
+    # can stand in for each other.
     part: str = ""
-    bounds: BoundingBox | None = None
-    addressable: bool = False
+    bounds: BoundingBox | None = None  # around the maps that it answers from, null without any
+    addressable: bool = False  # it can be asked by `localise/<client>/<server id>`
 
 
 class MapInfo(Answer):

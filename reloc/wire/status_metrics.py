@@ -1,12 +1,23 @@
 """What a server says of itself, as Prometheus has it: on its own page, and on a gateway's."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 from reloc.wire.server import StatusReply
 
 _NAME = "featuredb_server_"
+
+
+class Figures(Collector):
+    """What a function says whenever the page is asked for."""
+
+    def __init__(self, ask: Callable[[], Iterator[Metric]]) -> None:
+        self._ask = ask
+
+    def collect(self) -> Iterator[Metric]:
+        return self._ask()
 
 
 def status_metrics(status: StatusReply | None) -> Iterator[Metric]:

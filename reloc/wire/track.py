@@ -35,14 +35,11 @@ class EndReason(StrEnum):
 
 
 class TrackOpenRequest(Request):
-    """Attachment of the query that opens a session.
+    """Attachment of the query that opens a session."""
 
-    `camera`: intrinsics of the frames, of any size of the same picture; without it they are estimated with
-    the first pose. `prior`: where the first frame may have been taken.
-    """
-
+    # Of the frames, of any size of the same picture; without it they are estimated with the first pose.
     camera: CameraRequest | None = None
-    prior: PriorRequest | None = None
+    prior: PriorRequest | None = None  # where the first frame may have been taken
 
     @model_validator(mode="after")
     def _exact_lens(self) -> "TrackOpenRequest":
@@ -71,14 +68,10 @@ class TrackOpened(Answer):
 
 
 class TrackFrame(Request):
-    """Attachment of a frame; the payload is the bytes of an image file.
+    """Attachment of a frame; the payload is the bytes of an image file. Both grow from frame to frame."""
 
-    `sequence` counts the client's frames from 0, also those that it does not send. `time_s` is on the
-    client's own clock. Both grow from frame to frame.
-    """
-
-    sequence: Sequence
-    time_s: Annotated[float, Field(ge=-1e12, le=1e12)]
+    sequence: Sequence  # of the client's frames from 0, also those that it does not send
+    time_s: Annotated[float, Field(ge=-1e12, le=1e12)]  # on the client's own clock
 
 
 TrackStateText = Literal["tracking", "relocalised", "lost"]

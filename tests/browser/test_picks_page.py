@@ -17,9 +17,10 @@ from featuredb.store import Database
 from ingest.anchoring import AnchorRequest
 from ingest.register.picks_page.server import create_app
 from ingest.register.picks_page.session import PickSession
+from reloc.listening import listen, uvicorn_server
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.viewer.server import listen, uvicorn_server
+from reloc.viewer.server import HOST
 from tests.browser.test_viewer import browser as browser
 from tests.support.hill_map import hill_map
 from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos
@@ -57,7 +58,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> PickSession:
 @pytest.fixture(scope="module")
 def url(session: PickSession) -> Iterator[str]:
     server = uvicorn_server(create_app(session, "token"))
-    with listen(0) as bound:
+    with listen(HOST, 0) as bound:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
         thread.start()
         end = time.monotonic() + 90.0  # a busy machine draws the overlay late

@@ -10,7 +10,7 @@ import pytest
 from featuredb.cli.main import main
 from reloc.cli.commands import add_server_arguments
 from reloc.client import Client
-from reloc.wire.endpoints import DEFAULT_ENDPOINT
+from reloc.wire.keys import DEFAULT_ENDPOINT
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not here")

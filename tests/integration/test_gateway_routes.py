@@ -17,7 +17,8 @@ from featuredb.cli.main import build_parser, main
 from featuredb.errors import InvalidValueError
 from reloc.client import CameraRequest, PriorRequest
 from reloc.gateway.options import GatewayOptions
-from reloc.gateway.serve import GatewayStartError, listen, serve
+from reloc.gateway.serve import listen, serve
+from reloc.listening import ListenError
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.wire.query import LocaliseReply
@@ -265,7 +266,7 @@ def test_options_that_make_no_sense_are_refused():
 def test_a_port_that_is_taken_is_said():
     with listen(GatewayOptions(port=0)) as bound:
         taken = replace(GatewayOptions(), port=bound.getsockname()[1])
-        with pytest.raises(GatewayStartError, match="--port"):
+        with pytest.raises(ListenError, match="--port"):
             listen(taken)
 
 

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from reloc.service.contributions.inbox import InboxOptions
-from reloc.service.live.options import LiveOptions
+from reloc.service.options import LiveOptions
 from tests.support.service import ScriptedLocaliser, photo, running_server
 
 _WIRE = Path(__file__).parents[2] / "docs" / "wire.md"

@@ -19,10 +19,9 @@ from featuredb.video.writer import VideoWriter
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.tracking.ground import EarthPose, Keyframe, Unmatched
+from reloc.tracking.ground import EarthPose, Keyframe, TrackedFrame, Unmatched
 from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.values import TrajectoryPoint
 from tests.support.hill_photos import CAMERA, FRAME, _render

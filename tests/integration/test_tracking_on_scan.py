@@ -19,10 +19,9 @@ from ingest.register.frame_registration import FramePrior
 from ingest.track.finders import MapOverScanFinder
 from ingest.track.scan_ground import ScanFinder, ScanGround
 from reloc.localiser import Localiser
-from reloc.tracking.ground import Finder, Keyframe, Unmatched
+from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, Unmatched
 from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import point_of

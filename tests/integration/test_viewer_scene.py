@@ -14,12 +14,13 @@ from featuredb.export.selection import Selection
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.options import ScanLabels
 from featuredb.store import Database
+from reloc.listening import listen
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.viewer.page import write_static_page
 from reloc.viewer.photos import Pictures
 from reloc.viewer.scene import ViewerScene, ViewerSceneOptions, build_scene
-from reloc.viewer.server import listen
+from reloc.viewer.server import HOST
 from tests.support.datasets import varied_database, varied_maps
 from tests.support.las_files import grid_points, write_scan
 from tests.support.maps import random_map
@@ -232,7 +233,7 @@ def test_what_cannot_be_is_said(
 
 
 def test_a_port_in_use_is_said(varied: Database, capsys: pytest.CaptureFixture[str]) -> None:
-    with listen(0) as bound:
+    with listen(HOST, 0) as bound:
         port = str(bound.getsockname()[1])
         code, _, err = run(capsys, "view", varied.url, "--maps", "fiji", "--port", port, "--no-browser")
     assert code == 2

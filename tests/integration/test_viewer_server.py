@@ -24,11 +24,12 @@ from PIL import ExifTags, Image
 from scipy.spatial import cKDTree
 
 from featuredb.store import Database
+from reloc.listening import ListenError, listen
 from reloc.localiser import Localiser
 from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.scene import build_scene
-from reloc.viewer.server import ViewerStartError, listen, serve
+from reloc.viewer.server import HOST, serve
 from reloc.wire.query import LocaliseWireRequest
 from tests.support.maps import random_map
 from tests.support.viewer import MISSING, ViewerWorld, get, make_world, running_viewer
@@ -169,13 +170,13 @@ def test_a_name_that_leads_here_is_refused(url: str, host: str) -> None:
 
 
 def test_it_listens_on_this_machine_only(url: str) -> None:
-    with listen(0) as bound:
+    with listen(HOST, 0) as bound:
         assert bound.getsockname()[0] == "127.0.0.1"
         port = bound.getsockname()[1]
-        with pytest.raises(ViewerStartError, match=f"127.0.0.1:{port}.*--port"):
-            listen(port)
-    with pytest.raises(ViewerStartError):
-        listen(70_000)
+        with pytest.raises(ListenError, match=f"127.0.0.1:{port}.*--port"):
+            listen(HOST, port)
+    with pytest.raises(ListenError):
+        listen(HOST, 70_000)
 
 
 def test_a_query_is_answered_as_by_the_server(url: str, world: ViewerWorld) -> None:

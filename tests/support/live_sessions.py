@@ -7,8 +7,7 @@ from dataclasses import replace
 
 from featuredb.errors import ServiceError
 from reloc.client import Client, LiveTrack, TrackPose
-from reloc.service.live.options import LiveOptions
-from reloc.service.options import ServeOptions
+from reloc.service.options import LiveOptions, ServeOptions
 from reloc.service.server import Server
 from reloc.tracking.options import TrackOptions
 from reloc.wire.track import LiveStatus

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.localise.candidates import IndexedArea
+from reloc.tracking.ground import TrackedFrame
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.tracker import Tracker
 from tests.support.hill_photos import CAMERA, _render
 from tests.support.hill_walk import WEST_M

@@ -16,13 +16,13 @@ from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
+from reloc.listening import listen, uvicorn_server
 from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
-from reloc.viewer.photos import Pictures
-from reloc.viewer.query import Queries
+from reloc.viewer.photos import Pictures, Queries
 from reloc.viewer.scene import ViewerScene, build_scene
-from reloc.viewer.server import create_app, listen, uvicorn_server
+from reloc.viewer.server import HOST, create_app
 from tests.support.maps import random_map
 from tests.support.planar_map import EPSG, field_texture, planar_map, render, view
 
@@ -120,7 +120,7 @@ def running_viewer(
     """A viewer on a free port, in a thread of the test; gives its URL without a slash at the end."""
     scene = scene or build_scene(database, database.snapshot())
     server = uvicorn_server(create_app(scene, Pictures(photos), Queries(database, scene)))
-    with listen(0) as bound:
+    with listen(HOST, 0) as bound:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
         thread.start()
         try:

@@ -6,7 +6,8 @@ import pytest
 import zenoh
 
 from reloc.gateway.options import GatewayOptions
-from reloc.gateway.serve import GatewayStartError, listen
+from reloc.gateway.serve import listen
+from reloc.listening import ListenError
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.service.session import ServiceStartError, authenticates, check_exposure
@@ -111,7 +112,7 @@ def test_a_server_that_strangers_reach_starts_when_it_is_told_to() -> None:
 
 
 def test_a_gateway_that_strangers_reach_starts_when_it_is_told_to() -> None:
-    with pytest.raises(GatewayStartError, match=r"proxy.*--insecure"):
+    with pytest.raises(ListenError, match=r"proxy.*--insecure"):
         listen(GatewayOptions(host="0.0.0.0", port=0))
     for options in (GatewayOptions(port=0), GatewayOptions(host="0.0.0.0", port=0, insecure=True)):
         listen(options).close()

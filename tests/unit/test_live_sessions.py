@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import zenoh
 
-from reloc.service.live.options import LiveOptions
 from reloc.service.live.session import LiveSession
 from reloc.service.live.sessions import LiveSessions
+from reloc.service.options import LiveOptions
 from reloc.wire.keys import Keys
 from reloc.wire.query import ErrorCode, RequestError
 from tests.support.live import wait_until

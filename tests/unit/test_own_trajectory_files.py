@@ -15,12 +15,17 @@ from featuredb.maps.unplaced_map import OwnFrame
 from featuredb.store import Database
 from ingest.track.finders import FilmGround, finder_for
 from reloc.localise.result import OwnPose
+from reloc.tracking.ground import TrackedFrame
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.track_video import _words
-from reloc.tracking.tracked_frame import TrackedFrame
-from reloc.tracking.trajectory.files import CSV_COLUMNS, check_format, write_trajectory
-from reloc.tracking.trajectory.outputs import exit_code, write_outputs
+from reloc.tracking.trajectory.files import (
+    CSV_COLUMNS,
+    exit_code,
+    format_of,
+    write_outputs,
+    write_trajectory,
+)
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 from tests.support.maps import random_unplaced_map
@@ -76,7 +81,7 @@ def test_a_track_without_a_place_counts_as_found_and_says_so(tmp_path: Path) -> 
 @pytest.mark.parametrize("suffix", [".tum", ".geojson", ".kml", ".json"])
 def test_formats_of_places_on_earth_refuse(suffix: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidValueError, match="needs places on Earth, and map film-0 has none"):
-        check_format(tmp_path / f"t{suffix}", "film-0")
+        format_of(tmp_path / f"t{suffix}", "film-0")
     with pytest.raises(InvalidValueError, match="needs places on Earth"):
         write_trajectory(tmp_path / f"t{suffix}", _TRACK)
 

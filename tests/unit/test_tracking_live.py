@@ -10,10 +10,10 @@ import pytest
 
 import reloc.tracking.tracker as tracker_module
 from reloc.localise.candidates import IndexedArea
+from reloc.tracking.flow_track import RecentFrame, RecentFrames
+from reloc.tracking.ground import TrackedFrame
 from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.recent import RecentFrame, RecentFrames
-from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.tracker import Tracker
 from tests.support.live import error_m, field_area, frame
 from tests.support.planar_map import CAMERA

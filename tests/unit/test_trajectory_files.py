@@ -18,7 +18,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
 from reloc.tracking.ground import EarthPose
-from reloc.tracking.trajectory.files import CSV_COLUMNS, check_format, write_trajectory
+from reloc.tracking.trajectory.files import CSV_COLUMNS, format_of, write_trajectory
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from schemas import load_schema
 from tests.support.planar_map import view
@@ -173,7 +173,7 @@ def test_other_formats_are_refused_before_anything_is_done(
     name: str, trajectory: Trajectory, tmp_path: Path
 ) -> None:
     with pytest.raises(InvalidValueError, match=r"expected a name that ends in \.csv, \.tum"):
-        check_format(tmp_path / name)
+        format_of(tmp_path / name)
     with pytest.raises(InvalidValueError, match="expected a name"):
         write_trajectory(tmp_path / name, trajectory)
     assert not list(tmp_path.iterdir())

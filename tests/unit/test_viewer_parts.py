@@ -15,10 +15,9 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from reloc.viewer.map_layer import coverage, describe_photos
 from reloc.viewer.page import page, page_in_one
-from reloc.viewer.places import Spot, group, scan_box
 from reloc.viewer.points import DrawnPoints, map_points, sampled, shares
 from reloc.viewer.poses import drawn_pose, ellipse_95
-from reloc.viewer.scene import _budget
+from reloc.viewer.scene import Spot, _budget, group, scan_box
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
 from tests.support.planar_map import CAMERA, planar_map, view
 
@@ -129,9 +128,9 @@ def test_a_map_without_points_covers_nothing() -> None:
 
 def test_places_are_what_lies_within_reach_of_each_other() -> None:
     def spot(km: float, epsg: int = EPSG) -> Spot:
-        return Spot(easting=EASTING + 1000.0 * km, northing=NORTHING, height=HEIGHT, epsg=epsg)
+        return np.array([EASTING + 1000.0 * km, NORTHING, HEIGHT]), epsg
 
-    far = Spot(easting=300_000.0, northing=6_200_000.0, height=5.0, epsg=32734)
+    far: Spot = np.array([300_000.0, 6_200_000.0, 5.0]), 32734
     places = group([far, spot(0), spot(15), spot(30), spot(90)])
     assert [rows for _, rows in places] == [[1, 2, 3], [0], [4]]
     frame = places[0][0]
@@ -146,7 +145,7 @@ def test_maps_of_neighbouring_zones_are_one_place() -> None:
     spots = []
     for frame, epsg in ((west, 32632), (east, 32633)):
         e, n, h = frame.utm_from_enu(np.zeros(3), epsg)
-        spots.append(Spot(easting=float(e), northing=float(n), height=float(h), epsg=epsg))
+        spots.append((np.array([e, n, h]), epsg))
     ((frame, rows),) = group(spots)
     assert rows == [0, 1]
     assert frame.longitude_deg == pytest.approx(12.0, abs=1e-4)

@@ -1,8 +1,7 @@
 """Contributed photos on their way from a query to the database: a bounded queue and one thread that writes.
 
 A query never waits for the store: a place in the queue is reserved before the answer is sent and used after
-it.
-What cannot be taken is refused with a reason, and the query is answered all the same.
+it. What cannot be taken is refused with a reason, and the query is answered all the same.
 """
 
 import logging
@@ -12,9 +11,8 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Any
 
-from featuredb.features.exif.read import ExifInfo, read_exif
+from featuredb.features.exif.read import read_exif
 from featuredb.features.image_header import read_header
 from featuredb.store.candidates.photos import InboxCounts
 from featuredb.store.candidates.states import Contribution
@@ -31,17 +29,15 @@ _ANSWER = {
 
 
 def contribution_of(
-    data: bytes,
-    request: LocaliseWireRequest,
-    reply: LocaliseReply,
-    received_at: datetime,
-    owner: str,
+    data: bytes, request: LocaliseWireRequest, reply: LocaliseReply, received_at: datetime, owner: str
 ) -> Contribution:
     """The row of a contributed photo out of its query, which has been answered and found valid.
 
     `owner`: the name by which the client was authenticated, ANONYMOUS where it was not.
     """
     header = read_header(data)
+    exif = {k: v for k, v in asdict(read_exif(data, header)).items() if v not in (None, "", ())}
+    exif = {k: v.isoformat() if isinstance(v, datetime) else v for k, v in exif.items()}
     asked = request.model_dump(mode="json", include={"request_id", "camera", "prior", "options"})
     return Contribution(
         image=data,
@@ -52,43 +48,26 @@ def contribution_of(
         licence=request.licence or "",
         client_id=request.client_id or "",
         received_at=received_at,
-        request={**asked, "exif": _told(read_exif(data, header))},
+        request={**asked, "exif": exif},
         answer=reply.model_dump(mode="json", include=_ANSWER),
         snapshot=reply.snapshot,
     )
 
 
-def _told(exif: ExifInfo) -> dict[str, Any]:
-    """What the photo says about itself, without what it does not say."""
-    told = {name: value for name, value in asdict(exif).items() if value not in (None, "", ())}
-    return {name: value.isoformat() if isinstance(value, datetime) else value for name, value in told.items()}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InboxOptions:
-    """Bounds of the inbox.
+    """Bounds of the inbox."""
 
-    Attributes:
-        max_queue: photos that wait for the writing thread. It writes them together, in less than a second on
-            a disk; two workers answer some eight queries a second.
-        max_queued_bytes: of these photos, so that they cannot fill the memory.
-        max_owner_photos: photos of one owner (an identity; all who have none are one) that wait for growth; a
-            day's walk has some hundreds, and one owner cannot crowd out the others.
-        max_photos: photos of all owners that wait for growth.
-        max_stored_bytes: of all stored photos, whatever has become of them; some thousands of a drone's.
-        batch: photos that are written in one commit.
-        refresh_s: how old the counts may be by which the last three are judged.
-        retry_s: pauses before a failed write is tried again; after the last its photos are given up.
-    """
-
-    max_queue: int = 32
+    max_queue: int = 32  # photos that wait for the writing thread
     max_queued_bytes: int = 256 * 2**20
+    # Photos of one owner (an identity; all who have none are one) that wait for growth; a day's walk has some
+    # hundreds, and one owner cannot crowd out the others.
     max_owner_photos: int = 2_000
-    max_photos: int = 20_000
-    max_stored_bytes: int = 40 * 2**30
-    batch: int = 8
-    refresh_s: float = 30.0
-    retry_s: tuple[float, ...] = (0.5, 2.0, 8.0, 30.0)
+    max_photos: int = 20_000  # of all owners that wait for growth
+    max_stored_bytes: int = 40 * 2**30  # of all stored photos, whatever has become of them
+    batch: int = 8  # photos that are written in one commit
+    refresh_s: float = 30.0  # how old the counts may be by which these limits of what is stored are judged
+    retry_s: tuple[float, ...] = (0.5, 2.0, 8.0, 30.0)  # pauses before a failed write is tried again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,15 +83,10 @@ class Inbox:
 
     def __init__(
         self,
-        write: Callable[[list[Contribution]], object],
-        count: Callable[[], InboxCounts],
+        write: Callable[[list[Contribution]], object],  # in one append; may take seconds, and fail
+        count: Callable[[], InboxCounts],  # how much is stored; likewise
         options: InboxOptions | None = None,
     ) -> None:
-        """
-        Args:
-            write: stores contributions in one append, may take seconds, and fail.
-            count: how much is stored; likewise.
-        """
         self._store, self._count = write, count
         self._options = options or InboxOptions()
         self._changed = threading.Condition()
@@ -218,7 +192,12 @@ class Inbox:
         while (batch := self._next()) is not None:
             if batch:
                 self._write(batch)
-            self._refresh_if_old()
+            with self._changed:
+                due = time.monotonic() - self._counted_at >= self._options.refresh_s
+                # The counts matter to those who were refused by them, and while the store was failing.
+                wanted = self._limited or self._error is not None or self._written > 0
+            if due and wanted:
+                self._refresh()
 
     def _next(self) -> "list[tuple[Ticket, Callable[[], Contribution]]] | None":
         """What waits, at most a batch; nothing when counts are due; None once closed and empty."""
@@ -268,14 +247,6 @@ class Inbox:
                 return True
         _lost(len(contributions), "the store does not take them")
         return False
-
-    def _refresh_if_old(self) -> None:
-        with self._changed:
-            due = time.monotonic() - self._counted_at >= self._options.refresh_s
-            # The counts matter to those who were refused by them, and while the store was failing.
-            wanted = self._limited or self._error is not None or self._written > 0
-        if due and wanted:
-            self._refresh()
 
     def _refresh(self) -> None:
         """Take new counts; a store that answers again is trusted again."""

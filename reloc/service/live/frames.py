@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError
 from featuredb.features.decode import decode_gray, probe
 from featuredb.features.shrink import fitted_size, shrunk
-from featuredb.features.stored_image import ImageHeader
-from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from reloc.answered_view import geo_prior
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.service.handler import image_refused, query_camera
-from reloc.service.live.options import LiveOptions
+from reloc.service.options import LiveOptions
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.pose_message import pose_message
 from reloc.tracking.tracker import Tracker
@@ -34,17 +32,12 @@ _YIELDING = 10  # niceness: a ninth of the processor that a query gets beside it
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameAsk:
-    """A frame whose header is in order; the image's bytes follow.
-
-    Attributes:
-        sequence, time_s: later than those of the frame before. dropped: frames before it that were not looked
-            at. received_at: ISO 8601.
-    """
+    """A frame whose header is in order; the image's bytes follow."""
 
     sequence: int
     time_s: float
-    dropped: int
-    received_at: str
+    dropped: int  # frames before it that were not looked at
+    received_at: str  # ISO 8601
 
 
 class FrameAnswerer:
@@ -55,10 +48,7 @@ class FrameAnswerer:
     """
 
     def __init__(self, session: str, request: TrackOpenRequest, options: LiveOptions) -> None:
-        """
-        Raises:
-            RequestError: the camera or the prior is none.
-        """
+        """Raises RequestError: the camera or the prior is none."""
         self._session, self._options = session, options
         self._lens = lens = request.camera
         if lens is not None:
@@ -101,7 +91,8 @@ class FrameAnswerer:
     def _decoded(self, data: bytes) -> NDArray[np.uint8]:
         limits = self._options.limits
         try:
-            if _is_heavy(probe(data, limits)):
+            header = probe(data, limits)
+            if header.width * header.height * header.scans > _VIDEO_PIXELS:
                 _yield_to_queries()
             gray = decode_gray(data, limits)
         except ImageError as error:
@@ -131,32 +122,21 @@ class FrameAnswerer:
         finder = MapFinder([a for a in localiser.areas if a.area.extractor_fingerprint == wanted])
         if self._tracker is None:
             options = replace(self._options.track, live=True, localise=localise)
-            self._tracker = Tracker(finder, self._camera_for(gray), options, self._request)
             self._size = (gray.shape[1], gray.shape[0])
+            tracked_size = fitted_size(*self._size, self._options.max_side_px)
+            camera = None if self._lens is None else query_camera(self._lens, *tracked_size)
+            self._tracker = Tracker(finder, camera, options, self._request)
         else:
             self._tracker.use(finder)
         self._localiser = localiser
         return self._tracker
 
-    def _camera_for(self, gray: NDArray[np.uint8]) -> Camera | None:
-        """The session's camera, of the size that is tracked."""
-        size = fitted_size(gray.shape[1], gray.shape[0], self._options.max_side_px)
-        return None if self._lens is None else query_camera(self._lens, *size)
-
-
-def _is_heavy(header: ImageHeader) -> bool:
-    return header.width * header.height * header.scans > _VIDEO_PIXELS
-
 
 def _yield_to_queries() -> None:
-    """This process works behind queries from now on.
-
-    A session's process is its own; a priority that was given up does not come back. Linux has priorities by
-    thread: all that are there get it, and those to come inherit it.
-    """
+    """This process, a session's own, works behind queries from now on: a priority does not come back."""
     if os.nice(0) >= _YIELDING:
         return
-    tasks = Path("/proc/self/task")
+    tasks = Path("/proc/self/task")  # Linux has priorities by thread; those to come inherit it
     for task in [int(one.name) for one in tasks.iterdir()] if tasks.exists() else [0]:
         with suppress(OSError):  # it has ended meanwhile
             os.setpriority(os.PRIO_PROCESS, task, _YIELDING)

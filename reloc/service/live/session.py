@@ -1,20 +1,186 @@
-"""One live session: a thread that takes the latest frame, has it tracked and hands out its pose."""
+"""One live session: a thread that takes the latest frame, has a process follow it and hands out its pose."""
 
 import logging
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Self
 
 from pydantic import BaseModel
 
-from reloc.service.live.follower import Arrival, Follower, FollowerStoppedError, FrameError
-from reloc.service.logs import fields
-from reloc.service.tally import Tally
-from reloc.wire.track import EndReason, TrackEvent
+from featuredb.stage_clock import StageClock
+from reloc.service.live.frames import FrameAnswerer, FrameAsk
+from reloc.service.logs import Tally, fields
+from reloc.service.options import ServeOptions
+from reloc.service.workers.area_files import LocaliserFiles
+from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
+from reloc.wire.query import ErrorCode, RequestError, parse_attachment
+from reloc.wire.track import EndReason, TrackEvent, TrackFrame, TrackPose
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arrival:
+    """A frame as it came."""
+
+    header: bytes  # its attachment
+    payload: bytes  # the image file's bytes; empty where `size` is over the limit
+    size: int  # bytes that were sent
+    received: float  # `time.perf_counter` at receipt
+    received_at: datetime  # the same by the clock
+
+
+class FrameError(RequestError):
+    """A frame cannot be used; `sequence`: its number, where it could be read."""
+
+    def __init__(self, code: ErrorCode, message: str, sequence: int | None) -> None:
+        super().__init__(code, message)
+        self.sequence = sequence
+
+
+class Follower:
+    """Answers the frames of one session, in their order, from one thread but for `stop`. A context manager.
+
+    The track lives in the process. A frame that the process does not survive is refused; with the next one a
+    new process begins, in which the track is looked for anew.
+    """
+
+    def __init__(
+        self,
+        answerer: FrameAnswerer,
+        options: ServeOptions,  # a frame has the limits of a query
+        files: Callable[[], LocaliserFiles],  # the area in service, maybe another one from frame to frame
+    ) -> None:
+        self._answerer, self._files = answerer, files
+        self._limits, self._frame_s = options.worker_limits, options.work_s
+        self._max_bytes = options.live.limits.max_bytes
+        self._process: WorkerProcess | None = None
+        self._last: TrackFrame | None = None  # whose header was in order
+        self._last_time_s: float | None = None  # of the last frame that was tracked
+        self._looked_at = 0
+        self._stopped = False
+
+    def __enter__(self) -> Self:
+        """Raises WorkerEndedError: no process comes up, or as told."""
+        try:
+            self._ready()
+        except WorkerEndedError:
+            self._close()
+            raise
+        return self
+
+    def __exit__(self, *failed: object) -> None:
+        self._close()
+
+    def stop(self) -> None:
+        """Kill the process, whatever it is at; returns at once."""
+        self._stopped = True
+        process = self._process
+        if process is not None:
+            process.kill()
+
+    def answer(self, arrival: Arrival) -> TrackPose:
+        """The pose of a frame, or that the track is lost.
+
+        Raises:
+            FrameError: a header that is none or goes back, what `FrameAnswerer.answer` refuses, or a frame
+                that is beyond the limits or ends the process. WorkerEndedError: it was told to stop.
+        """
+        clock = StageClock(start=arrival.received)
+        sequence: int | None = None
+        try:
+            header = parse_attachment(TrackFrame, arrival.header)
+            sequence = header.sequence
+            self._check(header, arrival.size)
+            process = self._ready()
+            clock.lap("queue")
+            frame = FrameAsk(
+                sequence=header.sequence,
+                time_s=header.time_s,
+                dropped=header.sequence + 1 - self._looked_at,
+                received_at=arrival.received_at.isoformat(),
+            )
+            pose = self._asked(process, frame, arrival.payload)
+        except RequestError as error:
+            raise FrameError(ErrorCode(error.code), error.message, sequence) from error
+        except (WorkerEndedError, WorkerDefectError) as error:
+            self._close()
+            if self._stopped:
+                raise
+            logger.exception("a frame failed", extra=fields("frame_failed"))
+            how = error if isinstance(error, WorkerEndedError) else "a defect"
+            raise FrameError(
+                ErrorCode.INTERNAL,
+                f"{how} on this frame; the server's log has it. The track begins anew",
+                sequence,
+            ) from error
+        self._last_time_s = header.time_s
+        clock.lap("worker", pose.timings_ms)
+        return pose.model_copy(update={"timings_ms": clock.milliseconds()})
+
+    def _asked(self, process: WorkerProcess, frame: FrameAsk, data: bytes) -> TrackPose:
+        late = threading.Event()
+
+        def end() -> None:
+            late.set()
+            process.kill()
+
+        watch = threading.Timer(self._frame_s, end)
+        watch.start()
+        try:
+            return process.ask(frame, data, TrackPose)
+        except WorkerEndedError as error:
+            if late.is_set():
+                raise RequestError(
+                    ErrorCode.DEADLINE,
+                    f"the frame was not done within {self._frame_s:g} s; send smaller ones",
+                ) from error
+            raise
+        finally:
+            watch.cancel()
+
+    def _ready(self) -> WorkerProcess:
+        """The process, a new one where it has ended, over the area in service."""
+        if self._process is None or not self._process.is_alive():
+            self._close()
+            self._process = WorkerProcess(self._limits, self._answerer.answer)
+            if self._stopped:  # while it was started
+                self._process.kill()
+        self._process.open(self._files())
+        return self._process
+
+    def _close(self) -> None:
+        if self._process is not None:
+            self._process.close()
+            self._process = None
+
+    def _check(self, header: TrackFrame, size: int) -> None:
+        """Raises RequestError: the header goes back, or the payload is too large."""
+        if self._last is not None and header.sequence <= self._last.sequence:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST,
+                f"sequence: expected more than {self._last.sequence}, that of the frame before, found "
+                f"{header.sequence}; number the frames from 0, and open a new session to begin again",
+            )
+        self._last = header
+        self._looked_at += 1
+        if self._last_time_s is not None and header.time_s <= self._last_time_s:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST,
+                f"time_s: expected more than {self._last_time_s}, that of the frame before, found "
+                f"{header.time_s}",
+            )
+        if size > self._max_bytes:
+            raise RequestError(
+                ErrorCode.TOO_LARGE,
+                f"payload: expected at most {self._max_bytes} bytes, found {size}; send smaller or more "
+                "compressed frames",
+            )
+
 
 _END_TEXT = {
     EndReason.CLIENT_GONE: "the client has closed the session, or is gone",
@@ -29,9 +195,7 @@ _AT_ONCE = (EndReason.CLIENT_GONE, EndReason.MADE_ROOM)
 class LiveSession:
     """Begins with `start` and ends by itself (idle, a defect), or by `end`; never more than one frame waits.
 
-    Attributes:
-        name: of the session on the wire.
-        asker: who shares the server with others, as of a query.
+    `name`: of the session on the wire. `asker`: who shares the server with others, as of a query.
     """
 
     def __init__(
@@ -41,15 +205,10 @@ class LiveSession:
         follower: Follower,
         *,
         idle_timeout_s: float,
-        publish: Callable[[str, BaseModel], None],
+        publish: Callable[[str, BaseModel], None],  # under a leaf of its key; never waits for the client
         tally: Tally,
-        on_end: Callable[[], None],
+        on_end: Callable[[], None],  # by the session's thread when nothing is left of it, before it says so
     ) -> None:
-        """
-        Args:
-            publish: sends a message under a leaf of the session's key; never waits for the client.
-            on_end: called by the session's thread when nothing is left of it, before it says so.
-        """
         self.name, self.asker = name, asker
         self._follower = follower
         self._idle_timeout_s = idle_timeout_s
@@ -59,6 +218,7 @@ class LiveSession:
         self._waiting: Arrival | None = None
         self._reason: EndReason | None = None
         self._changed = threading.Condition()  # the two above
+        self._cut_off = False  # its process was ended, whatever it was at
         self._states: Counter[str] = Counter()
         self._thread = threading.Thread(target=self._run, name=f"live-{name}", daemon=True)
 
@@ -85,6 +245,7 @@ class LiveSession:
             self._reason = self._reason or reason
             self._changed.notify()
         if reason in _AT_ONCE:
+            self._cut_off = True
             self._follower.stop()
 
     @property
@@ -100,11 +261,10 @@ class LiveSession:
         try:
             with self._follower:
                 self._answer_frames()
-        except FollowerStoppedError:
-            pass
         except Exception:
-            logger.exception("live session failed", extra=fields("internal", session=self.name))
-            self.end(EndReason.INTERNAL)
+            if not self._cut_off:
+                logger.exception("live session failed", extra=fields("internal", session=self.name))
+                self.end(EndReason.INTERNAL)
         self._on_end()
         self._say_ended()
 
@@ -148,8 +308,6 @@ class LiveSession:
         logger.info("live session ended", extra=fields("live_ended", **said))
 
     def _event(self, kind: str, code: str, message: str, sequence: int | None) -> None:
-        fields = {"type": kind, "session": self.name, "code": code, "message": message}
-        event = TrackEvent.model_validate(
-            {**fields, "sequence": sequence, "time": datetime.now(UTC).isoformat()}
-        )
-        self._publish("events", event)
+        said = {"type": kind, "code": code, "message": message, "sequence": sequence}
+        now = datetime.now(UTC).isoformat()
+        self._publish("events", TrackEvent.model_validate({**said, "session": self.name, "time": now}))

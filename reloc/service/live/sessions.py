@@ -14,14 +14,12 @@ from zenoh.handlers import Callback
 
 from featuredb.errors import IncompatibleExtractorError
 from reloc.localise.candidates import usable_areas
-from reloc.service.live.follower import Arrival, Follower
 from reloc.service.live.frames import FrameAnswerer
-from reloc.service.live.options import LiveOptions
-from reloc.service.live.session import LiveSession
-from reloc.service.logs import fields
-from reloc.service.pending import session_of
+from reloc.service.live.session import Arrival, Follower, LiveSession
+from reloc.service.logs import Tally, fields
+from reloc.service.options import LiveOptions
+from reloc.service.queueing import session_of
 from reloc.service.source import ServedArea
-from reloc.service.tally import Tally
 from reloc.wire.keys import NAME_EXPECTED, Keys, is_name
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
@@ -57,18 +55,13 @@ class LiveSessions:
         self,
         session: zenoh.Session,
         keys: Keys,
-        area: Callable[[], ServedArea],
+        area: Callable[[], ServedArea],  # in service now
         follower: Callable[[FrameAnswerer], Follower],
         options: LiveOptions,
         server_id: str,
         *,
-        authenticates: bool,
+        authenticates: bool,  # clients' names are proven; else who asks is the session it says it is
     ) -> None:
-        """
-        Args:
-            area: gives the area in service. follower: has a session's frames answered.
-            authenticates: whether clients' names are proven; else who asks is the session it says it is.
-        """
         self._session, self._keys, self._area, self._follower = session, keys, area, follower
         self._options, self._server_id, self._authenticates = options, server_id, authenticates
         self._tally = Tally()
@@ -159,11 +152,7 @@ class LiveSessions:
             session.end(EndReason.CLIENT_GONE)
 
     def _opened(self, client: str, name: str, query: zenoh.Query) -> TrackOpened:
-        """Open the client's session of this name.
-
-        Raises:
-            RequestError: why it is not opened.
-        """
+        """Open the client's session of this name. Raises RequestError: why it is not opened."""
         for what, found in (("client", client), ("session", name)):
             if not is_name(found):
                 raise RequestError(ErrorCode.BAD_REQUEST, f"{what}: {NAME_EXPECTED}, found {found[:80]!r}")
@@ -172,7 +161,10 @@ class LiveSessions:
         request = parse_attachment(TrackOpenRequest, attachment)
         answerer, area = FrameAnswerer(name, request, self._options), self._area()
         asker = client if self._authenticates else session_of(query)
-        _check_comparable(area)
+        try:
+            usable_areas(area.localiser.areas, area.localiser.options.extractor.fingerprint)
+        except IncompatibleExtractorError as error:
+            raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
         with ExitStack() as undo, self._lock:
             self._make_room(key, asker)
             session = LiveSession(
@@ -276,12 +268,3 @@ class LiveSessions:
             )
         except zenoh.ZError:
             logger.warning("a live session's message could not be published", exc_info=True)
-
-
-def _check_comparable(area: ServedArea) -> None:
-    """Raises RequestError: no map can be compared with the frames."""
-    localiser = area.localiser
-    try:
-        usable_areas(localiser.areas, localiser.options.extractor.fingerprint)
-    except IncompatibleExtractorError as error:
-        raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error

@@ -33,17 +33,11 @@ Answerer = Callable[[Any, bytes, Localiser], BaseModel]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerLimits:
-    """What one picture may use.
+    """What one picture may use."""
 
-    Attributes:
-        threads: of OpenCV and BLAS.
-        memory_bytes: of address space, beyond what the process has before.
-        processor_s: of all threads together.
-    """
-
-    threads: int
-    memory_bytes: int
-    processor_s: float
+    threads: int  # of OpenCV and BLAS
+    memory_bytes: int  # of address space, beyond what the process has before
+    processor_s: float  # of all threads together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

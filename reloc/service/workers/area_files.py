@@ -24,11 +24,7 @@ _LENGTH_BYTES = 8
 
 
 class AreaFile:
-    """A file without a name in any folder, closed with its last user.
-
-    Attributes:
-        key: names it, once and for all. file: open.
-    """
+    """A file without a name in any folder, closed with its last user; its key names it once and for all."""
 
     def __init__(self, key: int) -> None:
         self.key = key
@@ -86,8 +82,7 @@ class MappedAreas:
     def localiser(self, keys: Sequence[int], receive: Callable[[], int]) -> Any:
         """The localiser of some files, by key in the order of `LocaliserFiles`; known ones are kept.
 
-        Args:
-            receive: the descriptor of the next file, which is closed here: one is open at a time.
+        `receive` gives the descriptor of the next file, which is closed here: one is open at a time.
         """
         found: dict[int, object] = {}
         localiser: object = None
@@ -106,39 +101,28 @@ class MappedAreas:
 
 
 class _Pickler(pickle.Pickler):
-    def __init__(
-        self,
-        file: IO[bytes],
-        buffers: list[pickle.PickleBuffer],
-        whole: object,
-        key_of: Callable[[object], int],
-    ) -> None:
-        super().__init__(file, protocol=5, buffer_callback=buffers.append)
-        self._whole, self._key_of = whole, key_of
+    whole: object  # that is written
+    key_of: Callable[[object], int]
 
     def persistent_id(self, obj: object) -> int | None:
-        if obj is self._whole or not isinstance(obj, Area | Segment | DescriptorIndex | OnDemand):
+        if obj is self.whole or not isinstance(obj, Area | Segment | DescriptorIndex | OnDemand):
             return None
-        return self._key_of(obj)
+        return self.key_of(obj)
 
 
 class _Unpickler(pickle.Unpickler):
-    def __init__(self, file: IO[bytes], buffers: list[memoryview], parts: Mapping[int, object]) -> None:
-        super().__init__(file, buffers=buffers)
-        self._parts = parts
+    parts: Mapping[int, object]  # what is within, by key
 
     def persistent_load(self, pid: int) -> object:
-        return self._parts[pid]
+        return self.parts[pid]
 
 
 def _write(value: object, file: IO[bytes], key_of: Callable[[object], int]) -> None:
-    """Arrays as they are, then the rest pickled, then where each of them lies.
-
-    Args:
-        key_of: of what is within and is a file of its own, an area for example.
-    """
+    """Arrays, then the rest pickled, then where each lies; `key_of` what within has a file of its own."""
     stream, buffers = io.BytesIO(), list[pickle.PickleBuffer]()
-    _Pickler(stream, buffers, value, key_of).dump(value)
+    pickler = _Pickler(stream, protocol=5, buffer_callback=buffers.append)
+    pickler.whole, pickler.key_of = value, key_of
+    pickler.dump(value)
     places = []
     for content in (*(buffer.raw() for buffer in buffers), stream.getbuffer()):
         file.write(bytes(-file.tell() % _ALIGNMENT))
@@ -155,4 +139,6 @@ def _read(descriptor: int, parts: Mapping[int, object]) -> Any:
     length = int.from_bytes(content[-_LENGTH_BYTES:], "little")
     places = pickle.loads(content[-_LENGTH_BYTES - length : -_LENGTH_BYTES])
     *buffers, stream = [content[start : start + size] for start, size in places]
-    return _Unpickler(io.BytesIO(stream), buffers, parts).load()
+    unpickler = _Unpickler(io.BytesIO(stream), buffers=buffers)
+    unpickler.parts = parts
+    return unpickler.load()

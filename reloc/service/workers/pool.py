@@ -14,8 +14,7 @@ from reloc.service.contributions.inbox import Inbox, contribution_of
 from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
-from reloc.service.pending import PendingQuery
-from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
+from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
 from reloc.service.workers.area_files import AreaFiles
@@ -38,17 +37,10 @@ class WorkerPool:
     """Takes queries from the queue and answers each from the area in service at that moment.
 
     A process that is still at a query when its time is over, or that ends before its answer, is replaced.
-
-    Attributes:
-        published: the area that is answered from.
     """
 
     def __init__(
-        self,
-        queue: QueryQueue,
-        watch: DeadlineWatch,
-        options: ServeOptions,
-        inbox: Inbox | None = None,
+        self, queue: QueryQueue, watch: DeadlineWatch, options: ServeOptions, inbox: Inbox | None = None
     ) -> None:
         self._queue = queue
         self._watch = watch
@@ -177,23 +169,14 @@ class WorkerPool:
         except WorkerEndedError as error:
             with self._changed:
                 self._up.discard(process)
-            item.refuse(
-                RequestError(
-                    ErrorCode.INTERNAL,
-                    f"{error} on this query, which concerns no other; the server's log has it under request "
-                    f"id {item.request_id}",
-                )
-            )
+            what = f"{error} on this query, which concerns no other; the server's log has it"
+            item.refuse(RequestError(ErrorCode.INTERNAL, f"{what} under request id {item.request_id}"))
         except Exception as error:
             trace = {"trace": str(error)} if isinstance(error, WorkerDefectError) else {}
             told = fields("internal", request_id=item.request_id, **trace)
             logger.exception("query failed", extra=told)
-            item.refuse(
-                RequestError(
-                    ErrorCode.INTERNAL,
-                    f"the server failed on this query; its log says why under request id {item.request_id}",
-                )
-            )
+            what = "the server failed on this query; its log says why"
+            item.refuse(RequestError(ErrorCode.INTERNAL, f"{what} under request id {item.request_id}"))
 
     def _localise(self, item: PendingQuery, process: WorkerProcess) -> None:
         clock = StageClock(start=item.received)

@@ -127,10 +127,7 @@ class WorkerProcess:
         self._open = files
 
     def ask(self, ask: object, data: bytes, reply: type[_Reply]) -> _Reply:
-        """What the process's answerer answers.
-
-        Args:
-            data: the image file. reply: what the answer is.
+        """What the process's answerer answers about an image file, read as `reply`.
 
         Raises:
             RequestError: why there is no answer; TOO_LARGE where the process has ended for want of memory.

@@ -1,62 +1,127 @@
-"""A trajectory as a file: CSV, TUM, GeoJSON, KML, or OGC GeoPose series.
+"""A trajectory as files: CSV, TUM, GeoJSON, KML, or OGC GeoPose series, as the suffix says.
 
-The suffix chooses. Frames whose track is lost are rows without a pose in CSV, and gaps in all others. A file
-appears whole or not at all.
+Frames whose track is lost are rows without a pose in CSV, and gaps in all others. One in the own frame of a
+map without a place is CSV only, with columns of other names, so that nobody takes it for one on Earth.
 """
 
+import csv
+import io
 import json
 import os
-import secrets
+import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
+from featuredb.atomic import atomic_file
+from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.geo.geopose_documents import irregular_series
+from featuredb.geometry.rotation import quaternion_from_matrix
+from reloc.localise.result import OwnPose
 from reloc.tracking.ground import EarthPose
-from reloc.tracking.trajectory.own_frame_files import UPPER, columns_of, csv_table, own_csv_text
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 
-_AXES = ("re", "rn", "ru", "e", "n", "u")
+_NOTHING_FOUND, _FAILED = 1, 2  # exit codes: no frame was localised; a file could not be written
+_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+
+
+def _covariance_columns(prefix: str, axes: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"{prefix}_{axes[i]}_{axes[j]}" for i, j in _UPPER)
+
+
 _POSE = (
     *("easting", "northing", "height", "qx", "qy", "qz", "qw", "latitude", "longitude"),
     *("heading_deg", "pitch_deg", "roll_deg", "epsg", "height_datum", "map_id"),
-    *(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in UPPER),
+    *_covariance_columns("cov", ("re", "rn", "ru", "e", "n", "u")),
 )
-CSV_COLUMNS = columns_of(_POSE)
+_OWN_POSE = (
+    *("own_x", "own_y", "own_z", "own_qx", "own_qy", "own_qz", "own_qw"),
+    *("own_unit", "own_z_is_up", "unplaced_map"),
+    *_covariance_columns("own_cov", ("rx", "ry", "rz", "x", "y", "z")),
+)
+CSV_COLUMNS, OWN_CSV_COLUMNS = (
+    ("frame", "time_s", "state", "inliers", *pose, "detail") for pose in (_POSE, _OWN_POSE)
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outputs:
+    """What became of the files: names of those that were written, and why others were not."""
+
+    written: tuple[str, ...]
+    failed: tuple[str, ...]
+
+
+def check_outputs(files: Sequence[Path]) -> None:
+    """Before an hour of tracking, not after it.
+
+    Raises:
+        InvalidValueError: a suffix that stands for no format, or a folder that cannot be written.
+    """
+    for file in files:
+        format_of(file)
+        folder = next(folder for folder in file.absolute().parents if folder.exists())
+        if not folder.is_dir() or not os.access(folder, os.W_OK):
+            raise InvalidValueError(f"{file}: expected a folder that can be written, found {folder}")
+
+
+def write_outputs(files: Sequence[Path], trajectory: Trajectory) -> Outputs:
+    """Write all that can be written; without any pose only tables."""
+    known = any(point.found for point in trajectory.points)
+    written, failed = [], []
+    for file in files:
+        if not known and file.suffix.lower() != ".csv":
+            continue
+        try:
+            write_trajectory(file, trajectory)
+            written.append(str(file))
+        except (FeatureDbError, OSError) as error:
+            failed.append(f"{file}: {error}")
+    return Outputs(written=tuple(written), failed=tuple(failed))
+
+
+def exit_code(outputs: Outputs, trajectory: Trajectory) -> int:
+    """0, 1 where no frame was localised, 2 where a file could not be written; stderr says which."""
+    for text in outputs.failed:
+        sys.stderr.write(f"featuredb: {text}\n")
+    if outputs.failed:
+        return _FAILED
+    return 0 if any(point.found for point in trajectory.points) else _NOTHING_FOUND
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series).
-
-    One in the frame of a map without a place: `.csv`, see `own_frame_files`.
+    """Write a trajectory, whole or not at all.
 
     Raises:
-        InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
+        InvalidValueError: see `format_of`; or no frame has a pose and the format holds nothing else.
     """
     own = next((point.in_map.map_id for point in trajectory.points if point.in_map is not None), None)
-    text = _format(path, own)(trajectory)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
-    try:
+    text = format_of(path, own)(trajectory)
+    with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
-def check_format(path: Path, own_map: str | None = None) -> None:
-    """Whether the suffix is one of those above.
-
-    Args:
-        own_map: id of the map without a place in whose frame the poses are.
+def format_of(path: Path, own_map: str | None = None) -> Callable[[Trajectory], str]:
+    """What makes the text of a file with this suffix; `own_map`: id of the map in whose own frame poses are.
 
     Raises:
-        InvalidValueError: it is not.
+        InvalidValueError: there is no such format.
     """
-    _format(path, own_map)
+    suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else {".csv": own_csv_text}
+    if suffix in formats:
+        return formats[suffix]
+    if own_map is None:
+        raise InvalidValueError(
+            f"{path.name}: expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
+        )
+    raise InvalidValueError(
+        f"{path.name}: needs places on Earth, and map {own_map} has none: expected .csv, with "
+        "poses in the map's own frame; or place the map first: `featuredb maps` says how"
+    )
 
 
 def csv_text(trajectory: Trajectory) -> str:
@@ -66,7 +131,36 @@ def csv_text(trajectory: Trajectory) -> str:
     into camera axes (x right, y down, z forward); cov_* is the covariance, rad and m, axes true east, north,
     up: rotation (re, rn, ru) before displacement (e, n, u).
     """
-    return csv_table(_POSE, trajectory, lambda point: None if point.pose is None else _cells(point.pose))
+    return _csv_table(
+        CSV_COLUMNS, trajectory, lambda point: None if point.pose is None else _cells(point.pose)
+    )
+
+
+def own_csv_text(trajectory: Trajectory) -> str:
+    """One row a frame.
+
+    own_x .. own_z is the camera centre in the map's own frame, in own_unit (metre, or map_unit where nothing
+    tells the scale); own_qx .. own_qw turn the frame's axes into camera axes (x right, y down, z forward);
+    own_cov_* is the covariance, axes of the frame: rotation (rx, ry, rz) in rad before displacement.
+    """
+    return _csv_table(
+        OWN_CSV_COLUMNS, trajectory, lambda point: None if point.in_map is None else _own_cells(point.in_map)
+    )
+
+
+def _csv_table(
+    columns: tuple[str, ...],
+    trajectory: Trajectory,
+    cells: Callable[[TrajectoryPoint], Sequence[object] | None],
+) -> str:
+    """One row a frame; `cells`: those of its pose, None where it has none."""
+    out = io.StringIO()
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(columns)
+    for point in trajectory.points:
+        head = (point.index, f"{point.time_s:.6f}", point.state, point.inliers)
+        rows.writerow((*head, *(cells(point) or [""] * (len(columns) - 5)), point.detail))
+    return out.getvalue()
 
 
 def _cells(pose: EarthPose) -> list[object]:
@@ -76,7 +170,16 @@ def _cells(pose: EarthPose) -> list[object]:
         *(f"{pose.geopose.latitude_deg:.10f}", f"{pose.geopose.longitude_deg:.10f}"),
         *(f"{a:.5f}" for a in pose.geopose.heading_pitch_roll_deg),
         *(pose.epsg, pose.height_datum, pose.map_id),
-        *(f"{pose.covariance[i, j]:.6e}" for i, j in UPPER),
+        *(f"{pose.covariance[i, j]:.6e}" for i, j in _UPPER),
+    ]
+
+
+def _own_cells(pose: OwnPose) -> list[str]:
+    return [
+        *(f"{v:.9g}" for v in pose.cam_from_map.center),
+        *(f"{q:.9f}" for q in quaternion_from_matrix(pose.cam_from_map.rotation)),
+        *("metre" if pose.frame.metric else "map_unit", str(pose.frame.upright).lower(), pose.map_id),
+        *(f"{pose.covariance[i, j]:.6e}" for i, j in _UPPER),
     ]
 
 
@@ -106,40 +209,31 @@ def geojson_text(trajectory: Trajectory) -> str:
     features = []
     for number, stretch in enumerate(trajectory.stretches()):
         if len(stretch) > 1:
-            features.append(
-                {
-                    "type": "Feature",
-                    "geometry": {"type": "LineString", "coordinates": [_place(pose) for _, pose in stretch]},
-                    "properties": {
-                        "stretch": number,
-                        "from_s": stretch[0][0].time_s,
-                        "to_s": stretch[-1][0].time_s,
-                        "source": trajectory.source,
-                    },
-                }
-            )
+            said = {"stretch": number, "from_s": stretch[0][0].time_s, "to_s": stretch[-1][0].time_s}
+            line = [_place(pose) for _, pose in stretch]
+            features.append(_feature("LineString", line, {**said, "source": trajectory.source}))
         for point, pose in stretch:
             heading, pitch, roll = pose.geopose.heading_pitch_roll_deg
             sigma = np.sqrt(np.diag(pose.covariance)[3:])
-            features.append(
-                {
-                    "type": "Feature",
-                    "geometry": {"type": "Point", "coordinates": _place(pose)},
-                    "properties": {
-                        "frame": point.index,
-                        "time_s": round(point.time_s, 6),
-                        "state": point.state,
-                        "heading_deg": round(heading, 4),
-                        "pitch_deg": round(pitch, 4),
-                        "roll_deg": round(roll, 4),
-                        "sigma_enu_m": [round(float(v), 4) for v in sigma],
-                        "height_datum": pose.height_datum,
-                        "map_id": pose.map_id,
-                        "geopose": pose.geopose.to_json(),
-                    },
-                }
-            )
+            properties = {
+                "frame": point.index,
+                "time_s": round(point.time_s, 6),
+                "state": point.state,
+                "heading_deg": round(heading, 4),
+                "pitch_deg": round(pitch, 4),
+                "roll_deg": round(roll, 4),
+                "sigma_enu_m": [round(float(v), 4) for v in sigma],
+                "height_datum": pose.height_datum,
+                "map_id": pose.map_id,
+                "geopose": pose.geopose.to_json(),
+            }
+            features.append(_feature("Point", _place(pose), properties))
     return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
+
+
+def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> dict[str, Any]:
+    geometry = {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
 def kml_text(trajectory: Trajectory) -> str:
@@ -181,20 +275,6 @@ _FORMATS: dict[str, Callable[[Trajectory], str]] = {
 }
 
 
-def _format(path: Path, own_map: str | None) -> Callable[[Trajectory], str]:
-    suffix, formats = path.suffix.lower(), _FORMATS if own_map is None else {".csv": own_csv_text}
-    if suffix in formats:
-        return formats[suffix]
-    if own_map is None:
-        raise InvalidValueError(
-            f"{path.name}: expected a name that ends in {', '.join(formats)}, found {path.suffix!r}"
-        )
-    raise InvalidValueError(
-        f"{path.name}: needs places on Earth, and map {own_map} has none: expected .csv, with "
-        "poses in the map's own frame; or place the map first: `featuredb maps` says how"
-    )
-
-
 def _known(
     trajectory: Trajectory, what: str, *, datums: bool = False
 ) -> Sequence[tuple[TrajectoryPoint, EarthPose]]:
@@ -216,8 +296,5 @@ def _known(
 
 
 def _place(pose: EarthPose) -> list[float]:
-    return [
-        round(pose.geopose.longitude_deg, 10),
-        round(pose.geopose.latitude_deg, 10),
-        round(float(pose.utm[2]), 4),
-    ]
+    longitude, latitude = pose.geopose.longitude_deg, pose.geopose.latitude_deg
+    return [round(longitude, 10), round(latitude, 10), round(float(pose.utm[2]), 4)]

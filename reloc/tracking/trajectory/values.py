@@ -11,28 +11,20 @@ from itertools import groupby
 
 from featuredb.errors import InvalidValueError
 from reloc.localise.result import OwnPose
-from reloc.tracking.ground import EarthPose
-from reloc.tracking.tracked_frame import TrackedFrame, TrackState
+from reloc.tracking.ground import EarthPose, TrackedFrame, TrackState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrajectoryPoint:
-    """One frame.
+    """One frame."""
 
-    Attributes:
-        index: of the frame, from 0. time_s: on the film's own clock.
-        pose: on Earth; None where the track is lost, and then `detail` says why, or where it is `in_map`.
-        in_map: the pose in the frame of a map without a place.
-        inliers: landmarks that agree with the pose.
-    """
-
-    index: int
-    time_s: float
+    index: int  # from 0
+    time_s: float  # on the film's own clock
     state: TrackState
-    pose: EarthPose | None = None
-    in_map: OwnPose | None = None
-    inliers: int = 0
-    detail: str = ""
+    pose: EarthPose | None = None  # on Earth; None where the track is lost, or where it is `in_map`
+    in_map: OwnPose | None = None  # in the frame of a map without a place
+    inliers: int = 0  # landmarks that agree with the pose
+    detail: str = ""  # why there is none
 
     def __post_init__(self) -> None:
         if self.pose is not None and self.in_map is not None:
@@ -46,16 +38,11 @@ class TrajectoryPoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trajectory:
-    """The frames of one video, in order.
+    """The frames of one video, in order."""
 
-    Attributes:
-        source: name of the video.
-        start: when the film's clock showed 0, timezone-aware; None: not known.
-    """
-
-    source: str
+    source: str  # the video's name
     points: tuple[TrajectoryPoint, ...]
-    start: datetime | None = None
+    start: datetime | None = None  # when the film's clock showed 0, timezone-aware; None: not known
 
     @property
     def is_in_map(self) -> bool:
