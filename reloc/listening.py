@@ -37,8 +37,8 @@ def listen(host: str, port: int) -> socket.socket:
         return bound
     except OSError as error:
         raise ListenError(
-            f"cannot listen on {host}:{port}: {error.strerror or error}; choose another with --port, 0 takes "
-            "a free one"
+            f"cannot listen on {host}:{port}: {error.strerror or error}; choose a port with --port, 0 takes "
+            "a free one, and with --host an address of this machine"
         ) from error
 
 

@@ -234,7 +234,7 @@ class Localiser:
         """Pose of the image (h, w) uint8, or the reason why there is none.
 
         Args:
-            size: width and height of the image at full size, where `gray` is a smaller copy.
+            size: width and height of the image, where `gray` is smaller, as for `extract`.
 
         Raises:
             MapNotFoundError: the request names maps that the snapshot does not serve.

@@ -166,7 +166,7 @@ def _decode(content: bytes, header: ImageHeader, flags: int, by: int = 1) -> NDA
     if pixels.shape[:2] != (-(-header.height // by), -(-header.width // by)):
         raise ImageError(
             f"the {header.format} claims {header.width}x{header.height} pixels but holds "
-            f"{pixels.shape[1]}x{pixels.shape[0]}",
+            f"{by * pixels.shape[1]}x{by * pixels.shape[0]}",
             "broken",
         )
     if header.format == "JPEG" and header.scans == 1 and _ends_early(content, header, pixels, flags, by):

@@ -74,7 +74,8 @@ def extract(
 
     Args:
         gray: (h, w) uint8, pixels as stored in the file (EXIF orientation not applied).
-        size: width and height of the image at full size, where `gray` is a smaller copy.
+        size: width and height of the image, of which `gray` is every second, fourth or eighth pixel (as
+            `decode_gray` makes it).
 
     Returns:
         Features in full-size pixels, strongest and best-spread first.
@@ -101,7 +102,8 @@ def extract(
         rows = np.repeat(np.arange(len(points)), counts)[: options.max_features]
         angle = angles[rows, np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]]
         points = points.take(rows)
-    ratio = np.array([width / space.width, height / space.height])
+    reduced = round(width / gray.shape[1])  # whose last pixels may reach beyond the image
+    ratio = reduced * np.array([gray.shape[1] / space.width, gray.shape[0] / space.height])
     return Features(
         xy=(points.xy * ratio).astype(np.float32),
         scale=points.diameter * np.float32(ratio.mean()),

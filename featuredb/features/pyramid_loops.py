@@ -44,6 +44,8 @@ def blur(
 
 @compiled
 def _mirrored(index: int, count: int) -> int:
+    if count == 1:
+        return 0
     while index < 0 or index >= count:
         index = -index if index < 0 else 2 * count - 2 - index
     return index

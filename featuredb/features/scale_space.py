@@ -138,9 +138,9 @@ class ScaleSpace:
     def _resized(self) -> NDArray[np.float32]:
         # Whole grey levels would be too coarse between the pixels.
         if self._enlarged == 1.0:
-            return shrunk(self._gray, max(self.width, self.height)).astype(np.float32)
+            return shrunk(self._gray, max(self.width, self.height)).astype(np.float32, order="C")
         size = (self.width, self.height)
-        enlarged = cv2.resize(self._gray.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+        enlarged = cv2.resize(self._gray.astype(np.float32, order="C"), size, interpolation=cv2.INTER_LINEAR)
         return np.asarray(enlarged, dtype=np.float32)
 
     def _blurred(

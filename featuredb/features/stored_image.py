@@ -28,3 +28,8 @@ class ImageHeader:
     end: int = 0
     orientation: int | None = None
     jfif: bool = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height

@@ -28,7 +28,7 @@ _FEW = 25_000
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
 _LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
 LISTS = 2048
-_CHUNK = 2_048  # descriptors at a time: bounds the float32 copies
+_CHUNK = 2_048  # descriptors at a time: bounds the copies
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,7 +127,7 @@ class DescriptorIndex:
             lists = np.argpartition(_from_lists(asked), _PROBES, axis=1)[:, :_PROBES].astype(np.int64)
             _, row = self._index.search_preassigned(asked, k, lists, np.zeros(lists.shape, np.float32))
         else:
-            parts = np.array_split(asked, opencv_threads())
+            parts = np.array_split(asked, min(opencv_threads(), len(asked)))
             row = np.concatenate(mapped(lambda part: self._flat(part, k), parts, len(parts)))
         return np.asarray(row, dtype=np.int64)
 
@@ -146,7 +146,9 @@ def squared_distances(
     """Exact squared distances (m,) of pairs of descriptors, a row of `query` and one of `base` each."""
     squared = np.empty(len(base_rows), np.float32)
     loops = compiled_module("featuredb.index.distance_loops")
-    query = np.require(query, requirements=["C", "W"])  # the loop is compiled for these alone
+    # The loop is compiled for these alone.
+    query = np.require(query, requirements=["C", "W"])
+    query_rows = np.ascontiguousarray(query_rows, dtype=np.int64)
     for start in range(0, len(base_rows), _CHUNK):
         part = slice(start, start + _CHUNK)
         loops.pair_distances(query, query_rows[part], base[base_rows[part]], squared[part])

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.errors import InvalidValueError
 from featuredb.geo.crs.utm_transform import raster_from_utm
 from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.formats.ortho_image import OrthoImage, sample_ortho
@@ -39,6 +40,7 @@ LAID = {  # what a scan's id says of how the image is laid on its points
 }
 _EMPTY_M = np.float32(-1e9)
 _FINEST_M, _COARSEST_M = 0.03, 2.0
+_MAX_CELLS = 200_000_000
 
 
 def margin_m(spacing_m: float) -> float:
@@ -62,6 +64,11 @@ def seen_from_above(xyz: FloatArray, spacing_m: float) -> NDArray[np.bool_]:
     local = (xyz - np.floor(xyz.min(axis=0))).astype(np.float32)
     cell = np.floor(local[:, :2] / radius).astype(np.int64) + 1
     columns, rows = (int(cell[:, k].max()) + 2 for k in (0, 1))
+    if columns * rows > _MAX_CELLS:
+        raise InvalidValueError(
+            f"seen_from_above: expected a tile, found points over {columns} x {rows} cells of "
+            f"{radius:.2f} m; call it by tiles with a margin"
+        )
     at = cell[:, 1] * columns + cell[:, 0]
     highest = _highest(at, local[:, 2], rows * columns)
     return ~(

@@ -117,7 +117,8 @@ class Staged:
             rows: (n,) POINT_ROW, by level and node.
             outliers: how many were dropped.
         """
-        np.save(self._path(block, "npy"), rows)
+        with atomic_file(self._path(block, "npy")) as temporary, temporary.open("wb") as file:
+            np.save(file, rows)
         classes, counts = np.unique(rows["classification"], return_counts=True)
         utm = rows["utm"]
         facts = {

@@ -127,17 +127,19 @@ class Snapshot:
 
     def any_maps(self, *, include_retired: bool = False) -> list[MapSummary | UnplacedSummary]:
         """All maps, oldest first."""
-        rows = [row for row in self._rows.values() if include_retired or row["status"] != RETIRED]
-        rows.sort(key=lambda r: (r["created_at"], r["map_id"]))
-        return [self.get_any(row["map_id"]) for row in rows]
+        return [self.get_any(row["map_id"]) for row in self._oldest_first(include_retired)]
 
     def maps(self, *, include_retired: bool = False) -> list[MapSummary]:
         """Those of `any_maps` with a place."""
-        return [m for m in self.any_maps(include_retired=include_retired) if isinstance(m, MapSummary)]
+        return [_summary(row) for row in self._oldest_first(include_retired) if has_place(row)]
 
     def unplaced_maps(self, *, include_retired: bool = False) -> list[UnplacedSummary]:
         """Those without."""
-        return [m for m in self.any_maps(include_retired=include_retired) if isinstance(m, UnplacedSummary)]
+        return [_unplaced_summary(row) for row in self._oldest_first(include_retired) if not has_place(row)]
+
+    def _oldest_first(self, include_retired: bool) -> list[Row]:
+        rows = [row for row in self._rows.values() if include_retired or row["status"] != RETIRED]
+        return sorted(rows, key=lambda r: (r["created_at"], r["map_id"]))
 
     def get(self, map_id: str) -> MapSummary:
         """The summary of one map with a place, retired or not.

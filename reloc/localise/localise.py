@@ -69,7 +69,7 @@ def localise(
 
     Args:
         gray: (h, w) uint8, pixels as stored in the file.
-        size: width and height of the photo at full size, where `gray` is a smaller copy.
+        size: width and height of the photo, where `gray` is smaller, as for `extract`.
         areas: the indexed maps to search; those of another extractor than the options' are left out.
         snapshot: version of the database that the areas come from, passed through.
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.errors import (
     ImageError,
@@ -41,13 +42,11 @@ def answer_query(
     """
     clock = StageClock()
     try:
-        header = probe(data, limits)
-        side_px = localiser.options.extractor.first_octave_px
-        gray = decode_gray(data, limits, header=header, side_px=side_px)
+        gray, header = decode_photo(data, localiser, limits)
         clock.lap("decode")
         request = localise_request(wire_request, data, header)
         clock.lap("exif")
-        result = localiser.localise(gray, request, (header.width, header.height))
+        result = localiser.localise(gray, request, header.size)
     except ImageError as error:
         raise image_refused(error) from error
     except IncompatibleExtractorError as error:
@@ -59,6 +58,19 @@ def answer_query(
     reply = reply_from_result(result, request_id=request_id, timings_ms={})
     clock.lap("reply")
     return reply.model_copy(update={"timings_ms": clock.milliseconds()})
+
+
+def decode_photo(
+    data: bytes, localiser: Localiser, limits: DecodeLimits = DEFAULT_LIMITS
+) -> tuple[NDArray[np.uint8], ImageHeader]:
+    """Grey pixels of an image file, not much larger than the localiser needs them, and its header.
+
+    Raises:
+        ImageError: no usable image.
+    """
+    header = probe(data, limits)
+    side_px = localiser.options.extractor.first_octave_px
+    return decode_gray(data, limits, header=header, side_px=side_px), header
 
 
 def localise_request(wire_request: LocaliseWireRequest, data: bytes, header: ImageHeader) -> LocaliseRequest:

@@ -72,8 +72,20 @@ def fit_pose(
 
     def linearise() -> None:
         longer = focal * float(np.exp(zoom))
-        places = (pose.rotation, pose.translation, points, seen)
-        linearised(*places, focal, longer, loss, residual, jacobian, normal, gradient)
+        rotation = np.ascontiguousarray(pose.rotation)  # the loop is compiled for this order alone
+        linearised(
+            rotation,
+            pose.translation,
+            points,
+            seen,
+            focal,
+            longer,
+            loss,
+            residual,
+            jacobian,
+            normal,
+            gradient,
+        )
 
     for _ in range(_ITERATIONS):
         linearise()

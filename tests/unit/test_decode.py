@@ -119,6 +119,18 @@ def test_a_large_jpeg_is_decoded_smaller(side_px: int, by: int, options: dict[st
     assert np.abs(small[: mean.shape[0], : mean.shape[1]] - mean).mean() < 2.0
 
 
+@pytest.mark.parametrize("by", [2, 4, 8])
+def test_a_smaller_picture_of_odd_sides_has_whole_blocks_in_its_pixels(by: int) -> None:
+    """The last ones reach beyond the picture: it is not stretched to them."""
+    picture = np.zeros((8 * 37 + 3, 8 * 61 + 5), np.uint8)
+    picture[:, 8 * 50 :] = 255
+    data = _encode(Image.fromarray(picture), "JPEG", quality=95)
+    small = decode_gray(data, side_px=picture.shape[1] // by)
+    assert small.shape == tuple(-(-side // by) for side in picture.shape)
+    assert small[:, 8 * 50 // by - 1].max() < 40
+    assert small[:, 8 * 50 // by].min() > 215
+
+
 def test_what_is_no_jpeg_is_decoded_whole() -> None:
     assert decode_gray(_encode(_scene(), "PNG"), side_px=32).shape == (SIZE[1], SIZE[0])
 

@@ -2,11 +2,12 @@
 
 import pickle
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from featuredb.index import descriptor_index
+from featuredb.index import descriptor_index, distance_loops
 from featuredb.index.descriptor_index import DescriptorCodes, DescriptorIndex, squared_distances
 from featuredb.index.nearest import nearest
 from tests.support.scenes import noisy, random_descriptors
@@ -71,6 +72,28 @@ def test_the_neighbours_are_found_among_the_first_ten() -> None:
     asker, rank = np.nonzero(row >= 0)
     exact = squared_distances(query, asker, base, row[asker, rank])
     np.testing.assert_array_equal(exact, truth[asker, row[asker, rank]])
+
+
+@pytest.mark.parametrize("count", [1, 3, 2049])
+def test_the_neighbours_are_the_same_for_any_number_of_threads(count: int) -> None:
+    base = clustered(3000)
+    query = noisy(np.random.default_rng(5), clustered(2100)[:count], 5.0)
+    before = cv2.getNumThreads()
+    rows = []
+    for threads in (1, 4):
+        cv2.setNumThreads(threads)
+        rows.append(found(query, base, 10))
+    cv2.setNumThreads(before)
+    np.testing.assert_array_equal(*rows)
+
+
+def test_distances_are_compiled_once_for_rows_of_any_order() -> None:
+    """A worker that compiles is over its time."""
+    base = clustered(50)
+    rows = np.array(np.nonzero(np.ones((5, 5)))).T
+    squared_distances(base, rows[:, 0], base, rows[:, 1])
+    squared_distances(np.asfortranarray(base), np.ascontiguousarray(rows[:, 0]), base, rows[:, 1])
+    assert len(distance_loops.pair_distances.signatures) == 1
 
 
 def test_codes_of_parts_are_those_of_the_whole() -> None:

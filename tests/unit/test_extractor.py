@@ -51,6 +51,27 @@ def test_centres_of_blobs_within_a_twentieth_of_a_pixel(factor: float, sigma: fl
     assert np.linalg.norm(errors, axis=1).max() < 0.1 * factor
 
 
+@pytest.mark.parametrize("by", [2, 4])
+def test_centres_of_blobs_in_a_smaller_copy_of_odd_sides(by: int) -> None:
+    """Its last pixels reach beyond the image: who stretches them to its sides is off by pixels there."""
+    width, height = by * 330 + 1, by * 250 + 1
+    centers = by * np.array([[60.0, 60.0], [290.0, 60.0], [290.0, 210.0], [60.0, 210.0]]) + 0.3
+    image = blobs(width, height, centers, 6.0 * by).astype(float)
+    padded = np.pad(image, ((0, by - 1), (0, by - 1)), mode="edge")
+    small = padded.reshape(len(padded) // by, by, -1, by).mean((1, 3)).astype(np.uint8)
+    found = extract(small, ExtractorOptions(first_octave_px=640, contrast_threshold=0.01), (width, height))
+    assert (found.width, found.height) == (width, height)
+    for center in centers:
+        assert np.linalg.norm(found.xy - center, axis=1).min() < 0.15 * by
+
+
+@pytest.mark.parametrize("shape", [(64, 65_500), (65_500, 64)])
+def test_a_picture_like_a_thread_has_no_features(shape: tuple[int, int]) -> None:
+    """Made as small as it has to be it is a line of pixels."""
+    image = np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8)
+    assert len(extract(image, ExtractorOptions(first_octave_px=1400))) == 0
+
+
 def test_scale_is_in_full_size_pixels() -> None:
     """A blob twice as large in an image twice as large, shrunk by two, has twice the diameter."""
     center = np.array([[100.3, 99.6]])

@@ -1,12 +1,14 @@
 """Pose graphs over maps against closed forms."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from ingest.growth.graph import pose_graph
 from ingest.growth.graph.pose_graph import GraphEdge, left_jacobian
 from tests.support.pose_graphs import GraphNode, graph_edge, solved
 
@@ -156,6 +158,21 @@ def test_of_two_overlaps_that_alone_hold_a_map_none_is_left_out(
     found = solved(nodes, [_edge(*pair, wrong if pair == edge else (0.0,) * 7) for pair in pairs])
     assert found.reason == "CONTRADICTION"
     assert not found.corrections
+
+
+def test_the_only_way_to_an_anchor_is_never_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the figures say of it: without it the map would have no place."""
+    nodes, edges = _square((0.0,) * 7)
+    nodes = [*nodes, GraphNode(map_id="far", prior=None)]
+    edges = [*edges, _edge("far", "m1", (0.0,) * 7)]
+
+    def bridge(fitted: Any, judged: object) -> Any:
+        return next((of for of in fitted.edges if of[0] == "far"), None)
+
+    monkeypatch.setattr(pose_graph, "_contradicting", bridge)
+    found = solved(nodes, edges)
+    assert found.left_out == ()
+    assert "far" in found.corrections
 
 
 def test_an_edge_within_its_noise_is_kept() -> None:

@@ -93,6 +93,20 @@ def test_compound_systems(code: str, datum: str, unit_m: float) -> None:
         assert not crs.is_3d
 
 
+def test_a_bound_compound_is_refused_since_its_heights_would_pass_for_ellipsoidal() -> None:
+    source = CRS.from_user_input("EPSG:25832+7837")
+    shift = (
+        'ABRIDGEDTRANSFORMATION["shift",METHOD["Geocentric translations (geog3D domain)",ID["EPSG",1035]],'
+        'PARAMETER["X-axis translation",0],PARAMETER["Y-axis translation",0],'
+        'PARAMETER["Z-axis translation",0]]'
+    )
+    target = CRS.from_epsg(4979).to_wkt()
+    wkt = f"BOUNDCRS[SOURCECRS[{source.to_wkt()}],TARGETCRS[{target}],{shift}]"
+    assert CRS.from_wkt(wkt).is_vertical
+    with pytest.raises(GeodesyError, match="expected a projected"):
+        scan_crs(wkt=wkt)
+
+
 def test_a_stated_datum_wins_and_a_contradiction_is_told() -> None:
     crs = scan_crs(override="EPSG:6556+5703", height_datum="egm96")
     assert crs.height_datum == "egm96"

@@ -16,7 +16,7 @@ from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
 from featuredb.features.exif.gps import RADIUS_68
 from featuredb.features.exif.write import gps_directory, with_app1, with_gps, with_properties
 from featuredb.features.image_header import read_header
-from featuredb.maps.photo_files import PhotoFolder
+from featuredb.file_digest import file_sha256
 
 FILES_TABLE = "files.csv"
 # What the receiver said of its own position no longer belongs to the position that is written.
@@ -50,7 +50,7 @@ def write_exif(job: ExportJob, photos: Path | None) -> Exported:
         raise ExportError("--format exif: expected --photos FOLDER with the photos to be copied, found none")
     if not photos.is_dir():
         raise ExportError(f"--photos {photos}: expected the folder of the photos, found none")
-    there = PhotoFolder(photos)
+    found = files_by_sha256(photos)
     files: list[_File] = []
     attribution: list[Attribution] = []
     with whole_or_nothing(job.out) as part:
@@ -59,10 +59,8 @@ def write_exif(job: ExportJob, photos: Path | None) -> Exported:
             folder = Path(folder_name(feature_map.map_id))
             names = image_names(feature_map)
             credits = attribution_of(feature_map)
-            rows = zip(feature_map.images, shots_of(feature_map), names, credits, strict=True)
-            for image, shot, name, credit in rows:
-                original, _ = there.find(image)
-                outcome = _copy(part, folder / _safe(name), shot, original)
+            for shot, name, credit in zip(shots_of(feature_map), names, credits, strict=True):
+                outcome = _copy(part, folder / _safe(name), shot, found.get(shot.sha256))
                 files.append(outcome)
                 if not outcome.reason:
                     attribution.append(credit)
@@ -76,6 +74,15 @@ def write_exif(job: ExportJob, photos: Path | None) -> Exported:
         write_csv(part / FILES_TABLE, _File._fields, files)
         write_attribution(part, attribution)
         return replace(job.exported(part), images=len(attribution))
+
+
+def files_by_sha256(folder: Path) -> dict[str, Path]:
+    """All files below a folder by the hex digest of their bytes; of equal ones the first by name."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            found.setdefault(file_sha256(path), path)
+    return found
 
 
 def with_pose(data: bytes, shot: PosedPhoto) -> bytes:

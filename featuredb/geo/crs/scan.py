@@ -88,7 +88,8 @@ def scan_crs(
     vertical = None
     if crs.is_compound:
         crs, vertical = crs.sub_crs_list[0], crs.sub_crs_list[1]
-    if not (crs.is_projected or crs.is_geographic or crs.is_geocentric):
+    # A bound compound is vertical, and projected as well: its heights would pass for ellipsoidal ones.
+    if crs.is_vertical or not (crs.is_projected or crs.is_geographic or crs.is_geocentric):
         raise GeodesyError(
             f"expected a projected, geographic or geocentric CRS, found {crs.type_name} {crs.name!r} "
             f"({source}), which names no place on Earth; {DEMAND}"

@@ -33,8 +33,10 @@ from featuredb.store.candidates.states import (
     Contribution,
     candidate_id_of,
     candidate_of,
+    contributions_of,
     owner_of,
     request_column,
+    standing_of,
 )
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
@@ -175,24 +177,26 @@ def delete_images(database: Database, candidate_ids: Iterable[str]) -> list[str]
 
 def list_candidates(database: Database, *, state: CandidateState | None = None) -> list[Candidate]:
     """The contributed photos, or only those in one state, oldest first."""
-    wanted = [c for c in _candidates(database, answers=True) if state is None or c.state == state]
+    live = live_maps(database)
+    found = [candidate_of(own, live) for own in by_candidate(read_events(database, answers=True)).values()]
+    wanted = [c for c in found if state is None or c.state == state]
     return sorted(wanted, key=lambda c: (c.received_at, c.candidate_id))
 
 
 def count_candidates(database: Database) -> InboxCounts:
     """How many there are in each state, how many wait of each owner, and how many bytes they take."""
-    found = _candidates(database, answers=False)
-    return InboxCounts(
-        by_state=dict(Counter(c.state for c in found)),
-        waiting_by_owner=dict(Counter(c.owner for c in found if c.state == "waiting")),
-        stored_bytes=sum(c.size_bytes for c in found if c.state != "withdrawn"),
-    )
-
-
-def _candidates(database: Database, *, answers: bool) -> list[Candidate]:
     live = live_maps(database)
-    events = by_candidate(read_events(database, answers=answers))
-    return [candidate_of(own, live) for own in events.values()]
+    states: Counter[str] = Counter()
+    owners: Counter[str] = Counter()
+    stored = 0
+    for events in by_candidate(read_events(database)).values():  # often, and of all: no more than is counted
+        state = standing_of(events, live).state
+        states[state] += 1
+        if state == "waiting":
+            owners[owner_of(contributions_of(events)[0])] += 1
+        if state != "withdrawn":
+            stored += next(e for e in events if e["event"] == CONTRIBUTED)["size_bytes"]
+    return InboxCounts(by_state=dict(states), waiting_by_owner=dict(owners), stored_bytes=stored)
 
 
 def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tuple[str, bytes]]:

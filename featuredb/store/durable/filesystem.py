@@ -51,8 +51,10 @@ def sha256_of(files: fs.FileSystem, path: str) -> str:
     Raises:
         OSError: it cannot be read.
     """
-    with files.open_input_file(path) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    digest = hashlib.sha256()
+    for block in blocks_of(files, path):  # each is a request to an object store
+        digest.update(block)
+    return digest.hexdigest()
 
 
 def object_writer(files: fs.PyFileSystem, path: str) -> Any:

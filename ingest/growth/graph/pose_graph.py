@@ -70,7 +70,7 @@ class _Fit:
 
     def __init__(self, ids: Sequence[str], edges: Sequence[GraphEdge]) -> None:
         self._ids, rows = ids, {map_id: i for i, map_id in enumerate(ids)}
-        self.edges = [(m, edge) for m, edge in edges if m in rows]
+        self.edges = [of for of in edges if of[0] in rows]
         self._ends = [(rows[m], rows.get(edge.map_id)) for m, edge in self.edges]
         self._anchors = {m for m, edge in self.edges if edge.map_id == WORLD}
         # W with W C W^T = I.

@@ -5,7 +5,7 @@ they see existing points; then gates ask whether to believe it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +86,8 @@ def place_by_maps(
     found = agreed_similarity(model, own, correspondences)
     edges = edges_of(model, found[0], correspondences, found[2]) if found else ()
     if not found or not edges:
-        return Refused.by(gates.agreement(0, len(own)))
+        gate = gates.agreement(0, len(own))
+        return replace(Refused.by(gate), message=f"no placement: {gate.message}")
     fit, agree, used = found
     maps = {m.map_id: m for area in areas for m in area.maps}
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)

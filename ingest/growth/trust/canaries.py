@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from featuredb.features.decode import decode_gray, probe
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
@@ -29,7 +28,7 @@ from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult
 from reloc.localiser import Localiser
-from reloc.service.handler import localise_request
+from reloc.service.handler import decode_photo, localise_request
 from reloc.wire.query import LocaliseWireRequest
 
 # What a map keeps of its images shows its own points alone: that an image does not show what a new map adds
@@ -125,10 +124,10 @@ def run_canaries(
 def check_known(database: Database, canary: Canary, before: Localiser, after: Localiser) -> CanaryCheck:
     """Ask one known query of both."""
     data = load_canary_image(database, canary)
-    gray, header = decode_gray(data), probe(data)
+    gray, header = decode_photo(data, after)
     asked = LocaliseWireRequest.model_validate_json(json.dumps(dict(canary.request)))
     request = localise_request(asked, data, header)
-    results = [localiser.localise(gray, request) for localiser in (before, after)]
+    results = [localiser.localise(gray, request, header.size) for localiser in (before, after)]
     known = canary.pose
     if known is None:
         verdicts: list[Verdict] = ["not_found" if r.pose is None else "found" for r in results]
@@ -149,8 +148,8 @@ def answer_now(database: Database, image: bytes) -> tuple[KnownPose | None, int]
         ImageError: no usable image.
     """
     localiser = Localiser.open(database)
-    request = localise_request(LocaliseWireRequest(), image, probe(image))
-    result = localiser.localise(decode_gray(image), request)
+    gray, header = decode_photo(image, localiser)
+    result = localiser.localise(gray, localise_request(LocaliseWireRequest(), image, header), header.size)
     if result.pose is None:
         return None, localiser.snapshot
     known = KnownPose(

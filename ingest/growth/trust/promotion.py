@@ -75,7 +75,7 @@ def promote_confirmed(
         StoreError
     """
     snapshot = database.snapshot()
-    asked = _question(database, options, new)
+    asked = _question(snapshot, database, options, new)
     open_maps: list[MapSummary] = []
     outcomes: list[Promotion] = []
     for summary in snapshot.maps():
@@ -99,7 +99,7 @@ def promote_confirmed(
     if not ready:
         return outcomes + stay
     decided = _promote(database, localiser, ready, examine)
-    _remember(work, decided, _question(database, options, new))
+    _remember(work, decided, _question(database.snapshot(), database, options, new))
     return outcomes + stay + decided
 
 
@@ -127,9 +127,9 @@ def _examined(
         sources = more
 
 
-def _question(database: Database, options: GrowthOptions, new: NewPhotos | None) -> str:
+def _question(snapshot: Snapshot, database: Database, options: GrowthOptions, new: NewPhotos | None) -> str:
     """Digest of all that an examination depends on: live maps, canaries, photos, whose word counts."""
-    maps = sorted(f"{m.write_id} {m.status}" for m in database.snapshot().maps())
+    maps = sorted(f"{m.write_id} {m.status}" for m in snapshot.maps())
     canaries = [f"{c.name} {c.created_at.isoformat()}" for c in list_canaries(database)]
     photos = [] if new is None else [new.given.photos[row].sha256 for row in new.rows]
     sources = _sources(database, options)

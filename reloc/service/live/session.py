@@ -261,8 +261,8 @@ class LiveSession:
         try:
             with self._follower:
                 self._answer_frames()
-        except Exception:
-            if not self._cut_off:
+        except Exception as error:
+            if not (self._cut_off and isinstance(error, WorkerEndedError)):
                 logger.exception("live session failed", extra=fields("internal", session=self.name))
                 self.end(EndReason.INTERNAL)
         self._on_end()
