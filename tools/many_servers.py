@@ -43,7 +43,9 @@ class _Slow:
 
     options, snapshot, areas = LocaliseOptions(), 1, ()
 
-    def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
+    def localise(
+        self, gray: NDArray[np.uint8], request: LocaliseRequest, size: tuple[int, int]
+    ) -> LocaliseResult:
         time.sleep(_TAKES_S)
         return LocaliseResult(
             reason="NO_COVERAGE",

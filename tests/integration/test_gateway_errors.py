@@ -219,7 +219,7 @@ def test_more_photos_than_the_gateway_takes_are_busy_at_once():
         gate.wait()
         return plain(gray, request)
 
-    localiser.localise = held
+    localiser.localise = lambda gray, request, size: held(gray, request)
     with (
         running_server(localiser) as server,
         running_gateway(server.endpoints[0], max_in_flight=1) as gateway,

@@ -59,8 +59,8 @@ def messages():
     plain = ScriptedLocaliser(1)
 
     class Mixed(ScriptedLocaliser):
-        def localise(self, gray, request):
-            return answer(gray, request) or plain.localise(gray, request)
+        def localise(self, gray, request, size):
+            return answer(gray, request) or plain.localise(gray, request, size)
 
     source = MemorySource(area_of(Mixed(1)))
     options = ServeOptions(poll_interval_s=0.05, limits=DecodeLimits(max_bytes=100_000))

@@ -128,7 +128,9 @@ class ScriptedLocaliser:
             with suppress(OSError):  # the worker may have been killed meanwhile
                 connection.send(answer)
 
-    def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
+    def localise(
+        self, gray: NDArray[np.uint8], request: LocaliseRequest, size: tuple[int, int]
+    ) -> LocaliseResult:
         self.requests.append(request)
         self.grays.append(gray)
         if self._answer is not None:
@@ -146,9 +148,11 @@ class _Remote:
     def __init__(self, address: str, authkey: bytes, snapshot: int, areas: tuple[IndexedArea, ...]) -> None:
         self.areas, self.snapshot, self._address, self._authkey = areas, snapshot, address, authkey
 
-    def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
+    def localise(
+        self, gray: NDArray[np.uint8], request: LocaliseRequest, size: tuple[int, int]
+    ) -> LocaliseResult:
         with mp.Client(self._address, authkey=self._authkey) as connection:
-            connection.send((gray, request))
+            connection.send((gray, request, size))
             answer = connection.recv()
         if isinstance(answer, Exception):
             raise answer
