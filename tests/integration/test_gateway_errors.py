@@ -215,11 +215,11 @@ def test_more_photos_than_the_gateway_takes_are_busy_at_once():
     localiser = ScriptedLocaliser(1)
     plain = localiser.localise
 
-    def held(gray, request):
+    def held(gray, request, size):
         gate.wait()
-        return plain(gray, request)
+        return plain(gray, request, size)
 
-    localiser.localise = lambda gray, request, size: held(gray, request)
+    localiser.localise = held
     with (
         running_server(localiser) as server,
         running_gateway(server.endpoints[0], max_in_flight=1) as gateway,
