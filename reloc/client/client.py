@@ -217,7 +217,7 @@ class Client:
                 except ServiceError as error:
                     if error.code == TIMEOUT:
                         self._fleet.lose(server_id)
-                        raise
+                        raise said or error from None  # a server that ends may be silent when asked again
                     if error.code in (NO_SERVER, ErrorCode.SHUTTING_DOWN) and server_id != ANY:
                         self._fleet.lose(server_id)
                         lost.add(server_id)
