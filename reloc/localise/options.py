@@ -91,7 +91,7 @@ class LocaliseOptions:
     """All of the localisation's settings."""
 
     extractor: ExtractorOptions = field(
-        default_factory=lambda: ExtractorOptions(first_octave_px=1400, max_features=3000, oversample=1.25)
+        default_factory=lambda: ExtractorOptions(first_octave_px=1600, max_features=3000, oversample=1.25)
     )
     candidates: CandidateOptions = field(default_factory=CandidateOptions)
     matching: PointMatchOptions = field(default_factory=PointMatchOptions)
