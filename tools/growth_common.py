@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from featuredb.features.decode import decode_gray, probe
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.world import Truth, read_truth
@@ -25,7 +24,7 @@ from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from reloc.localise.result import LocaliseResult
 from reloc.localiser import Localiser
-from reloc.service.handler import localise_request
+from reloc.service.handler import decode_photo, localise_request
 from reloc.wire.query import LocaliseWireRequest
 from tools.figures import say, study_parser, write_figures
 from tools.growth_gates import WRONG_M, recorded
@@ -225,8 +224,8 @@ def _album_name(album: Album, name: str, folder: str = "") -> str:
 def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     """The answer to a photo, asked as a client does that knows nothing but the file."""
     data = photo.read_bytes()
-    gray = decode_gray(data)
-    return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, probe(data)))
+    gray, header = decode_photo(data, localiser)
+    return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, header), header.size)
 
 
 def conclude(out: Path, name: str, verdicts: Sequence[Verdict]) -> int:
