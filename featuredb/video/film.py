@@ -104,12 +104,14 @@ class VideoFrame:
         rgb: makes the colours (h, w, 3) uint8, red first, anew at each call, from one thread at a time.
             Raises VideoError where the picture's format cannot be converted, or its file is no longer there.
             Holds on to the decoded picture (1.5 bytes a pixel at full size).
+        camera_key: of a picture in a folder of several cameras; "" where the film's own holds.
     """
 
     index: int
     time_s: float
     gray: NDArray[np.uint8]
     rgb: Callable[[], NDArray[np.uint8]] = field(repr=False)
+    camera_key: str = ""
 
     def __post_init__(self) -> None:
         if self.gray.ndim != 2 or self.gray.dtype != np.uint8 or not self.gray.size:

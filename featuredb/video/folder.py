@@ -78,7 +78,9 @@ class FolderVideo(Video):
         self._closed = False
         length_s = timed[-1][0] - timed[0][0]
         rate = (len(timed) - 1) / length_s if length_s > 0 else options.fps
-        exif = self._exif()
+        told = [self._exif_of(timed[i][1]) for i in sorted({0, len(timed) // 2, len(timed) - 1})]
+        self._several_cameras = len({exif.camera_key for exif in told}) > 1
+        exif = ExifInfo() if self._several_cameras else told[0]
         super().__init__(
             VideoInfo(
                 name=folder.name or str(folder),
@@ -119,7 +121,13 @@ class FolderVideo(Video):
         gray = self._pixels(decode_gray, name)
         self._report.decoded += 1
         self._report.last_s = time_s
-        return VideoFrame(index=index, time_s=time_s, gray=gray, rgb=lambda: self._pixels(decode_rgb, name))
+        return VideoFrame(
+            index=index,
+            time_s=time_s,
+            gray=gray,
+            rgb=lambda: self._pixels(decode_rgb, name),
+            camera_key=self._exif_of(name).camera_key if self._several_cameras else "",
+        )
 
     def _pixels(
         self, decode: Callable[[Path, DecodeLimits], NDArray[np.uint8]], name: str
@@ -137,14 +145,12 @@ class FolderVideo(Video):
         except ImageError as error:
             raise VideoError(f"{self._folder.name}: the picture {name} cannot be read: {error}") from error
 
-    def _exif(self) -> ExifInfo:
-        """What the first picture says of its camera, if one in the middle and the last say the same."""
-        names = [self._timed[i][1] for i in sorted({0, len(self._timed) // 2, len(self._timed) - 1})]
+    def _exif_of(self, name: str) -> ExifInfo:
+        """What a picture says of its camera."""
         try:
-            said = [read_exif((self._folder / name).read_bytes()) for name in names]
+            return read_exif((self._folder / name).read_bytes())
         except OSError:
             return ExifInfo()  # whoever comes to that picture says what is wrong with it
-        return said[0] if len({exif.camera_key for exif in said}) == 1 else ExifInfo()
 
 
 def _timed(folder: Path, names: list[str], fps: float | None) -> list[tuple[float, str]]:

@@ -63,11 +63,15 @@ _INSTANT_S = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RecentFrame:
-    """A frame: its number, its time on the film's clock, and its grey values (h, w) uint8."""
+    """A frame: its number, its time on the film's clock, and its grey values (h, w) uint8.
+
+    `camera_key`: where it has another camera than the film.
+    """
 
     index: int
     time_s: float
     gray: NDArray[np.uint8]
+    camera_key: str = ""
 
 
 class RecentFrames:

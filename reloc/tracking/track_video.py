@@ -217,7 +217,7 @@ def track_video(
             clock.lap("tracking")
             for frame in until_it_ends(ahead, trouble):
                 clock.lap("waiting")
-                tracked = tracker.track(frame.gray, frame.time_s)
+                tracked = tracker.track(frame.gray, frame.time_s, frame.camera_key)
                 point = point_of(tracked)
                 points.append(point)
                 _filled(points, tracker.late)

@@ -88,11 +88,14 @@ class Tracker:
         """Intrinsics in use, or of the last frame with a pose; None until something was localised."""
         return self._camera if self._track is None else self._track.camera
 
-    def track(self, gray: NDArray[np.uint8], time_s: float) -> TrackedFrame:
-        """The pose of the next frame (h, w) uint8, taken at `time_s`, later than the last one."""
+    def track(self, gray: NDArray[np.uint8], time_s: float, camera_key: str = "") -> TrackedFrame:
+        """The pose of the next frame (h, w) uint8, taken at `time_s`, later than the last one.
+
+        `camera_key`: where it has another camera than the film.
+        """
         self._index += 1
         before = self._frames.last
-        now = RecentFrame(index=self._index, time_s=time_s, gray=gray)
+        now = RecentFrame(index=self._index, time_s=time_s, gray=gray, camera_key=camera_key)
         self._frames.add(now, self._needed_from())
         self._late = []
         fitted = None
@@ -318,7 +321,7 @@ class Tracker:
         if self._sent is not None:
             return
         self._behind, options = _FAR, self._options
-        answer = self._pool.submit(self._finder.find, now.gray.copy(), self._request_now(), options)
+        answer = self._pool.submit(self._finder.find, now.gray.copy(), self._request_of(now), options)
         due, due_s = now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s
         self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s, slow=True)
 
@@ -342,11 +345,14 @@ class Tracker:
         self._next_keyframe = now.index + options.keyframe_every
         self._next_keyframe_s = now.time_s + options.keyframe_every_s
 
-    def _request_now(self) -> LocaliseRequest:
+    def _request_of(self, frame: RecentFrame) -> LocaliseRequest:
+        asked = self._request
+        if frame.camera_key:
+            asked = replace(asked, camera_key=frame.camera_key)
         if not self._found:
-            return self._request
+            return asked
         # What was known of the first frame is not known of one after a loss.
-        asked = replace(self._request, camera=self._given, prior=None)
+        asked = replace(asked, camera=self._given, prior=None)
         if self._camera is None or asked.exif_focal_px is not None:
             return asked
         return replace(asked, exif_focal_px=self._camera.focal_px)

@@ -12,7 +12,10 @@ from featuredb.video.film import VideoOptions
 from featuredb.video.folder import natural_key
 from featuredb.video.frames import open_video
 from reloc.localise.result import LocaliseRequest
+from reloc.tracking.ground import Unmatched
+from reloc.tracking.options import TrackOptions
 from reloc.tracking.track_video import _with_film
+from reloc.tracking.tracker import Tracker
 from tests.support.films import HEIGHT, WIDTH, overwritten, picture, read, shown
 
 
@@ -162,3 +165,22 @@ def test_a_folder_says_whose_lens_its_pictures_have(tmp_path: Path) -> None:
     with open_video(folder, VideoOptions(fps=1.0)) as video:
         assert (video.info.camera_key, video.info.focal_px) == ("", None)
         assert _with_film(LocaliseRequest(), video.info, folder) == LocaliseRequest()
+        one, _, two = (frame.camera_key for frame in video)
+    assert one == info.camera_key
+    assert two.startswith("maker|two|")
+
+
+def test_a_frame_of_another_camera_is_looked_for_with_its_own_lens(tmp_path: Path) -> None:
+    keys = ["maker|one", "maker|two", "maker|two"]
+    asked: list[str | None] = []
+
+    class Nowhere:
+        def find(self, gray: np.ndarray, request: LocaliseRequest, options: TrackOptions) -> Unmatched:
+            asked.append(request.camera_key)
+            return Unmatched(reason="TOO_FEW_MATCHES", detail="")
+
+    at_once = TrackOptions(lost_answer_after=1)
+    with Tracker(Nowhere(), None, at_once, LocaliseRequest(camera_key="of the film")) as tracker:
+        for k, key in enumerate([*keys, "", ""]):  # the last one waits for the answer
+            tracker.track(picture(k)[:, :, 0], float(k), key)
+    assert asked[:4] == [*keys, "of the film"]
