@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from featuredb.adjust.block import Block, whole_camera
 from featuredb.adjust.problem import Problem
@@ -24,13 +25,14 @@ from reloc.localise.self_calibration import LensProblem, calibrate, measured_noi
 from reloc.wire.query import CameraRequest, LocaliseReply
 
 _LEAST_PHOTOS = 3  # that agree on a lens
-# By how much more a photo's pixels may disagree with the common lens than with one of its own: half a
-# chi-square of eight degrees of freedom, 99.9 % of which is below. Photos of one lens had 10 at most, those
-# of another camera 2,800 and more.
-_MAX_EXCESS = 13.1
-# Errors of neighbouring pixels are not independent: the focal lengths of random groups of 3 to 14 photos of a
-# simulated drone were off by 1.4 to 1.7 of the plain sigmas.
-_SIGMA_SCALE = 1.6
+# By how much more a photo's pixels disagree with the common lens than with one of its own is half a
+# chi-square of eight degrees of freedom, times a variance factor: errors of neighbouring pixels, and of a
+# real map's points, are not independent. The photos' median tells that factor; no more is believed than how
+# far photos disagree about lenses (decision 0004).
+_MEDIAN_EXCESS, _MAX_EXCESS = 0.5 * chdtri(8, 0.5), 0.5 * chdtri(8, 0.001)
+# The focal lengths of random groups of 3 to 14 photos of a simulated drone were off by 1.4 to 1.7 of the
+# plain sigmas, where excesses tell nothing.
+_LEAST_FACTOR, _MOST_FACTOR = 1.6**2, 50.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,10 +136,10 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
         camera = block.cameras[0]
         for r, found in zip(rows, block.cam_from_block, strict=True):
             excess[r] = problems[r].cost_of_pixels(found, camera) - alone[r]
+        factor = float(np.clip(np.median(excess[rows]) / _MEDIAN_EXCESS, _LEAST_FACTOR, _MOST_FACTOR))
         worst = max(rows, key=lambda r: excess[r])
-        if excess[worst] <= _MAX_EXCESS:
-            sigmas = _SIGMA_SCALE * np.sqrt(np.diag(covariance))
-            return SharedLens(camera=camera, sigmas=sigmas, agree=agree)
+        if excess[worst] <= factor * _MAX_EXCESS:
+            return SharedLens(camera=camera, sigmas=np.sqrt(factor * np.diag(covariance)), agree=agree)
         agree[worst] = False
     return None
 

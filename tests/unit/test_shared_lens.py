@@ -1,5 +1,7 @@
 """One lens of many photos, against scenes of exact geometry with noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -74,6 +76,20 @@ def test_the_sigmas_hold_over_many_draws() -> None:
         squared.append(((found.camera.params[0] - 900.0) / found.sigmas[0]) ** 2)
     # The scale that covers correlated pixels makes independent ones look better than they are.
     assert 0.02 < np.mean(squared) < 2.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_photos_of_one_lens_agree_on_a_map_that_is_not_exact(seed: int) -> None:
+    """Neighbouring points are off together, by as much as real maps' are."""
+    rng = np.random.default_rng(seed)
+    bent = []
+    for view in photos(rng, 10, TRUE):
+        waves = np.sin(view.points @ rng.normal(0.0, 0.06, (3, 3)) + rng.uniform(0.0, 6.0, 3))
+        bent.append(replace(view, points=view.points + 0.1 * waves))
+    found = shared_lens(bent)
+    assert found is not None
+    assert found.agree.all()
+    assert abs(found.camera.params[0] - 900.0) < 3.0 * found.sigmas[0]
 
 
 def test_a_photo_of_another_lens_is_left_out() -> None:
