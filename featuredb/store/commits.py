@@ -137,9 +137,9 @@ def apply_change(
     Raises:
         StaleVersionError: someone else committed since `table` was read.
     """
-    if change.only_adds and not change.added:
+    if change.added is not None and not change.added:
         return table.version
     metadata = {OPERATION: operation, CHANGED: "\n".join(changed), REASON: reason, **(extra or {})}
-    if change.only_adds:
+    if change.added is not None:
         return table.swap(rows_table(table.spec.name, change.added), mode="append", metadata=metadata)
     return table.swap(rows_table(table.spec.name, change.rows), mode="overwrite", metadata=metadata)

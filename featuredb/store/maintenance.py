@@ -1,12 +1,14 @@
 """Compaction and vacuum: fewer files, and no rows that nothing can see any more."""
 
 from collections import defaultdict
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 import pyarrow.compute as pc
 
-from featuredb.store.candidates.upkeep import named_writes, superfluous_images
+from featuredb.store.candidates.events import read_events
+from featuredb.store.candidates.upkeep import superfluous_images
 from featuredb.store.changes import RETIRED, Change
 from featuredb.store.commits import CHANGED, KEPT_FROM, OPERATION, REASON, apply_change, oldest_kept_version
 from featuredb.store.database import Database
@@ -75,15 +77,16 @@ def vacuum(
 
 def _vacuum(database: Database, options: VacuumOptions, dry_run: bool) -> VacuumReport:
     now = store_time(database.table(MAPS).storage)
-    kept_from = retry_stale("vacuum", lambda: _announce(database, options, now, dry_run))
-    named = write_ids_of_history(database, kept_from)
-    grace = timedelta(hours=options.orphan_grace_h)
+    history, grace = timedelta(hours=options.history_h), timedelta(hours=options.orphan_grace_h)
+    kept_from = retry_stale("vacuum", lambda: _announce(database, now - history, dry_run))
+    # Asked before rows are removed, which gives those beside them newer files.
+    refused = _refused_images(database, now, history, grace)
     orphans: set[str] = set()
-    for name in CHILD_TABLES:
+    gone = {scan_id for scan_id, time in retired_since(database).items() if time <= now - history}
+    for name, named in named_writes(database, kept_from, gone):
         orphans |= _remove_orphans(database.table(name), named, now - grace, dry_run)
-    orphans |= _vacuum_scans(database, options, now, dry_run)
-    unnamed, refused = _vacuum_candidates(database, options, now, dry_run)
-    orphans |= unnamed
+    if refused and not dry_run:
+        database.table(CANDIDATE_IMAGES).delete_rows("candidate_id", refused)
     return VacuumReport(
         kept_from=kept_from,
         write_ids=tuple(sorted(orphans)),
@@ -91,6 +94,24 @@ def _vacuum(database: Database, options: VacuumOptions, dry_run: bool) -> Vacuum
         files=tuple(_vacuum_files(database, options, kept_from, dry_run)),
         dry_run=dry_run,
     )
+
+
+def named_writes(
+    database: Database, first_version: int, gone: Collection[str] = ()
+) -> Iterator[tuple[str, set[str]]]:
+    """The child tables that there are, and the write ids that what is above each of them names.
+
+    Args:
+        first_version: of `maps`; what only earlier ones name does not count.
+        gone: ids of scans that do not count where they are retired.
+    """
+    named = write_ids_of_history(database, first_version)
+    yield from ((name, named) for name in CHILD_TABLES)
+    if database.has(LIDAR):
+        rows = [r for r in scan_rows(database) if r["status"] != RETIRED or r["scan_id"] not in gone]
+        yield LIDAR_POINTS, {row["write_id"] for row in rows}
+    if database.has(CANDIDATES):
+        yield CANDIDATE_IMAGES, {event["write_id"] for event in read_events(database)}
 
 
 def write_ids_of_history(database: Database, first_version: int) -> set[str]:
@@ -146,12 +167,11 @@ def _compact_maps(database: Database) -> int:
     return files - 1
 
 
-def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run: bool) -> int:
-    """Commit from which version on the past is kept; returns that version."""
+def _announce(database: Database, cutoff: datetime, dry_run: bool) -> int:
+    """Commit from which version on the past is kept: what was newest at a time; returns that version."""
     maps = database.table(MAPS)
     commits = maps.commits()
     # The version that was newest then, and all later ones; all if none is so old.
-    cutoff = now - timedelta(hours=options.history_h)
     old = [version for version, time in list_entries(maps.storage).items() if time <= cutoff]
     kept_from = max(*old, oldest_kept_version(commits), 0)
     if not dry_run and kept_from > oldest_kept_version(commits):
@@ -165,37 +185,15 @@ def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run
     return kept_from
 
 
-def _vacuum_scans(database: Database, options: VacuumOptions, now: datetime, dry_run: bool) -> set[str]:
-    """Remove points that no scan names, and those of scans that were retired before the kept history."""
-    if not database.has(LIDAR):
-        return set()
-    since = retired_since(database)
-    history = timedelta(hours=options.history_h)
-    named = {
-        row["write_id"]
-        for row in scan_rows(database)
-        if row["status"] != RETIRED or now - since.get(row["scan_id"], now) < history
-    }
-    grace = timedelta(hours=options.orphan_grace_h)
-    return _remove_orphans(database.table(LIDAR_POINTS), named, now - grace, dry_run)
-
-
-def _vacuum_candidates(
-    database: Database, options: VacuumOptions, now: datetime, dry_run: bool
-) -> tuple[set[str], set[str]]:
-    """Remove images that no event names, and those of photos that were refused long ago."""
+def _refused_images(database: Database, now: datetime, history: timedelta, grace: timedelta) -> set[str]:
+    """Photos that were refused long ago and that nobody is giving again just now."""
     if not database.has(CANDIDATES):
-        return set(), set()
+        return set()
     table = database.table(CANDIDATE_IMAGES)
-    grace = timedelta(hours=options.orphan_grace_h)
     writes = write_ids_in(table)
     times = write_times(writes, table.storage)
     fresh = {write_id for write_id in writes if write_id not in times or now - times[write_id] < grace}
-    refused = superfluous_images(database, now, timedelta(hours=options.history_h), fresh)
-    orphans = _remove_orphans(table, named_writes(database), now - grace, dry_run)
-    if refused and not dry_run:
-        table.delete_rows("candidate_id", refused)
-    return orphans, refused
+    return superfluous_images(database, now, history, fresh)
 
 
 def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dry_run: bool) -> list[str]:

@@ -271,7 +271,7 @@ def _add_row(database: Database, row: Row) -> str:
     if visible is not None:
         return str(visible["write_id"])
     kept = [r for r in rows if r["scan_id"] != row["scan_id"]]
-    change = Change(rows=[*kept, row], added=[row], only_adds=len(kept) == len(rows))
+    change = Change(rows=[*kept, row], added=[row] if len(kept) == len(rows) else None)
     apply_change(table, change, operation="lidar add", changed=[row["scan_id"]])
     return str(row["write_id"])
 

@@ -13,7 +13,7 @@ from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
 from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.photos import count_candidates
-from featuredb.store.candidates.upkeep import check_growth_tables, named_writes
+from featuredb.store.candidates.upkeep import check_growth_tables
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
@@ -21,17 +21,12 @@ from featuredb.store.durable.copies import LIST, CopyPlace, cut_off
 from featuredb.store.durable.filesystem import one_line, sha256_of, store_errors, table_files
 from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, encode_map
-from featuredb.store.maintenance import write_ids_in, write_ids_of_history
-from featuredb.store.scans import PointsChecksum, ScanSummary, list_scans, scan_batches, scan_rows
+from featuredb.store.maintenance import named_writes, write_ids_in
+from featuredb.store.scans import PointsChecksum, ScanSummary, list_scans, scan_batches
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import (
     BOUNDS,
-    CANDIDATE_IMAGES,
-    CANDIDATES,
-    CHILD_TABLES,
     IMAGES,
-    LIDAR,
-    LIDAR_POINTS,
     MAPS,
     OBSERVATIONS,
     POINTS,
@@ -267,12 +262,7 @@ def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
 
 def _orphans(database: Database) -> list[str]:
     first = oldest_kept_version(database.table(MAPS).commits())
-    present: set[str] = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
-    orphans = present - write_ids_of_history(database, first)
-    if database.has(LIDAR):
-        orphans |= set(write_ids_in(database.table(LIDAR_POINTS))) - {
-            r["write_id"] for r in scan_rows(database)
-        }
-    if database.has(CANDIDATES):
-        orphans |= set(write_ids_in(database.table(CANDIDATE_IMAGES))) - named_writes(database)
+    orphans: set[str] = set()
+    for name, named in named_writes(database, first):
+        orphans |= write_ids_in(database.table(name)).keys() - named
     return sorted(orphans)

@@ -16,11 +16,6 @@ from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATES
 _GROWTH = (CANDIDATES, CANDIDATE_IMAGES, CANARIES)
 
 
-def named_writes(database: Database) -> set[str]:
-    """Write ids of the events, which are those of the images that they name."""
-    return {event["write_id"] for event in read_events(database)}
-
-
 def superfluous_images(
     database: Database, now: datetime, history: timedelta, fresh_writes: Collection[str]
 ) -> set[str]:
@@ -28,8 +23,6 @@ def superfluous_images(
 
     Bytes of `fresh_writes` stay: somebody may be giving the photo again just now.
     """
-    if not database.has(CANDIDATES):
-        return set()
     live = live_maps(database)
     found = set()
     for candidate_id, events in by_candidate(read_events(database)).items():
