@@ -17,6 +17,7 @@ from featuredb.render.cloud import CloudNodes, PointCloud
 from featuredb.render.spacing import point_spacing
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_points
+from featuredb.store.snapshot import full_id
 from featuredb.store.tables import UTM_COORDINATES
 
 _RGB = ("red", "green", "blue")
@@ -124,25 +125,15 @@ def chosen_scans(database: Database, scan_ids: Sequence[str] | None) -> list[Sca
     """
     scans = list_scans(database)
     if scan_ids is not None:
-        meant = {_full_id(scans, start) for start in scan_ids}
+        ids, meant = [scan.scan_id for scan in scans], set()
+        for start in scan_ids:
+            said = f"no scan {start}" if start else "expected a scan's id or its first letters, found nothing"
+            none = ScanNotFoundError(f"{said}; `featuredb lidar list` lists what there is")
+            meant.add(full_id(start, ids, "scans", none))
         scans = [s for s in scans if s.scan_id in meant]
     if not scans:
         raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
     return scans
-
-
-def _full_id(scans: Sequence[ScanSummary], start: str) -> str:
-    """The id that is meant by itself, or by its first letters if no other begins so."""
-    ids = [scan.scan_id for scan in scans]
-    found = [start] if start in ids else [i for i in ids if start and i.startswith(start)]
-    if len(found) > 1:
-        raise ScanNotFoundError(
-            f"{start}: {len(found)} scans begin so ({', '.join(sorted(found)[:4])}); write more of the id"
-        )
-    if not found:
-        said = f"no scan {start}" if start else "expected a scan's id or its first letters, found nothing"
-        raise ScanNotFoundError(f"{said}; `featuredb lidar list` lists what there is")
-    return found[0]
 
 
 def _utm_box(frame: LocalFrame, box: PlanBox | None, epsg: int) -> PlanBox | None:

@@ -148,7 +148,7 @@ def add_canary(
 
 def list_canaries(database: Database) -> list[Canary]:
     """All known queries, by name."""
-    return [_canary(row) for row in sorted(_rows(database), key=lambda row: str(row["name"]))]
+    return [_canary(row) for row in sorted(database.rows(CANARIES, _LIGHT), key=lambda row: str(row["name"]))]
 
 
 def remove_canary(database: Database, name: str) -> None:
@@ -157,7 +157,7 @@ def remove_canary(database: Database, name: str) -> None:
     Raises:
         CanaryNotFoundError, ConflictError, StoreError
     """
-    mine = [row["canary_id"] for row in _rows(database) if row["name"] == name]
+    mine = [row["canary_id"] for row in database.rows(CANARIES, _LIGHT) if row["name"] == name]
     if not mine:
         raise CanaryNotFoundError(f"no canary {name!r}; `featuredb canary list` lists what there is")
     database.table(CANARIES).delete_rows("canary_id", mine, {OPERATION: "canary remove", CHANGED: name})
@@ -179,11 +179,6 @@ def load_canary_image(database: Database, canary: Canary) -> bytes:
     if hashlib.sha256(image).hexdigest() != canary.sha256:
         raise StoreError(f"canary {canary.name}: its image is not the one that was added")
     return image
-
-
-def _rows(database: Database) -> list[Row]:
-    """All rows without their images; none where the table does not exist."""
-    return read_rows(database.table(CANARIES), _LIGHT) if database.has(CANARIES) else []
 
 
 def _same(there: Row, wanted: Row) -> Row:

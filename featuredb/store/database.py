@@ -34,7 +34,7 @@ from featuredb.store.commits import (
     new_write_id,
 )
 from featuredb.store.decode import read_rows
-from featuredb.store.delta import Table
+from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.copies import check_restored
 from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
@@ -102,6 +102,12 @@ class Database:
     def table(self, name: str, version: int | None = None) -> Table:
         """A table at its newest or the given version; for maintenance and tests."""
         return Table.load(self.table_url(name), SPECS[name], self._storage_options, version)
+
+    def rows(
+        self, name: str, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()
+    ) -> list[Row]:
+        """Rows of a table at its newest version, as `read_rows`; none where there is no such table."""
+        return read_rows(self.table(name), columns, where) if self.has(name) else []
 
     def has(self, name: str) -> bool:
         """Whether there is a table of CHILDREN, and with it those of which it names rows.

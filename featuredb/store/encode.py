@@ -52,10 +52,10 @@ def encode_map(feature_map: AnyMap, write_id: str, created_at: datetime) -> Enco
     Raises:
         InvalidValueError: provenance or evidence that JSON cannot hold.
     """
-    ids = {"write_id": write_id, "map_id": feature_map.map_id}
-    point_tiles = _point_tiles(feature_map)
+    zone, point_tiles, utm, image_tiles = _where(feature_map)
+    ids = {"write_id": write_id, "map_id": feature_map.map_id, "zone": zone}
     children = {
-        IMAGES: _image_rows(feature_map, ids),
+        IMAGES: _image_rows(feature_map, ids, utm, image_tiles),
         POINTS: _point_rows(feature_map, ids, point_tiles),
         OBSERVATIONS: _observation_rows(feature_map, ids, point_tiles),
     }
@@ -79,7 +79,7 @@ def content_digest(feature_map: AnyMap) -> str:
     for array in (
         _coordinates(feature_map), points.rgb, points.track_length, points.error_px, points.covariance,
         seen.point_index, seen.image_id, seen.xy, seen.scale, seen.angle, seen.has_descriptor,
-        _masked_descriptors(seen),
+        np.where(seen.has_descriptor[:, None], seen.descriptors, np.uint8(0)),
     ):  # fmt: skip
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
@@ -90,10 +90,16 @@ def _coordinates(feature_map: AnyMap) -> FloatArray:
     return feature_map.points.xyz if isinstance(feature_map, UnplacedMap) else feature_map.points.utm
 
 
-def _point_tiles(feature_map: AnyMap) -> NDArray[Any]:
+def _where(feature_map: AnyMap) -> tuple[int, NDArray[Any], FloatArray, NDArray[Any]]:
+    """Zone, tiles of the points (n,), UTM (i, 3) and tiles (i,) of the cameras; NaN without a place."""
+    points, images = len(feature_map.points), len(feature_map.images)
     if isinstance(feature_map, UnplacedMap):
-        return np.full(len(feature_map.points), NO_TILE, dtype=object)
-    return np.asarray(tile_of(feature_map.points.utm), dtype=object)
+        none, no_utm = np.full(max(points, images), NO_TILE, dtype=object), np.full((images, 3), np.nan)
+        return NO_ZONE, none[:points], no_utm, none[:images]
+    centers = np.array([i.cam_from_local.center for i in feature_map.images], dtype=np.float64).reshape(-1, 3)
+    utm = feature_map.frame.utm_from_enu(centers, feature_map.epsg)
+    of_points = np.asarray(tile_of(feature_map.points.utm), dtype=object)
+    return feature_map.epsg, of_points, utm, tile_of(utm)
 
 
 def _place_columns(feature_map: AnyMap) -> Row:
@@ -178,36 +184,17 @@ def _image_row(image: MapImage) -> Row:
     }
 
 
-def _image_places(feature_map: AnyMap) -> tuple[FloatArray, list[str]]:
-    """UTM (n, 3) and tiles of the cameras; NaN and `NO_TILE` where the map has no place."""
-    count = len(feature_map.images)
-    if isinstance(feature_map, UnplacedMap):
-        return np.full((count, 3), np.nan), [NO_TILE] * count
-    centers = np.array([i.cam_from_local.center for i in feature_map.images], dtype=np.float64).reshape(-1, 3)
-    utm = feature_map.frame.utm_from_enu(centers, feature_map.epsg)
-    return utm, list(tile_of(utm))
-
-
-def _zone(feature_map: AnyMap) -> int:
-    return NO_ZONE if isinstance(feature_map, UnplacedMap) else feature_map.epsg
-
-
-def _image_rows(feature_map: AnyMap, ids: Row) -> pa.Table:
-    utm, tiles = _image_places(feature_map)
+def _image_rows(feature_map: AnyMap, ids: Row, utm: FloatArray, tiles: NDArray[Any]) -> pa.Table:
+    placed = zip(feature_map.images, utm.tolist(), tiles.tolist(), strict=True)
     rows = [
         {
             **ids,
             **_image_row(image),
             "image_index": index,
-            "easting": easting,
-            "northing": northing,
-            "height": height,
-            "zone": _zone(feature_map),
+            **dict(zip(UTM_COORDINATES, place, strict=True)),
             "tile": tile,
         }
-        for index, (image, (easting, northing, height), tile) in enumerate(
-            zip(feature_map.images, utm.tolist(), tiles, strict=True)
-        )
+        for index, (image, place, tile) in enumerate(placed)
     ]
     return rows_table(IMAGES, rows)
 
@@ -229,7 +216,7 @@ def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
         columns[name] = points.rgb[:, axis].astype(np.int16)
     for axis, name in enumerate(POINT_COVARIANCE):
         columns[name] = points.covariance[:, axis]
-    return table_of(POINTS, {**ids, "zone": _zone(feature_map)}, columns, len(points))
+    return table_of(POINTS, ids, columns, len(points))
 
 
 def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) -> pa.Table:
@@ -246,7 +233,7 @@ def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) 
         # An observation lies with its point, so that a tile's points come with all their descriptors.
         "tile": point_tiles[seen.point_index],
     }
-    return table_of(OBSERVATIONS, {**ids, "zone": _zone(feature_map)}, columns, len(seen))
+    return table_of(OBSERVATIONS, ids, columns, len(seen))
 
 
 def table_of(name: str, constants: Row, columns: dict[str, Any], count: int) -> pa.Table:
@@ -260,10 +247,6 @@ def table_of(name: str, constants: Row, columns: dict[str, Any], count: int) -> 
         else:
             arrays.append(pa.nulls(count, type=field.type))
     return pa.Table.from_arrays(arrays, schema=SPECS[name].schema)
-
-
-def _masked_descriptors(seen: MapObservations) -> NDArray[np.uint8]:
-    return np.where(seen.has_descriptor[:, None], seen.descriptors, np.uint8(0))
 
 
 def _descriptor_column(seen: MapObservations) -> pa.Array:

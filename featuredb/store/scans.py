@@ -95,10 +95,7 @@ class ScanSummary:
 
 def scan_rows(database: Database) -> list[Row]:
     """All rows of `lidar`, oldest first; none where the table does not exist."""
-    if not database.has(LIDAR):
-        return []
-    rows = read_rows(database.table(LIDAR))
-    return sorted(rows, key=lambda row: (row["created_at"], row["scan_id"]))
+    return sorted(database.rows(LIDAR), key=lambda row: (row["created_at"], row["scan_id"]))
 
 
 def list_scans(database: Database, *, include_retired: bool = False) -> list[ScanSummary]:

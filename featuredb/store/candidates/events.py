@@ -7,7 +7,6 @@ from featuredb.errors import CandidateNotFoundError
 from featuredb.store.candidates.states import CONTRIBUTED, event_order
 from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
-from featuredb.store.decode import read_rows
 from featuredb.store.delta import Condition
 from featuredb.store.encode import Row, rows_table
 from featuredb.store.tables import CANDIDATES, SPECS
@@ -21,13 +20,11 @@ def read_events(
     Args:
         answers: also what the server answered, the longest column by far.
     """
-    if not database.has(CANDIDATES):
-        return []
     where: list[Condition] = []
     if candidate_ids is not None:
         where = [("candidate_id", "in", sorted(candidate_ids))]
     columns = [name for name in SPECS[CANDIDATES].schema.names if answers or name != "answer"]
-    return sorted(read_rows(database.table(CANDIDATES), columns, where), key=event_order)
+    return sorted(database.rows(CANDIDATES, columns, where), key=event_order)
 
 
 def by_candidate(events: Iterable[Row]) -> dict[str, list[Row]]:

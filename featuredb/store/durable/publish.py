@@ -26,6 +26,7 @@ from featuredb.store.durable.log import (
     actions_digest,
     entry_name,
     named_checkpoint,
+    paths_of,
     read_actions,
 )
 from featuredb.store.retry import StaleVersionError
@@ -67,7 +68,7 @@ def publish(entries: Iterable[Path], work: Path, table: Path, version: int, *, r
     """
     for entry in entries:
         actions = read_actions(entry.read_bytes())
-        paths = [path for path in _paths("add", actions) if not (work / path).is_symlink()]
+        paths = [path for path in paths_of("add", actions) if not (work / path).is_symlink()]
         _note_digests(work, entry, actions, paths)
         for path in paths:
             flush(work / path)
@@ -133,10 +134,6 @@ def _note_digests(work: Path, entry: Path, actions: list[Action], paths: list[st
     entry.write_text("".join(json.dumps(action, separators=(",", ":")) + "\n" for action in actions))
 
 
-def _paths(kind: str, actions: Iterable[Action]) -> list[str]:
-    return [unquote(action[kind]["path"]) for action in actions if kind in action]
-
-
 def _link(entry: Path, actions: list[Action], log: Path, version: int, rebase: bool) -> int:
     """Give the entry the first free place from `version` on; returns it."""
     while True:
@@ -158,4 +155,4 @@ def _independent(mine: list[Action], entry: Path) -> bool:
     except ValueError as error:
         raise StoreError(f"cannot commit: log entry {entry}: {error}; run `featuredb repair`") from error
     changed = any("metaData" in action or "protocol" in action for action in theirs)
-    return not changed and not set(_paths("remove", mine)) & set(_paths("remove", theirs))
+    return not changed and not set(paths_of("remove", mine)) & set(paths_of("remove", theirs))

@@ -79,7 +79,7 @@ def _repair_table(
         if version < whole or whole < 0:
             advice = "restore the database from a backup: newer states build on this one"
             yield RepairStep(where=where, what=problem.what, action="", advice=advice)
-        elif head is not None and version <= head and not give_up_lost:
+        elif version <= head and not give_up_lost:
             advice = (
                 "it was acknowledged: restore the database from a backup, or give up what it said with "
                 f"--give-up-lost, which goes back to version {whole} of {name}"
@@ -88,7 +88,7 @@ def _repair_table(
         else:
             action = f"set aside: back to version {whole} of {name}"
             yield _step(files, where, problem, action, apply and version in there)
-            if apply and head is not None and head > whole:
+            if apply and head > whole:
                 forget_acknowledged(files, whole)
     if apply and broken:  # a checkpoint of what was set aside must go, too
         problems = list(log_problems(files))
