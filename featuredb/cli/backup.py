@@ -28,22 +28,20 @@ def register(subparsers: Any) -> None:
         parser.set_defaults(run=run)
 
 
-def run_backup(args: argparse.Namespace) -> int:
+def run_backup(args: argparse.Namespace) -> None:
     from featuredb.store.durable.backup import backup
 
     report = backup(open_database(args), args.target, _target_options(args))
     _write_report("backup", args.target, report)
-    return 0
 
 
-def run_restore(args: argparse.Namespace) -> int:
+def run_restore(args: argparse.Namespace) -> None:
     from featuredb.store import Database
     from featuredb.store.durable.backup import restore
 
     target = Database(args.target, _target_options(args))
     report = restore(args.db, target, storage_options(args))
     _write_report("database", target.url, report)
-    return 0
 
 
 def _target_options(args: argparse.Namespace) -> dict[str, str]:

@@ -75,16 +75,15 @@ def register(subparsers: Any) -> None:
     _register_repair(subparsers)
 
 
-def run_init(args: argparse.Namespace) -> int:
+def run_init(args: argparse.Namespace) -> None:
     from featuredb.store import Database
 
     place_for_database(args)
     database = Database.create(args.db, storage_options=storage_options(args))
     sys.stdout.write(f"database at {database.url}, version {database.poll_version()}\n")
-    return 0
 
 
-def run_maps(args: argparse.Namespace) -> int:
+def run_maps(args: argparse.Namespace) -> None:
     snapshot = open_database(args).snapshot(args.as_of)
     maps = snapshot.maps(include_retired=args.all)
     unplaced = snapshot.unplaced_maps(include_retired=args.all)
@@ -92,9 +91,8 @@ def run_maps(args: argparse.Namespace) -> int:
         wanted = {m.map_id for m in snapshot.any_maps(include_retired=args.all)}
         rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
         write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
-        return 0
+        return
     sys.stdout.write(maps_table(maps, snapshot.place_bounds()) + unplaced_text(unplaced))
-    return 0
 
 
 def maps_table(maps: Sequence["MapSummary"], bounds: Mapping[str, "PlaceBounds"]) -> str:
@@ -143,22 +141,20 @@ def unplaced_text(unplaced: Sequence["UnplacedSummary"]) -> str:
     return "".join(lines)
 
 
-def run_history(args: argparse.Namespace) -> int:
+def run_history(args: argparse.Namespace) -> None:
     rows = [
         (e.version, e.timestamp, e.operation, ", ".join(e.maps), e.reason)
         for e in open_database(args).history()
     ]
     sys.stdout.write(format_table(("version", "time", "operation", "maps", "reason"), rows))
-    return 0
 
 
-def run_sql(args: argparse.Namespace) -> int:
+def run_sql(args: argparse.Namespace) -> None:
     from featuredb.store.sql import SqlSession
 
     database = open_database(args)
     with SqlSession(database.snapshot(args.as_of), database) as session:
         write_result(session.query(args.query), args.format)
-    return 0
 
 
 def run_verify(args: argparse.Namespace) -> int:
@@ -182,7 +178,7 @@ def run_verify(args: argparse.Namespace) -> int:
     return 0 if report.ok else 1
 
 
-def run_retire(args: argparse.Namespace) -> int:
+def run_retire(args: argparse.Namespace) -> None:
     from featuredb.store.scans import list_scans, retire_scan
 
     database = open_database(args)
@@ -192,23 +188,20 @@ def run_retire(args: argparse.Namespace) -> int:
     elif retire_scan(database, args.map_id, args.reason):
         retired = (args.map_id,)
     sys.stdout.write(f"retired: {', '.join(retired) if retired else 'nothing, it was retired already'}\n")
-    return 0
 
 
-def run_rollback(args: argparse.Namespace) -> int:
+def run_rollback(args: argparse.Namespace) -> None:
     sys.stdout.write(f"version {open_database(args).rollback(args.version)}\n")
-    return 0
 
 
-def run_compact(args: argparse.Namespace) -> int:
+def run_compact(args: argparse.Namespace) -> None:
     from featuredb.store.maintenance import compact
 
     for table, saved in compact(open_database(args)).items():
         sys.stdout.write(f"{table}: {saved} files less\n")
-    return 0
 
 
-def run_upgrade(args: argparse.Namespace) -> int:
+def run_upgrade(args: argparse.Namespace) -> None:
     from featuredb.store.maintenance import upgrade
     from featuredb.store.tables import FORMAT_VERSION
 
@@ -216,7 +209,6 @@ def run_upgrade(args: argparse.Namespace) -> int:
     sys.stdout.writelines(f"{step}\n" for step in steps)
     if not steps:
         sys.stdout.write(f"format {FORMAT_VERSION}, nothing to do\n")
-    return 0
 
 
 def run_repair(args: argparse.Namespace) -> int:
@@ -239,7 +231,7 @@ def run_repair(args: argparse.Namespace) -> int:
     return 1 if open_ends else 0
 
 
-def run_vacuum(args: argparse.Namespace) -> int:
+def run_vacuum(args: argparse.Namespace) -> None:
     from featuredb.store.maintenance import vacuum
 
     options = VacuumOptions(
@@ -254,7 +246,6 @@ def run_vacuum(args: argparse.Namespace) -> int:
         f"{would} {len(report.files)} files and the rows of {len(report.write_ids)} writes that no map "
         f"names{images}; versions from {report.kept_from} on stay readable\n"
     )
-    return 0
 
 
 def write_result(result: "SqlResult", output: str) -> None:
@@ -276,24 +267,12 @@ def write_result(result: "SqlResult", output: str) -> None:
 
 def _register_vacuum(subparsers: Any) -> None:
     parser = add_command(subparsers, "vacuum", run_vacuum, "remove what no snapshot needs any more")
-    parser.add_argument(
-        "--keep-history-hours",
-        type=hours,
-        default=_DEFAULTS.history_h,
-        help="snapshots of this time stay readable (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--orphan-grace-hours",
-        type=hours,
-        default=_DEFAULTS.orphan_grace_h,
-        help="rows of unfinished commits stay this long (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--file-grace-hours",
-        type=hours,
-        default=_DEFAULTS.file_grace_h,
-        help="unused files stay this long for running readers (default: %(default)s)",
-    )
+    for option, default, text in (
+        ("--keep-history-hours", _DEFAULTS.history_h, "snapshots of this time stay readable"),
+        ("--orphan-grace-hours", _DEFAULTS.orphan_grace_h, "rows of unfinished commits stay this long"),
+        ("--file-grace-hours", _DEFAULTS.file_grace_h, "unused files stay this long for running readers"),
+    ):
+        parser.add_argument(option, type=hours, default=default, help=f"{text} (default: %(default)s)")
     parser.add_argument("--dry-run", action="store_true", help="only say what would be removed")
 
 

@@ -48,7 +48,7 @@ def register(subparsers: Any) -> None:
     picture.add_argument("out", metavar="PNG", type=Path)
 
 
-def run_add(args: argparse.Namespace) -> int:
+def run_add(args: argparse.Namespace) -> None:
     from featuredb.lidar.add import add_scan
     from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 
@@ -73,16 +73,15 @@ def run_add(args: argparse.Namespace) -> int:
 
         write_plan_view(database, result.scan, args.picture)
         sys.stdout.write(f"  {'picture':<12}{args.picture}\n")
-    return 0
 
 
-def run_list(args: argparse.Namespace) -> int:
+def run_list(args: argparse.Namespace) -> None:
     from featuredb.store.scans import list_scans
 
     scans = list_scans(open_database(args), include_retired=args.all)
     if args.json:
         write_json({"scans": [{**scan.row, "created_at": scan.created_at} for scan in scans]})
-        return 0
+        return
     header = (
         "scan", "name", "status", "epsg", "heights", "points", "spacing_m", "colour", "intensity",
         "east_m", "north_m", "files", "added",
@@ -97,17 +96,15 @@ def run_list(args: argparse.Namespace) -> int:
         for s in scans
     ]  # fmt: skip
     sys.stdout.write(format_table(header, table))
-    return 0
 
 
-def run_picture(args: argparse.Namespace) -> int:
+def run_picture(args: argparse.Namespace) -> None:
     from featuredb.lidar.picture import write_plan_view
     from featuredb.store.scans import find_scan
 
     database = open_database(args)
     write_plan_view(database, find_scan(database, args.scan_id), args.out)
     sys.stdout.write(f"{args.out}\n")
-    return 0
 
 
 def summary(scan: "ScanSummary", outcome: str) -> str:

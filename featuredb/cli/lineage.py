@@ -32,7 +32,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 
-def run_lineage(args: argparse.Namespace) -> int:
+def run_lineage(args: argparse.Namespace) -> None:
     snapshot = open_database(args).snapshot(args.as_of)
     lineages = snapshot.lineages()
     maps = _wanted(snapshot, args.map_id, include_retired=args.all)
@@ -45,7 +45,6 @@ def run_lineage(args: argparse.Namespace) -> int:
         write_json({"snapshot": snapshot.version, "maps": told})
     else:
         sys.stdout.writelines(f"{line}\n" for line in draw_tree(maps, lineages, args.map_id))
-    return 0
 
 
 def draw_tree(

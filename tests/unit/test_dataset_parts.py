@@ -186,7 +186,10 @@ def test_checksums_find_each_damage(tmp_path: Path) -> None:
 
 def test_every_column_is_explained() -> None:
     for table in (columns.MAPS, columns.CAMERAS, columns.IMAGES, columns.POINTS, columns.OBSERVATIONS):
-        assert table.schema.names == list(table.meaning)
+        meaning = table.meaning()
+        assert table.schema.names == list(meaning)
+        assert all(meaning.values())
+        assert set(table.words) <= set(meaning)
         assert set(table.repeating) <= set(table.schema.names)
 
 

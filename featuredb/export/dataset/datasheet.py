@@ -147,7 +147,7 @@ def _reading(contents: Contents) -> str:
 
 
 def _columns(title: str, table: columns.Columns) -> str:
-    rows = [(f"`{f.name}`", str(f.type), table.meaning[f.name]) for f in table.schema]
+    rows = [(f"`{n}`", str(table.schema.field(n).type), text) for n, text in table.meaning().items()]
     return f"\n### {title}\n" + _table(("column", "type", "what"), rows)
 
 
