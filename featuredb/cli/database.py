@@ -85,13 +85,12 @@ def run_init(args: argparse.Namespace) -> None:
 
 def run_maps(args: argparse.Namespace) -> None:
     snapshot = open_database(args).snapshot(args.as_of)
-    maps = snapshot.maps(include_retired=args.all)
-    unplaced = snapshot.unplaced_maps(include_retired=args.all)
     if args.json:
-        wanted = {m.map_id for m in snapshot.any_maps(include_retired=args.all)}
-        rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
+        rows = [row for row in snapshot.rows() if args.all or row["status"] != "retired"]
         write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
         return
+    maps = snapshot.maps(include_retired=args.all)
+    unplaced = snapshot.unplaced_maps(include_retired=args.all)
     sys.stdout.write(maps_table(maps, snapshot.place_bounds()) + unplaced_text(unplaced))
 
 

@@ -50,20 +50,22 @@ def register(subparsers: Any) -> None:
 
 def run_add(args: argparse.Namespace) -> None:
     from featuredb.lidar.add import add_scan
-    from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
+    from featuredb.lidar.options import AddOptions
 
     database = place_for_database(args)
     options = AddOptions(crs=args.crs, height_unit=args.height_unit, height_datum=args.height_datum)
     if args.keep_outliers:
         options = replace(options, outliers=None)
-    ortho = None if args.ortho is None else OrthoChoice(path=args.ortho, crs=args.ortho_crs)
     with _progress(args.quiet) as on_progress:
         result = add_scan(
             database,
             args.files,
             options,
-            ScanLabels(name=args.name, licence=args.licence, source=args.source),
-            ortho=ortho,
+            name=args.name,
+            licence=args.licence,
+            source=args.source,
+            ortho=args.ortho,
+            ortho_crs=args.ortho_crs,
             work=args.work,
             on_progress=on_progress,
         )

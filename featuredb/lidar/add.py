@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from featuredb.atomic import atomic_file, user_cache
 from featuredb.errors import ConflictError, GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
@@ -24,7 +26,7 @@ from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.formats.ortho_image import OrthoImage, open_ortho
 from featuredb.lidar.levels import finest_level
-from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
+from featuredb.lidar.options import AddOptions
 from featuredb.lidar.ortho import LAID
 from featuredb.lidar.spill import Spill
 from featuredb.lidar.staged import BlockPlan, Staged, stretch_of
@@ -116,9 +118,12 @@ def add_scan(
     database: Database,
     files: Sequence[Path],
     options: AddOptions | None = None,
-    labels: ScanLabels | None = None,
     *,
-    ortho: OrthoChoice | None = None,
+    name: str = "",
+    licence: str = "",
+    source: str = "",
+    ortho: Path | None = None,
+    ortho_crs: str | None = None,
     work: Path | None = None,
     on_progress: OnProgress = lambda step, done, total: None,
 ) -> AddResult:
@@ -130,7 +135,8 @@ def add_scan(
 
     Args:
         files: the files of one survey; they may differ in CRS, but not in the datum of their heights.
-        ortho: image that colours what is seen from above.
+        name: for listings; "" for the first file's name. licence, source: for those who use it later.
+        ortho: image that GDAL reads, which colours what is seen from above. ortho_crs: in place of its own.
         work: where unfinished work is kept; by default `_work` in a local database.
 
     Raises:
@@ -140,10 +146,11 @@ def add_scan(
         StoreError: the database cannot be written.
         MissingExtraError: the packages of the extra `lidar` are not installed.
     """
-    options, labels = options or AddOptions(), labels or ScanLabels()
-    opened = _open_all(files)
-    image = None if ortho is None else open_ortho(ortho.path, ortho.crs)
-    scan_id = options.scan_id([file.sha256 for file in opened], _ortho_identity(ortho))
+    options, opened = options or AddOptions(), _open_all(files)
+    image = None if ortho is None else open_ortho(ortho, ortho_crs)
+    # What tells the image and its use from others: name apart, so that a copy is the same.
+    look = [] if ortho is None else [file_sha256(ortho), ortho_crs or "", json.dumps(LAID, sort_keys=True)]
+    scan_id = options.scan_id([file.sha256 for file in opened], look)
     for scan in list_scans(database):
         if scan.scan_id == scan_id:
             return AddResult(created=False, scan=scan)
@@ -151,9 +158,10 @@ def add_scan(
     with work_folder(database, work, f"lidar-{scan_id}", sum(f.points for f in opened)) as folder:
         plan = _read_all(folder, inputs, options, on_progress)
         staged = _clean_all(folder, plan, options, image, inputs[0].to_utm.epsg, on_progress)
-        row = _row(scan_id, inputs, plan, staged, options, labels)
-        if ortho is not None:
-            row |= {"colour": "ortho", "ortho": json.dumps(_ortho_identity(ortho))}
+        row = _row(scan_id, inputs, plan, staged, options)
+        row |= {"name": name or inputs[0].file.path.name, "source": source, "licence": licence}
+        if look:
+            row |= {"colour": "ortho", "ortho": json.dumps(look)}
         Database.create(database.url, storage_options=database.storage_options)
         created, _ = commit_scan(
             database,
@@ -162,13 +170,6 @@ def add_scan(
             lambda points: on_progress("write", points, row["points"]),
         )
     return AddResult(created=created, scan=find_scan(database, scan_id))
-
-
-def _ortho_identity(ortho: OrthoChoice | None) -> list[str]:
-    """What tells the ortho image and its use from others: name apart, so that a copy is the same."""
-    if ortho is None:
-        return []
-    return [file_sha256(ortho.path), ortho.crs or "", json.dumps(LAID, sort_keys=True)]
 
 
 def _open_all(files: Sequence[Path]) -> list[ScanFile]:
@@ -217,7 +218,7 @@ def _read_all(
 ) -> BlockPlan:
     """Read all files into blocks, or find that this was done."""
     if (folder / _PLAN).is_file():
-        return BlockPlan.from_json(json.loads((folder / _PLAN).read_text()))
+        return TypeAdapter(BlockPlan).validate_json((folder / _PLAN).read_bytes())
     total = sum(item.file.points for item in inputs)
     spill = Spill(folder / "spill")
     spill.clear()
@@ -275,14 +276,12 @@ def _row(
     plan: BlockPlan,
     staged: Staged,
     options: AddOptions,
-    labels: ScanLabels,
 ) -> Row:
-    """The scan's row in `lidar`."""
+    """The scan's row in `lidar`, but for what people say about it."""
     crs = inputs[0].crs
     notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
     return {
         "scan_id": scan_id,
-        "name": labels.name or inputs[0].file.path.name,
         "files": [_file_row(item) for item in inputs],
         "epsg": inputs[0].to_utm.epsg,
         "height_datum": crs.height_datum,
@@ -305,8 +304,6 @@ def _row(
         "height_unit_reason": crs.height_unit_reason,
         "notes": list(dict.fromkeys(notes)),
         "options": json.dumps(asdict(options), sort_keys=True),
-        "source": labels.source,
-        "licence": labels.licence,
     }
 
 

@@ -4,9 +4,10 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 
 from featuredb.lidar.outliers import OutlierOptions
+
+_FORMAT = 1  # raised when the same files and options give other rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,33 +50,3 @@ class AddOptions:
             chosen.pop(name)
         text = json.dumps([_FORMAT, sorted(sha256), list(ortho), chosen], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OrthoChoice:
-    """The ortho image that colours a scan.
-
-    Attributes:
-        path: an image that GDAL reads.
-        crs: its CRS in place of its own.
-    """
-
-    path: Path
-    crs: str | None = None
-
-
-_FORMAT = 1  # raised when the same files and options give other rows
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanLabels:
-    """What people say about a scan; does not change its id.
-
-    Attributes:
-        name: for listings; "" for the first file's name.
-        licence, source: for those who use it later.
-    """
-
-    name: str = ""
-    licence: str = ""
-    source: str = ""

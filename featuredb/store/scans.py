@@ -47,18 +47,8 @@ POINT_ROW = np.dtype(
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TilePoints:
-    """Points of one tile on their way into the store.
-
-    Attributes:
-        rows: (n,) POINT_ROW, by level and then node.
-        has_intensity: whether the intensities mean something.
-    """
-
-    tile: str
-    rows: NDArray[Any]
-    has_intensity: bool
+TileRows = tuple[str, NDArray[Any]]
+"""A tile, and points of it on their way into the store: (n,) POINT_ROW, by level and then node."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +108,7 @@ def find_scan(database: Database, scan_id: str) -> ScanSummary:
 def commit_scan(
     database: Database,
     row: Row,
-    groups: Iterable[Callable[[], Iterator[TilePoints]]],
+    groups: Iterable[Callable[[], Iterator[TileRows]]],
     on_progress: Callable[[int], None] = lambda points: None,
 ) -> tuple[bool, str]:
     """Write a scan's points and then its row; a scan that is visible already is left alone.
@@ -143,14 +133,15 @@ def commit_scan(
     checksum = PointsChecksum()
     written = 0
 
-    def batches(group: Callable[[], Iterator[TilePoints]]) -> Iterator[pa.RecordBatch]:
+    def batches(group: Callable[[], Iterator[TileRows]]) -> Iterator[pa.RecordBatch]:
         nonlocal written
-        for points in group():
-            table = _point_rows(points, row["epsg"], write_id)
-            checksum.add(points.rows["utm"])
-            written += len(points.rows)
+        for tile, points in group():
+            checksum.add(points["utm"])
+            written += len(points)
             on_progress(written)
-            yield from table.to_batches()
+            constants = {"write_id": write_id, "zone": row["epsg"], "tile": tile}
+            columns = _point_columns(points, row["has_intensity"])
+            yield from table_of(LIDAR_POINTS, constants, columns, len(points)).to_batches()
 
     for group in groups:
         stream = pa.RecordBatchReader.from_batches(SPECS[LIDAR_POINTS].schema, batches(group))
@@ -273,8 +264,7 @@ def _add_row(database: Database, row: Row) -> str:
     return str(row["write_id"])
 
 
-def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
-    rows, n = points.rows, len(points.rows)
+def _point_columns(rows: NDArray[Any], has_intensity: bool) -> dict[str, Any]:
     no_rgb = ~rows["has_rgb"]
     columns: dict[str, Any] = {
         "classification": rows["classification"].astype(np.int16),
@@ -287,10 +277,9 @@ def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
     for axis, name in enumerate(("red", "green", "blue")):
         if not no_rgb.all():
             columns[name] = pa.array(rows["rgb"][:, axis].astype(np.int16), mask=no_rgb)
-    if points.has_intensity:
+    if has_intensity:
         columns["intensity"] = rows["intensity"].astype(np.int16)
-    constants = {"write_id": write_id, "zone": epsg, "tile": points.tile}
-    return table_of(LIDAR_POINTS, constants, columns, n)
+    return columns
 
 
 def _level_rows(

@@ -5,7 +5,7 @@ needs, and has no way to files, network, extensions or settings.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -104,7 +104,7 @@ class SqlTable:
         return f"<table><tr>{head}</tr>{body}</table><p>{len(self)} rows</p>"
 
 
-class SqlSession:
+class SqlSession(AbstractContextManager["SqlSession"]):
     """DuckDB over one snapshot; a context manager.
 
     Views: `maps` (retired ones included, see its column `status`); `images`, `points`, `observations` and
@@ -122,9 +122,6 @@ class SqlSession:
             self._register_growth(database)
         self._connection.execute("SET enable_external_access = false")
         self._connection.execute("SET lock_configuration = true")
-
-    def __enter__(self) -> "SqlSession":
-        return self
 
     def __exit__(self, *failed: object) -> None:
         self._connection.close()

@@ -18,7 +18,7 @@ from featuredb.errors import (
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import chosen_scans, load_cloud, scan_frame
-from featuredb.lidar.options import AddOptions, ScanLabels
+from featuredb.lidar.options import AddOptions
 from featuredb.store import Database
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.scans import find_scan, list_scans, retire_scan
@@ -162,7 +162,7 @@ def test_files_of_one_survey_become_one_scan(database: Database, tmp_path: Path)
         write_scan(tmp_path / "west.laz", xyz[west], red=np.full(west.sum(), 200)),
         write_scan(tmp_path / "east.laz", xyz[~west], point_format=6),
     ]
-    result = add_scan(database, files, labels=ScanLabels(name="both", licence="CC0", source="test"))
+    result = add_scan(database, files, name="both", licence="CC0", source="test")
     assert result.scan.points == 4000
     assert (result.scan.name, result.scan.licence, result.scan.row["source"]) == ("both", "CC0", "test")
     assert [f["points"] for f in result.scan.row["files"]] == [int(west.sum()), int((~west).sum())]

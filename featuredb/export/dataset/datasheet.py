@@ -169,7 +169,7 @@ def _counts(counts: Mapping[str, int]) -> str:
 
 
 def _words(value: Any) -> str:
-    return _plain(", ".join(map(str, value)) if isinstance(value, list) else str(value))
+    return _plain(", ".join(map(str, value)) if isinstance(value, tuple) else str(value))
 
 
 def _plain(text: str) -> str:

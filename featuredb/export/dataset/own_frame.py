@@ -4,6 +4,7 @@ They have no coordinates on Earth, so neither GeoParquet nor the catalogue has r
 """
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ def table_path(table: str) -> str:
     return f"{FOLDER}/{table}.parquet"
 
 
-class OwnFrameFiles:
+class OwnFrameFiles(AbstractContextManager["OwnFrameFiles"]):
     """Writes maps without a place one after the other; use it in a `with` block. No map, no folder."""
 
     def __init__(self, folder: Path) -> None:
@@ -44,9 +45,6 @@ class OwnFrameFiles:
                 self._open[table] = TableFile(path, SPECS[table].schema, ("map_id",))
             if len(rows):
                 self._open[table].write(rows.cast(SPECS[table].schema))
-
-    def __enter__(self) -> "OwnFrameFiles":
-        return self
 
     def __exit__(self, *failed: object) -> None:
         for file in self._open.values():

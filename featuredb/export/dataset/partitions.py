@@ -1,5 +1,6 @@
 """The files that hold the rows of all maps: by zone and height datum, cut before they grow too large."""
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ COLUMNS = {POINTS: columns.POINTS, IMAGES: columns.IMAGES, OBSERVATIONS: columns
 LARGEST_ROWS = 4_000_000
 
 
-class PartitionFiles:
+class PartitionFiles(AbstractContextManager["PartitionFiles"]):
     """Writes maps one after the other; use it in a `with` block.
 
     A file holds maps of one zone and height datum. A map is in one file of each table, and a row group has
@@ -71,9 +72,6 @@ class PartitionFiles:
             return TableFile(path, what.schema, what.repeating)
         crs = utm_projjson(partition.epsg, partition.height_datum)
         return GeoFile(path, what.schema, what.repeating, crs)
-
-    def __enter__(self) -> "PartitionFiles":
-        return self
 
     def __exit__(self, *failed: object) -> None:
         for file in self._open.values():

@@ -245,7 +245,6 @@ def _lineage_json(lineage: MapLineage) -> str:
 
 def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict[str, Any]:
     """What `dataset.json` says, and the datasheet and the catalogue are made of."""
-    chosen = job.selection
     return {
         "format": layout.FORMAT,
         "format_version": layout.FORMAT_VERSION,
@@ -253,13 +252,7 @@ def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict
         "snapshot": job.snapshot.version,
         "snapshot_time": job.snapshot.timestamp.isoformat(),
         "featuredb": version("featuredb"),
-        "selection": {
-            "maps": list(chosen.maps),
-            "statuses": list(chosen.statuses),
-            "bbox": None if chosen.bbox is None else list(chosen.bbox),
-            "where": chosen.where,
-            "licences": None if chosen.licences is None else list(chosen.licences),
-        },
+        "selection": asdict(job.selection),
         **{name: contents.total(name) for name in ("images", "points", "observations", "descriptors")},
         "maps": len(contents.maps),
         **({"maps_without_a_place": len(own.rows)} if own.rows else {}),

@@ -60,7 +60,7 @@ def write_exif(job: ExportJob, photos: Path | None) -> Exported:
             names = image_names(feature_map)
             credits = attribution_of(feature_map)
             for shot, name, credit in zip(shots_of(feature_map), names, credits, strict=True):
-                outcome = _copy(part, folder / _safe(name), shot, found.get(shot.sha256))
+                outcome = _copy(part, folder / _safe(name), shot, found.get(shot.image.sha256))
                 files.append(outcome)
                 if not outcome.reason:
                     attribution.append(credit)
@@ -124,10 +124,10 @@ def properties(shot: PosedPhoto) -> dict[str, str]:
         "Camera:GPSZAccuracy": f"{up:.4f}",
         "featuredb:HeightDatum": altitude_of(shot)[1],
         "featuredb:MapId": shot.map_id,
-        "featuredb:OriginalSha256": shot.sha256,
+        "featuredb:OriginalSha256": shot.image.sha256,
     }
-    if shot.owner:
-        told["featuredb:Owner"] = shot.owner
+    if shot.image.owner:
+        told["featuredb:Owner"] = shot.image.owner
     if shot.licence:
         told["featuredb:Licence"] = shot.licence
     return told
@@ -146,7 +146,9 @@ def _copy(part: Path, name: Path, shot: PosedPhoto, original: Path | None) -> _F
             (part / name).parent.mkdir(parents=True, exist_ok=True)
             (part / name).write_bytes(data)
     file = "" if reason else name.as_posix()
-    return _File(map_id=shot.map_id, image=shot.name, sha256=shot.sha256, file=file, reason=reason)
+    return _File(
+        map_id=shot.map_id, image=shot.image.name, sha256=shot.image.sha256, file=file, reason=reason
+    )
 
 
 def _safe(name: str) -> Path:
