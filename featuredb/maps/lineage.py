@@ -107,18 +107,17 @@ def children_of(maps: Iterable[Described]) -> dict[str, tuple[str, ...]]:
 
 def family_of(map_id: str, maps: Mapping[str, Described]) -> set[str]:
     """The map, all that it stands on and all that stands on it, as far as they are among `maps`."""
-    down = children_of(maps.values())
     up = {m: described.parents for m, described in maps.items()}
-    return _reach(map_id, up, maps) | _reach(map_id, down, maps)
+    return (reached(map_id, up) | reached(map_id, children_of(maps.values()))) & maps.keys()
 
 
-def _reach(start: str, following: Mapping[str, tuple[str, ...]], maps: Mapping[str, Described]) -> set[str]:
+def reached(start: str, following: Mapping[str, Sequence[str]]) -> set[str]:
+    """What can be reached from there, itself included, by what follows each."""
     found, queue = {start}, [start]
     while queue:
-        for other in following.get(queue.pop(), ()):
-            if other in maps and other not in found:
-                found.add(other)
-                queue.append(other)
+        more = set(following.get(queue.pop(), ())) - found
+        found |= more
+        queue += more
     return found
 
 

@@ -128,12 +128,15 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
         return Change(rows=list(rows), added=()), []
     dependants = sorted(anchored(rows) - anchored(rows, without=map_id) - {map_id})
     retired = [map_id, *dependants]
-    changed = _with_status(rows, [map_id], RETIRED, reason)
-    return Change(rows=_with_status(changed, dependants, RETIRED, f"{reason} ({map_id})")), retired
+    changed = with_status(rows, [map_id], RETIRED, reason)
+    return Change(rows=with_status(changed, dependants, RETIRED, f"{reason} ({map_id})")), retired
 
 
-def _with_status(rows: Iterable[Row], map_ids: Sequence[str], status: str, reason: str) -> list[Row]:
-    return [{**r, "status": status, "status_reason": reason} if r["map_id"] in map_ids else r for r in rows]
+def with_status(
+    rows: Iterable[Row], ids: Sequence[str], status: str, reason: str, column: str = "map_id"
+) -> list[Row]:
+    """The rows, with another status of some maps, or of scans by `scan_id`."""
+    return [{**r, "status": status, "status_reason": reason} if r[column] in ids else r for r in rows]
 
 
 def change_status(
@@ -164,13 +167,13 @@ def change_status(
     wanted = [m for m in dict.fromkeys(map_ids) if known[m]["status"] != status]
     if not wanted:
         return Change(rows=list(rows), added=()), []
-    changed = _with_status(rows, wanted, status, reason)
+    changed = with_status(rows, wanted, status, reason)
     standing = anchored(changed, statuses=(ACTIVE,))
     if status == ACTIVE:
         _check_parents(known, [m for m in wanted if m not in standing])
         return Change(rows=changed), wanted
     fallen = sorted(anchored(rows, statuses=(ACTIVE,)) - standing - set(wanted))
-    changed = _with_status(changed, fallen, QUARANTINED, f"{reason} ({', '.join(wanted)})")
+    changed = with_status(changed, fallen, QUARANTINED, f"{reason} ({', '.join(wanted)})")
     return Change(rows=changed), [*wanted, *fallen]
 
 

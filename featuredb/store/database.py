@@ -59,19 +59,14 @@ class Database:
         self._poll_table: Table | None = None
 
     @classmethod
-    def create(
-        cls, url: str | Path, *, exist_ok: bool = True, storage_options: Mapping[str, str] | None = None
-    ) -> "Database":
-        """Make the tables at a URL, `maps` last, and open the database.
+    def create(cls, url: str | Path, *, storage_options: Mapping[str, str] | None = None) -> "Database":
+        """Make the tables at a URL, `maps` last, where there are none, and open the database.
 
         Raises:
-            StoreError: a database is there and `exist_ok` is false, one is being restored there, or the place
-                cannot be written.
+            StoreError: a database is being restored there, or the place cannot be written.
         """
         database = cls(str(url), storage_options)
         check_restored(database.url, database._storage_options)
-        if not exist_ok and database.has(MAPS):
-            raise StoreError(f"there is a database at {database.url} already")
         database.make(MAPS)
         database.table(MAPS)
         return database
@@ -293,9 +288,17 @@ class Database:
         return self.change_maps(f"{status} for {', '.join(map_ids)}", operation, reason, decided)
 
     def change_maps(
-        self, what: str, operation: str, reason: str, make: Callable[[list[Row]], tuple[Change, list[str]]]
+        self,
+        what: str,
+        operation: str,
+        reason: str,
+        make: Callable[[list[Row]], tuple[Change, list[str]]],
+        name: str = MAPS,
     ) -> StatusResult:
         """Commit what `make` makes of the newest rows of `maps`: the change, and the ids that it is about.
+
+        Args:
+            name: LIDAR to change scans instead.
 
         Raises:
             ConflictError: other writers were faster too many times. StoreError; and what `make` raises.
@@ -303,9 +306,9 @@ class Database:
         changed: list[str] = []
 
         def attempt() -> int:
-            maps = self.table(MAPS)
-            change, changed[:] = make(read_rows(maps))
-            return apply_change(maps, change, operation=operation, changed=changed, reason=reason)
+            table = self.table(name)
+            change, changed[:] = make(read_rows(table))
+            return apply_change(table, change, operation=operation, changed=changed, reason=reason)
 
         version = retry_stale(what, attempt)
         return StatusResult(version=version, changed=tuple(changed))

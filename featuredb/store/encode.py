@@ -19,20 +19,7 @@ from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObservations
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
-from featuredb.store.tables import (
-    BOUNDS,
-    IMAGES,
-    NO_PLACE_COLUMNS,
-    NO_TILE,
-    NO_ZONE,
-    OBSERVATIONS,
-    OWN_COORDINATES,
-    PLACE_COLUMNS,
-    POINT_COVARIANCE,
-    POINTS,
-    SPECS,
-    UTM_COORDINATES,
-)
+from featuredb.store import tables
 
 Row = dict[str, Any]
 AS_IN_MAP = ("map_id", "name", "status", "extractor_fingerprint", "source", "licence")
@@ -55,12 +42,12 @@ def encode_map(feature_map: AnyMap, write_id: str, created_at: datetime) -> Enco
     zone, point_tiles, utm, image_tiles = _where(feature_map)
     ids = {"write_id": write_id, "map_id": feature_map.map_id, "zone": zone}
     children = {
-        IMAGES: _image_rows(feature_map, ids, utm, image_tiles),
-        POINTS: _point_rows(feature_map, ids, point_tiles),
-        OBSERVATIONS: _observation_rows(feature_map, ids, point_tiles),
+        tables.IMAGES: _image_rows(feature_map, ids, utm, image_tiles),
+        tables.POINTS: _point_rows(feature_map, ids, point_tiles),
+        tables.OBSERVATIONS: _observation_rows(feature_map, ids, point_tiles),
     }
     found = {tile for table in children.values() for tile in table["tile"].unique().to_pylist()}
-    tiles = sorted(found - {NO_TILE})
+    tiles = sorted(found - {tables.NO_TILE})
     return EncodedMap(row=_map_row(feature_map, write_id, created_at, tiles), children=children)
 
 
@@ -69,7 +56,7 @@ def content_digest(feature_map: AnyMap) -> str:
     digest = hashlib.sha256()
     row = _map_row(feature_map, "", datetime.fromtimestamp(0, tz=UTC), [], digest="")
     # A placed map has the digest that format 1 gave it.
-    new = NO_PLACE_COLUMNS if isinstance(feature_map, FeatureMap) else ()
+    new = tables.NO_PLACE_COLUMNS if isinstance(feature_map, FeatureMap) else ()
     for name in ("status", "status_reason", *new):
         row.pop(name)
     row["created_at"] = ""
@@ -94,8 +81,8 @@ def _where(feature_map: AnyMap) -> tuple[int, NDArray[Any], FloatArray, NDArray[
     """Zone, tiles of the points (n,), UTM (i, 3) and tiles (i,) of the cameras; NaN without a place."""
     points, images = len(feature_map.points), len(feature_map.images)
     if isinstance(feature_map, UnplacedMap):
-        none, no_utm = np.full(max(points, images), NO_TILE, dtype=object), np.full((images, 3), np.nan)
-        return NO_ZONE, none[:points], no_utm, none[:images]
+        none = np.full(max(points, images), tables.NO_TILE, dtype=object)
+        return tables.NO_ZONE, none[:points], np.full((images, 3), np.nan), none[:images]
     centers = np.array([i.cam_from_local.center for i in feature_map.images], dtype=np.float64).reshape(-1, 3)
     utm = feature_map.frame.utm_from_enu(centers, feature_map.epsg)
     of_points = np.asarray(tile_of(feature_map.points.utm), dtype=object)
@@ -107,7 +94,7 @@ def _place_columns(feature_map: AnyMap) -> Row:
     if isinstance(feature_map, UnplacedMap):
         no_place = dataclasses.asdict(feature_map.no_place)
         return {
-            **dict.fromkeys((*PLACE_COLUMNS, *BOUNDS)),
+            **dict.fromkeys((*tables.PLACE_COLUMNS, *tables.BOUNDS)),
             "generation": 0,
             "frame_is_metric": feature_map.frame.metric,
             "frame_is_upright": feature_map.frame.upright,
@@ -116,10 +103,10 @@ def _place_columns(feature_map: AnyMap) -> Row:
     utm, placement, frame = feature_map.points.utm, feature_map.placement, feature_map.frame
     bounds = [*utm.min(axis=0).tolist(), *utm.max(axis=0).tolist()] if len(utm) else [None] * 6
     return {
-        **dict.fromkeys(NO_PLACE_COLUMNS),
+        **dict.fromkeys(tables.NO_PLACE_COLUMNS),
         "epsg": feature_map.epsg,
         "height_datum": feature_map.height_datum,
-        **dict(zip(BOUNDS, bounds, strict=True)),
+        **dict(zip(tables.BOUNDS, bounds, strict=True)),
         "method": placement.method,
         "generation": feature_map.generation,
         "residual_rms_m": float(placement.residual_rms_m),
@@ -191,12 +178,12 @@ def _image_rows(feature_map: AnyMap, ids: Row, utm: FloatArray, tiles: NDArray[A
             **ids,
             **_image_row(image),
             "image_index": index,
-            **dict(zip(UTM_COORDINATES, place, strict=True)),
+            **dict(zip(tables.UTM_COORDINATES, place, strict=True)),
             "tile": tile,
         }
         for index, (image, place, tile) in enumerate(placed)
     ]
-    return rows_table(IMAGES, rows)
+    return rows_table(tables.IMAGES, rows)
 
 
 def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
@@ -207,16 +194,16 @@ def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
         "error_px": points.error_px,
         "tile": tiles,
     }
-    here = UTM_COORDINATES
+    here = tables.UTM_COORDINATES
     if isinstance(feature_map, UnplacedMap):
-        here = OWN_COORDINATES
-        columns |= {name: np.full(len(points), np.nan) for name in UTM_COORDINATES}
+        here = tables.OWN_COORDINATES
+        columns |= {name: np.full(len(points), np.nan) for name in tables.UTM_COORDINATES}
     columns |= dict(zip(here, _coordinates(feature_map).T, strict=True))
     for axis, name in enumerate(("red", "green", "blue")):
         columns[name] = points.rgb[:, axis].astype(np.int16)
-    for axis, name in enumerate(POINT_COVARIANCE):
+    for axis, name in enumerate(tables.POINT_COVARIANCE):
         columns[name] = points.covariance[:, axis]
-    return table_of(POINTS, ids, columns, len(points))
+    return table_of(tables.POINTS, ids, columns, len(points))
 
 
 def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) -> pa.Table:
@@ -233,20 +220,20 @@ def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) 
         # An observation lies with its point, so that a tile's points come with all their descriptors.
         "tile": point_tiles[seen.point_index],
     }
-    return table_of(OBSERVATIONS, ids, columns, len(seen))
+    return table_of(tables.OBSERVATIONS, ids, columns, len(seen))
 
 
 def table_of(name: str, constants: Row, columns: dict[str, Any], count: int) -> pa.Table:
     """`count` rows in the order and types of a table's schema: values that all share, columns, else null."""
     arrays = []
-    for field in SPECS[name].schema:
+    for field in tables.SPECS[name].schema:
         if field.name in constants:
             arrays.append(pa.repeat(pa.scalar(constants[field.name], type=field.type), count))
         elif field.name in columns:
             arrays.append(pa.array(columns[field.name], type=field.type))
         else:
             arrays.append(pa.nulls(count, type=field.type))
-    return pa.Table.from_arrays(arrays, schema=SPECS[name].schema)
+    return pa.Table.from_arrays(arrays, schema=tables.SPECS[name].schema)
 
 
 def _descriptor_column(seen: MapObservations) -> pa.Array:
@@ -261,4 +248,4 @@ def _descriptor_column(seen: MapObservations) -> pa.Array:
 
 def rows_table(name: str, rows: Sequence[Row]) -> pa.Table:
     """Rows of a table as an Arrow table."""
-    return pa.Table.from_pylist(list(rows), schema=SPECS[name].schema)
+    return pa.Table.from_pylist(list(rows), schema=tables.SPECS[name].schema)

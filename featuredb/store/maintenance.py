@@ -7,6 +7,7 @@ from datetime import datetime, timedelta
 
 import pyarrow.compute as pc
 
+from featuredb.store import tables
 from featuredb.store.candidates.events import read_events
 from featuredb.store.candidates.upkeep import superfluous_images
 from featuredb.store.changes import RETIRED, Change
@@ -20,15 +21,6 @@ from featuredb.store.durable.log import list_entries
 from featuredb.store.encode import rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.scans import retired_since, scan_rows
-from featuredb.store.tables import (
-    CANDIDATE_IMAGES,
-    CANDIDATES,
-    CHILD_TABLES,
-    FORMAT_VERSION,
-    LIDAR,
-    LIDAR_POINTS,
-    MAPS,
-)
 from featuredb.store.vacuum_options import VacuumOptions as VacuumOptions
 
 
@@ -54,9 +46,9 @@ def compact(database: Database) -> dict[str, int]:
     """Merge small files; returns for each table how many files it has less. Snapshots do not change."""
     saved = {}
     for name in database.tables():
-        if name not in (MAPS, LIDAR):
+        if name not in (tables.MAPS, tables.LIDAR):
             saved[name] = database.table(name).compact()
-    saved[MAPS] = retry_stale("compact maps", lambda: _compact_maps(database))
+    saved[tables.MAPS] = retry_stale("compact maps", lambda: _compact_maps(database))
     return saved
 
 
@@ -76,7 +68,7 @@ def vacuum(
 
 
 def _vacuum(database: Database, options: VacuumOptions, dry_run: bool) -> VacuumReport:
-    now = store_time(database.table(MAPS).storage)
+    now = store_time(database.table(tables.MAPS).storage)
     history, grace = timedelta(hours=options.history_h), timedelta(hours=options.orphan_grace_h)
     kept_from = retry_stale("vacuum", lambda: _announce(database, now - history, dry_run))
     # Asked before rows are removed, which gives those beside them newer files.
@@ -86,7 +78,7 @@ def _vacuum(database: Database, options: VacuumOptions, dry_run: bool) -> Vacuum
     for name, named in named_writes(database, kept_from, gone):
         orphans |= _remove_orphans(database.table(name), named, now - grace, dry_run)
     if refused and not dry_run:
-        database.table(CANDIDATE_IMAGES).delete_rows("candidate_id", refused)
+        database.table(tables.CANDIDATE_IMAGES).delete_rows("candidate_id", refused)
     return VacuumReport(
         kept_from=kept_from,
         write_ids=tuple(sorted(orphans)),
@@ -106,21 +98,21 @@ def named_writes(
         gone: ids of scans that do not count where they are retired.
     """
     named = write_ids_of_history(database, first_version)
-    yield from ((name, named) for name in CHILD_TABLES)
-    if database.has(LIDAR):
+    yield from ((name, named) for name in tables.CHILD_TABLES)
+    if database.has(tables.LIDAR):
         rows = [r for r in scan_rows(database) if r["status"] != RETIRED or r["scan_id"] not in gone]
-        yield LIDAR_POINTS, {row["write_id"] for row in rows}
-    if database.has(CANDIDATES):
-        yield CANDIDATE_IMAGES, {event["write_id"] for event in read_events(database)}
+        yield tables.LIDAR_POINTS, {row["write_id"] for row in rows}
+    if database.has(tables.CANDIDATES):
+        yield tables.CANDIDATE_IMAGES, {event["write_id"] for event in read_events(database)}
 
 
 def write_ids_of_history(database: Database, first_version: int) -> set[str]:
     """All write ids that the versions from `first_version` on name."""
-    maps = database.table(MAPS)
+    maps = database.table(tables.MAPS)
     named: set[str] = set()
     seen_files: frozenset[str] = frozenset()
     for version in range(maps.version, first_version - 1, -1):
-        table = database.table(MAPS, version)
+        table = database.table(tables.MAPS, version)
         files = frozenset(file.path for file in table.files())
         if files - seen_files:  # otherwise it shows a part of what a newer version shows
             named.update(row["write_id"] for row in read_rows(table))
@@ -159,7 +151,7 @@ def _remove_orphans(table: Table, named: set[str], before: datetime, dry_run: bo
 
 
 def _compact_maps(database: Database) -> int:
-    maps = database.table(MAPS)
+    maps = database.table(tables.MAPS)
     files = len(maps.files())
     if files <= 1:
         return 0
@@ -169,7 +161,7 @@ def _compact_maps(database: Database) -> int:
 
 def _announce(database: Database, cutoff: datetime, dry_run: bool) -> int:
     """Commit from which version on the past is kept: what was newest at a time; returns that version."""
-    maps = database.table(MAPS)
+    maps = database.table(tables.MAPS)
     commits = maps.commits()
     # The version that was newest then, and all later ones; all if none is so old.
     old = [version for version, time in list_entries(maps.storage).items() if time <= cutoff]
@@ -187,9 +179,9 @@ def _announce(database: Database, cutoff: datetime, dry_run: bool) -> int:
 
 def _refused_images(database: Database, now: datetime, history: timedelta, grace: timedelta) -> set[str]:
     """Photos that were refused long ago and that nobody is giving again just now."""
-    if not database.has(CANDIDATES):
+    if not database.has(tables.CANDIDATES):
         return set()
-    table = database.table(CANDIDATE_IMAGES)
+    table = database.table(tables.CANDIDATE_IMAGES)
     writes = write_ids_in(table)
     times = write_times(writes, table.storage)
     fresh = {write_id for write_id in writes if write_id not in times or now - times[write_id] < grace}
@@ -199,11 +191,11 @@ def _refused_images(database: Database, now: datetime, history: timedelta, grace
 def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dry_run: bool) -> list[str]:
     files = []
     for name in database.tables():
-        if name == LIDAR:
+        if name == tables.LIDAR:
             continue
         table = database.table(name)
         # Versions of `maps` are kept by number; the newest child table serves all of them.
-        keep = range(kept_from, table.version + 1) if name == MAPS else ()
+        keep = range(kept_from, table.version + 1) if name == tables.MAPS else ()
         removed = table.vacuum(
             timedelta(hours=options.file_grace_h), dry_run=dry_run, keep_versions=list(keep)
         )
@@ -226,18 +218,20 @@ def upgrade(database: Database) -> list[str]:
     steps: list[str] = []
     for name in reversed(database.tables()):
         found = database.table(name).format
-        if found < FORMAT_VERSION:
+        if found < tables.FORMAT_VERSION:
             _to_newest_format(database, name)
-            steps.append(f"{name}: format {found} became {FORMAT_VERSION}, which older releases cannot read")
+            steps.append(
+                f"{name}: format {found} became {tables.FORMAT_VERSION}, which older releases cannot read"
+            )
     return steps
 
 
 def _to_newest_format(database: Database, name: str) -> None:
     def attempt() -> None:
         table = database.table(name)
-        if name == MAPS:
-            said = {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {FORMAT_VERSION}"}
-            table.upgrade(rows_table(MAPS, read_rows(table)), said)
+        if name == tables.MAPS:
+            said = {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {tables.FORMAT_VERSION}"}
+            table.upgrade(rows_table(tables.MAPS, read_rows(table)), said)
         else:
             table.upgrade()
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geometry.arrays import FloatArray
-from featuredb.store.changes import RETIRED, Change, live_row
+from featuredb.store.changes import RETIRED, Change, live_row, with_status
 from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, apply_change, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import of_columns, read_rows
@@ -168,18 +168,12 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
         raise StoreError(f"retire {scan_id}: expected a reason, for those who will ask later")
     find_scan(database, scan_id)
 
-    def attempt() -> bool:
-        table = database.table(LIDAR)
-        rows = read_rows(table)
+    def retired(rows: list[Row]) -> tuple[Change, list[str]]:
         if live_row(rows, scan_id, "scan_id") is None:
-            return False
-        changed = [
-            {**r, "status": RETIRED, "status_reason": reason} if r["scan_id"] == scan_id else r for r in rows
-        ]
-        apply_change(table, Change(rows=changed), operation="retire", changed=[scan_id], reason=reason)
-        return True
+            return Change(rows=rows, added=()), []
+        return Change(rows=with_status(rows, [scan_id], RETIRED, reason, "scan_id")), [scan_id]
 
-    return retry_stale(f"retire {scan_id}", attempt)
+    return bool(database.change_maps(f"retire {scan_id}", "retire", reason, retired, LIDAR).changed)
 
 
 def scan_points(

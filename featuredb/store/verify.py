@@ -11,6 +11,7 @@ import pyarrow.dataset as ds
 
 from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
+from featuredb.store import tables
 from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.photos import count_candidates
 from featuredb.store.candidates.upkeep import check_growth_tables
@@ -24,26 +25,21 @@ from featuredb.store.encode import Row, encode_map
 from featuredb.store.maintenance import named_writes, write_ids_in
 from featuredb.store.scans import PointsChecksum, ScanSummary, list_scans, scan_batches
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import (
-    BOUNDS,
-    IMAGES,
-    MAPS,
-    OBSERVATIONS,
-    POINTS,
-    SPECS,
-    UTM_COORDINATES,
-)
 
 logger = logging.getLogger(__name__)
 
 # Columns that follow from a map's coordinates, and are not part of what is loaded.
 _PLACES = {
-    IMAGES: (*UTM_COORDINATES, "zone", "tile"),
-    POINTS: (*UTM_COORDINATES, "zone", "tile"),
-    OBSERVATIONS: ("zone", "tile"),
+    tables.IMAGES: (*tables.UTM_COORDINATES, "zone", "tile"),
+    tables.POINTS: (*tables.UTM_COORDINATES, "zone", "tile"),
+    tables.OBSERVATIONS: ("zone", "tile"),
 }
 _SAME_M = 1e-3
-_INDEX = {IMAGES: "image_index", POINTS: "point_index", OBSERVATIONS: "observation_index"}
+_INDEX = {
+    tables.IMAGES: "image_index",
+    tables.POINTS: "point_index",
+    tables.OBSERVATIONS: "observation_index",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,7 +152,7 @@ def _verify(database: Database) -> VerifyReport:
 
 def check_logs(database: Database) -> Iterator[Found]:
     """Is every entry of every log there and whole, and does the log end where it was acknowledged to end?"""
-    for name in SPECS:
+    for name in tables.SPECS:
         files = table_files(database.table_url(name), database.storage_options)
         for problem in log_problems(files):
             what = f"{problem.what}; `featuredb repair` says what can be done"
@@ -208,7 +204,7 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Found]:
     if encoded.row["content_digest"] != row["content_digest"]:
         yield where, "its rows are not those that were committed: content digests differ"
         return
-    if any(encoded.row[name] != row[name] for name in (*BOUNDS, "tiles")):
+    if any(encoded.row[name] != row[name] for name in (*tables.BOUNDS, "tiles")):
         yield where, "its box or its tiles are not those of its coordinates"
     mine = ds.field("write_id") == row["write_id"]
     for name, expected in encoded.children.items():
@@ -237,8 +233,8 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
     levels, coordinates = np.zeros(len(scan.level_points), np.int64), PointsChecksum()
     elsewhere = 0
     try:
-        for batch in scan_batches(database, scan, (*UTM_COORDINATES, "tile", "level")):
-            utm = np.column_stack([batch[name].to_numpy() for name in UTM_COORDINATES])
+        for batch in scan_batches(database, scan, (*tables.UTM_COORDINATES, "tile", "level")):
+            utm = np.column_stack([batch[name].to_numpy() for name in tables.UTM_COORDINATES])
             coordinates.add(utm)
             levels += np.bincount(batch["level"].to_numpy(), minlength=len(levels))[: len(levels)]
             if not np.isfinite(utm).all():
@@ -261,7 +257,7 @@ def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
 
 
 def _orphans(database: Database) -> list[str]:
-    first = oldest_kept_version(database.table(MAPS).commits())
+    first = oldest_kept_version(database.table(tables.MAPS).commits())
     orphans: set[str] = set()
     for name, named in named_writes(database, first):
         orphans |= write_ids_in(database.table(name)).keys() - named

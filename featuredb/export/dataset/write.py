@@ -73,7 +73,7 @@ def write_catalogue(contents: Contents, description: Mapping[str, Any], folder: 
     }
     for tile in (tile for scan in contents.scans for tile in scan["tiles"]):
         assets[tile["file"]] = _asset(f"../{tile['file']}", "LiDAR tile", _LAZ, "data")
-    items = {f"items/{layout.file_name(entry.map_id)}.json": entry for entry in contents.maps}
+    items = {f"items/{layout.file_name(entry.row['map_id'])}.json": entry for entry in contents.maps}
     collection = {
         "type": "Collection",
         "stac_version": STAC_VERSION,
@@ -124,7 +124,7 @@ def _item(entry: MapEntry, collection: str) -> dict[str, Any]:
         "type": "Feature",
         "stac_version": STAC_VERSION,
         "stac_extensions": [PROJECTION],
-        "id": entry.map_id,
+        "id": entry.row["map_id"],
         "collection": collection,
         "geometry": entry.footprint.geometry,
         "bbox": list(entry.footprint.bbox),

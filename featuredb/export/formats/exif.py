@@ -125,27 +125,23 @@ def properties(shot: PosedPhoto) -> dict[str, str]:
         "featuredb:HeightDatum": altitude_of(shot)[1],
         "featuredb:MapId": shot.map_id,
         "featuredb:OriginalSha256": shot.image.sha256,
+        "featuredb:Owner": shot.image.owner,
+        "featuredb:Licence": shot.licence,
     }
-    if shot.image.owner:
-        told["featuredb:Owner"] = shot.image.owner
-    if shot.licence:
-        told["featuredb:Licence"] = shot.licence
-    return told
+    return {name: text for name, text in told.items() if text}
 
 
 def _copy(part: Path, name: Path, shot: PosedPhoto, original: Path | None) -> _File:
-    reason = ""
-    if original is None:
-        reason = "no file of these bytes in the folder"
+    reason, file = "", name.as_posix()
+    try:
+        if original is None:
+            raise ExportError("no file of these bytes in the folder")
+        data = with_pose(original.read_bytes(), shot)
+    except FeatureDbError as error:
+        reason, file = str(error), ""
     else:
-        try:
-            data = with_pose(original.read_bytes(), shot)
-        except FeatureDbError as error:
-            reason = str(error)
-        else:
-            (part / name).parent.mkdir(parents=True, exist_ok=True)
-            (part / name).write_bytes(data)
-    file = "" if reason else name.as_posix()
+        (part / name).parent.mkdir(parents=True, exist_ok=True)
+        (part / name).write_bytes(data)
     return _File(
         map_id=shot.map_id, image=shot.image.name, sha256=shot.image.sha256, file=file, reason=reason
     )

@@ -95,15 +95,10 @@ class MapList:
         attribution = attribution_of(feature_map)
         licences = "; ".join(sorted({row.licence for row in attribution if row.licence}))
         points = len(feature_map.points)
-        place: tuple[object, object] = ("", "")
-        if isinstance(feature_map, FeatureMap):
-            place = feature_map.epsg, feature_map.height_datum
-        self._rows.append(
-            (
-                *(index, feature_map.map_id, feature_map.name, file if points else ""),
-                *(*place, points, licences),
-            )
-        )
+        placed = isinstance(feature_map, FeatureMap)
+        place = (feature_map.epsg, feature_map.height_datum) if placed else ("", "")
+        row = (index, feature_map.map_id, feature_map.name, file if points else "", *place, points, licences)
+        self._rows.append(row)
         self._photos.extend(attribution)
         return index
 
