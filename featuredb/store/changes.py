@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from featuredb.errors import ConflictError, MapNotFoundError, StoreError
+from featuredb.maps.lineage import children_of, reached
 from featuredb.store.encode import Row
 from featuredb.store.tables import PLACE_COLUMNS
 
@@ -283,9 +284,4 @@ def anchored(
     """
     live = {row["map_id"]: row["parents"] for row in rows if row["status"] in statuses}
     live.pop(without or "", None)
-    reached = {map_id for map_id, parents in live.items() if not parents}
-    while True:
-        more = {m for m, parents in live.items() if m not in reached and reached.intersection(parents)}
-        if not more:
-            return reached
-        reached |= more
+    return reached([map_id for map_id, parents in live.items() if not parents], children_of(live))

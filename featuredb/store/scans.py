@@ -279,8 +279,9 @@ def _point_columns(rows: NDArray[Any], has_intensity: bool) -> dict[str, Any]:
 def _level_rows(
     database: Database, scan: ScanSummary, level: int, box: tuple[float, float, float, float] | None
 ) -> ds.Dataset:
-    where: list[Condition] = [("zone", "=", scan.epsg), ("level", "=", level)]
-    where.append(("write_id", "=", scan.write_id))
+    where: list[Condition] = [
+        ("zone", "=", scan.epsg), ("level", "=", level), ("write_id", "=", scan.write_id)
+    ]  # fmt: skip
     if box is not None:
         e0, n0, e1, n1 = box
         where += [

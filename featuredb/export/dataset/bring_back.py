@@ -154,17 +154,22 @@ def _missing_parents(rows: Sequence[Row], live: Mapping[str, Sequence[str]]) -> 
     known = [{"map_id": m, "parents": p, "status": ACTIVE} for m, p in parents.items()]
     standing = anchored(known)
     fallen = [r["map_id"] for r in rows if r["status"] == ACTIVE and r["map_id"] not in standing]
-    return {map_id: tuple(sorted(reached(map_id, parents) - parents.keys())) for map_id in fallen}
+    return {map_id: tuple(sorted(reached([map_id], parents) - parents.keys())) for map_id in fallen}
 
 
 def _parents_first(rows: Sequence[Row]) -> list[Row]:
-    """Maps whose parents are not in the dataset, then those that only these placed, and so on."""
-    ordered: list[Row] = []
-    left = list(rows)
-    while left:
-        waiting = {row["map_id"] for row in left}
-        ready = [row for row in left if waiting.isdisjoint(row["parents"])] or left[:1]  # a circle: one of it
-        ordered += ready
-        done = {row["map_id"] for row in ready}
-        left = [row for row in left if row["map_id"] not in done]
-    return ordered
+    """In the dataset's order, but for maps that come before their parents there."""
+    known = {row["map_id"]: row for row in rows}
+    ordered: dict[str, Row] = {}
+    for row in rows:
+        waiting = [row]
+        seen = set()
+        while waiting:
+            top = waiting[-1]
+            seen.add(top["map_id"])
+            before = [p for p in top["parents"] if p in known and p not in ordered and p not in seen]
+            if before:
+                waiting.append(known[before[0]])
+            else:
+                ordered.setdefault(top["map_id"], waiting.pop())
+    return list(ordered.values())

@@ -11,6 +11,7 @@ from featuredb.store.canaries import list_canaries, load_canary_image
 from featuredb.store.candidates.events import by_candidate, live_maps, read_events
 from featuredb.store.candidates.states import CONTRIBUTED, EVENTS, standing_of
 from featuredb.store.database import Database
+from featuredb.store.durable.filesystem import one_line
 from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATES
 
 _GROWTH = (CANDIDATES, CANDIDATE_IMAGES, CANARIES)
@@ -65,7 +66,7 @@ def _check_candidates(database: Database) -> Iterator[tuple[str, str]]:
         live = live_maps(database)
         digests = dict(_stored_digests(database))
     except (FeatureDbError, OSError, pa.ArrowException) as error:
-        yield "candidates", f"cannot be read: {' '.join(str(error).split())[:300]}"
+        yield "candidates", f"cannot be read: {one_line(error)[:300]}"
         return
     whole = by_candidate(events)
     for event in events:
