@@ -40,6 +40,7 @@ _LARGEST_8_BIT = 255
 
 # Spilled and finished points take 36 and 55 bytes, and both lie here at the end.
 _BYTES_PER_POINT = 100
+_OF_CRS = ("horizontal_unit", "height_datum", "height_unit", "height_unit_m", "height_unit_reason")
 _PLAN = "spill.json"  # in a work folder: the first pass is done
 
 
@@ -284,7 +285,6 @@ def _row(
         "scan_id": scan_id,
         "files": [_file_row(item) for item in inputs],
         "epsg": inputs[0].to_utm.epsg,
-        "height_datum": crs.height_datum,
         **staged.totals(),
         "tiles": sorted({block.tile for block in plan.blocks}),
         "points_in_files": plan.read,
@@ -297,11 +297,8 @@ def _row(
         "intensity_low": None if plan.stretch is None else plan.stretch.low,
         "intensity_high": None if plan.stretch is None else plan.stretch.high,
         "crs_source": crs.source,
-        "horizontal_unit": crs.horizontal_unit,
         "vertical_crs": crs.vertical_name,
-        "height_unit": crs.height_unit,
-        "height_unit_m": crs.height_unit_m,
-        "height_unit_reason": crs.height_unit_reason,
+        **{name: getattr(crs, name) for name in _OF_CRS},
         "notes": list(dict.fromkeys(notes)),
         "options": json.dumps(asdict(options), sort_keys=True),
     }

@@ -1,7 +1,6 @@
 """Scans of a database, or parts of them, as a point cloud in a local frame."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,7 @@ def scan_frame(scan: ScanSummary) -> LocalFrame:
 
 
 def load_cloud(
-    database: Database | str | Path,
+    database: Database,
     frame: LocalFrame,
     box_local: PlanBox | None = None,
     *,
@@ -72,8 +71,6 @@ def load_cloud(
         ScanError: the scans' heights are of different datums, or even the coarsest level has too many points.
         StoreError: the points cannot be read.
     """
-    if not isinstance(database, Database):
-        database = Database.open(database)
     scans = chosen_scans(database, scan_ids)
     datums = sorted({scan.height_datum for scan in scans})
     if len(datums) > 1:

@@ -17,9 +17,10 @@ from featuredb.errors import CanaryNotFoundError, InvalidValueError, StoreError
 from featuredb.geo.datum import check_datum
 from featuredb.geo.utm import zone_of
 from featuredb.geometry.arrays import FloatArray, freeze
-from featuredb.store.commits import CHANGED, OPERATION, new_write_id
+from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import of_columns, read_image, read_rows
+from featuredb.store.durable.log import CHANGED, OPERATION
 from featuredb.store.encode import Row, rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.tables import CANARIES, SPECS, UTM_COORDINATES

@@ -25,12 +25,10 @@ from featuredb.store.changes import (
 from featuredb.store.commits import (
     LONGEST_COMMIT,
     CommitResult,
-    HistoryEntry,
     StatusResult,
     apply_change,
     check_children,
     commit_as_of,
-    history_entry,
     new_write_id,
 )
 from featuredb.store.decode import read_rows
@@ -214,19 +212,20 @@ class Database:
             rows = read_rows(maps)
             visible = {m: row for m in ids if (row := _already_there(rows, m, replaces, digests))}
             pending = [m for m in feature_maps if m.map_id not in visible]
-            if pending:
-                check_unchanged(rows, based_on or {})
-            for feature_map in pending:
-                if feature_map.map_id not in encoded:
-                    encoded[feature_map.map_id] = self._write_children(feature_map)
-                    encoded[feature_map.map_id].row["status_reason"] = why.get(feature_map.map_id, "")
-            if monotonic() - started > LONGEST_COMMIT.total_seconds():
-                raise ConflictError(f"commit of {', '.join(ids)} took over {LONGEST_COMMIT}; commit again")
-            for feature_map in pending:
-                check_children(encoded[feature_map.map_id], self.table)
             version = maps.version
             flagged: tuple[str, ...] = ()
             if pending:
+                check_unchanged(rows, based_on or {})
+                for feature_map in pending:
+                    if feature_map.map_id not in encoded:
+                        encoded[feature_map.map_id] = self._write_children(feature_map)
+                        encoded[feature_map.map_id].row["status_reason"] = why.get(feature_map.map_id, "")
+                if monotonic() - started > LONGEST_COMMIT.total_seconds():
+                    raise ConflictError(
+                        f"commit of {', '.join(ids)} took over {LONGEST_COMMIT}; commit again"
+                    )
+                for feature_map in pending:
+                    check_children(encoded[feature_map.map_id], self.table)
                 change = add_maps(rows, [encoded[m.map_id].row for m in pending], replaces, moves=moves)
                 flagged = change.flagged
                 changed = [*(m.map_id for m in pending), *flagged]
@@ -346,9 +345,9 @@ class Database:
                 "database any more then)"
             )
 
-    def history(self) -> list[HistoryEntry]:
+    def history(self) -> list[Commit]:
         """All versions, newest first."""
-        return [history_entry(commit) for commit in self.table(MAPS).commits()]
+        return self.table(MAPS).commits()
 
     def _snapshot_of(self, maps: Table, commit: Commit) -> Snapshot:
         rows, children = read_rows(maps), {name: self.table(name) for name in CHILD_TABLES}

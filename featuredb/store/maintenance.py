@@ -11,13 +11,13 @@ from featuredb.store import tables
 from featuredb.store.candidates.events import read_events
 from featuredb.store.candidates.upkeep import superfluous_images
 from featuredb.store.changes import RETIRED, Change
-from featuredb.store.commits import CHANGED, KEPT_FROM, OPERATION, REASON, apply_change, oldest_kept_version
+from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
 from featuredb.store.delta import Table
 from featuredb.store.durable.ages import store_time, write_times
 from featuredb.store.durable.filesystem import store_errors
-from featuredb.store.durable.log import list_entries
+from featuredb.store.durable.log import CHANGED, OPERATION, REASON, list_entries
 from featuredb.store.encode import rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.scans import retired_since, scan_rows

@@ -21,7 +21,7 @@ from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.changes import RETIRED, Change, live_row, with_status
-from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, apply_change, new_write_id
+from featuredb.store.commits import LONGEST_COMMIT, apply_change, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import of_columns, read_rows
 from featuredb.store.delta import Condition
@@ -208,8 +208,8 @@ def retired_since(database: Database) -> dict[str, datetime]:
     table = database.table(LIDAR)
     times, entries = {}, list_entries(table.storage)
     for commit in reversed(table.commits()):  # oldest first
-        if commit.metadata.get(OPERATION) == "retire":
-            times[commit.metadata.get(CHANGED, "")] = entries[commit.version]
+        if commit.operation == "retire":
+            times |= dict.fromkeys(commit.maps, entries[commit.version])
     return times
 
 

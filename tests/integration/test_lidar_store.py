@@ -202,7 +202,7 @@ def test_parts_of_scans_are_loaded(database: Database, tmp_path: Path) -> None:
     enu = frame.enu_from_utm(xyz, 32632)
     box = (-10.0, -5.0, 15.0, 20.0)
     inside = ((enu[:, :2] >= box[:2]) & (enu[:, :2] <= box[2:])).all(axis=1)
-    cloud = load_cloud(database.url, frame, box)
+    cloud = load_cloud(database, frame, box)
     assert inside.sum() <= len(cloud) <= 1.05 * inside.sum()
     distance, _ = cKDTree(cloud.xyz).query(enu[inside])
     assert distance.max() < 2e-3  # the file's millimetre

@@ -25,6 +25,8 @@ from featuredb.errors import StoreError
 logger = logging.getLogger(__name__)
 
 LOG, ACKNOWLEDGED, LAST_CHECKPOINT = "_delta_log", "_acknowledged", "_last_checkpoint"
+# Keys of what a commit says about itself.
+OPERATION, CHANGED, REASON = "featuredb.operation", "featuredb.maps", "featuredb.reason"
 # Tag of an added file: of its bytes. In the line commitInfo of an entry: of its actions without this.
 DIGEST = "featuredb.sha256"
 _ENTRY = re.compile(r"(\d{20})\.json")
@@ -121,6 +123,20 @@ class Commit:
     version: int
     timestamp: datetime
     metadata: dict[str, str]
+
+    @property
+    def operation(self) -> str:
+        """Commit, retire, ..."""
+        return self.metadata.get(OPERATION, "" if self.version else "init")
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Ids of the maps or scans that it is about."""
+        return tuple(filter(None, self.metadata.get(CHANGED, "").split("\n")))
+
+    @property
+    def reason(self) -> str:
+        return self.metadata.get(REASON, "")
 
 
 def read_commit(files: fs.FileSystem, version: int) -> Commit:
