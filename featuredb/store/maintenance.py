@@ -8,8 +8,8 @@ from datetime import datetime, timedelta
 import pyarrow.compute as pc
 
 from featuredb.store import tables
-from featuredb.store.candidates.events import read_events
-from featuredb.store.candidates.upkeep import superfluous_images
+from featuredb.store.candidates.events import by_candidate, live_maps, read_events
+from featuredb.store.candidates.states import standing_of
 from featuredb.store.changes import RETIRED, Change
 from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version
 from featuredb.store.database import Database
@@ -63,29 +63,26 @@ def vacuum(
     Raises:
         ConflictError, StoreError
     """
+    options = options or VacuumOptions()
     with store_errors(f"cannot vacuum {database.url}"):
-        return _vacuum(database, options or VacuumOptions(), dry_run)
-
-
-def _vacuum(database: Database, options: VacuumOptions, dry_run: bool) -> VacuumReport:
-    now = store_time(database.table(tables.MAPS).storage)
-    history, grace = timedelta(hours=options.history_h), timedelta(hours=options.orphan_grace_h)
-    kept_from = retry_stale("vacuum", lambda: _announce(database, now - history, dry_run))
-    # Asked before rows are removed, which gives those beside them newer files.
-    refused = _refused_images(database, now, history, grace)
-    orphans: set[str] = set()
-    gone = {scan_id for scan_id, time in retired_since(database).items() if time <= now - history}
-    for name, named in named_writes(database, kept_from, gone):
-        orphans |= _remove_orphans(database.table(name), named, now - grace, dry_run)
-    if refused and not dry_run:
-        database.table(tables.CANDIDATE_IMAGES).delete_rows("candidate_id", refused)
-    return VacuumReport(
-        kept_from=kept_from,
-        write_ids=tuple(sorted(orphans)),
-        candidate_images=tuple(sorted(refused)),
-        files=tuple(_vacuum_files(database, options, kept_from, dry_run)),
-        dry_run=dry_run,
-    )
+        now = store_time(database.table(tables.MAPS).storage)
+        history, grace = timedelta(hours=options.history_h), timedelta(hours=options.orphan_grace_h)
+        kept_from = retry_stale("vacuum", lambda: _announce(database, now - history, dry_run))
+        # Asked before rows are removed, which gives those beside them newer files.
+        refused = _refused_images(database, now, history, grace)
+        orphans: set[str] = set()
+        gone = {scan_id for scan_id, time in retired_since(database).items() if time <= now - history}
+        for name, named in named_writes(database, kept_from, gone):
+            orphans |= _remove_orphans(database.table(name), named, now - grace, dry_run)
+        if refused and not dry_run:
+            database.table(tables.CANDIDATE_IMAGES).delete_rows("candidate_id", refused)
+        return VacuumReport(
+            kept_from=kept_from,
+            write_ids=tuple(sorted(orphans)),
+            candidate_images=tuple(sorted(refused)),
+            files=tuple(_vacuum_files(database, options, kept_from, dry_run)),
+            dry_run=dry_run,
+        )
 
 
 def named_writes(
@@ -178,14 +175,24 @@ def _announce(database: Database, cutoff: datetime, dry_run: bool) -> int:
 
 
 def _refused_images(database: Database, now: datetime, history: timedelta, grace: timedelta) -> set[str]:
-    """Photos that were refused long ago and that nobody is giving again just now."""
+    """Photos whose bytes may go: withdrawn ones (left by a crash), and those refused `history` ago.
+
+    Not those with bytes younger than `grace`: somebody may be giving the photo again just now.
+    """
     if not database.has(tables.CANDIDATES):
         return set()
+    live = live_maps(database)
+    found = set()
+    for candidate_id, events in by_candidate(read_events(database)).items():
+        state = standing_of(events, live).state
+        if state == "withdrawn" or (state == "refused" and now - events[-1]["happened_at"] >= history):
+            found.add(candidate_id)
     table = database.table(tables.CANDIDATE_IMAGES)
-    writes = write_ids_in(table)
-    times = write_times(writes, table.storage)
-    fresh = {write_id for write_id in writes if write_id not in times or now - times[write_id] < grace}
-    return superfluous_images(database, now, history, fresh)
+    times = write_times(write_ids_in(table), table.storage)
+    stored = table.dataset().to_table(["candidate_id", "write_id"], use_threads=False).to_pylist()
+    old = {write_id for write_id, time in times.items() if now - time >= grace}
+    fresh = {row["candidate_id"] for row in stored if row["write_id"] not in old}
+    return (found & {row["candidate_id"] for row in stored}) - fresh
 
 
 def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dry_run: bool) -> list[str]:

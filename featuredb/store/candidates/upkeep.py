@@ -1,8 +1,7 @@
-"""Upkeep of contributed photos and known queries: what `vacuum` may remove and what `verify` looks at."""
+"""What `verify` looks at in contributed photos and known queries."""
 
 import hashlib
-from collections.abc import Collection, Iterator
-from datetime import datetime, timedelta
+from collections.abc import Iterator
 
 import pyarrow as pa
 
@@ -15,25 +14,6 @@ from featuredb.store.durable.filesystem import one_line
 from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATES
 
 _GROWTH = (CANDIDATES, CANDIDATE_IMAGES, CANARIES)
-
-
-def superfluous_images(
-    database: Database, now: datetime, history: timedelta, fresh_writes: Collection[str]
-) -> set[str]:
-    """Candidates whose bytes may go: withdrawn ones (left by a crash), and those refused `history` ago.
-
-    Bytes of `fresh_writes` stay: somebody may be giving the photo again just now.
-    """
-    live = live_maps(database)
-    found = set()
-    for candidate_id, events in by_candidate(read_events(database)).items():
-        state = standing_of(events, live).state
-        if state == "withdrawn" or (state == "refused" and now - events[-1]["happened_at"] >= history):
-            found.add(candidate_id)
-    columns = ["candidate_id", "write_id"]
-    stored = database.table(CANDIDATE_IMAGES).dataset().to_table(columns, use_threads=False).to_pylist()
-    fresh = {row["candidate_id"] for row in stored if row["write_id"] in fresh_writes}
-    return (found & {row["candidate_id"] for row in stored}) - fresh
 
 
 def check_growth_tables(database: Database) -> list[tuple[str, str]]:

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import pyarrow.fs as fs
 
-from featuredb.errors import StoreError
 from featuredb.store.database import Database
-from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.filesystem import store_errors, table_files
 from featuredb.store.durable.log import (
     LOG,
     LogProblem,
@@ -50,21 +49,14 @@ def repair(database: Database, *, apply: bool = False, give_up_lost: bool = Fals
         DatabaseNotFoundError: there is no database.
         StoreError: the store failed.
     """
-    try:
-        return _repair(database, apply, give_up_lost)
-    except OSError as error:
-        raise StoreError(f"cannot repair {database.url}: {error}") from error
-
-
-def _repair(database: Database, apply: bool, give_up_lost: bool) -> list[RepairStep]:
     steps: list[RepairStep] = []
-    for name in SPECS:
-        files = table_files(database.table_url(name), database.storage_options)
-        problems = list(log_problems(files))
-        if problems:
-            steps += _repair_table(name, files, problems, apply, give_up_lost)
-    if not steps:
-        database.table(MAPS)
+    with store_errors(f"cannot repair {database.url}"):
+        for name in SPECS:
+            files = table_files(database.table_url(name), database.storage_options)
+            if problems := list(log_problems(files)):
+                steps += _repair_table(name, files, problems, apply, give_up_lost)
+        if not steps:
+            database.table(MAPS)
     return steps
 
 
