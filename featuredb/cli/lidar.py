@@ -132,7 +132,10 @@ def summary(scan: "ScanSummary", outcome: str) -> str:
             "density",
             f"{scan.points / area_m2:.3g} points per m2 on {area_m2:,.0f} m2, spacing {scan.spacing_m:.3g} m",
         ),
-        ("classes", ", ".join(_class_count(c, n) for c, n in scan.classes.items())),
+        (
+            "classes",
+            ", ".join(f"{c} {_CLASS_NAMES.get(c, 'other')} {n:,}" for c, n in scan.classes.items()),
+        ),
         ("colour", {"file": "of the file", "ortho": "from the ortho image"}.get(scan.colour, "none")),
         ("intensity", _intensity(scan)),
         (
@@ -151,10 +154,6 @@ def summary(scan: "ScanSummary", outcome: str) -> str:
 
 
 _SAY_DATUM = "; --height-datum states it: " + ", ".join(d for d in HEIGHT_DATUMS if d != "unknown")
-
-
-def _class_count(number: int, points: int) -> str:
-    return f"{number} {_CLASS_NAMES.get(number, 'other')} {points:,}"
 
 
 def _intensity(scan: "ScanSummary") -> str:

@@ -100,7 +100,8 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
             "parents": tuple(row["parents"]),
             "provenance": json.loads(row["provenance"]),
         }
-        points = _decode_points(children[tables.POINTS], row["points"], _coordinate_columns(row))
+        here = tables.UTM_COORDINATES if has_place(row) else tables.OWN_COORDINATES
+        points = _decode_points(children[tables.POINTS], row["points"], here)
         if not has_place(row):
             return UnplacedMap(
                 frame=OwnFrame(metric=row["frame_is_metric"], upright=row["frame_is_upright"]),
@@ -142,10 +143,6 @@ def decode_no_place(row: Row) -> NoPlace:
     """Why the map of a row without a place has none."""
     said = json.loads(row["no_place"])
     return NoPlace(**{**said, "ways": tuple(said["ways"])})
-
-
-def _coordinate_columns(row: Row) -> tuple[str, ...]:
-    return tables.UTM_COORDINATES if has_place(row) else tables.OWN_COORDINATES
 
 
 def placement_of(row: Row) -> Placement:

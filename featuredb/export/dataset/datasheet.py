@@ -51,7 +51,7 @@ def _title(contents: Contents, description: Mapping[str, Any]) -> str:
             (name, f"{contents.total(name):,}")
             for name in ("images", "points", "observations", "descriptors")
         ),
-        ("status of the maps", _counts(contents.count("status"))),
+        ("status of the maps", ", ".join(f"{n:,} {s}" for s, n in sorted(contents.count("status").items()))),
         ("west, south, east, north", f"{west:.6f}, {south:.6f}, {east:.6f}, {north:.6f} (WGS84 degrees)"),
         (
             "photos taken",
@@ -162,10 +162,6 @@ def _prose(text: str) -> str:
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [header, ["---"] * len(header), *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
-def _counts(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count:,} {name}" for name, count in sorted(counts.items()))
 
 
 def _words(value: Any) -> str:

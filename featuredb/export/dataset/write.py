@@ -36,10 +36,8 @@ from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_js
 from featuredb.extras import require
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store.encode import encode_map
-from featuredb.store.snapshot import MapSummary
 
 # Of maps.parquet, in a row group.
 _ROWS_AT_ONCE = 256
@@ -187,8 +185,12 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
             if isinstance(feature_map, UnplacedMap):
                 own.add(feature_map, job.snapshot.get_any(feature_map.map_id))
                 continue
-            row = _write_rows(feature_map, job.snapshot.get(feature_map.map_id), files)
-            row["lineage"] = _lineage_json(lineages[feature_map.map_id])
+            summary, lineage = job.snapshot.get(feature_map.map_id), lineages[feature_map.map_id]
+            encoded = encode_map(feature_map, "", summary.created_at)
+            of_files = {f"{table}_file": path for table, path in files.write(feature_map, encoded).items()}
+            row = encoded.row | {"status_reason": summary.status_reason} | of_files
+            stands_on = {k: v for k, v in asdict(lineage).items() if k != "map_id"} | {"steps": lineage.steps}
+            row["lineage"] = json.dumps(stands_on, sort_keys=True)
             contents.maps.append(entry_of(feature_map, row))
             cameras += _camera_rows(feature_map)
             del feature_map  # before the next one is loaded
@@ -202,15 +204,6 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
     with TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()) as file:
         file.write(pa.Table.from_pylist(cameras, schema=CAMERAS.schema))
     return contents, own
-
-
-def _write_rows(feature_map: FeatureMap, summary: MapSummary, files: PartitionFiles) -> dict[str, Any]:
-    """The map's images, points and observations; returns its row of maps.parquet, in part."""
-    encoded = encode_map(feature_map, "", summary.created_at)
-    encoded.row["status_reason"] = summary.status_reason
-    for table, path in files.write(feature_map, encoded).items():
-        encoded.row[f"{table}_file"] = path
-    return encoded.row
 
 
 def _write_areas(maps: list[MapEntry], folder: Path) -> None:
@@ -235,12 +228,6 @@ def _camera_rows(feature_map: FeatureMap) -> list[dict[str, Any]]:
         {"map_id": feature_map.map_id, "camera_id": number, **asdict(camera), "key": key}
         for number, (camera, key) in enumerate(zip(feature_map.cameras, keys, strict=True))
     ]
-
-
-def _lineage_json(lineage: MapLineage) -> str:
-    document = asdict(lineage) | {"steps": lineage.steps}
-    del document["map_id"]
-    return json.dumps(document, sort_keys=True)
 
 
 def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from xml.sax.saxutils import escape
 
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
-from featuredb.maps.feature_map import FeatureMap
 
 _NEAR_M = 10.0  # where the picture hangs ahead of the camera
 
@@ -23,9 +22,11 @@ def write_kml(job: ExportJob) -> Exported:
             )
             for feature_map in job.maps():
                 shots = list(shots_of(feature_map))
+                datum = altitude_of(shots[0])[1] if shots else feature_map.height_datum
+                told = f"map {feature_map.map_id}, {len(shots)} photos; altitudes: {datum}"
                 out.write(
                     f"<Folder><name>{_text(feature_map.name or feature_map.map_id)}</name>"
-                    f"<description>{_text(_told(feature_map, shots))}</description>\n"
+                    f"<description>{_text(told)}</description>\n"
                 )
                 out.writelines(overlay(shot) for shot in shots)
                 out.write("</Folder>\n")
@@ -88,11 +89,6 @@ def field_of_view_deg(shot: PosedPhoto) -> tuple[float, float, float, float]:
     edges = (-cx / fx, (camera.width - cx) / fx, -(camera.height - cy) / fy, cy / fy)
     left, right, bottom, top = (math.degrees(math.atan(edge)) for edge in edges)
     return left, right, bottom, top
-
-
-def _told(feature_map: FeatureMap, shots: list[PosedPhoto]) -> str:
-    datum = altitude_of(shots[0])[1] if shots else feature_map.height_datum
-    return f"map {feature_map.map_id}, {len(shots)} photos; altitudes: {datum}"
 
 
 def _credit(shot: PosedPhoto) -> str:
