@@ -49,8 +49,7 @@ def register(subparsers: Any) -> None:
 
 
 def run_add(args: argparse.Namespace) -> None:
-    from featuredb.lidar.add import add_scan
-    from featuredb.lidar.options import AddOptions
+    from featuredb.lidar.add import AddOptions, add_scan
 
     database = place_for_database(args)
     options = AddOptions(crs=args.crs, height_unit=args.height_unit, height_datum=args.height_datum)

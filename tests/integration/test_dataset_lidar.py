@@ -19,8 +19,7 @@ from featuredb.export.dataset.lidar_part import touched_tiles
 from featuredb.export.selection import Selection
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.tiles import tile_of
-from featuredb.lidar.add import add_scan
-from featuredb.lidar.options import AddOptions
+from featuredb.lidar.add import AddOptions, add_scan
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from featuredb.store.encode import encode_map

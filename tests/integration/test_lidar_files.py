@@ -16,8 +16,7 @@ from featuredb.errors import (
     ScanError,
     ScanFileError,
 )
-from featuredb.lidar.add import add_scan
-from featuredb.lidar.options import AddOptions
+from featuredb.lidar.add import AddOptions, add_scan
 from featuredb.store import Database
 from tests.support.geotiff import write_geotiff
 from tests.support.las_files import SOUTH, WEST, grid_points, write_scan

@@ -16,9 +16,8 @@ from featuredb.errors import (
     ScanNotFoundError,
 )
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.lidar.add import add_scan
+from featuredb.lidar.add import AddOptions, add_scan
 from featuredb.lidar.load import chosen_scans, load_cloud, scan_frame
-from featuredb.lidar.options import AddOptions
 from featuredb.store import Database
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.scans import find_scan, list_scans, retire_scan

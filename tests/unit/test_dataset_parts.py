@@ -12,7 +12,7 @@ from featuredb.errors import ExportError, GeodesyError, InvalidValueError, Store
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents, Footprint, entry_of, footprint_of
 from featuredb.export.dataset.geoparquet import point_columns, wkb_of
-from featuredb.export.dataset.sums import check_sums, write_sums
+from featuredb.export.dataset.layout import check_sums, write_sums
 from featuredb.export.shots import pose_covariance
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.geo.local_frame import LocalFrame

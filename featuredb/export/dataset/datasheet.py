@@ -5,11 +5,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents
+from featuredb.export.dataset.layout import SUMS
 from featuredb.export.dataset.own_frame import FOLDER
-from featuredb.export.dataset.sums import SUMS
+from featuredb.export.job import ATTRIBUTION
 from featuredb.geo.crs.wkt import utm_projjson
 
 _WIDTH = 110

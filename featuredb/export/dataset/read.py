@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 from featuredb.errors import ExportError, FeatureDbError
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.columns import CAMERAS, MAPS
+from featuredb.export.dataset.layout import check_sums
 from featuredb.export.dataset.partitions import COLUMNS
-from featuredb.export.dataset.sums import check_sums
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import MapKind
 from featuredb.store.decode import decode_map

@@ -22,17 +22,25 @@ import numpy as np
 import pyarrow as pa
 
 from featuredb.errors import ExportError
-from featuredb.export.attribution import ATTRIBUTION, Attribution, attribution_of, write_attribution
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.contents import Contents, MapEntry, entry_of
 from featuredb.export.dataset.datasheet import write_datasheet
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, wkb_of
+from featuredb.export.dataset.layout import write_sums
 from featuredb.export.dataset.lidar_part import write_scans
 from featuredb.export.dataset.own_frame import OwnFrameFiles
 from featuredb.export.dataset.partitions import PartitionFiles
-from featuredb.export.dataset.sums import write_sums
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_json
+from featuredb.export.job import (
+    ATTRIBUTION,
+    Attribution,
+    Exported,
+    ExportJob,
+    attribution_of,
+    whole_or_nothing,
+    write_attribution,
+    write_json,
+)
 from featuredb.extras import require
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.maps.feature_map import FeatureMap

@@ -15,7 +15,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.georeference import write_georeference
 from featuredb.export.job import Exported, ExportJob, folder_for_each
 from featuredb.maps.feature_map import MapImage
@@ -47,7 +46,6 @@ def write_map(folder: Path, feature_map: AnyMap, *, text: bool = False) -> None:
         reconstruction.write_binary(str(model))
     write_colmap_database(folder / DATABASE, feature_map, keypoints, names)
     write_georeference(folder, feature_map, names)
-    write_attribution(folder, attribution_of(feature_map))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -9,9 +9,17 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from featuredb.errors import ExportError, FeatureDbError, ImageError
-from featuredb.export.attribution import Attribution, attribution_of, write_attribution
 from featuredb.export.formats.colmap import image_names
-from featuredb.export.job import Exported, ExportJob, folder_name, whole_or_nothing, write_csv
+from featuredb.export.job import (
+    Attribution,
+    Exported,
+    ExportJob,
+    attribution_of,
+    folder_name,
+    whole_or_nothing,
+    write_attribution,
+    write_csv,
+)
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
 from featuredb.features.exif.gps import RADIUS_68
 from featuredb.features.exif.write import gps_directory, with_app1, with_gps, with_properties

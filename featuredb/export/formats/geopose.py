@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.job import Exported, ExportJob, folder_for_each, folder_name, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.geo.geopose_documents import basic_ypr, irregular_series
@@ -47,7 +46,6 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
         ],
     }
     write_json(folder / MANIFEST, manifest)
-    write_attribution(folder, attribution_of(feature_map))
 
 
 def _file_names(shots: Sequence[PosedPhoto]) -> list[str]:

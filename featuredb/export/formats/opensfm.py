@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 from typing import IO, Any
 
-from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.formats.colmap import image_names
 from featuredb.export.formats.opensfm_camera import opensfm_camera
 from featuredb.export.georeference import write_georeference
@@ -39,7 +38,6 @@ def write_map(folder: Path, feature_map: FeatureMap) -> None:
     with (folder / "tracks.csv").open("w", encoding="utf-8", newline="\n") as out:
         _write_tracks(out, feature_map, names)
     write_georeference(folder, feature_map, names)
-    write_attribution(folder, attribution_of(feature_map))
 
 
 def _reference(feature_map: FeatureMap) -> dict[str, float]:

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ExportError
-from featuredb.export.attribution import Attribution, attribution_of, write_attribution
-from featuredb.export.job import write_csv
+from featuredb.export.job import Attribution, attribution_of, write_attribution, write_csv
 from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, PointColumns
