@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 import pyarrow.compute as pc
 
 from featuredb.store import tables
-from featuredb.store.candidates.events import by_candidate, live_maps, read_events
+from featuredb.store.candidates.photos import by_candidate, live_maps, read_events
 from featuredb.store.candidates.states import standing_of
 from featuredb.store.changes import RETIRED, Change
 from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version

@@ -15,8 +15,7 @@ from featuredb.store import Database
 from featuredb.store import verify as verify_module
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image
 from featuredb.store.candidates import upkeep
-from featuredb.store.candidates.events import append_events
-from featuredb.store.candidates.photos import contribute, list_candidates, withdraw
+from featuredb.store.candidates.photos import append_events, contribute, list_candidates, withdraw
 from featuredb.store.commits import new_write_id
 from featuredb.store.delta import Table
 from featuredb.store.maintenance import VacuumOptions, vacuum

@@ -7,7 +7,7 @@ import pyarrow as pa
 
 from featuredb.errors import FeatureDbError
 from featuredb.store.canaries import list_canaries, load_canary_image
-from featuredb.store.candidates.events import by_candidate, live_maps, read_events
+from featuredb.store.candidates.photos import by_candidate, live_maps, read_events
 from featuredb.store.candidates.states import CONTRIBUTED, EVENTS, standing_of
 from featuredb.store.database import Database
 from featuredb.store.durable.filesystem import one_line
