@@ -1,5 +1,6 @@
 """Does the database hold what it says? Every file, every row and every cross-reference of one snapshot."""
 
+import hashlib
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -12,9 +13,9 @@ import pyarrow.dataset as ds
 from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
 from featuredb.store import tables
-from featuredb.store.canaries import list_canaries
-from featuredb.store.candidates.photos import count_candidates
-from featuredb.store.candidates.upkeep import check_growth_tables
+from featuredb.store.canaries import list_canaries, load_canary_image
+from featuredb.store.candidates.photos import by_candidate, count_candidates, live_maps, read_events
+from featuredb.store.candidates.states import CONTRIBUTED, EVENTS, standing_of
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
@@ -76,6 +77,7 @@ class VerifyReport:
         return not self.problems
 
 
+_GROWTH = (tables.CANDIDATES, tables.CANDIDATE_IMAGES, tables.CANARIES)
 _TOLD = 3  # problems in a message
 Found = tuple[str, str]  # where, and what
 
@@ -250,6 +252,90 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
         yield where, "its points are not those that were committed: checksums differ"
     if elsewhere:
         yield where, f"{elsewhere} points in another tile than their coordinates'"
+
+
+def check_growth_tables(database: Database) -> list[Found]:
+    """What is wrong with contributed photos and known queries: where, and what. Reads every image.
+
+    Where others commit meanwhile, as a withdrawal does, it looks again for what it has found.
+    """
+
+    def look() -> tuple[list[int], list[Found]]:
+        return versions(), [*_check_candidates(database), *_check_canaries(database)]
+
+    def versions() -> list[int]:
+        return [database.table(name).version for name in database.tables() if name in _GROWTH]
+
+    seen, found = look()
+    while found and seen != versions():
+        seen, again = look()
+        lasting = [problem for problem in found if problem in again]
+        if lasting == found:
+            break
+        found = lasting
+    return found
+
+
+def _check_candidates(database: Database) -> Iterator[Found]:
+    if not database.has(tables.CANDIDATES):
+        return
+    try:
+        events = read_events(database)
+        live = live_maps(database)
+        digests = dict(_stored_digests(database))
+    except (FeatureDbError, OSError, pa.ArrowException) as error:
+        yield "candidates", f"cannot be read: {one_line(error)[:300]}"
+        return
+    whole = by_candidate(events)
+    for event in events:
+        where = f"candidate {event['candidate_id']}"
+        if event["event"] not in EVENTS:
+            yield where, f"an event {event['event']!r} that is none of {', '.join(EVENTS)}"
+        elif event["candidate_id"] not in whole:
+            yield where, f"an event {event['event']!r} of a photo that nobody contributed"
+    for candidate_id, own in whole.items():
+        where, state = f"candidate {candidate_id}", standing_of(own, live).state
+        expected = next(e["sha256"] for e in own if e["event"] == CONTRIBUTED)
+        if not str(expected).startswith(candidate_id):
+            yield where, f"its id is not the beginning of its hash {expected}"
+        if candidate_id not in digests:
+            if state in ("waiting", "used"):
+                yield where, f"it is {state}, but its image is not there"
+        elif state == "withdrawn":
+            yield where, "it is withdrawn, but its image is still there; withdraw it again"
+        elif digests[candidate_id] != expected:
+            yield where, "its image is not the one that was contributed: hashes differ"
+
+
+def _check_canaries(database: Database) -> Iterator[Found]:
+    try:
+        canaries = list_canaries(database)
+    except FeatureDbError as error:
+        yield "canaries", f"cannot be read: {error}"
+        return
+    names = [canary.name for canary in canaries]
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        yield f"canary {name}", "there are several of this name"
+    for canary in canaries:
+        try:
+            load_canary_image(database, canary)
+        except FeatureDbError as error:
+            yield f"canary {canary.name}", str(error)
+
+
+def _stored_digests(database: Database) -> Iterator[Found]:
+    """Candidate and SHA-256 of each stored image, one in memory at a time."""
+    dataset = database.table(tables.CANDIDATE_IMAGES).dataset()
+    batches = dataset.to_batches(
+        columns=["candidate_id", "image"],
+        batch_size=1,
+        batch_readahead=1,
+        fragment_readahead=1,
+        use_threads=False,
+    )
+    for batch in batches:
+        for candidate_id, image in zip(batch["candidate_id"], batch["image"], strict=True):
+            yield candidate_id.as_py(), hashlib.sha256(image.as_buffer()).hexdigest()
 
 
 def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from featuredb.export.job import Exported, ExportJob, folder_for_each, folder_name, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.geo.geopose_documents import basic_ypr, irregular_series
+from featuredb.geo.geopose import basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
 
 BASIC, SERIES, MANIFEST = "basic_ypr", "series.json", "manifest.json"
