@@ -8,7 +8,6 @@ from typing import Any
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents
 from featuredb.export.dataset.layout import SUMS
-from featuredb.export.dataset.own_frame import FOLDER
 from featuredb.export.job import ATTRIBUTION
 from featuredb.geo.crs.wkt import utm_projjson
 
@@ -127,7 +126,7 @@ def _files() -> str:
             f"`{layout.STAC}/collection.json` is a STAC 1.0 catalogue with an item for each map, "
             f"`{layout.DESCRIPTION}` says what this is for programs, `{SUMS}` lists every file: "
             f"`sha256sum --check {SUMS}`. Scans, if any, are in `{layout.LIDAR}/scans.json`, maps "
-            f"without a place in `{FOLDER}`."
+            f"without a place in `{layout.OWN_FRAME}`."
         ),
         _prose(
             "Files of points and images are named by zone, height datum and number, since a GeoParquet "

@@ -20,6 +20,7 @@ DATASHEET = "README.md"
 SUMS = "SHA256SUMS"  # as `sha256sum -c SHA256SUMS` reads it
 STAC = "stac"
 LIDAR = "lidar"
+OWN_FRAME = "own_frame"  # maps without a place: neither GeoParquet nor the catalogue has room for them
 
 _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
@@ -36,6 +37,11 @@ class Partition:
     def file(self, table: str, number: int) -> str:
         """Path in the folder of the n-th file, from 0, of a table's rows in this partition."""
         return f"{table}/{self.epsg}-{self.height_datum}-{number:04d}.parquet"
+
+
+def own_path(table: str) -> str:
+    """Where the rows of maps without a place are, as the store has them, in the dataset's folder."""
+    return f"{OWN_FRAME}/{table}.parquet"
 
 
 def file_name(name: str) -> str:

@@ -29,8 +29,7 @@ from featuredb.export.dataset.datasheet import write_datasheet
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, wkb_of
 from featuredb.export.dataset.layout import write_sums
 from featuredb.export.dataset.lidar_part import write_scans
-from featuredb.export.dataset.own_frame import OwnFrameFiles
-from featuredb.export.dataset.partitions import PartitionFiles
+from featuredb.export.dataset.partitions import OwnFrameFiles, PartitionFiles
 from featuredb.export.job import (
     ATTRIBUTION,
     Attribution,
