@@ -206,11 +206,9 @@ def retired_since(database: Database) -> dict[str, datetime]:
     if not database.has(LIDAR):
         return {}
     table = database.table(LIDAR)
-    times, entries = {}, list_entries(table.storage)
-    for commit in reversed(table.commits()):  # oldest first
-        if commit.operation == "retire":
-            times |= dict.fromkeys(commit.maps, entries[commit.version])
-    return times
+    entries = list_entries(table.storage)
+    commits = reversed(table.commits())  # oldest first
+    return {s: entries[c.version] for c in commits if c.operation == "retire" for s in c.maps}
 
 
 def count_points(

@@ -94,8 +94,9 @@ class MapList:
         attribution = attribution_of(feature_map)
         licences = "; ".join(sorted({row.licence for row in attribution if row.licence}))
         points = len(feature_map.points)
-        placed = isinstance(feature_map, FeatureMap)
-        place = (feature_map.epsg, feature_map.height_datum) if placed else ("", "")
+        place: tuple[object, object] = ("", "")
+        if isinstance(feature_map, FeatureMap):
+            place = feature_map.epsg, feature_map.height_datum
         row = (index, feature_map.map_id, feature_map.name, file if points else "", *place, points, licences)
         self._rows.append(row)
         self._photos.extend(attribution)
