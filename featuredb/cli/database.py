@@ -1,6 +1,6 @@
 """The commands that keep a database: from init and maps to verify, repair and vacuum.
 
-`lineage`, `candidates`, `backup` and `restore` are in modules of their own and are registered here.
+`lineage` and `candidates` are in modules of their own and are registered here.
 """
 
 import argparse
@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from featuredb.cli import backup, candidates, lineage
+from featuredb.cli import candidates, lineage
 from featuredb.cli.common import (
     add_as_of_argument,
     add_command,
+    add_database_argument,
     format_table,
     hours,
     json_text,
@@ -28,6 +29,7 @@ from featuredb.store.vacuum_options import VacuumOptions
 if TYPE_CHECKING:
     from featuredb.maps.place_bounds import PlaceBounds
     from featuredb.store import MapSummary, UnplacedSummary
+    from featuredb.store.durable.backup import CopyReport
     from featuredb.store.sql import SqlResult
 
 _DEFAULTS = VacuumOptions()
@@ -68,7 +70,7 @@ def register(subparsers: Any) -> None:
     rollback.add_argument("version", type=version_or_time, metavar="VERSION", help="number or ISO 8601 time")
     lineage.register(subparsers)
     candidates.register(subparsers)
-    backup.register(subparsers)
+    _register_backup(subparsers)
     add_command(subparsers, "compact", run_compact, "merge small files")
     add_command(subparsers, "upgrade", run_upgrade, "bring a database of an older release to today's format")
     _register_vacuum(subparsers)
@@ -247,6 +249,36 @@ def run_vacuum(args: argparse.Namespace) -> None:
     )
 
 
+def run_backup(args: argparse.Namespace) -> None:
+    from featuredb.store.durable.backup import backup
+
+    report = backup(open_database(args), args.target, _target_options(args))
+    _write_report("backup", args.target, report)
+
+
+def run_restore(args: argparse.Namespace) -> None:
+    from featuredb.store import Database
+    from featuredb.store.durable.backup import restore
+
+    target = Database(args.target, _target_options(args))
+    report = restore(args.db, target, storage_options(args))
+    _write_report("database", target.url, report)
+
+
+def _target_options(args: argparse.Namespace) -> dict[str, str]:
+    """Those of the target, else those of the source."""
+    given = argparse.Namespace(storage_option=args.target_storage_option or args.storage_option)
+    return storage_options(given)
+
+
+def _write_report(what: str, target: str, report: "CopyReport") -> None:
+    removed = f", {report.removed} of before removed" if report.removed else ""
+    sys.stdout.write(
+        f"{what} at {target}: version {report.version}, {report.files} files copied "
+        f"({report.bytes / 1e6:.1f} MB), {report.kept} there already{removed}\n"
+    )
+
+
 def write_result(result: "SqlResult", output: str) -> None:
     """Write a query's rows to stdout as table, csv or json; the latter two row by row."""
     if output == "table":
@@ -285,3 +317,21 @@ def _register_repair(subparsers: Any) -> None:
         action="store_true",
         help="go back also behind commits that were done and whose log entry is lost",
     )
+
+
+def _register_backup(subparsers: Any) -> None:
+    for name, run, text, source in (
+        ("backup", run_backup, "copy a database that may be in use; again: what is new", "the database"),
+        ("restore", run_restore, "make a database of a backup, where there is none", "the backup"),
+    ):
+        parser = subparsers.add_parser(name, help=text, description=text)
+        add_database_argument(parser, "SOURCE", f"folder or URL of {source}")
+        parser.add_argument("target", metavar="TARGET", help="folder or URL to write to")
+        parser.add_argument(
+            "--target-storage-option",
+            metavar="KEY=VALUE",
+            action="append",
+            default=[],
+            help="option of the target's object store, where it is not the source's; may be repeated",
+        )
+        parser.set_defaults(run=run)

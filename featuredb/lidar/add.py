@@ -22,13 +22,12 @@ from featuredb.errors import ConflictError, GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
 from featuredb.geo.crs.scan import ScanCrs, scan_crs
 from featuredb.geo.crs.utm_transform import UtmTransform, utm_transform
-from featuredb.lidar.clean import clean_block
+from featuredb.lidar.clean import OutlierOptions, clean_block
 from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.formats.ortho_image import OrthoImage, open_ortho
 from featuredb.lidar.levels import finest_level
 from featuredb.lidar.ortho import LAID
-from featuredb.lidar.outliers import OutlierOptions
 from featuredb.lidar.spill import Spill
 from featuredb.lidar.staged import BlockPlan, Staged, stretch_of
 from featuredb.store import Database
