@@ -14,7 +14,6 @@ from featuredb.maps.lineage import reached
 from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
 from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
 from featuredb.store.database import Database
-from featuredb.store.decode import has_place
 from featuredb.store.snapshot import MapSummary
 
 
@@ -68,6 +67,7 @@ def import_dataset(
     if own and not dry_run:
         database.require_newest_format("keep maps without a place")
     rows = [*rows, *own]
+    own_ids = {row["map_id"] for row in own}
     snapshot = database.snapshot()
     there = {m.map_id: m for m in snapshot.any_maps(include_retired=True)}
     live = {map_id: m for map_id, m in there.items() if m.status != RETIRED}
@@ -83,7 +83,7 @@ def import_dataset(
         new = map_id not in there or (map_id not in live and row["status"] != RETIRED)
         (created if new else present).append(map_id)
         if dry_run or new:
-            found = load_map(folder, row, listed) if has_place(row) else load_own(folder, row, listed)
+            found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
             if not dry_run:
                 _commit(database, found, _vouched_reason(row, missing), map_id in missing, trusted)
         told(done + 1, len(rows))
