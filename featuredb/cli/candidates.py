@@ -49,7 +49,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--reason", default="", help="kept with a withdrawal, which needs one")
 
 
-def run_candidates(args: argparse.Namespace) -> int:
+def run_candidates(args: argparse.Namespace) -> None:
     from featuredb.store.candidates.photos import list_candidates, withdraw
 
     database = open_database(args)
@@ -65,7 +65,7 @@ def run_candidates(args: argparse.Namespace) -> int:
                 f"maps {', '.join(report.used_by)} were built with them and keep their features (no pixels); "
                 "`featuredb retire` removes a map\n"
             )
-        return 0
+        return
     shown = [
         c
         for c in candidates
@@ -73,14 +73,13 @@ def run_candidates(args: argparse.Namespace) -> int:
     ]
     if args.json:
         write_json({"candidates": [asdict(c) for c in shown]})
-        return 0
+        return
     counts = Counter(c.state for c in candidates)
     sys.stdout.write(", ".join(f"{counts[state]} {state}" for state in CANDIDATE_STATES) + "\n")
     if shown:
         header = ("candidate", "state", "owner", "credit", "licence", "received", "answer", "kB", "about")
         shown.sort(key=lambda c: CANDIDATE_STATES.index(c.state))  # stable: oldest first within a state
         sys.stdout.write("\n" + format_table(header, map(_row, shown)))
-    return 0
 
 
 def _given_by(candidate: Candidate, owner: str | None, credit: str | None) -> bool:

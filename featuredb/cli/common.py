@@ -38,7 +38,7 @@ def add_database_argument(
 def add_command(
     subparsers: Any,
     name: str,
-    run: Callable[[argparse.Namespace], int],
+    run: Callable[[argparse.Namespace], int | None],
     text: str,
     *,
     description: str | None = None,

@@ -1,6 +1,6 @@
 """The commands that keep a database: from init and maps to verify, repair and vacuum.
 
-`lineage`, `candidates`, `backup` and `restore` are in modules of their own and are registered here.
+`lineage` and `candidates` are in modules of their own and are registered here.
 """
 
 import argparse
@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from featuredb.cli import backup, candidates, lineage
+from featuredb.cli import candidates, lineage
 from featuredb.cli.common import (
     add_as_of_argument,
     add_command,
+    add_database_argument,
     format_table,
     hours,
     json_text,
@@ -28,6 +29,7 @@ from featuredb.store.vacuum_options import VacuumOptions
 if TYPE_CHECKING:
     from featuredb.maps.place_bounds import PlaceBounds
     from featuredb.store import MapSummary, UnplacedSummary
+    from featuredb.store.durable.backup import CopyReport
     from featuredb.store.sql import SqlResult
 
 _DEFAULTS = VacuumOptions()
@@ -68,33 +70,30 @@ def register(subparsers: Any) -> None:
     rollback.add_argument("version", type=version_or_time, metavar="VERSION", help="number or ISO 8601 time")
     lineage.register(subparsers)
     candidates.register(subparsers)
-    backup.register(subparsers)
+    _register_backup(subparsers)
     add_command(subparsers, "compact", run_compact, "merge small files")
     add_command(subparsers, "upgrade", run_upgrade, "bring a database of an older release to today's format")
     _register_vacuum(subparsers)
     _register_repair(subparsers)
 
 
-def run_init(args: argparse.Namespace) -> int:
+def run_init(args: argparse.Namespace) -> None:
     from featuredb.store import Database
 
     place_for_database(args)
     database = Database.create(args.db, storage_options=storage_options(args))
     sys.stdout.write(f"database at {database.url}, version {database.poll_version()}\n")
-    return 0
 
 
-def run_maps(args: argparse.Namespace) -> int:
+def run_maps(args: argparse.Namespace) -> None:
     snapshot = open_database(args).snapshot(args.as_of)
+    if args.json:
+        rows = [row for row in snapshot.rows() if args.all or row["status"] != "retired"]
+        write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
+        return
     maps = snapshot.maps(include_retired=args.all)
     unplaced = snapshot.unplaced_maps(include_retired=args.all)
-    if args.json:
-        wanted = {m.map_id for m in snapshot.any_maps(include_retired=args.all)}
-        rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
-        write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
-        return 0
     sys.stdout.write(maps_table(maps, snapshot.place_bounds()) + unplaced_text(unplaced))
-    return 0
 
 
 def maps_table(maps: Sequence["MapSummary"], bounds: Mapping[str, "PlaceBounds"]) -> str:
@@ -143,22 +142,20 @@ def unplaced_text(unplaced: Sequence["UnplacedSummary"]) -> str:
     return "".join(lines)
 
 
-def run_history(args: argparse.Namespace) -> int:
+def run_history(args: argparse.Namespace) -> None:
     rows = [
         (e.version, e.timestamp, e.operation, ", ".join(e.maps), e.reason)
         for e in open_database(args).history()
     ]
     sys.stdout.write(format_table(("version", "time", "operation", "maps", "reason"), rows))
-    return 0
 
 
-def run_sql(args: argparse.Namespace) -> int:
+def run_sql(args: argparse.Namespace) -> None:
     from featuredb.store.sql import SqlSession
 
     database = open_database(args)
     with SqlSession(database.snapshot(args.as_of), database) as session:
         write_result(session.query(args.query), args.format)
-    return 0
 
 
 def run_verify(args: argparse.Namespace) -> int:
@@ -182,7 +179,7 @@ def run_verify(args: argparse.Namespace) -> int:
     return 0 if report.ok else 1
 
 
-def run_retire(args: argparse.Namespace) -> int:
+def run_retire(args: argparse.Namespace) -> None:
     from featuredb.store.scans import list_scans, retire_scan
 
     database = open_database(args)
@@ -192,23 +189,20 @@ def run_retire(args: argparse.Namespace) -> int:
     elif retire_scan(database, args.map_id, args.reason):
         retired = (args.map_id,)
     sys.stdout.write(f"retired: {', '.join(retired) if retired else 'nothing, it was retired already'}\n")
-    return 0
 
 
-def run_rollback(args: argparse.Namespace) -> int:
+def run_rollback(args: argparse.Namespace) -> None:
     sys.stdout.write(f"version {open_database(args).rollback(args.version)}\n")
-    return 0
 
 
-def run_compact(args: argparse.Namespace) -> int:
+def run_compact(args: argparse.Namespace) -> None:
     from featuredb.store.maintenance import compact
 
     for table, saved in compact(open_database(args)).items():
         sys.stdout.write(f"{table}: {saved} files less\n")
-    return 0
 
 
-def run_upgrade(args: argparse.Namespace) -> int:
+def run_upgrade(args: argparse.Namespace) -> None:
     from featuredb.store.maintenance import upgrade
     from featuredb.store.tables import FORMAT_VERSION
 
@@ -216,7 +210,6 @@ def run_upgrade(args: argparse.Namespace) -> int:
     sys.stdout.writelines(f"{step}\n" for step in steps)
     if not steps:
         sys.stdout.write(f"format {FORMAT_VERSION}, nothing to do\n")
-    return 0
 
 
 def run_repair(args: argparse.Namespace) -> int:
@@ -239,7 +232,7 @@ def run_repair(args: argparse.Namespace) -> int:
     return 1 if open_ends else 0
 
 
-def run_vacuum(args: argparse.Namespace) -> int:
+def run_vacuum(args: argparse.Namespace) -> None:
     from featuredb.store.maintenance import vacuum
 
     options = VacuumOptions(
@@ -254,7 +247,36 @@ def run_vacuum(args: argparse.Namespace) -> int:
         f"{would} {len(report.files)} files and the rows of {len(report.write_ids)} writes that no map "
         f"names{images}; versions from {report.kept_from} on stay readable\n"
     )
-    return 0
+
+
+def run_backup(args: argparse.Namespace) -> None:
+    from featuredb.store.durable.backup import backup
+
+    report = backup(open_database(args), args.target, _target_options(args))
+    _write_report("backup", args.target, report)
+
+
+def run_restore(args: argparse.Namespace) -> None:
+    from featuredb.store import Database
+    from featuredb.store.durable.backup import restore
+
+    target = Database(args.target, _target_options(args))
+    report = restore(args.db, target, storage_options(args))
+    _write_report("database", target.url, report)
+
+
+def _target_options(args: argparse.Namespace) -> dict[str, str]:
+    """Those of the target, else those of the source."""
+    given = argparse.Namespace(storage_option=args.target_storage_option or args.storage_option)
+    return storage_options(given)
+
+
+def _write_report(what: str, target: str, report: "CopyReport") -> None:
+    removed = f", {report.removed} of before removed" if report.removed else ""
+    sys.stdout.write(
+        f"{what} at {target}: version {report.version}, {report.files} files copied "
+        f"({report.bytes / 1e6:.1f} MB), {report.kept} there already{removed}\n"
+    )
 
 
 def write_result(result: "SqlResult", output: str) -> None:
@@ -276,24 +298,12 @@ def write_result(result: "SqlResult", output: str) -> None:
 
 def _register_vacuum(subparsers: Any) -> None:
     parser = add_command(subparsers, "vacuum", run_vacuum, "remove what no snapshot needs any more")
-    parser.add_argument(
-        "--keep-history-hours",
-        type=hours,
-        default=_DEFAULTS.history_h,
-        help="snapshots of this time stay readable (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--orphan-grace-hours",
-        type=hours,
-        default=_DEFAULTS.orphan_grace_h,
-        help="rows of unfinished commits stay this long (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--file-grace-hours",
-        type=hours,
-        default=_DEFAULTS.file_grace_h,
-        help="unused files stay this long for running readers (default: %(default)s)",
-    )
+    for option, default, text in (
+        ("--keep-history-hours", _DEFAULTS.history_h, "snapshots of this time stay readable"),
+        ("--orphan-grace-hours", _DEFAULTS.orphan_grace_h, "rows of unfinished commits stay this long"),
+        ("--file-grace-hours", _DEFAULTS.file_grace_h, "unused files stay this long for running readers"),
+    ):
+        parser.add_argument(option, type=hours, default=default, help=f"{text} (default: %(default)s)")
     parser.add_argument("--dry-run", action="store_true", help="only say what would be removed")
 
 
@@ -307,3 +317,21 @@ def _register_repair(subparsers: Any) -> None:
         action="store_true",
         help="go back also behind commits that were done and whose log entry is lost",
     )
+
+
+def _register_backup(subparsers: Any) -> None:
+    for name, run, text, source in (
+        ("backup", run_backup, "copy a database that may be in use; again: what is new", "the database"),
+        ("restore", run_restore, "make a database of a backup, where there is none", "the backup"),
+    ):
+        parser = subparsers.add_parser(name, help=text, description=text)
+        add_database_argument(parser, "SOURCE", f"folder or URL of {source}")
+        parser.add_argument("target", metavar="TARGET", help="folder or URL to write to")
+        parser.add_argument(
+            "--target-storage-option",
+            metavar="KEY=VALUE",
+            action="append",
+            default=[],
+            help="option of the target's object store, where it is not the source's; may be repeated",
+        )
+        parser.set_defaults(run=run)

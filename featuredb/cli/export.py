@@ -91,7 +91,7 @@ def add_selection_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_export(args: argparse.Namespace) -> int:
+def run_export(args: argparse.Namespace) -> None:
     database = open_database(args)
     done = export_maps(
         database,
@@ -106,7 +106,6 @@ def run_export(args: argparse.Namespace) -> int:
         write_json({"format": args.format, "out": args.out, "version": done.version, **asdict(done.written)})
     else:
         sys.stdout.write(done.as_text())
-    return 0
 
 
 def selection_of(args: argparse.Namespace) -> "Selection":

@@ -22,7 +22,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
 
 
-def run_import(args: argparse.Namespace) -> int:
+def run_import(args: argparse.Namespace) -> None:
     from featuredb.export.dataset import import_dataset
 
     done = import_dataset(
@@ -43,4 +43,3 @@ def run_import(args: argparse.Namespace) -> int:
     if not done.dry_run:
         lines.append(f"version {done.version}")
     sys.stdout.write("\n".join(lines) + "\n")
-    return 0

@@ -48,22 +48,23 @@ def register(subparsers: Any) -> None:
     picture.add_argument("out", metavar="PNG", type=Path)
 
 
-def run_add(args: argparse.Namespace) -> int:
-    from featuredb.lidar.add import add_scan
-    from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
+def run_add(args: argparse.Namespace) -> None:
+    from featuredb.lidar.add import AddOptions, add_scan
 
     database = place_for_database(args)
     options = AddOptions(crs=args.crs, height_unit=args.height_unit, height_datum=args.height_datum)
     if args.keep_outliers:
         options = replace(options, outliers=None)
-    ortho = None if args.ortho is None else OrthoChoice(path=args.ortho, crs=args.ortho_crs)
     with _progress(args.quiet) as on_progress:
         result = add_scan(
             database,
             args.files,
             options,
-            ScanLabels(name=args.name, licence=args.licence, source=args.source),
-            ortho=ortho,
+            name=args.name,
+            licence=args.licence,
+            source=args.source,
+            ortho=args.ortho,
+            ortho_crs=args.ortho_crs,
             work=args.work,
             on_progress=on_progress,
         )
@@ -73,16 +74,15 @@ def run_add(args: argparse.Namespace) -> int:
 
         write_plan_view(database, result.scan, args.picture)
         sys.stdout.write(f"  {'picture':<12}{args.picture}\n")
-    return 0
 
 
-def run_list(args: argparse.Namespace) -> int:
+def run_list(args: argparse.Namespace) -> None:
     from featuredb.store.scans import list_scans
 
     scans = list_scans(open_database(args), include_retired=args.all)
     if args.json:
         write_json({"scans": [{**scan.row, "created_at": scan.created_at} for scan in scans]})
-        return 0
+        return
     header = (
         "scan", "name", "status", "epsg", "heights", "points", "spacing_m", "colour", "intensity",
         "east_m", "north_m", "files", "added",
@@ -97,17 +97,15 @@ def run_list(args: argparse.Namespace) -> int:
         for s in scans
     ]  # fmt: skip
     sys.stdout.write(format_table(header, table))
-    return 0
 
 
-def run_picture(args: argparse.Namespace) -> int:
+def run_picture(args: argparse.Namespace) -> None:
     from featuredb.lidar.picture import write_plan_view
     from featuredb.store.scans import find_scan
 
     database = open_database(args)
     write_plan_view(database, find_scan(database, args.scan_id), args.out)
     sys.stdout.write(f"{args.out}\n")
-    return 0
 
 
 def summary(scan: "ScanSummary", outcome: str) -> str:
@@ -133,7 +131,10 @@ def summary(scan: "ScanSummary", outcome: str) -> str:
             "density",
             f"{scan.points / area_m2:.3g} points per m2 on {area_m2:,.0f} m2, spacing {scan.spacing_m:.3g} m",
         ),
-        ("classes", ", ".join(_class_count(c, n) for c, n in scan.classes.items())),
+        (
+            "classes",
+            ", ".join(f"{c} {_CLASS_NAMES.get(c, 'other')} {n:,}" for c, n in scan.classes.items()),
+        ),
         ("colour", {"file": "of the file", "ortho": "from the ortho image"}.get(scan.colour, "none")),
         ("intensity", _intensity(scan)),
         (
@@ -152,10 +153,6 @@ def summary(scan: "ScanSummary", outcome: str) -> str:
 
 
 _SAY_DATUM = "; --height-datum states it: " + ", ".join(d for d in HEIGHT_DATUMS if d != "unknown")
-
-
-def _class_count(number: int, points: int) -> str:
-    return f"{number} {_CLASS_NAMES.get(number, 'other')} {points:,}"
 
 
 def _intensity(scan: "ScanSummary") -> str:

@@ -32,7 +32,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 
-def run_lineage(args: argparse.Namespace) -> int:
+def run_lineage(args: argparse.Namespace) -> None:
     snapshot = open_database(args).snapshot(args.as_of)
     lineages = snapshot.lineages()
     maps = _wanted(snapshot, args.map_id, include_retired=args.all)
@@ -45,7 +45,6 @@ def run_lineage(args: argparse.Namespace) -> int:
         write_json({"snapshot": snapshot.version, "maps": told})
     else:
         sys.stdout.writelines(f"{line}\n" for line in draw_tree(maps, lineages, args.map_id))
-    return 0
 
 
 def draw_tree(
@@ -57,7 +56,9 @@ def draw_tree(
         lineages: of at least these maps.
         marked: a map that gets an asterisk.
     """
-    parent_of = {map_id: _drawn_under(map_id, maps, lineages) for map_id in maps}
+    # Chains lead to anchors, so nothing can be drawn under itself.
+    chains = {map_id: lineages[map_id].chain for map_id in maps}
+    parent_of = {m: chain[1] if len(chain) > 1 and chain[1] in maps else None for m, chain in chains.items()}
     children: dict[str, list[str]] = {}
     for map_id, parent in parent_of.items():
         if parent is not None:
@@ -80,17 +81,6 @@ def _wanted(snapshot: "Snapshot", map_id: str | None, *, include_retired: bool) 
         family = family_of(snapshot.get(map_id).map_id, every)
         return {m: summary for m, summary in every.items() if m in family}
     return {m: summary for m, summary in every.items() if include_retired or summary.status != "retired"}
-
-
-def _drawn_under(
-    map_id: str, maps: Mapping[str, "MapSummary"], lineages: Mapping[str, MapLineage]
-) -> str | None:
-    """The parent under which a map is drawn: that on its chain. None: it is a root here.
-
-    Chains lead to anchors, so nothing can be drawn under itself.
-    """
-    chain = lineages[map_id].chain
-    return chain[1] if len(chain) > 1 and chain[1] in maps else None
 
 
 def _line(summary: "MapSummary", lineage: MapLineage, drawn_under: str | None) -> str:

@@ -37,7 +37,7 @@ def register(subparsers: Any) -> None:
     parser.set_defaults(run=run_simworld)
 
 
-def run_simworld(args: argparse.Namespace) -> int:
+def run_simworld(args: argparse.Namespace) -> None:
     from rich.console import Console
 
     from featuredb.simworld.scan_world import write_lidar
@@ -54,7 +54,6 @@ def run_simworld(args: argparse.Namespace) -> int:
             args.out, options, lambda done, total: bars.update(task, completed=done, total=total)
         )
     Console().print(_summary(world, lidar=args.lidar))
-    return 0
 
 
 def _summary(world: "World", *, lidar: bool) -> str:

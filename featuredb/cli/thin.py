@@ -32,7 +32,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--dry-run", action="store_true", help="only say what would become of the map")
 
 
-def run_thin(args: argparse.Namespace) -> int:
+def run_thin(args: argparse.Namespace) -> None:
     """Thin the map and commit it as a new state of itself."""
     from featuredb.maps.thin import thin_map
 
@@ -43,16 +43,15 @@ def run_thin(args: argparse.Namespace) -> int:
     after: AnyMap = thin_map(cast("FeatureMap", before), args.cover)  # either kind comes out as it goes in
     sys.stdout.write(f"map {summary.map_id}: {_figures(before)} -> {_figures(after)}\n")
     if args.dry_run:
-        return 0
+        return
     if after is before:
         sys.stdout.write("thinned so before; nothing to do\n")
-        return 0
+        return
     done = database.commit_map(after, replaces=summary.map_id, based_on=summary.write_id, moves=False)
     sys.stdout.write(
         f"version {done.version}; `featuredb rollback {database.url} {snapshot.version}` brings back the "
         "state before\n"
     )
-    return 0
 
 
 def _thinnable(snapshot: "Snapshot", map_id: str) -> "MapSummary | UnplacedSummary":

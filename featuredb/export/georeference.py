@@ -1,18 +1,20 @@
 """Where a model in a local frame lies on Earth, as JSON that other programs, and the import, can use."""
 
-import json
 from collections import Counter
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+from featuredb.export.job import write_json
 from featuredb.export.selection import licence_of
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import meridian_convergence_deg, point_scale, zone_of
-from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 
 GEOREFERENCE = "georeference.json"
 FORMAT = "featuredb georeference 1"
+_OF_MAP = ("name", "status", "parents", "source", "licence", "extractor_fingerprint", "camera_keys")
 
 _HOW = (
     "Exactly: x_ecef = ecef_from_local (x, y, z, 1), or PROJ's utm.pipeline on x, y, z. Not by adding the "
@@ -25,17 +27,40 @@ _HEIGHTS = (
 )
 
 
-def georeference(feature_map: FeatureMap, names: list[str]) -> dict[str, Any]:
-    """The place of a map's local frame, and what of the map a COLMAP model has no room for.
+def write_georeference(folder: Path, feature_map: AnyMap, names: list[str]) -> None:
+    """Write the place of a map's local frame, or that it has none, and what a COLMAP model has no room for.
 
     Args:
         names: of the images as the model has them, in the map's order.
     """
+    of_map = {"id": feature_map.map_id, **{name: getattr(feature_map, name) for name in _OF_MAP}}
+    if isinstance(feature_map, UnplacedMap):
+        place = _own_frame(feature_map)
+    else:
+        place, of_map["generation"] = _on_earth(feature_map), feature_map.generation
+    seen = feature_map.observations
+    described = Counter(seen.image_id[seen.has_descriptor].tolist())
+    images = [
+        {
+            "image_id": image.image_id + 1,
+            "name": name,
+            "original_name": image.name,
+            "sha256": image.sha256,
+            "owner": image.owner,
+            "licence": licence_of(image, feature_map),
+            "capture_time": None if image.capture_time is None else image.capture_time.isoformat(),
+            "gps": None if image.gps is None else asdict(image.gps),
+            "descriptors": described[image.image_id],
+        }
+        for image, name in zip(feature_map.images, names, strict=True)
+    ]
+    write_json(folder / GEOREFERENCE, {"format": FORMAT, **place, "map": of_map, "images": images})
+
+
+def _on_earth(feature_map: FeatureMap) -> dict[str, Any]:
     frame, epsg = feature_map.frame, feature_map.epsg
-    easting, northing, height = frame.utm_from_enu((0.0, 0.0, 0.0), epsg)
     placement = feature_map.placement
     return {
-        "format": FORMAT,
         "frame": {
             "axes": "x east, y north, z up at the origin; metres",
             "origin": asdict(frame),
@@ -50,7 +75,7 @@ def georeference(feature_map: FeatureMap, names: list[str]) -> dict[str, Any]:
         },
         "utm": {
             "epsg": epsg,
-            "origin": [float(easting), float(northing), float(height)],
+            "origin": frame.utm_from_enu((0.0, 0.0, 0.0), epsg).tolist(),
             "meridian_convergence_deg": meridian_convergence_deg(
                 frame.latitude_deg, frame.longitude_deg, epsg
             ),
@@ -58,45 +83,24 @@ def georeference(feature_map: FeatureMap, names: list[str]) -> dict[str, Any]:
             "pipeline": utm_pipeline(frame, epsg),
             "how": _HOW,
         },
-        "map": _map(feature_map) | {"generation": feature_map.generation},
         "placement": {
             "method": placement.method,
             "residual_rms_m": placement.residual_rms_m,
             "covariance": placement.covariance.tolist(),
             "covariance_of": "left perturbation (log scale, rotation rad, translation m) in the local frame",
         },
-        "images": _images(feature_map, names),
     }
 
 
-def own_frame(unplaced: UnplacedMap, names: list[str]) -> dict[str, Any]:
-    """What says of a map without a place that it has none, and what `georeference` says of its photos."""
+def _own_frame(unplaced: UnplacedMap) -> dict[str, Any]:
     frame, why = unplaced.frame, unplaced.no_place
+    axes = "z up, x and y anywhere" if frame.upright else "axes in any direction"
+    unit = "metres" if frame.metric else "units of any length"
     return {
-        "format": FORMAT,
-        "frame": {
-            "axes": "no place on Earth: "
-            + ("z up, x and y anywhere" if frame.upright else "axes in any direction")
-            + ("; metres" if frame.metric else "; units of any length"),
-            "metric": frame.metric,
-            "upright": frame.upright,
-            "origin": None,
-        },
-        "map": _map(unplaced),
+        "frame": {"axes": f"no place on Earth: {axes}; {unit}", **asdict(frame), "origin": None},
         "placement": None,
-        "no_place": {"reason_code": why.reason_code, "reason": why.reason, "ways": list(why.ways)},
-        "images": _images(unplaced, names),
+        "no_place": {"reason_code": why.reason_code, "reason": why.reason, "ways": why.ways},
     }
-
-
-def georeference_text(feature_map: AnyMap, names: list[str]) -> str:
-    """`georeference`, or `own_frame`, as the text of its file."""
-    told = (
-        own_frame(feature_map, names)
-        if isinstance(feature_map, UnplacedMap)
-        else georeference(feature_map, names)
-    )
-    return json.dumps(told, indent=1, allow_nan=False) + "\n"
 
 
 def utm_pipeline(frame: LocalFrame, epsg: int) -> str:
@@ -108,39 +112,3 @@ def utm_pipeline(frame: LocalFrame, epsg: int) -> str:
         f"+lat_0={frame.latitude_deg!r} +h_0={frame.height_m!r} +step +inv +proj=cart +ellps=WGS84 "
         f"+step +proj=utm +zone={zone}{south} +ellps=WGS84"
     )
-
-
-def _map(feature_map: AnyMap) -> dict[str, Any]:
-    return {
-        "id": feature_map.map_id,
-        "name": feature_map.name,
-        "status": feature_map.status,
-        "parents": list(feature_map.parents),
-        "source": feature_map.source,
-        "licence": feature_map.licence,
-        "extractor_fingerprint": feature_map.extractor_fingerprint,
-        "camera_keys": list(feature_map.camera_keys),
-    }
-
-
-def _images(feature_map: AnyMap, names: list[str]) -> list[dict[str, Any]]:
-    seen = feature_map.observations
-    described = Counter(seen.image_id[seen.has_descriptor].tolist())
-    return [
-        _image(image, feature_map, name, described[image.image_id])
-        for image, name in zip(feature_map.images, names, strict=True)
-    ]
-
-
-def _image(image: MapImage, feature_map: AnyMap, name: str, descriptors: int) -> dict[str, Any]:
-    return {
-        "image_id": image.image_id + 1,
-        "name": name,
-        "original_name": image.name,
-        "sha256": image.sha256,
-        "owner": image.owner,
-        "licence": licence_of(image, feature_map),
-        "capture_time": None if image.capture_time is None else image.capture_time.isoformat(),
-        "gps": None if image.gps is None else asdict(image.gps),
-        "descriptors": descriptors,
-    }

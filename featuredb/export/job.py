@@ -1,4 +1,4 @@
-"""What every format is given and gives back, and an output that is there whole or not at all."""
+"""What every format is given and gives back, the photos it names, and an output that is whole or absent."""
 
 import csv
 import json
@@ -9,16 +9,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 from urllib.parse import quote
 
 from featuredb.errors import ExportError
-from featuredb.export.selection import Selection, exported, selected_any, selected_maps
+from featuredb.export.selection import Selection, exported, licence_of, selected_any, selected_maps
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store.database import Database
 from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary
 
+ATTRIBUTION = "attribution.csv"  # goes with every export, as licences ask
 _Kind = TypeVar("_Kind", FeatureMap, AnyMap)
 Told = Callable[[int, int], None]
 """Called with the number of maps written and their total."""
@@ -117,7 +118,7 @@ def folder_name(map_id: str) -> str:
 
 
 def folder_for_each(job: ExportJob, maps: Iterable[_Kind], write: Callable[[Path, _Kind], None]) -> Exported:
-    """Make `job.out` with a folder for every map, which `write` makes and fills.
+    """Make `job.out` with a folder for every map, which `write` makes and fills, and its photos' owners.
 
     Raises:
         ExportError: there is something at `job.out`; and what `write` raises.
@@ -125,7 +126,9 @@ def folder_for_each(job: ExportJob, maps: Iterable[_Kind], write: Callable[[Path
     with whole_or_nothing(job.out) as part:
         part.mkdir()
         for feature_map in maps:
-            write(part / folder_name(feature_map.map_id), feature_map)
+            folder = part / folder_name(feature_map.map_id)
+            write(folder, feature_map)
+            write_attribution(folder, attribution_of(feature_map))
             del feature_map  # or it would stay while the next one is loaded
         return job.exported(part)
 
@@ -149,3 +152,36 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object
     """Write a table with a header: UTF-8, commas, quotes where they are needed."""
     with path.open("w", encoding="utf-8", newline="") as out:
         csv.writer(out, lineterminator="\n").writerows([columns, *rows])
+
+
+class Attribution(NamedTuple):
+    """One photo: who made it, under which licence it was given ("" where nobody has said)."""
+
+    map_id: str
+    image: str
+    sha256: str
+    owner: str
+    licence: str
+    capture_time: str
+    source: str
+
+
+def attribution_of(feature_map: AnyMap) -> list[Attribution]:
+    """A row for every photo of the map, in the map's order."""
+    return [
+        Attribution(
+            map_id=feature_map.map_id,
+            image=image.name,
+            sha256=image.sha256,
+            owner=image.owner,
+            licence=licence_of(image, feature_map),
+            capture_time="" if image.capture_time is None else image.capture_time.isoformat(),
+            source=feature_map.source,
+        )
+        for image in feature_map.images
+    ]
+
+
+def write_attribution(folder: Path, rows: Iterable[Attribution]) -> None:
+    """The table of the photos in a folder."""
+    write_csv(folder / ATTRIBUTION, Attribution._fields, rows)

@@ -61,13 +61,10 @@ def selected_maps(database: Database, snapshot: Snapshot, selection: Selection) 
     """
     found = selected_any(database, snapshot, selection)
     asked = bool(selection.maps) or "unplaced" in selection.statuses
-    placed = [m for m in found if isinstance(m, MapSummary)]
-    for summary in found if asked else ():
-        if isinstance(summary, UnplacedSummary):
-            try:
-                snapshot.get(summary.map_id)
-            except UnplacedMapError as error:
-                raise ExportError(f"{error}. Exports to {', '.join(KEEP_UNPLACED)} need none") from error
+    try:
+        placed = [snapshot.get(m.map_id) for m in found if asked or isinstance(m, MapSummary)]
+    except UnplacedMapError as error:
+        raise ExportError(f"{error}. Exports to {', '.join(KEEP_UNPLACED)} need none") from error
     _some(placed, "maps with a place")
     return placed
 

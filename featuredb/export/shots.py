@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import datetime
 
 import numpy as np
 
@@ -20,20 +19,17 @@ class PosedPhoto:
     """One photo.
 
     Attributes:
-        name: as the map has it. number: of the image within the map.
+        image: as the map has it; `licence` is the map's where it has none of its own.
         geopose: where it was taken; its height is in `height_datum`.
         height_datum: of `geopose`: "ellipsoidal" wherever the map's datum could be converted.
         map_height_m: in the map's own datum, `map_height_datum`.
         sigma_enu_m: (3,) standard deviation of the position along true east, north, up: what the photo
             leaves open, and the map's place on Earth.
         sigma_rotation_deg: (3,) of the rotation about the same axes.
-        unix_ms: when it was taken, where the photo says in which time zone.
     """
 
     map_id: str
-    number: int
-    name: str
-    sha256: str
+    image: MapImage
     camera: Camera
     geopose: GeoPose
     height_datum: str
@@ -41,14 +37,7 @@ class PosedPhoto:
     map_height_datum: str
     sigma_enu_m: FloatArray
     sigma_rotation_deg: FloatArray
-    capture_time: datetime | None
-    owner: str
     licence: str
-
-    @property
-    def unix_ms(self) -> int | None:
-        time = self.capture_time
-        return None if time is None or time.tzinfo is None else round(1000.0 * time.timestamp())
 
 
 def shots_of(feature_map: FeatureMap) -> Iterator[PosedPhoto]:
@@ -63,9 +52,7 @@ def shots_of(feature_map: FeatureMap) -> Iterator[PosedPhoto]:
         sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         yield PosedPhoto(
             map_id=feature_map.map_id,
-            number=image.image_id,
-            name=image.name,
-            sha256=image.sha256,
+            image=image,
             camera=feature_map.cameras[image.camera_id],
             geopose=replace(placed, height_m=height),
             height_datum=feature_map.height_datum if converted.height_m is None else "ellipsoidal",
@@ -73,8 +60,6 @@ def shots_of(feature_map: FeatureMap) -> Iterator[PosedPhoto]:
             map_height_datum=feature_map.height_datum,
             sigma_enu_m=sigmas[3:],
             sigma_rotation_deg=np.degrees(sigmas[:3]),
-            capture_time=image.capture_time,
-            owner=image.owner,
             licence=licence_of(image, feature_map),
         )
 

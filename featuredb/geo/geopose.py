@@ -1,11 +1,16 @@
-"""OGC GeoPose 1.0, Basic-Quaternion: a pose on Earth as a position and a rotation in the true ENU there.
+"""OGC GeoPose 1.0 (21-056r11): a pose on Earth as a position and a rotation in the true ENU there.
+
+As a value and as JSON: Basic-Quaternion, Basic-YPR, Irregular Series.
 
 The body that turns is the camera with axes x forward, y left, z up; the camera itself has x right,
 y down, z forward. A level camera that looks true east has the identity rotation. The rotation belongs to the
 pose's own position, not to a map's origin: verticals differ by a degree in 111 km, and meridians converge.
 """
 
+import hashlib
+import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -22,6 +27,11 @@ BODY_AXES: Final = "x forward, y left, z up"
 
 BODY_FROM_CAM: FloatArray = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 BODY_FROM_CAM.setflags(write=False)
+
+# Members of documents are those that the schemas of OGC's compliance suite ask for; earlier drafts had a word
+# for the transition model, the standard has a frame-like object.
+_AUTHORITY = "/geopose/1.0"
+_TRANSITION = {"authority": _AUTHORITY, "id": "none", "parameters": ""}  # nothing is known between two poses
 
 # Three decimals are what the tersest clients send; a quaternion further off unit length is no rotation.
 UNIT_NORM_TOLERANCE = 2e-3
@@ -109,3 +119,69 @@ def geopose_from_camera(cam_from_local: Rigid3, frame: LocalFrame) -> GeoPose:
         height_m=float(height),
         quaternion_xyzw=(float(x), float(y), float(z), float(w)),
     )
+
+
+def basic_ypr(pose: GeoPose) -> dict[str, Any]:
+    """A Basic-YPR GeoPose."""
+    yaw, pitch, roll = pose.yaw_pitch_roll_deg
+    return {
+        "position": pose.to_json()["position"],
+        "angles": {"yaw": yaw, "pitch": pitch, "roll": roll},
+    }
+
+
+def irregular_series(poses: Sequence[tuple[int, GeoPose]]) -> dict[str, Any]:
+    """Poses of one body with their times; the outer frame is east-north-up at the first of them.
+
+    Translations are metres, rotations are quaternions x, y, z, w of the body.
+
+    Args:
+        poses: at least one, in the order of their times, Unix milliseconds.
+
+    Raises:
+        ValueError: no poses.
+    """
+    if not poses:
+        raise ValueError("an Irregular Series has at least one pose, found none")
+    outer = _frame_at(poses[0][1])
+    series = [{"frame": _inner(outer, pose), "validTime": unix_ms} for unix_ms, pose in poses]
+    digest = hashlib.sha256(json.dumps(series, separators=(",", ":")).encode()).hexdigest()
+    check = {"poseCount": len(series), "integrityCheck": json.dumps({"SHA256": digest})}
+    return {
+        "header": {
+            **check,
+            "startInstant": poses[0][0],
+            "stopInstant": poses[-1][0],
+            "transitionModel": _TRANSITION,
+        },
+        "outerFrame": _tangent(outer),
+        "innerFrameAndTimeSeries": series,
+        "trailer": check,
+    }
+
+
+def _frame_at(pose: GeoPose) -> LocalFrame:
+    return LocalFrame(
+        latitude_deg=pose.latitude_deg, longitude_deg=pose.longitude_deg, height_m=pose.height_m
+    )
+
+
+def _tangent(frame: LocalFrame) -> dict[str, str]:
+    return {
+        "authority": _AUTHORITY,
+        "id": "LTP-ENU",
+        "parameters": f"longitude={frame.longitude_deg:.10f}&latitude={frame.latitude_deg:.10f}"
+        f"&height={frame.height_m:.4f}",
+    }
+
+
+def _inner(outer: LocalFrame, pose: GeoPose) -> dict[str, str]:
+    outer_from_here = outer.enu_from(_frame_at(pose))
+    turned = quaternion_from_matrix(outer_from_here.rotation @ pose.true_enu_from_body)
+    translation = ", ".join(f"{v:.4f}" for v in outer_from_here.translation)
+    rotation = ", ".join(f"{v:.9f}" for v in turned)
+    return {
+        "authority": _AUTHORITY,
+        "id": "RotateTranslate",
+        "parameters": f"translation=[{translation}]&rotation=[{rotation}]",
+    }

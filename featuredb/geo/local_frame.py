@@ -83,12 +83,15 @@ class LocalFrame:
             InvalidValueError: wrong shape or not finite.
         """
         points = as_geodetic("LocalFrame.enu_from_geodetic", lat_lon_h)
-        return points.shaped_like_input(self._enu_from_ecef(ecef_from_geodetic(points.rows)))
+        origin, rotation = _origin_and_axes(self)
+        return points.shaped_like_input((ecef_from_geodetic(points.rows) - origin) @ rotation.T)
 
     def geodetic_from_enu(self, enu: ArrayLike) -> FloatArray:
         """Latitude, longitude (degrees), height (m) of points (n, 3) or (3,) of this frame, same shape."""
         points = as_points("LocalFrame.geodetic_from_enu", enu)
-        return points.shaped_like_input(self._geodetic(points.rows))
+        if len(points.rows) == 1:
+            return points.shaped_like_input(np.array([_geodetic_of_point(self, *points.rows[0].tolist())]))
+        return points.shaped_like_input(geodetic_from_ecef(self._ecef_from_enu(points.rows)))
 
     def enu_from(self, other: "LocalFrame") -> Rigid3:
         """The transform this_enu_from_other_enu: exact, since both frames are rigid in geocentric space."""
@@ -128,16 +131,6 @@ class LocalFrame:
         sin, cos = np.sin(convergence), np.cos(convergence)
         grid_from_true = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         return np.asarray(grid_from_true @ self.true_enu_from_enu(point), dtype=np.float64)
-
-    def _geodetic(self, rows: FloatArray) -> FloatArray:
-        """Latitude, longitude (degrees), height (m) of points (n, 3) of this frame."""
-        if len(rows) == 1:
-            return np.array([_geodetic_of_point(self, *rows[0].tolist())])
-        return geodetic_from_ecef(self._ecef_from_enu(rows))
-
-    def _enu_from_ecef(self, ecef: FloatArray) -> FloatArray:
-        origin, rotation = _origin_and_axes(self)
-        return np.asarray((ecef - origin) @ rotation.T, dtype=np.float64)
 
     def _ecef_from_enu(self, enu: FloatArray) -> FloatArray:
         origin, rotation = _origin_and_axes(self)

@@ -5,26 +5,28 @@ finished is not done again. Files that are wrong in any way are found in the fir
 behind.
 """
 
+import hashlib
 import json
 import logging
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+
+from pydantic import TypeAdapter
 
 from featuredb.atomic import atomic_file, user_cache
 from featuredb.errors import ConflictError, GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
 from featuredb.geo.crs.scan import ScanCrs, scan_crs
 from featuredb.geo.crs.utm_transform import UtmTransform, utm_transform
-from featuredb.lidar.clean import clean_block
+from featuredb.lidar.clean import OutlierOptions, clean_block
 from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.formats.ortho_image import OrthoImage, open_ortho
 from featuredb.lidar.levels import finest_level
-from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 from featuredb.lidar.ortho import LAID
 from featuredb.lidar.spill import Spill
 from featuredb.lidar.staged import BlockPlan, Staged, stretch_of
@@ -38,7 +40,51 @@ _LARGEST_8_BIT = 255
 
 # Spilled and finished points take 36 and 55 bytes, and both lie here at the end.
 _BYTES_PER_POINT = 100
+_OF_CRS = ("horizontal_unit", "height_datum", "height_unit", "height_unit_m", "height_unit_reason")
 _PLAN = "spill.json"  # in a work folder: the first pass is done
+_FORMAT = 1  # of scans: raised when the same files and options give other rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddOptions:
+    """How a scan is read, cleaned and ordered.
+
+    Attributes:
+        crs: CRS in place of the files' own: EPSG code, WKT or PROJ string; None to take theirs.
+        height_unit: unit of Z in place of the CRS's: "m", "ft" or "us-ft".
+        height_datum: datum of the heights in place of the CRS's, see featuredb.geo.datum.
+        epsg: UTM zone to store in; None for that of the first file's centre.
+        outliers: outlier removal, or None for none.
+        intensity_low_percent, intensity_high_percent: raw intensities that become 0 and 255.
+        block_points: most points that are held at a time, without their surroundings.
+        chunk_points: points that are read at a time.
+    """
+
+    crs: str | None = None
+    height_unit: str | None = None
+    height_datum: str | None = None
+    epsg: int | None = None
+    outliers: OutlierOptions | None = field(default_factory=OutlierOptions)
+    # Specular glints and the darkest returns are a few per thousand to a percent of airborne scans, and
+    # spread over most of the raw range; one percent at each end leaves the contrast to the rest.
+    intensity_low_percent: float = 1.0
+    intensity_high_percent: float = 99.0
+    # About 400 bytes per point at the peak (neighbour search): a million are 0.4 GB.
+    block_points: int = 1_000_000
+    chunk_points: int = 500_000
+
+    def scan_id(self, sha256: Sequence[str], ortho: Sequence[str] = ()) -> str:
+        """Id of the scan that these files make with these options; the order of files does not count.
+
+        Args:
+            sha256: digest of each file.
+            ortho: what names the ortho image that colours it, if any.
+        """
+        chosen = asdict(self)
+        for name in ("block_points", "chunk_points"):  # do not change the result
+            chosen.pop(name)
+        text = json.dumps([_FORMAT, sorted(sha256), list(ortho), chosen], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @contextmanager
@@ -116,9 +162,12 @@ def add_scan(
     database: Database,
     files: Sequence[Path],
     options: AddOptions | None = None,
-    labels: ScanLabels | None = None,
     *,
-    ortho: OrthoChoice | None = None,
+    name: str = "",
+    licence: str = "",
+    source: str = "",
+    ortho: Path | None = None,
+    ortho_crs: str | None = None,
     work: Path | None = None,
     on_progress: OnProgress = lambda step, done, total: None,
 ) -> AddResult:
@@ -130,7 +179,8 @@ def add_scan(
 
     Args:
         files: the files of one survey; they may differ in CRS, but not in the datum of their heights.
-        ortho: image that colours what is seen from above.
+        name: for listings; "" for the first file's name. licence, source: for those who use it later.
+        ortho: image that GDAL reads, which colours what is seen from above. ortho_crs: in place of its own.
         work: where unfinished work is kept; by default `_work` in a local database.
 
     Raises:
@@ -140,10 +190,11 @@ def add_scan(
         StoreError: the database cannot be written.
         MissingExtraError: the packages of the extra `lidar` are not installed.
     """
-    options, labels = options or AddOptions(), labels or ScanLabels()
-    opened = _open_all(files)
-    image = None if ortho is None else open_ortho(ortho.path, ortho.crs)
-    scan_id = options.scan_id([file.sha256 for file in opened], _ortho_identity(ortho))
+    options, opened = options or AddOptions(), _open_all(files)
+    image = None if ortho is None else open_ortho(ortho, ortho_crs)
+    # What tells the image and its use from others: name apart, so that a copy is the same.
+    look = [] if ortho is None else [file_sha256(ortho), ortho_crs or "", json.dumps(LAID, sort_keys=True)]
+    scan_id = options.scan_id([file.sha256 for file in opened], look)
     for scan in list_scans(database):
         if scan.scan_id == scan_id:
             return AddResult(created=False, scan=scan)
@@ -151,9 +202,10 @@ def add_scan(
     with work_folder(database, work, f"lidar-{scan_id}", sum(f.points for f in opened)) as folder:
         plan = _read_all(folder, inputs, options, on_progress)
         staged = _clean_all(folder, plan, options, image, inputs[0].to_utm.epsg, on_progress)
-        row = _row(scan_id, inputs, plan, staged, options, labels)
-        if ortho is not None:
-            row |= {"colour": "ortho", "ortho": json.dumps(_ortho_identity(ortho))}
+        row = _row(scan_id, inputs, plan, staged, options)
+        row |= {"name": name or inputs[0].file.path.name, "source": source, "licence": licence}
+        if look:
+            row |= {"colour": "ortho", "ortho": json.dumps(look)}
         Database.create(database.url, storage_options=database.storage_options)
         created, _ = commit_scan(
             database,
@@ -162,13 +214,6 @@ def add_scan(
             lambda points: on_progress("write", points, row["points"]),
         )
     return AddResult(created=created, scan=find_scan(database, scan_id))
-
-
-def _ortho_identity(ortho: OrthoChoice | None) -> list[str]:
-    """What tells the ortho image and its use from others: name apart, so that a copy is the same."""
-    if ortho is None:
-        return []
-    return [file_sha256(ortho.path), ortho.crs or "", json.dumps(LAID, sort_keys=True)]
 
 
 def _open_all(files: Sequence[Path]) -> list[ScanFile]:
@@ -217,7 +262,7 @@ def _read_all(
 ) -> BlockPlan:
     """Read all files into blocks, or find that this was done."""
     if (folder / _PLAN).is_file():
-        return BlockPlan.from_json(json.loads((folder / _PLAN).read_text()))
+        return TypeAdapter(BlockPlan).validate_json((folder / _PLAN).read_bytes())
     total = sum(item.file.points for item in inputs)
     spill = Spill(folder / "spill")
     spill.clear()
@@ -275,17 +320,14 @@ def _row(
     plan: BlockPlan,
     staged: Staged,
     options: AddOptions,
-    labels: ScanLabels,
 ) -> Row:
-    """The scan's row in `lidar`."""
+    """The scan's row in `lidar`, but for what people say about it."""
     crs = inputs[0].crs
     notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
     return {
         "scan_id": scan_id,
-        "name": labels.name or inputs[0].file.path.name,
         "files": [_file_row(item) for item in inputs],
         "epsg": inputs[0].to_utm.epsg,
-        "height_datum": crs.height_datum,
         **staged.totals(),
         "tiles": sorted({block.tile for block in plan.blocks}),
         "points_in_files": plan.read,
@@ -298,15 +340,10 @@ def _row(
         "intensity_low": None if plan.stretch is None else plan.stretch.low,
         "intensity_high": None if plan.stretch is None else plan.stretch.high,
         "crs_source": crs.source,
-        "horizontal_unit": crs.horizontal_unit,
         "vertical_crs": crs.vertical_name,
-        "height_unit": crs.height_unit,
-        "height_unit_m": crs.height_unit_m,
-        "height_unit_reason": crs.height_unit_reason,
+        **{name: getattr(crs, name) for name in _OF_CRS},
         "notes": list(dict.fromkeys(notes)),
         "options": json.dumps(asdict(options), sort_keys=True),
-        "source": labels.source,
-        "licence": labels.licence,
     }
 
 

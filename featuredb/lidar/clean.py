@@ -1,17 +1,56 @@
-"""One block of a scan: outliers out, colours and intensities as bytes, ordered by level and node."""
+"""One block of a scan: outliers out, colours and intensities as bytes, ordered by level and node.
 
+Outliers are points much farther from their neighbours than those are from theirs.
+"""
+
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from featuredb.compiled import compiled_module
+from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.formats.ortho_image import OrthoImage
 from featuredb.lidar.levels import order_by_level
 from featuredb.lidar.ortho import colour_by_ortho, margin_m
-from featuredb.lidar.outliers import OutlierOptions, find_outliers
 from featuredb.lidar.spill import SPILLED, Spill, TileBlock
 from featuredb.lidar.staged import BlockPlan
 from featuredb.store.scans import POINT_ROW
+
+_QUERY_ROWS = 100_000  # neighbours of this many points at a time: 15 MB
+_SORTED_CELLS = 8.0  # cells per reach when points are sorted: about as many as there are neighbours
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutlierOptions:
+    """Which points are outliers.
+
+    Attributes:
+        neighbours: how many nearest neighbours are looked at.
+        fewest: a point with fewer of them in reach is an outlier: alone, or a pair of birds.
+        ratio: a point is one if the mean distance to its neighbours is this many times the median of theirs.
+        reach_spacings: neighbours are looked for within this many of the scan's spacings, ...
+        shortest_reach_m: ... but at least this far.
+    """
+
+    # Eight, as many as surround a point of a grid.
+    neighbours: int = 8
+    fewest: int = 4
+    # A ratio of neighbours and no distance: scans are denser near the scanner and where strips overlap, and a
+    # distance that is odd in one place is usual in another. docs/measurements/lidar.md has the distributions.
+    ratio: float = 5.0
+    reach_spacings: float = 12.0
+    shortest_reach_m: float = 1.0
+
+    def reach_m(self, spacing_m: float) -> float:
+        """How far neighbours are looked for, metres."""
+        return max(self.shortest_reach_m, self.reach_spacings * spacing_m)
+
+    def margin_m(self, spacing_m: float) -> float:
+        """How far around a block points decide on its own: neighbours, and their neighbours."""
+        return 2.0 * self.reach_m(spacing_m)
 
 
 def clean_block(
@@ -79,3 +118,46 @@ def _colours(rows: NDArray[Any], colour_bits: tuple[int, ...]) -> tuple[NDArray[
     bits = np.array(colour_bits, np.int64)[rows["file"]]
     shift = np.where(bits == 16, 8, 0).astype(np.uint16)
     return (rows["rgb"] >> shift[:, None]).astype(np.uint8), bits > 0
+
+
+def outlier_ratio(xyz: FloatArray, core: int, reach_m: float, options: OutlierOptions) -> FloatArray:
+    """Mean distance to the nearest neighbours, as a multiple of the median of the same of those neighbours.
+
+    Neighbours farther than `reach_m` count as that far away, so that the ratio of a point depends only on
+    what lies within twice the reach: pieces of a scan that overlap by that give what the whole scan gives.
+
+    Args:
+        xyz: (n, 3) metres.
+        core: the ratio is asked for the first `core` points; the others are their surroundings.
+
+    Returns:
+        (core,) float64; infinity for a point with less than `options.fewest` neighbours in reach.
+    """
+    loops: Any = compiled_module("featuredb.render.loops.level_loops")
+    local = (xyz - xyz.min(axis=0)).astype(np.float32)
+    # Asking for neighbours in the order of space is three times faster than in that of most files.
+    order = np.argsort(loops.morton_codes(local, np.zeros(3), reach_m / _SORTED_CELLS), kind="stable")
+    points = xyz[order]
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    mean = np.empty(len(points) + 1, np.float32)
+    mean[-1] = np.nan  # what is not there has row n
+    rows = np.empty((len(points), options.neighbours), np.int32)
+    for start in range(0, len(points), _QUERY_ROWS):
+        part = slice(start, min(start + _QUERY_ROWS, len(points)))
+        found: Any = tree.query(points[part], k=options.neighbours + 1, distance_upper_bound=reach_m)
+        mean[part] = np.minimum(found[0][:, 1:], reach_m).mean(axis=1)
+        rows[part] = found[1][:, 1:]
+    ratio = np.full(len(points), np.inf)
+    for start in range(0, len(points), _QUERY_ROWS):
+        part = slice(start, min(start + _QUERY_ROWS, len(points)))
+        some = (rows[part] < len(points)).sum(axis=1) >= options.fewest
+        theirs = np.nanmedian(mean[rows[part][some]], axis=1)
+        ratio[part][some] = mean[part][some] / np.maximum(theirs, 1e-9)
+    unsorted = np.empty(len(points))
+    unsorted[order] = ratio
+    return unsorted[:core]
+
+
+def find_outliers(xyz: FloatArray, core: int, spacing_m: float, options: OutlierOptions) -> NDArray[np.bool_]:
+    """(core,) bool, which of the first `core` points are outliers; see `outlier_ratio`."""
+    return outlier_ratio(xyz, core, options.reach_m(spacing_m), options) > options.ratio

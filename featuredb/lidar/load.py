@@ -1,8 +1,6 @@
 """Scans of a database, or parts of them, as a point cloud in a local frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,8 @@ from featuredb.render.cloud import CloudNodes, PointCloud
 from featuredb.render.spacing import point_spacing
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_points
-from featuredb.store.tables import UTM_COORDINATES
+from featuredb.store.snapshot import full_id
+from featuredb.store.tables import LIDAR_POINTS, SPECS, UTM_COORDINATES
 
 _RGB = ("red", "green", "blue")
 
@@ -29,14 +28,8 @@ PlanBox = tuple[float, float, float, float]
 _LARGEST_POINTS = 20_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """One level of one scan."""
-
-    level: int
-    utm: NDArray[np.float64]
-    epsg: int
-    columns: pa.Table
+_Part = tuple[ScanSummary, int, pa.Table]
+"""One level of one scan."""
 
 
 def scan_frame(scan: ScanSummary) -> LocalFrame:
@@ -51,7 +44,7 @@ def scan_frame(scan: ScanSummary) -> LocalFrame:
 
 
 def load_cloud(
-    database: Database | str | Path,
+    database: Database,
     frame: LocalFrame,
     box_local: PlanBox | None = None,
     *,
@@ -78,8 +71,6 @@ def load_cloud(
         ScanError: the scans' heights are of different datums, or even the coarsest level has too many points.
         StoreError: the points cannot be read.
     """
-    if not isinstance(database, Database):
-        database = Database.open(database)
     scans = chosen_scans(database, scan_ids)
     datums = sorted({scan.height_datum for scan in scans})
     if len(datums) > 1:
@@ -90,7 +81,8 @@ def load_cloud(
     touched = [s for s in scans if (b := boxes[s.scan_id]) is None or s.box.touches(*b)]
     rgb = bool(touched) and all(scan.colour for scan in touched)
     intensity = bool(touched) and all(scan.has_intensity for scan in touched)
-    columns = (*UTM_COORDINATES, *(_RGB if rgb else ()), *(("intensity",) if intensity else ()))
+    columns = [*UTM_COORDINATES, *(_RGB if rgb else ()), *(("intensity",) if intensity else ())]
+    columns += ["classification", "node", "node_spacing_m"]
     parts: list[_Part] = []
     total = 0
     for level in range(max((len(scan.level_points) for scan in touched), default=0)):
@@ -103,17 +95,10 @@ def load_cloud(
                 )
             break
         for scan in touched:
-            table = scan_points(
-                database,
-                scan,
-                level,
-                boxes[scan.scan_id],
-                (*columns, "classification", "node", "node_spacing_m"),
-            )
+            table = scan_points(database, scan, level, boxes[scan.scan_id], columns)
             if len(table):
-                utm = np.stack([table[name].to_numpy() for name in UTM_COORDINATES], axis=1)
-                parts.append(_Part(level, utm, scan.epsg, table))
-    return _cloud(frame, scans[0].height_datum, parts, rgb, intensity)
+                parts.append((scan, level, table))
+    return _cloud(frame, scans[0].height_datum, parts, columns)
 
 
 def chosen_scans(database: Database, scan_ids: Sequence[str] | None) -> list[ScanSummary]:
@@ -124,25 +109,15 @@ def chosen_scans(database: Database, scan_ids: Sequence[str] | None) -> list[Sca
     """
     scans = list_scans(database)
     if scan_ids is not None:
-        meant = {_full_id(scans, start) for start in scan_ids}
+        ids, meant = [scan.scan_id for scan in scans], set()
+        for start in scan_ids:
+            said = f"no scan {start}" if start else "expected a scan's id or its first letters, found nothing"
+            none = ScanNotFoundError(f"{said}; `featuredb lidar list` lists what there is")
+            meant.add(full_id(start, ids, "scans", none))
         scans = [s for s in scans if s.scan_id in meant]
     if not scans:
         raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
     return scans
-
-
-def _full_id(scans: Sequence[ScanSummary], start: str) -> str:
-    """The id that is meant by itself, or by its first letters if no other begins so."""
-    ids = [scan.scan_id for scan in scans]
-    found = [start] if start in ids else [i for i in ids if start and i.startswith(start)]
-    if len(found) > 1:
-        raise ScanNotFoundError(
-            f"{start}: {len(found)} scans begin so ({', '.join(sorted(found)[:4])}); write more of the id"
-        )
-    if not found:
-        said = f"no scan {start}" if start else "expected a scan's id or its first letters, found nothing"
-        raise ScanNotFoundError(f"{said}; `featuredb lidar list` lists what there is")
-    return found[0]
 
 
 def _utm_box(frame: LocalFrame, box: PlanBox | None, epsg: int) -> PlanBox | None:
@@ -159,29 +134,30 @@ def _utm_box(frame: LocalFrame, box: PlanBox | None, epsg: int) -> PlanBox | Non
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, intensity: bool) -> PointCloud:
+def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], columns: Sequence[str]) -> PointCloud:
     """The parts one after the other, in the frame, with their nodes."""
-    placed = (frame.enu_from_utm(part.utm, part.epsg).astype(np.float32) for part in parts)
-    xyz = np.concatenate([np.empty((0, 3), np.float32), *placed])
+    none = SPECS[LIDAR_POINTS].schema.empty_table().select(columns)
+    table = pa.concat_tables([none, *(part for _, _, part in parts)], promote_options="permissive")
+    xyz = np.empty((len(table), 3), np.float32)
+    row = 0
+    for scan, _, part in parts:
+        utm = np.stack([part[name].to_numpy() for name in UTM_COORDINATES], axis=1)
+        xyz[row : row + len(part)] = frame.enu_from_utm(utm, scan.epsg)
+        row += len(part)
     return PointCloud(
         frame=frame,
         height_datum=datum,
         xyz=xyz,
-        rgb=_bytes(parts, _RGB) if rgb else None,
-        intensity=np.ascontiguousarray(_bytes(parts, ("intensity",))[:, 0]) if intensity else None,
-        classification=np.ascontiguousarray(_bytes(parts, ("classification",))[:, 0]),
-        nodes=_nodes(xyz, parts),
+        rgb=np.stack([_bytes(table, name) for name in _RGB], axis=1) if "red" in columns else None,
+        intensity=_bytes(table, "intensity") if "intensity" in columns else None,
+        classification=_bytes(table, "classification"),
+        nodes=_nodes(xyz, table, parts),
         spacing_m=point_spacing(xyz),
     )
 
 
-def _bytes(parts: Sequence[_Part], names: Sequence[str]) -> NDArray[np.uint8]:
-    """Columns of all parts as (n, columns) uint8; where a point has no value, its intensity or a grey."""
-    columns = [np.stack([_filled(part.columns, name) for name in names], axis=1) for part in parts]
-    return np.concatenate([np.empty((0, len(names)), np.uint8), *columns])
-
-
-def _filled(table: pa.Table, name: str) -> NDArray[np.uint8]:
+def _bytes(table: pa.Table, name: str) -> NDArray[np.uint8]:
+    """A column (n,) as uint8; where a point has no value, its intensity or a grey."""
     column: Any = table[name]
     if column.null_count:
         grey = [table["intensity"]] if "intensity" in table.column_names else []
@@ -189,26 +165,18 @@ def _filled(table: pa.Table, name: str) -> NDArray[np.uint8]:
     return np.asarray(column.to_numpy(), dtype=np.uint8)
 
 
-def _nodes(xyz: NDArray[np.float32], parts: Sequence[_Part]) -> CloudNodes:
+def _nodes(xyz: NDArray[np.float32], table: pa.Table, parts: Sequence[_Part]) -> CloudNodes:
     """Runs of equal node keys, and the boxes around their points."""
-    starts, levels, spacings = [], [], []
-    row = 0
-    for part in parts:
-        node, spacing = (part.columns[name].to_numpy() for name in ("node", "node_spacing_m"))
-        new = np.ones(len(node), np.bool_)
-        new[1:] = (node[1:] != node[:-1]) | (spacing[1:] != spacing[:-1])
-        first = np.flatnonzero(new)
-        starts.append(row + first)
-        levels.append(np.full(len(first), part.level, np.int16))
-        spacings.append(spacing[first])
-        row += len(node)
-    empty = np.empty(0)
-    start = np.concatenate([empty.astype(np.int64), *starts])
+    node, spacing = (table[name].to_numpy() for name in ("node", "node_spacing_m"))
+    part = np.repeat(np.arange(len(parts)), np.array([len(rows) for _, _, rows in parts], np.int64))
+    new = np.ones(len(node), np.bool_)
+    new[1:] = (node[1:] != node[:-1]) | (spacing[1:] != spacing[:-1]) | (part[1:] != part[:-1])
+    start = np.flatnonzero(new)
     return CloudNodes(
         start=start,
         count=np.diff(start, append=len(xyz)),
-        level=np.concatenate([empty.astype(np.int16), *levels]),
-        spacing_m=np.concatenate([empty.astype(np.float32), *spacings]),
+        level=np.array([level for _, level, _ in parts], np.int16)[part[start]],
+        spacing_m=spacing[start],
         box_min=np.minimum.reduceat(xyz, start, axis=0) if len(start) else np.empty((0, 3), np.float32),
         box_max=np.maximum.reduceat(xyz, start, axis=0) if len(start) else np.empty((0, 3), np.float32),
     )

@@ -15,7 +15,7 @@ from featuredb.atomic import atomic_file
 from featuredb.errors import ScanError
 from featuredb.lidar.spill import TileBlock
 from featuredb.store.encode import Row
-from featuredb.store.scans import TilePoints
+from featuredb.store.scans import TileRows
 from featuredb.store.tables import BOUNDS
 
 # Tiles are committed together until they have this many points: fewer, larger commits.
@@ -84,19 +84,6 @@ class BlockPlan:
     colour_bits: tuple[int, ...]
     blocks: tuple[TileBlock, ...]
 
-    @classmethod
-    def from_json(cls, value: dict[str, Any]) -> "BlockPlan":
-        """The inverse of `asdict`, through JSON."""
-        stretch = value["stretch"]
-        return cls(
-            **{
-                **value,
-                "stretch": None if stretch is None else IntensityStretch(**stretch),
-                "colour_bits": tuple(value["colour_bits"]),
-                "blocks": tuple(TileBlock(**block) for block in value["blocks"]),
-            }
-        )
-
 
 class Staged:
     """The folder of finished blocks; a block is finished when its JSON is there."""
@@ -158,7 +145,7 @@ class Staged:
             "classes": [{"classification": c, "points": n} for c, n in sorted(classes.items())],
         }
 
-    def groups(self) -> list[Callable[[], Iterator[TilePoints]]]:
+    def groups(self) -> list[Callable[[], Iterator[TileRows]]]:
         """What is to be committed, tile after tile."""
         groups: list[list[TileBlock]] = [[]]
         for _, blocks in groupby(self._plan.blocks, key=lambda block: block.tile):
@@ -168,11 +155,11 @@ class Staged:
             groups[-1] += tile
         return [lambda group=group: self._points(group) for group in groups]  # type: ignore[misc]
 
-    def _points(self, blocks: list[TileBlock]) -> Iterator[TilePoints]:
+    def _points(self, blocks: list[TileBlock]) -> Iterator[TileRows]:
         for block in blocks:
             rows = np.load(self._path(block, "npy"))
             if len(rows):
-                yield TilePoints(tile=block.tile, rows=rows, has_intensity=self._plan.stretch is not None)
+                yield block.tile, rows
 
     def _path(self, block: TileBlock, suffix: str) -> Path:
         return self._folder / f"{block.key}.{suffix}"

@@ -269,6 +269,9 @@ class MapParts:
             if not np.isin(observations.image_id, np.asarray(ids, dtype=np.int32)).all():
                 raise InvalidValueError(f"{where}: an observation names an image that the map does not have")
 
+    def with_status(self, status: str) -> Self:
+        return replace(self, status=status)
+
     def image_rows(self, image_id: NDArray[np.int32]) -> NDArray[np.int64]:
         """Places (k,) in `images` of images with these ids (k,)."""
         ids = np.array([image.image_id for image in self.images], dtype=np.int32)
@@ -320,9 +323,6 @@ class FeatureMap(MapParts):
         """The map without its images, points and observations: what is left is small."""
         none = self.points.take(np.zeros(0, np.int64))
         return replace(self, images=(), points=none, observations=self.observations.none())
-
-    def with_status(self, status: MapStatus) -> "FeatureMap":
-        return replace(self, status=status)
 
 
 def _covariance(name: str, value: ArrayLike, size: int) -> FloatArray:

@@ -96,29 +96,29 @@ def drift_and_budget(evidence: Mapping[str, Any]) -> tuple[float | None, float |
     return _metres(growth.get("drift_m")), _metres(growth.get("budget_m"))
 
 
-def children_of(maps: Iterable[Described]) -> dict[str, tuple[str, ...]]:
-    """For each map that placed others: those, in the order given."""
+def children_of(parents: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """For each map that placed others: those, in the order given; of the parents of each map."""
     found: dict[str, list[str]] = {}
-    for described in maps:
-        for parent in dict.fromkeys(described.parents):
-            found.setdefault(parent, []).append(described.map_id)
-    return {parent: tuple(children) for parent, children in found.items()}
+    for map_id, above in parents.items():
+        for parent in dict.fromkeys(above):
+            found.setdefault(parent, []).append(map_id)
+    return found
 
 
 def family_of(map_id: str, maps: Mapping[str, Described]) -> set[str]:
     """The map, all that it stands on and all that stands on it, as far as they are among `maps`."""
-    down = children_of(maps.values())
     up = {m: described.parents for m, described in maps.items()}
-    return _reach(map_id, up, maps) | _reach(map_id, down, maps)
+    return (reached([map_id], up) | reached([map_id], children_of(up))) & maps.keys()
 
 
-def _reach(start: str, following: Mapping[str, tuple[str, ...]], maps: Mapping[str, Described]) -> set[str]:
-    found, queue = {start}, [start]
+def reached(starts: Iterable[str], following: Mapping[str, Sequence[str]]) -> set[str]:
+    """What can be reached from there, the starts included, by what follows each."""
+    found = set(starts)
+    queue = list(found)
     while queue:
-        for other in following.get(queue.pop(), ()):
-            if other in maps and other not in found:
-                found.add(other)
-                queue.append(other)
+        more = set(following.get(queue.pop(), ())) - found
+        found |= more
+        queue += more
     return found
 
 

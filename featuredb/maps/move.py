@@ -39,10 +39,14 @@ def move_map(feature_map: FeatureMap, move: Sim3, *, covariance: FloatArray | No
     )
     if is_identity(move):
         return replace(feature_map, placement=moved)
+    points = feature_map.points
+    if len(points):
+        utm = feature_map.frame.utm_from_enu(move.act(feature_map.points_local()), feature_map.epsg)
+        points = replace(points, utm=utm, covariance=moved_covariances(points.covariance, move))
     return replace(
         feature_map,
         images=tuple(moved_image(image, move) for image in feature_map.images),
-        points=_moved_points(feature_map, move),
+        points=points,
         placement=moved,
     )
 
@@ -103,14 +107,6 @@ def moved_image(image: MapImage, move: Sim3) -> MapImage:
         growth = np.repeat([1.0, move.scale], 3)
         covariance = covariance * np.outer(growth, growth)
     return replace(image, cam_from_local=pose, covariance=covariance)
-
-
-def _moved_points(feature_map: FeatureMap, move: Sim3) -> MapPoints:
-    points = feature_map.points
-    if not len(points):
-        return points
-    utm = feature_map.frame.utm_from_enu(move.act(feature_map.points_local()), feature_map.epsg)
-    return replace(points, utm=utm, covariance=moved_covariances(points.covariance, move))
 
 
 def moved_covariances(upper: NDArray[np.float32], move: Sim3) -> NDArray[np.float32]:

@@ -49,7 +49,7 @@ def thin_map(feature_map: MapKind, cover: int) -> MapKind:
     kept = _thinned_views(feature_map, points, cover)
     note = {
         "options": {"cover": cover},
-        "points_before": len(_described_points(feature_map)),
+        "points_before": len(np.unique(seen.point_index[seen.has_descriptor])),
         "points": int(points.sum()),
     }
     descriptors = np.where(kept[:, None], seen.descriptors, np.uint8(0))
@@ -187,8 +187,3 @@ def _farthest_first(place: FloatArray) -> NDArray[np.intp]:
         gap = np.minimum(gap, np.linalg.norm(place - place[order[-1]], axis=1))
         gap[order] = -1.0
     return np.array(order)
-
-
-def _described_points(feature_map: AnyMap) -> NDArray[np.int64]:
-    seen = feature_map.observations
-    return np.unique(seen.point_index[seen.has_descriptor])

@@ -4,7 +4,7 @@ It is another type than `FeatureMap`, so that nothing that needs a place takes o
 makes a FeatureMap of it, under the same map id.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar
 
 from featuredb.errors import InvalidValueError
@@ -87,9 +87,6 @@ class UnplacedMap(MapParts):
     def points_local(self) -> FloatArray:
         """Points (n, 3) in the own frame."""
         return self.points.xyz
-
-    def with_status(self, status: UnplacedStatus) -> "UnplacedMap":
-        return replace(self, status=status)
 
 
 AnyMap: TypeAlias = FeatureMap | UnplacedMap

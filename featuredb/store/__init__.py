@@ -7,14 +7,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from featuredb.store.commits import CommitResult, HistoryEntry, StatusResult
+    from featuredb.store.commits import CommitResult, StatusResult
     from featuredb.store.database import Database
+    from featuredb.store.durable.log import Commit
     from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary, UtmBox
 
 __all__ = [
+    "Commit",
     "CommitResult",
     "Database",
-    "HistoryEntry",
     "MapSummary",
     "Snapshot",
     "StatusResult",
@@ -23,8 +24,9 @@ __all__ = [
 ]
 
 _MODULES = {
-    "commits": ("CommitResult", "HistoryEntry", "StatusResult"),
+    "commits": ("CommitResult", "StatusResult"),
     "database": ("Database",),
+    "durable.log": ("Commit",),
     "snapshot": ("MapSummary", "Snapshot", "UnplacedSummary", "UtmBox"),
 }
 

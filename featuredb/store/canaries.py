@@ -17,9 +17,10 @@ from featuredb.errors import CanaryNotFoundError, InvalidValueError, StoreError
 from featuredb.geo.datum import check_datum
 from featuredb.geo.utm import zone_of
 from featuredb.geometry.arrays import FloatArray, freeze
-from featuredb.store.commits import CHANGED, OPERATION, new_write_id
+from featuredb.store.commits import new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import of_columns, read_image, read_rows
+from featuredb.store.durable.log import CHANGED, OPERATION
 from featuredb.store.encode import Row, rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.tables import CANARIES, SPECS, UTM_COORDINATES
@@ -29,7 +30,6 @@ LONGEST_NAME = 200
 _UNIT = 1e-6  # how far the norm of a stored quaternion may be from 1
 TOLERANCE_DEG = 1.0  # that an answer may be turned by; well above what more points move a pose by
 _POSE_AS_STORED = ("epsg", "height_datum", "tolerance_m", "tolerance_deg")
-_LIGHT = [field.name for field in SPECS[CANARIES].schema if field.name != "image"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,7 +136,7 @@ def add_canary(
 
     def attempt() -> Row:
         table = database.table(CANARIES)
-        for other in read_rows(table, _LIGHT):
+        for other in read_rows(table, _light()):
             if other["name"] == name:
                 return _same(other, row)
         rows = rows_table(CANARIES, [{**row, "image": image}])
@@ -148,7 +148,7 @@ def add_canary(
 
 def list_canaries(database: Database) -> list[Canary]:
     """All known queries, by name."""
-    return [_canary(row) for row in sorted(_rows(database), key=lambda row: str(row["name"]))]
+    return sorted(map(_canary, database.rows(CANARIES, _light())), key=lambda canary: canary.name)
 
 
 def remove_canary(database: Database, name: str) -> None:
@@ -157,7 +157,7 @@ def remove_canary(database: Database, name: str) -> None:
     Raises:
         CanaryNotFoundError, ConflictError, StoreError
     """
-    mine = [row["canary_id"] for row in _rows(database) if row["name"] == name]
+    mine = [row["canary_id"] for row in database.rows(CANARIES, _light()) if row["name"] == name]
     if not mine:
         raise CanaryNotFoundError(f"no canary {name!r}; `featuredb canary list` lists what there is")
     database.table(CANARIES).delete_rows("canary_id", mine, {OPERATION: "canary remove", CHANGED: name})
@@ -181,14 +181,14 @@ def load_canary_image(database: Database, canary: Canary) -> bytes:
     return image
 
 
-def _rows(database: Database) -> list[Row]:
-    """All rows without their images; none where the table does not exist."""
-    return read_rows(database.table(CANARIES), _LIGHT) if database.has(CANARIES) else []
+def _light() -> list[str]:
+    """All columns but the photo's bytes."""
+    return [name for name in SPECS[CANARIES].schema.names if name != "image"]
 
 
 def _same(there: Row, wanted: Row) -> Row:
     """The row that is there, if it says the same."""
-    differing = [k for k in _LIGHT if k not in ("write_id", "created_at") and there[k] != wanted.get(k)]
+    differing = [k for k in _light() if k not in ("write_id", "created_at") and there[k] != wanted.get(k)]
     if differing:
         raise StoreError(
             f"there is a canary {wanted['name']!r} with another {', '.join(differing)}; "

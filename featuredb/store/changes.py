@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from featuredb.errors import ConflictError, MapNotFoundError, StoreError
+from featuredb.maps.lineage import children_of, reached
 from featuredb.store.encode import Row
 from featuredb.store.tables import PLACE_COLUMNS
 
@@ -24,14 +25,12 @@ class Change:
 
     Attributes:
         rows: all rows after the change.
-        added: the rows among them that are new, where that is known.
-        only_adds: no old row is changed or gone, so that appending `added` is enough.
+        added: the new rows, where no old one is changed or gone, so that appending them is enough; else None.
         flagged: ids of maps put into quarantine, because a map that placed them gave way.
     """
 
     rows: list[Row]
-    added: Sequence[Row] = ()
-    only_adds: bool = False
+    added: Sequence[Row] | None = None
     flagged: tuple[str, ...] = ()
 
 
@@ -111,7 +110,8 @@ def add_maps(
     flagged = [row["map_id"] for row in kept if row["map_id"] in stale and row["status"] != QUARANTINED]
     kept = [_quarantined(row, stale[row["map_id"]]) if row["map_id"] in flagged else row for row in kept]
     unchanged = len(kept) == len(rows) and all(a is b for a, b in zip(kept, rows, strict=True))
-    return Change(rows=[*kept, *new_rows], added=list(new_rows), only_adds=unchanged, flagged=tuple(flagged))
+    added = new_rows if unchanged else None
+    return Change(rows=[*kept, *new_rows], added=added, flagged=tuple(flagged))
 
 
 def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, list[str]]:
@@ -126,15 +126,18 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
     if not any(row["map_id"] == map_id for row in rows):
         raise MapNotFoundError(f"no map {map_id}; `featuredb maps` lists what there is")
     if live_row(rows, map_id) is None:
-        return Change(rows=list(rows), only_adds=True), []
+        return Change(rows=list(rows), added=()), []
     dependants = sorted(anchored(rows) - anchored(rows, without=map_id) - {map_id})
     retired = [map_id, *dependants]
-    changed = _with_status(rows, [map_id], RETIRED, reason)
-    return Change(rows=_with_status(changed, dependants, RETIRED, f"{reason} ({map_id})")), retired
+    changed = with_status(rows, [map_id], RETIRED, reason)
+    return Change(rows=with_status(changed, dependants, RETIRED, f"{reason} ({map_id})")), retired
 
 
-def _with_status(rows: Iterable[Row], map_ids: Sequence[str], status: str, reason: str) -> list[Row]:
-    return [{**r, "status": status, "status_reason": reason} if r["map_id"] in map_ids else r for r in rows]
+def with_status(
+    rows: Iterable[Row], ids: Sequence[str], status: str, reason: str, column: str = "map_id"
+) -> list[Row]:
+    """The rows, with another status of some maps, or of scans by `scan_id`."""
+    return [{**r, "status": status, "status_reason": reason} if r[column] in ids else r for r in rows]
 
 
 def change_status(
@@ -164,14 +167,14 @@ def change_status(
             raise StoreError(f"map {map_id} is retired ({known[map_id]['status_reason']}); commit it again")
     wanted = [m for m in dict.fromkeys(map_ids) if known[m]["status"] != status]
     if not wanted:
-        return Change(rows=list(rows), only_adds=True), []
-    changed = _with_status(rows, wanted, status, reason)
+        return Change(rows=list(rows), added=()), []
+    changed = with_status(rows, wanted, status, reason)
     standing = anchored(changed, statuses=(ACTIVE,))
     if status == ACTIVE:
         _check_parents(known, [m for m in wanted if m not in standing])
         return Change(rows=changed), wanted
     fallen = sorted(anchored(rows, statuses=(ACTIVE,)) - standing - set(wanted))
-    changed = _with_status(changed, fallen, QUARANTINED, f"{reason} ({', '.join(wanted)})")
+    changed = with_status(changed, fallen, QUARANTINED, f"{reason} ({', '.join(wanted)})")
     return Change(rows=changed), [*wanted, *fallen]
 
 
@@ -229,7 +232,7 @@ def vouch_for(
         r["map_id"] for r in rows if r["map_id"] in reasons and is_imported(r["status"], r["status_reason"])
     ]
     if not ids:
-        return Change(rows=list(rows), only_adds=True), []
+        return Change(rows=list(rows), added=()), []
     up = {
         r["map_id"] for r in rows if r["map_id"] in active and r["map_id"] in ids and r["status"] != UNPLACED
     }
@@ -281,9 +284,4 @@ def anchored(
     """
     live = {row["map_id"]: row["parents"] for row in rows if row["status"] in statuses}
     live.pop(without or "", None)
-    reached = {map_id for map_id, parents in live.items() if not parents}
-    while True:
-        more = {m for m, parents in live.items() if m not in reached and reached.intersection(parents)}
-        if not more:
-            return reached
-        reached |= more
+    return reached([map_id for map_id, parents in live.items() if not parents], children_of(live))

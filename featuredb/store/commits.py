@@ -8,27 +8,14 @@ from datetime import UTC, datetime, timedelta
 from featuredb.errors import ConflictError, SnapshotNotFoundError
 from featuredb.store.changes import Change
 from featuredb.store.delta import Table
-from featuredb.store.durable.log import Commit
+from featuredb.store.durable.log import CHANGED, OPERATION, REASON, Commit
 from featuredb.store.encode import EncodedMap, rows_table
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
 # orphans; it is well below the vacuum's shortest default grace of a day.
 LONGEST_COMMIT = timedelta(hours=6)
 
-# Keys of what a commit to `maps` says about itself.
-OPERATION, CHANGED, REASON = "featuredb.operation", "featuredb.maps", "featuredb.reason"
-KEPT_FROM = "featuredb.kept_from"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HistoryEntry:
-    """One version of the database: number, UTC time, operation (commit, retire, ...), maps and reason."""
-
-    version: int
-    timestamp: datetime
-    operation: str
-    maps: tuple[str, ...]
-    reason: str
+KEPT_FROM = "featuredb.kept_from"  # key of what a vacuum's commit says
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,17 +46,6 @@ class StatusResult:
 
     version: int
     changed: tuple[str, ...]
-
-
-def history_entry(commit: Commit) -> HistoryEntry:
-    """A commit to `maps`, as people read it."""
-    return HistoryEntry(
-        version=commit.version,
-        timestamp=commit.timestamp,
-        operation=commit.metadata.get(OPERATION, "" if commit.version else "init"),
-        maps=tuple(filter(None, commit.metadata.get(CHANGED, "").split("\n"))),
-        reason=commit.metadata.get(REASON, ""),
-    )
 
 
 def new_write_id(now: datetime) -> str:
@@ -137,9 +113,9 @@ def apply_change(
     Raises:
         StaleVersionError: someone else committed since `table` was read.
     """
-    if change.only_adds and not change.added:
+    if change.added is not None and not change.added:
         return table.version
     metadata = {OPERATION: operation, CHANGED: "\n".join(changed), REASON: reason, **(extra or {})}
-    if change.only_adds:
+    if change.added is not None:
         return table.swap(rows_table(table.spec.name, change.added), mode="append", metadata=metadata)
     return table.swap(rows_table(table.spec.name, change.rows), mode="overwrite", metadata=metadata)

@@ -25,16 +25,14 @@ from featuredb.store.changes import (
 from featuredb.store.commits import (
     LONGEST_COMMIT,
     CommitResult,
-    HistoryEntry,
     StatusResult,
     apply_change,
     check_children,
     commit_as_of,
-    history_entry,
     new_write_id,
 )
 from featuredb.store.decode import read_rows
-from featuredb.store.delta import Table
+from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.copies import check_restored
 from featuredb.store.durable.log import Commit
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
@@ -59,19 +57,14 @@ class Database:
         self._poll_table: Table | None = None
 
     @classmethod
-    def create(
-        cls, url: str | Path, *, exist_ok: bool = True, storage_options: Mapping[str, str] | None = None
-    ) -> "Database":
-        """Make the tables at a URL, `maps` last, and open the database.
+    def create(cls, url: str | Path, *, storage_options: Mapping[str, str] | None = None) -> "Database":
+        """Make the tables at a URL, `maps` last, where there are none, and open the database.
 
         Raises:
-            StoreError: a database is there and `exist_ok` is false, one is being restored there, or the place
-                cannot be written.
+            StoreError: a database is being restored there, or the place cannot be written.
         """
         database = cls(str(url), storage_options)
         check_restored(database.url, database._storage_options)
-        if not exist_ok and database.has(MAPS):
-            raise StoreError(f"there is a database at {database.url} already")
         database.make(MAPS)
         database.table(MAPS)
         return database
@@ -102,6 +95,12 @@ class Database:
     def table(self, name: str, version: int | None = None) -> Table:
         """A table at its newest or the given version; for maintenance and tests."""
         return Table.load(self.table_url(name), SPECS[name], self._storage_options, version)
+
+    def rows(
+        self, name: str, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()
+    ) -> list[Row]:
+        """Rows of a table at its newest version, as `read_rows`; none where there is no such table."""
+        return read_rows(self.table(name), columns, where) if self.has(name) else []
 
     def has(self, name: str) -> bool:
         """Whether there is a table of CHILDREN, and with it those of which it names rows.
@@ -213,19 +212,20 @@ class Database:
             rows = read_rows(maps)
             visible = {m: row for m in ids if (row := _already_there(rows, m, replaces, digests))}
             pending = [m for m in feature_maps if m.map_id not in visible]
-            if pending:
-                check_unchanged(rows, based_on or {})
-            for feature_map in pending:
-                if feature_map.map_id not in encoded:
-                    encoded[feature_map.map_id] = self._write_children(feature_map)
-                    encoded[feature_map.map_id].row["status_reason"] = why.get(feature_map.map_id, "")
-            if monotonic() - started > LONGEST_COMMIT.total_seconds():
-                raise ConflictError(f"commit of {', '.join(ids)} took over {LONGEST_COMMIT}; commit again")
-            for feature_map in pending:
-                check_children(encoded[feature_map.map_id], self.table)
             version = maps.version
             flagged: tuple[str, ...] = ()
             if pending:
+                check_unchanged(rows, based_on or {})
+                for feature_map in pending:
+                    if feature_map.map_id not in encoded:
+                        encoded[feature_map.map_id] = self._write_children(feature_map)
+                        encoded[feature_map.map_id].row["status_reason"] = why.get(feature_map.map_id, "")
+                if monotonic() - started > LONGEST_COMMIT.total_seconds():
+                    raise ConflictError(
+                        f"commit of {', '.join(ids)} took over {LONGEST_COMMIT}; commit again"
+                    )
+                for feature_map in pending:
+                    check_children(encoded[feature_map.map_id], self.table)
                 change = add_maps(rows, [encoded[m.map_id].row for m in pending], replaces, moves=moves)
                 flagged = change.flagged
                 changed = [*(m.map_id for m in pending), *flagged]
@@ -287,9 +287,17 @@ class Database:
         return self.change_maps(f"{status} for {', '.join(map_ids)}", operation, reason, decided)
 
     def change_maps(
-        self, what: str, operation: str, reason: str, make: Callable[[list[Row]], tuple[Change, list[str]]]
+        self,
+        what: str,
+        operation: str,
+        reason: str,
+        make: Callable[[list[Row]], tuple[Change, list[str]]],
+        name: str = MAPS,
     ) -> StatusResult:
         """Commit what `make` makes of the newest rows of `maps`: the change, and the ids that it is about.
+
+        Args:
+            name: LIDAR to change scans instead.
 
         Raises:
             ConflictError: other writers were faster too many times. StoreError; and what `make` raises.
@@ -297,9 +305,9 @@ class Database:
         changed: list[str] = []
 
         def attempt() -> int:
-            maps = self.table(MAPS)
-            change, changed[:] = make(read_rows(maps))
-            return apply_change(maps, change, operation=operation, changed=changed, reason=reason)
+            table = self.table(name)
+            change, changed[:] = make(read_rows(table))
+            return apply_change(table, change, operation=operation, changed=changed, reason=reason)
 
         version = retry_stale(what, attempt)
         return StatusResult(version=version, changed=tuple(changed))
@@ -337,9 +345,9 @@ class Database:
                 "database any more then)"
             )
 
-    def history(self) -> list[HistoryEntry]:
+    def history(self) -> list[Commit]:
         """All versions, newest first."""
-        return [history_entry(commit) for commit in self.table(MAPS).commits()]
+        return self.table(MAPS).commits()
 
     def _snapshot_of(self, maps: Table, commit: Commit) -> Snapshot:
         rows, children = read_rows(maps), {name: self.table(name) for name in CHILD_TABLES}

@@ -18,19 +18,10 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObservations, MapPoints, Placement
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, OwnPoints, UnplacedMap
+from featuredb.store import tables
 from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import AS_IN_MAP, Row
-from featuredb.store.tables import (
-    IMAGES,
-    MAPS,
-    OBSERVATIONS,
-    OWN_COORDINATES,
-    POINT_COVARIANCE,
-    POINTS,
-    SPECS,
-    UTM_COORDINATES,
-)
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -52,7 +43,7 @@ def read_rows(
         with read_errors(f"cannot read the table {spec.name}"):
             found = table.dataset(where).to_table(columns and list(columns))
     except StoreError as error:
-        if spec.name == MAPS and isinstance(error.__cause__, FileNotFoundError):
+        if spec.name == tables.MAPS and isinstance(error.__cause__, FileNotFoundError):
             raise SnapshotNotFoundError(
                 f"version {table.version} is gone, vacuum removed its files ({error.__cause__}); "
                 "choose a newer one"
@@ -104,12 +95,13 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> An
             **{name: row[name] for name in AS_IN_MAP},
             "cameras": tuple(Camera(**{**c, "params": tuple(c["params"])}) for c in row["cameras"]),
             "camera_keys": tuple(row["camera_keys"]),
-            "images": decode_images(children[IMAGES], row["images"]),
-            "observations": _decode_observations(children[OBSERVATIONS], row["observations"]),
+            "images": decode_images(children[tables.IMAGES], row["images"]),
+            "observations": _decode_observations(children[tables.OBSERVATIONS], row["observations"]),
             "parents": tuple(row["parents"]),
             "provenance": json.loads(row["provenance"]),
         }
-        points = _decode_points(children[POINTS], row["points"], _coordinate_columns(row))
+        here = tables.UTM_COORDINATES if has_place(row) else tables.OWN_COORDINATES
+        points = _decode_points(children[tables.POINTS], row["points"], here)
         if not has_place(row):
             return UnplacedMap(
                 frame=OwnFrame(metric=row["frame_is_metric"], upright=row["frame_is_upright"]),
@@ -151,10 +143,6 @@ def decode_no_place(row: Row) -> NoPlace:
     """Why the map of a row without a place has none."""
     said = json.loads(row["no_place"])
     return NoPlace(**{**said, "ways": tuple(said["ways"])})
-
-
-def _coordinate_columns(row: Row) -> tuple[str, ...]:
-    return UTM_COORDINATES if has_place(row) else OWN_COORDINATES
 
 
 def placement_of(row: Row) -> Placement:
@@ -202,7 +190,7 @@ def _gathered(
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     """The rows of a child table, and the index (count,) of each."""
     parts = list(batches)
-    table = pa.Table.from_batches(parts) if parts else SPECS[name].schema.empty_table()
+    table = pa.Table.from_batches(parts) if parts else tables.SPECS[name].schema.empty_table()
     index: NDArray[np.int64] = table[index_column].to_numpy()
     if len(table) != count or not np.array_equal(np.sort(index), np.arange(count)):
         raise StoreError(
@@ -226,18 +214,18 @@ def _decode_points(
     batches: Iterable[pa.RecordBatch], count: int, coordinate_columns: Sequence[str]
 ) -> dict[str, Any]:
     """Arrays of PointColumns by name, and `coordinates` (count, 3)."""
-    table, index = _gathered(batches, POINTS, "point_index", count)
+    table, index = _gathered(batches, tables.POINTS, "point_index", count)
     return {
         "coordinates": _placed(table, index, coordinate_columns, np.float64),
         "rgb": _placed(table, index, ("red", "green", "blue"), np.uint8),
         "track_length": _placed(table, index, ["track_length"], np.int32)[:, 0],
         "error_px": _placed(table, index, ["error_px"], np.float32)[:, 0],
-        "covariance": _placed(table, index, POINT_COVARIANCE, np.float32),
+        "covariance": _placed(table, index, tables.POINT_COVARIANCE, np.float32),
     }
 
 
 def _decode_observations(batches: Iterable[pa.RecordBatch], count: int) -> MapObservations:
-    table, index = _gathered(batches, OBSERVATIONS, "observation_index", count)
+    table, index = _gathered(batches, tables.OBSERVATIONS, "observation_index", count)
     has, descriptors = np.zeros(count, np.bool_), np.zeros((count, DESCRIPTOR_SIZE), np.uint8)
     start = 0
     for chunk in table["descriptor"].chunks:

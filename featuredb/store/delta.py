@@ -28,7 +28,6 @@ from deltalake.exceptions import CommitFailedError, DeltaError
 from featuredb.errors import ConflictError, StoreError
 from featuredb.store.durable.ages import old_files, old_scratch_folders, remove_files
 from featuredb.store.durable.filesystem import store_errors, table_files
-from featuredb.store.durable.local import Sight, commit_locally, create_locally
 from featuredb.store.durable.log import Commit, acknowledge, check_end, read_commit
 from featuredb.store.durable.making import (
     check_format,
@@ -38,6 +37,7 @@ from featuredb.store.durable.making import (
     why_not_opened,
     writer_properties,
 )
+from featuredb.store.durable.publish import Sight, commit_locally, create_locally
 from featuredb.store.retry import ATTEMPTS, StaleVersionError, retry_stale
 from featuredb.store.tables import FORMAT_VERSION, TableSpec
 

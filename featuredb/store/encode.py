@@ -19,20 +19,7 @@ from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObservations
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
-from featuredb.store.tables import (
-    BOUNDS,
-    IMAGES,
-    NO_PLACE_COLUMNS,
-    NO_TILE,
-    NO_ZONE,
-    OBSERVATIONS,
-    OWN_COORDINATES,
-    PLACE_COLUMNS,
-    POINT_COVARIANCE,
-    POINTS,
-    SPECS,
-    UTM_COORDINATES,
-)
+from featuredb.store import tables
 
 Row = dict[str, Any]
 AS_IN_MAP = ("map_id", "name", "status", "extractor_fingerprint", "source", "licence")
@@ -52,15 +39,15 @@ def encode_map(feature_map: AnyMap, write_id: str, created_at: datetime) -> Enco
     Raises:
         InvalidValueError: provenance or evidence that JSON cannot hold.
     """
-    ids = {"write_id": write_id, "map_id": feature_map.map_id}
-    point_tiles = _point_tiles(feature_map)
+    zone, point_tiles, utm, image_tiles = _where(feature_map)
+    ids = {"write_id": write_id, "map_id": feature_map.map_id, "zone": zone}
     children = {
-        IMAGES: _image_rows(feature_map, ids),
-        POINTS: _point_rows(feature_map, ids, point_tiles),
-        OBSERVATIONS: _observation_rows(feature_map, ids, point_tiles),
+        tables.IMAGES: _image_rows(feature_map, ids, utm, image_tiles),
+        tables.POINTS: _point_rows(feature_map, ids, point_tiles),
+        tables.OBSERVATIONS: _observation_rows(feature_map, ids, point_tiles),
     }
     found = {tile for table in children.values() for tile in table["tile"].unique().to_pylist()}
-    tiles = sorted(found - {NO_TILE})
+    tiles = sorted(found - {tables.NO_TILE})
     return EncodedMap(row=_map_row(feature_map, write_id, created_at, tiles), children=children)
 
 
@@ -69,7 +56,7 @@ def content_digest(feature_map: AnyMap) -> str:
     digest = hashlib.sha256()
     row = _map_row(feature_map, "", datetime.fromtimestamp(0, tz=UTC), [], digest="")
     # A placed map has the digest that format 1 gave it.
-    new = NO_PLACE_COLUMNS if isinstance(feature_map, FeatureMap) else ()
+    new = tables.NO_PLACE_COLUMNS if isinstance(feature_map, FeatureMap) else ()
     for name in ("status", "status_reason", *new):
         row.pop(name)
     row["created_at"] = ""
@@ -79,7 +66,7 @@ def content_digest(feature_map: AnyMap) -> str:
     for array in (
         _coordinates(feature_map), points.rgb, points.track_length, points.error_px, points.covariance,
         seen.point_index, seen.image_id, seen.xy, seen.scale, seen.angle, seen.has_descriptor,
-        _masked_descriptors(seen),
+        np.where(seen.has_descriptor[:, None], seen.descriptors, np.uint8(0)),
     ):  # fmt: skip
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
@@ -90,10 +77,16 @@ def _coordinates(feature_map: AnyMap) -> FloatArray:
     return feature_map.points.xyz if isinstance(feature_map, UnplacedMap) else feature_map.points.utm
 
 
-def _point_tiles(feature_map: AnyMap) -> NDArray[Any]:
+def _where(feature_map: AnyMap) -> tuple[int, NDArray[Any], FloatArray, NDArray[Any]]:
+    """Zone, tiles of the points (n,), UTM (i, 3) and tiles (i,) of the cameras; NaN without a place."""
+    points, images = len(feature_map.points), len(feature_map.images)
     if isinstance(feature_map, UnplacedMap):
-        return np.full(len(feature_map.points), NO_TILE, dtype=object)
-    return np.asarray(tile_of(feature_map.points.utm), dtype=object)
+        none = np.full(max(points, images), tables.NO_TILE, dtype=object)
+        return tables.NO_ZONE, none[:points], np.full((images, 3), np.nan), none[:images]
+    centers = np.array([i.cam_from_local.center for i in feature_map.images], dtype=np.float64).reshape(-1, 3)
+    utm = feature_map.frame.utm_from_enu(centers, feature_map.epsg)
+    of_points = np.asarray(tile_of(feature_map.points.utm), dtype=object)
+    return feature_map.epsg, of_points, utm, tile_of(utm)
 
 
 def _place_columns(feature_map: AnyMap) -> Row:
@@ -101,7 +94,7 @@ def _place_columns(feature_map: AnyMap) -> Row:
     if isinstance(feature_map, UnplacedMap):
         no_place = dataclasses.asdict(feature_map.no_place)
         return {
-            **dict.fromkeys((*PLACE_COLUMNS, *BOUNDS)),
+            **dict.fromkeys((*tables.PLACE_COLUMNS, *tables.BOUNDS)),
             "generation": 0,
             "frame_is_metric": feature_map.frame.metric,
             "frame_is_upright": feature_map.frame.upright,
@@ -110,10 +103,10 @@ def _place_columns(feature_map: AnyMap) -> Row:
     utm, placement, frame = feature_map.points.utm, feature_map.placement, feature_map.frame
     bounds = [*utm.min(axis=0).tolist(), *utm.max(axis=0).tolist()] if len(utm) else [None] * 6
     return {
-        **dict.fromkeys(NO_PLACE_COLUMNS),
+        **dict.fromkeys(tables.NO_PLACE_COLUMNS),
         "epsg": feature_map.epsg,
         "height_datum": feature_map.height_datum,
-        **dict(zip(BOUNDS, bounds, strict=True)),
+        **dict(zip(tables.BOUNDS, bounds, strict=True)),
         "method": placement.method,
         "generation": feature_map.generation,
         "residual_rms_m": float(placement.residual_rms_m),
@@ -178,38 +171,19 @@ def _image_row(image: MapImage) -> Row:
     }
 
 
-def _image_places(feature_map: AnyMap) -> tuple[FloatArray, list[str]]:
-    """UTM (n, 3) and tiles of the cameras; NaN and `NO_TILE` where the map has no place."""
-    count = len(feature_map.images)
-    if isinstance(feature_map, UnplacedMap):
-        return np.full((count, 3), np.nan), [NO_TILE] * count
-    centers = np.array([i.cam_from_local.center for i in feature_map.images], dtype=np.float64).reshape(-1, 3)
-    utm = feature_map.frame.utm_from_enu(centers, feature_map.epsg)
-    return utm, list(tile_of(utm))
-
-
-def _zone(feature_map: AnyMap) -> int:
-    return NO_ZONE if isinstance(feature_map, UnplacedMap) else feature_map.epsg
-
-
-def _image_rows(feature_map: AnyMap, ids: Row) -> pa.Table:
-    utm, tiles = _image_places(feature_map)
+def _image_rows(feature_map: AnyMap, ids: Row, utm: FloatArray, tiles: NDArray[Any]) -> pa.Table:
+    placed = zip(feature_map.images, utm.tolist(), tiles.tolist(), strict=True)
     rows = [
         {
             **ids,
             **_image_row(image),
             "image_index": index,
-            "easting": easting,
-            "northing": northing,
-            "height": height,
-            "zone": _zone(feature_map),
+            **dict(zip(tables.UTM_COORDINATES, place, strict=True)),
             "tile": tile,
         }
-        for index, (image, (easting, northing, height), tile) in enumerate(
-            zip(feature_map.images, utm.tolist(), tiles, strict=True)
-        )
+        for index, (image, place, tile) in enumerate(placed)
     ]
-    return rows_table(IMAGES, rows)
+    return rows_table(tables.IMAGES, rows)
 
 
 def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
@@ -220,16 +194,16 @@ def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
         "error_px": points.error_px,
         "tile": tiles,
     }
-    here = UTM_COORDINATES
+    here = tables.UTM_COORDINATES
     if isinstance(feature_map, UnplacedMap):
-        here = OWN_COORDINATES
-        columns |= {name: np.full(len(points), np.nan) for name in UTM_COORDINATES}
+        here = tables.OWN_COORDINATES
+        columns |= {name: np.full(len(points), np.nan) for name in tables.UTM_COORDINATES}
     columns |= dict(zip(here, _coordinates(feature_map).T, strict=True))
     for axis, name in enumerate(("red", "green", "blue")):
         columns[name] = points.rgb[:, axis].astype(np.int16)
-    for axis, name in enumerate(POINT_COVARIANCE):
+    for axis, name in enumerate(tables.POINT_COVARIANCE):
         columns[name] = points.covariance[:, axis]
-    return table_of(POINTS, {**ids, "zone": _zone(feature_map)}, columns, len(points))
+    return table_of(tables.POINTS, ids, columns, len(points))
 
 
 def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) -> pa.Table:
@@ -246,24 +220,20 @@ def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) 
         # An observation lies with its point, so that a tile's points come with all their descriptors.
         "tile": point_tiles[seen.point_index],
     }
-    return table_of(OBSERVATIONS, {**ids, "zone": _zone(feature_map)}, columns, len(seen))
+    return table_of(tables.OBSERVATIONS, ids, columns, len(seen))
 
 
 def table_of(name: str, constants: Row, columns: dict[str, Any], count: int) -> pa.Table:
     """`count` rows in the order and types of a table's schema: values that all share, columns, else null."""
     arrays = []
-    for field in SPECS[name].schema:
+    for field in tables.SPECS[name].schema:
         if field.name in constants:
             arrays.append(pa.repeat(pa.scalar(constants[field.name], type=field.type), count))
         elif field.name in columns:
             arrays.append(pa.array(columns[field.name], type=field.type))
         else:
             arrays.append(pa.nulls(count, type=field.type))
-    return pa.Table.from_arrays(arrays, schema=SPECS[name].schema)
-
-
-def _masked_descriptors(seen: MapObservations) -> NDArray[np.uint8]:
-    return np.where(seen.has_descriptor[:, None], seen.descriptors, np.uint8(0))
+    return pa.Table.from_arrays(arrays, schema=tables.SPECS[name].schema)
 
 
 def _descriptor_column(seen: MapObservations) -> pa.Array:
@@ -278,4 +248,4 @@ def _descriptor_column(seen: MapObservations) -> pa.Array:
 
 def rows_table(name: str, rows: Sequence[Row]) -> pa.Table:
     """Rows of a table as an Arrow table."""
-    return pa.Table.from_pylist(list(rows), schema=SPECS[name].schema)
+    return pa.Table.from_pylist(list(rows), schema=tables.SPECS[name].schema)

@@ -1,32 +1,26 @@
 """Compaction and vacuum: fewer files, and no rows that nothing can see any more."""
 
 from collections import defaultdict
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 import pyarrow.compute as pc
 
-from featuredb.store.candidates.upkeep import named_writes, superfluous_images
+from featuredb.store import tables
+from featuredb.store.candidates.photos import by_candidate, live_maps, read_events
+from featuredb.store.candidates.states import standing_of
 from featuredb.store.changes import RETIRED, Change
-from featuredb.store.commits import CHANGED, KEPT_FROM, OPERATION, REASON, apply_change, oldest_kept_version
+from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import read_rows
 from featuredb.store.delta import Table
 from featuredb.store.durable.ages import store_time, write_times
 from featuredb.store.durable.filesystem import store_errors
-from featuredb.store.durable.log import list_entries
+from featuredb.store.durable.log import CHANGED, OPERATION, REASON, list_entries
 from featuredb.store.encode import rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.scans import retired_since, scan_rows
-from featuredb.store.tables import (
-    CANDIDATE_IMAGES,
-    CANDIDATES,
-    CHILD_TABLES,
-    FORMAT_VERSION,
-    LIDAR,
-    LIDAR_POINTS,
-    MAPS,
-)
 from featuredb.store.vacuum_options import VacuumOptions as VacuumOptions
 
 
@@ -52,9 +46,9 @@ def compact(database: Database) -> dict[str, int]:
     """Merge small files; returns for each table how many files it has less. Snapshots do not change."""
     saved = {}
     for name in database.tables():
-        if name not in (MAPS, LIDAR):
+        if name not in (tables.MAPS, tables.LIDAR):
             saved[name] = database.table(name).compact()
-    saved[MAPS] = retry_stale("compact maps", lambda: _compact_maps(database))
+    saved[tables.MAPS] = retry_stale("compact maps", lambda: _compact_maps(database))
     return saved
 
 
@@ -69,37 +63,53 @@ def vacuum(
     Raises:
         ConflictError, StoreError
     """
+    options = options or VacuumOptions()
     with store_errors(f"cannot vacuum {database.url}"):
-        return _vacuum(database, options or VacuumOptions(), dry_run)
+        now = store_time(database.table(tables.MAPS).storage)
+        history, grace = timedelta(hours=options.history_h), timedelta(hours=options.orphan_grace_h)
+        kept_from = retry_stale("vacuum", lambda: _announce(database, now - history, dry_run))
+        # Asked before rows are removed, which gives those beside them newer files.
+        refused = _refused_images(database, now, history, grace)
+        orphans: set[str] = set()
+        gone = {scan_id for scan_id, time in retired_since(database).items() if time <= now - history}
+        for name, named in named_writes(database, kept_from, gone):
+            orphans |= _remove_orphans(database.table(name), named, now - grace, dry_run)
+        if refused and not dry_run:
+            database.table(tables.CANDIDATE_IMAGES).delete_rows("candidate_id", refused)
+        return VacuumReport(
+            kept_from=kept_from,
+            write_ids=tuple(sorted(orphans)),
+            candidate_images=tuple(sorted(refused)),
+            files=tuple(_vacuum_files(database, options, kept_from, dry_run)),
+            dry_run=dry_run,
+        )
 
 
-def _vacuum(database: Database, options: VacuumOptions, dry_run: bool) -> VacuumReport:
-    now = store_time(database.table(MAPS).storage)
-    kept_from = retry_stale("vacuum", lambda: _announce(database, options, now, dry_run))
-    named = write_ids_of_history(database, kept_from)
-    grace = timedelta(hours=options.orphan_grace_h)
-    orphans: set[str] = set()
-    for name in CHILD_TABLES:
-        orphans |= _remove_orphans(database.table(name), named, now - grace, dry_run)
-    orphans |= _vacuum_scans(database, options, now, dry_run)
-    unnamed, refused = _vacuum_candidates(database, options, now, dry_run)
-    orphans |= unnamed
-    return VacuumReport(
-        kept_from=kept_from,
-        write_ids=tuple(sorted(orphans)),
-        candidate_images=tuple(sorted(refused)),
-        files=tuple(_vacuum_files(database, options, kept_from, dry_run)),
-        dry_run=dry_run,
-    )
+def named_writes(
+    database: Database, first_version: int, gone: Collection[str] = ()
+) -> Iterator[tuple[str, set[str]]]:
+    """The child tables that there are, and the write ids that what is above each of them names.
+
+    Args:
+        first_version: of `maps`; what only earlier ones name does not count.
+        gone: ids of scans that do not count where they are retired.
+    """
+    named = write_ids_of_history(database, first_version)
+    yield from ((name, named) for name in tables.CHILD_TABLES)
+    if database.has(tables.LIDAR):
+        rows = [r for r in scan_rows(database) if r["status"] != RETIRED or r["scan_id"] not in gone]
+        yield tables.LIDAR_POINTS, {row["write_id"] for row in rows}
+    if database.has(tables.CANDIDATES):
+        yield tables.CANDIDATE_IMAGES, {event["write_id"] for event in read_events(database)}
 
 
 def write_ids_of_history(database: Database, first_version: int) -> set[str]:
     """All write ids that the versions from `first_version` on name."""
-    maps = database.table(MAPS)
+    maps = database.table(tables.MAPS)
     named: set[str] = set()
     seen_files: frozenset[str] = frozenset()
     for version in range(maps.version, first_version - 1, -1):
-        table = database.table(MAPS, version)
+        table = database.table(tables.MAPS, version)
         files = frozenset(file.path for file in table.files())
         if files - seen_files:  # otherwise it shows a part of what a newer version shows
             named.update(row["write_id"] for row in read_rows(table))
@@ -138,7 +148,7 @@ def _remove_orphans(table: Table, named: set[str], before: datetime, dry_run: bo
 
 
 def _compact_maps(database: Database) -> int:
-    maps = database.table(MAPS)
+    maps = database.table(tables.MAPS)
     files = len(maps.files())
     if files <= 1:
         return 0
@@ -146,12 +156,11 @@ def _compact_maps(database: Database) -> int:
     return files - 1
 
 
-def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run: bool) -> int:
-    """Commit from which version on the past is kept; returns that version."""
-    maps = database.table(MAPS)
+def _announce(database: Database, cutoff: datetime, dry_run: bool) -> int:
+    """Commit from which version on the past is kept: what was newest at a time; returns that version."""
+    maps = database.table(tables.MAPS)
     commits = maps.commits()
     # The version that was newest then, and all later ones; all if none is so old.
-    cutoff = now - timedelta(hours=options.history_h)
     old = [version for version, time in list_entries(maps.storage).items() if time <= cutoff]
     kept_from = max(*old, oldest_kept_version(commits), 0)
     if not dry_run and kept_from > oldest_kept_version(commits):
@@ -165,47 +174,35 @@ def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run
     return kept_from
 
 
-def _vacuum_scans(database: Database, options: VacuumOptions, now: datetime, dry_run: bool) -> set[str]:
-    """Remove points that no scan names, and those of scans that were retired before the kept history."""
-    if not database.has(LIDAR):
+def _refused_images(database: Database, now: datetime, history: timedelta, grace: timedelta) -> set[str]:
+    """Photos whose bytes may go: withdrawn ones (left by a crash), and those refused `history` ago.
+
+    Not those with bytes younger than `grace`: somebody may be giving the photo again just now.
+    """
+    if not database.has(tables.CANDIDATES):
         return set()
-    since = retired_since(database)
-    history = timedelta(hours=options.history_h)
-    named = {
-        row["write_id"]
-        for row in scan_rows(database)
-        if row["status"] != RETIRED or now - since.get(row["scan_id"], now) < history
-    }
-    grace = timedelta(hours=options.orphan_grace_h)
-    return _remove_orphans(database.table(LIDAR_POINTS), named, now - grace, dry_run)
-
-
-def _vacuum_candidates(
-    database: Database, options: VacuumOptions, now: datetime, dry_run: bool
-) -> tuple[set[str], set[str]]:
-    """Remove images that no event names, and those of photos that were refused long ago."""
-    if not database.has(CANDIDATES):
-        return set(), set()
-    table = database.table(CANDIDATE_IMAGES)
-    grace = timedelta(hours=options.orphan_grace_h)
-    writes = write_ids_in(table)
-    times = write_times(writes, table.storage)
-    fresh = {write_id for write_id in writes if write_id not in times or now - times[write_id] < grace}
-    refused = superfluous_images(database, now, timedelta(hours=options.history_h), fresh)
-    orphans = _remove_orphans(table, named_writes(database), now - grace, dry_run)
-    if refused and not dry_run:
-        table.delete_rows("candidate_id", refused)
-    return orphans, refused
+    live = live_maps(database)
+    found = set()
+    for candidate_id, events in by_candidate(read_events(database)).items():
+        state = standing_of(events, live).state
+        if state == "withdrawn" or (state == "refused" and now - events[-1]["happened_at"] >= history):
+            found.add(candidate_id)
+    table = database.table(tables.CANDIDATE_IMAGES)
+    times = write_times(write_ids_in(table), table.storage)
+    stored = table.dataset().to_table(["candidate_id", "write_id"], use_threads=False).to_pylist()
+    old = {write_id for write_id, time in times.items() if now - time >= grace}
+    fresh = {row["candidate_id"] for row in stored if row["write_id"] not in old}
+    return (found & {row["candidate_id"] for row in stored}) - fresh
 
 
 def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dry_run: bool) -> list[str]:
     files = []
     for name in database.tables():
-        if name == LIDAR:
+        if name == tables.LIDAR:
             continue
         table = database.table(name)
         # Versions of `maps` are kept by number; the newest child table serves all of them.
-        keep = range(kept_from, table.version + 1) if name == MAPS else ()
+        keep = range(kept_from, table.version + 1) if name == tables.MAPS else ()
         removed = table.vacuum(
             timedelta(hours=options.file_grace_h), dry_run=dry_run, keep_versions=list(keep)
         )
@@ -228,18 +225,20 @@ def upgrade(database: Database) -> list[str]:
     steps: list[str] = []
     for name in reversed(database.tables()):
         found = database.table(name).format
-        if found < FORMAT_VERSION:
+        if found < tables.FORMAT_VERSION:
             _to_newest_format(database, name)
-            steps.append(f"{name}: format {found} became {FORMAT_VERSION}, which older releases cannot read")
+            steps.append(
+                f"{name}: format {found} became {tables.FORMAT_VERSION}, which older releases cannot read"
+            )
     return steps
 
 
 def _to_newest_format(database: Database, name: str) -> None:
     def attempt() -> None:
         table = database.table(name)
-        if name == MAPS:
-            said = {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {FORMAT_VERSION}"}
-            table.upgrade(rows_table(MAPS, read_rows(table)), said)
+        if name == tables.MAPS:
+            said = {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {tables.FORMAT_VERSION}"}
+            table.upgrade(rows_table(tables.MAPS, read_rows(table)), said)
         else:
             table.upgrade()
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geometry.arrays import FloatArray
-from featuredb.store.changes import RETIRED, Change, live_row
-from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, apply_change, new_write_id
+from featuredb.store.changes import RETIRED, Change, live_row, with_status
+from featuredb.store.commits import LONGEST_COMMIT, apply_change, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.decode import of_columns, read_rows
 from featuredb.store.delta import Condition
@@ -47,18 +47,8 @@ POINT_ROW = np.dtype(
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TilePoints:
-    """Points of one tile on their way into the store.
-
-    Attributes:
-        rows: (n,) POINT_ROW, by level and then node.
-        has_intensity: whether the intensities mean something.
-    """
-
-    tile: str
-    rows: NDArray[Any]
-    has_intensity: bool
+TileRows = tuple[str, NDArray[Any]]
+"""A tile, and points of it on their way into the store: (n,) POINT_ROW, by level and then node."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,10 +85,7 @@ class ScanSummary:
 
 def scan_rows(database: Database) -> list[Row]:
     """All rows of `lidar`, oldest first; none where the table does not exist."""
-    if not database.has(LIDAR):
-        return []
-    rows = read_rows(database.table(LIDAR))
-    return sorted(rows, key=lambda row: (row["created_at"], row["scan_id"]))
+    return sorted(database.rows(LIDAR), key=lambda row: (row["created_at"], row["scan_id"]))
 
 
 def list_scans(database: Database, *, include_retired: bool = False) -> list[ScanSummary]:
@@ -121,7 +108,7 @@ def find_scan(database: Database, scan_id: str) -> ScanSummary:
 def commit_scan(
     database: Database,
     row: Row,
-    groups: Iterable[Callable[[], Iterator[TilePoints]]],
+    groups: Iterable[Callable[[], Iterator[TileRows]]],
     on_progress: Callable[[int], None] = lambda points: None,
 ) -> tuple[bool, str]:
     """Write a scan's points and then its row; a scan that is visible already is left alone.
@@ -146,14 +133,15 @@ def commit_scan(
     checksum = PointsChecksum()
     written = 0
 
-    def batches(group: Callable[[], Iterator[TilePoints]]) -> Iterator[pa.RecordBatch]:
+    def batches(group: Callable[[], Iterator[TileRows]]) -> Iterator[pa.RecordBatch]:
         nonlocal written
-        for points in group():
-            table = _point_rows(points, row["epsg"], write_id)
-            checksum.add(points.rows["utm"])
-            written += len(points.rows)
+        for tile, points in group():
+            checksum.add(points["utm"])
+            written += len(points)
             on_progress(written)
-            yield from table.to_batches()
+            constants = {"write_id": write_id, "zone": row["epsg"], "tile": tile}
+            columns = _point_columns(points, row["has_intensity"])
+            yield from table_of(LIDAR_POINTS, constants, columns, len(points)).to_batches()
 
     for group in groups:
         stream = pa.RecordBatchReader.from_batches(SPECS[LIDAR_POINTS].schema, batches(group))
@@ -180,18 +168,12 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
         raise StoreError(f"retire {scan_id}: expected a reason, for those who will ask later")
     find_scan(database, scan_id)
 
-    def attempt() -> bool:
-        table = database.table(LIDAR)
-        rows = read_rows(table)
+    def retired(rows: list[Row]) -> tuple[Change, list[str]]:
         if live_row(rows, scan_id, "scan_id") is None:
-            return False
-        changed = [
-            {**r, "status": RETIRED, "status_reason": reason} if r["scan_id"] == scan_id else r for r in rows
-        ]
-        apply_change(table, Change(rows=changed), operation="retire", changed=[scan_id], reason=reason)
-        return True
+            return Change(rows=rows, added=()), []
+        return Change(rows=with_status(rows, [scan_id], RETIRED, reason, "scan_id")), [scan_id]
 
-    return retry_stale(f"retire {scan_id}", attempt)
+    return bool(database.change_maps(f"retire {scan_id}", "retire", reason, retired, LIDAR).changed)
 
 
 def scan_points(
@@ -224,11 +206,9 @@ def retired_since(database: Database) -> dict[str, datetime]:
     if not database.has(LIDAR):
         return {}
     table = database.table(LIDAR)
-    times, entries = {}, list_entries(table.storage)
-    for commit in reversed(table.commits()):  # oldest first
-        if commit.metadata.get(OPERATION) == "retire":
-            times[commit.metadata.get(CHANGED, "")] = entries[commit.version]
-    return times
+    entries = list_entries(table.storage)
+    commits = reversed(table.commits())  # oldest first
+    return {s: entries[c.version] for c in commits if c.operation == "retire" for s in c.maps}
 
 
 def count_points(
@@ -271,13 +251,12 @@ def _add_row(database: Database, row: Row) -> str:
     if visible is not None:
         return str(visible["write_id"])
     kept = [r for r in rows if r["scan_id"] != row["scan_id"]]
-    change = Change(rows=[*kept, row], added=[row], only_adds=len(kept) == len(rows))
+    change = Change(rows=[*kept, row], added=[row] if len(kept) == len(rows) else None)
     apply_change(table, change, operation="lidar add", changed=[row["scan_id"]])
     return str(row["write_id"])
 
 
-def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
-    rows, n = points.rows, len(points.rows)
+def _point_columns(rows: NDArray[Any], has_intensity: bool) -> dict[str, Any]:
     no_rgb = ~rows["has_rgb"]
     columns: dict[str, Any] = {
         "classification": rows["classification"].astype(np.int16),
@@ -290,17 +269,17 @@ def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
     for axis, name in enumerate(("red", "green", "blue")):
         if not no_rgb.all():
             columns[name] = pa.array(rows["rgb"][:, axis].astype(np.int16), mask=no_rgb)
-    if points.has_intensity:
+    if has_intensity:
         columns["intensity"] = rows["intensity"].astype(np.int16)
-    constants = {"write_id": write_id, "zone": epsg, "tile": points.tile}
-    return table_of(LIDAR_POINTS, constants, columns, n)
+    return columns
 
 
 def _level_rows(
     database: Database, scan: ScanSummary, level: int, box: tuple[float, float, float, float] | None
 ) -> ds.Dataset:
-    where: list[Condition] = [("zone", "=", scan.epsg), ("level", "=", level)]
-    where.append(("write_id", "=", scan.write_id))
+    where: list[Condition] = [
+        ("zone", "=", scan.epsg), ("level", "=", level), ("write_id", "=", scan.write_id)
+    ]  # fmt: skip
     if box is not None:
         e0, n0, e1, n1 = box
         where += [

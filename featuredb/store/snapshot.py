@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 from numpy.typing import NDArray
 
-from featuredb.errors import MapNotFoundError, UnplacedMapError
+from featuredb.errors import MapNotFoundError, StoreError, UnplacedMapError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapMethod, MapStatus
 from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
@@ -204,16 +204,8 @@ class Snapshot:
             MapNotFoundError: there is none, or several begin so.
         """
         live = [map_id for map_id, row in self._rows.items() if row["status"] != RETIRED]
-        found = [start] if start in live else [m for m in live if start and m.startswith(start)]
-        if len(found) > 1:
-            raise MapNotFoundError(
-                f"{start}: {len(found)} maps begin so ({', '.join(sorted(found)[:4])}); write more of the id"
-            )
-        if not found:
-            raise MapNotFoundError(
-                f"snapshot {self.version} has no live map {start}; `featuredb maps` lists what there is"
-            )
-        return self.get_any(found[0])
+        none = f"snapshot {self.version} has no live map {start}; `featuredb maps` lists what there is"
+        return self.get_any(full_id(start, live, "maps", MapNotFoundError(none)))
 
     def lineages(self) -> dict[str, MapLineage]:
         """What each map of the snapshot stands on, retired ones included, by id."""
@@ -321,6 +313,21 @@ class Snapshot:
                 found = child.dataset([where]).to_table(columns, use_threads=False)
         batches: list[pa.RecordBatch] = found.to_batches()
         return batches
+
+
+def full_id(start: str, ids: Collection[str], what: str, none: StoreError) -> str:
+    """The id that is meant by itself, or by its first letters if no other begins so.
+
+    Raises:
+        StoreError: `none` where there is no such id; of the same kind where several begin so.
+    """
+    found = [start] if start in ids else [i for i in ids if start and i.startswith(start)]
+    if len(found) > 1:
+        some = ", ".join(sorted(found)[:4])
+        raise type(none)(f"{start}: {len(found)} {what} begin so ({some}); write more of the id")
+    if not found:
+        raise none
+    return found[0]
 
 
 def _grouped(column: pa.ChunkedArray) -> dict[str, NDArray[np.int64]]:

@@ -5,7 +5,7 @@ needs, and has no way to files, network, extensions or settings.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -15,22 +15,12 @@ import pyarrow as pa
 
 from featuredb.errors import StoreError
 from featuredb.extras import require
+from featuredb.store import tables
 from featuredb.store.database import Database
 from featuredb.store.decode import plain_times
 from featuredb.store.encode import rows_table
 from featuredb.store.scans import list_scans, scan_rows
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import (
-    CANARIES,
-    CANDIDATES,
-    CHILD_TABLES,
-    IMAGES,
-    LIDAR,
-    LIDAR_POINTS,
-    MAPS,
-    POINTS,
-    SPECS,
-)
 
 _BATCH_ROWS = 1024  # rows that are fetched at a time; bounds memory, not the result
 _SHOWN_ROWS = 20  # in a notebook
@@ -52,12 +42,13 @@ _CHILD_VIEW = """
 _UTM_OR_NULL = "".join(
     f"CASE WHEN zone <> 0 THEN {name} END AS {name}, " for name in ("easting", "northing", "height")
 )
-_PLACES = {IMAGES: _UTM_OR_NULL, POINTS: _UTM_OR_NULL}
-_LIDAR_VIEW = f"CREATE VIEW {LIDAR} AS SELECT * EXCLUDE (write_id, points_checksum) FROM stored_{LIDAR}"
+_LIDAR_VIEW = (
+    f"CREATE VIEW {tables.LIDAR} AS SELECT * EXCLUDE (write_id, points_checksum) FROM stored_{tables.LIDAR}"
+)
 _LIDAR_POINTS_VIEW = f"""
-    CREATE VIEW {LIDAR_POINTS} AS
+    CREATE VIEW {tables.LIDAR_POINTS} AS
     SELECT s.scan_id, p.* EXCLUDE (write_id)
-    FROM stored_{LIDAR_POINTS} p JOIN stored_{LIDAR} s ON p.write_id = s.write_id
+    FROM stored_{tables.LIDAR_POINTS} p JOIN stored_{tables.LIDAR} s ON p.write_id = s.write_id
 """
 
 
@@ -104,7 +95,7 @@ class SqlTable:
         return f"<table><tr>{head}</tr>{body}</table><p>{len(self)} rows</p>"
 
 
-class SqlSession:
+class SqlSession(AbstractContextManager["SqlSession"]):
     """DuckDB over one snapshot; a context manager.
 
     Views: `maps` (retired ones included, see its column `status`); `images`, `points`, `observations` and
@@ -122,9 +113,6 @@ class SqlSession:
             self._register_growth(database)
         self._connection.execute("SET enable_external_access = false")
         self._connection.execute("SET lock_configuration = true")
-
-    def __enter__(self) -> "SqlSession":
-        return self
 
     def __exit__(self, *failed: object) -> None:
         self._connection.close()
@@ -157,31 +145,29 @@ class SqlSession:
         return statements[0]
 
     def _register(self) -> None:
-        self._connection.register("stored_maps", plain_times(rows_table(MAPS, self.snapshot.rows())))
+        self._connection.register("stored_maps", plain_times(rows_table(tables.MAPS, self.snapshot.rows())))
         self._connection.execute("CREATE VIEW maps AS SELECT * EXCLUDE (write_id) FROM stored_maps")
         self._connection.execute(_CAMERAS_VIEW)
-        for name in CHILD_TABLES:
+        for name in tables.CHILD_TABLES:
             self._connection.register(f"stored_{name}", self.snapshot.dataset(name, include_retired=False))
-            self._connection.execute(_CHILD_VIEW.format(name=name, places=_PLACES.get(name, "")))
+            places = "" if name == tables.OBSERVATIONS else _UTM_OR_NULL
+            self._connection.execute(_CHILD_VIEW.format(name=name, places=places))
 
     def _register_scans(self, database: Database) -> None:
-        rows = plain_times(rows_table(LIDAR, scan_rows(database)))
-        self._connection.register(f"stored_{LIDAR}", rows)
-        points = SPECS[LIDAR_POINTS].schema.empty_table()
-        if database.has(LIDAR):
+        rows = plain_times(rows_table(tables.LIDAR, scan_rows(database)))
+        self._connection.register(f"stored_{tables.LIDAR}", rows)
+        points = tables.SPECS[tables.LIDAR_POINTS].schema.empty_table()
+        if database.has(tables.LIDAR):
             named = [scan.write_id for scan in list_scans(database)]
-            points = database.table(LIDAR_POINTS).dataset([("write_id", "in", named)])
-        self._connection.register(f"stored_{LIDAR_POINTS}", points)
+            points = database.table(tables.LIDAR_POINTS).dataset([("write_id", "in", named)])
+        self._connection.register(f"stored_{tables.LIDAR_POINTS}", points)
         self._connection.execute(_LIDAR_VIEW)
         self._connection.execute(_LIDAR_POINTS_VIEW)
 
     def _register_growth(self, database: Database) -> None:
-        for name, hidden in ((CANDIDATES, "event_index"), (CANARIES, "image")):
-            columns = [field.name for field in SPECS[name].schema if field.name not in (hidden, "write_id")]
-            if database.has(name):
-                rows = database.table(name).dataset().to_table(columns)
-            else:
-                rows = SPECS[name].schema.empty_table().select(columns)
+        for name, hidden in ((tables.CANDIDATES, "event_index"), (tables.CANARIES, "image")):
+            columns = [n for n in tables.SPECS[name].schema.names if n not in (hidden, "write_id")]
+            rows = rows_table(name, database.rows(name, columns)).select(columns)
             self._connection.register(name, plain_times(rows))
 
     def _fetch(self) -> Iterator[tuple[Any, ...]]:

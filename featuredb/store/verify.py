@@ -1,5 +1,6 @@
 """Does the database hold what it says? Every file, every row and every cross-reference of one snapshot."""
 
+import hashlib
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -11,9 +12,10 @@ import pyarrow.dataset as ds
 
 from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
-from featuredb.store.canaries import list_canaries
-from featuredb.store.candidates.photos import count_candidates
-from featuredb.store.candidates.upkeep import check_growth_tables, named_writes
+from featuredb.store import tables
+from featuredb.store.canaries import list_canaries, load_canary_image
+from featuredb.store.candidates.photos import by_candidate, count_candidates, live_maps, read_events
+from featuredb.store.candidates.states import CONTRIBUTED, EVENTS, standing_of
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
@@ -21,34 +23,24 @@ from featuredb.store.durable.copies import LIST, CopyPlace, cut_off
 from featuredb.store.durable.filesystem import one_line, sha256_of, store_errors, table_files
 from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, encode_map
-from featuredb.store.maintenance import write_ids_in, write_ids_of_history
-from featuredb.store.scans import PointsChecksum, ScanSummary, list_scans, scan_batches, scan_rows
+from featuredb.store.maintenance import named_writes, write_ids_in
+from featuredb.store.scans import PointsChecksum, ScanSummary, list_scans, scan_batches
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import (
-    BOUNDS,
-    CANDIDATE_IMAGES,
-    CANDIDATES,
-    CHILD_TABLES,
-    IMAGES,
-    LIDAR,
-    LIDAR_POINTS,
-    MAPS,
-    OBSERVATIONS,
-    POINTS,
-    SPECS,
-    UTM_COORDINATES,
-)
 
 logger = logging.getLogger(__name__)
 
 # Columns that follow from a map's coordinates, and are not part of what is loaded.
 _PLACES = {
-    IMAGES: (*UTM_COORDINATES, "zone", "tile"),
-    POINTS: (*UTM_COORDINATES, "zone", "tile"),
-    OBSERVATIONS: ("zone", "tile"),
+    tables.IMAGES: (*tables.UTM_COORDINATES, "zone", "tile"),
+    tables.POINTS: (*tables.UTM_COORDINATES, "zone", "tile"),
+    tables.OBSERVATIONS: ("zone", "tile"),
 }
 _SAME_M = 1e-3
-_INDEX = {IMAGES: "image_index", POINTS: "point_index", OBSERVATIONS: "observation_index"}
+_INDEX = {
+    tables.IMAGES: "image_index",
+    tables.POINTS: "point_index",
+    tables.OBSERVATIONS: "observation_index",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +77,7 @@ class VerifyReport:
         return not self.problems
 
 
+_GROWTH = (tables.CANDIDATES, tables.CANDIDATE_IMAGES, tables.CANARIES)
 _TOLD = 3  # problems in a message
 Found = tuple[str, str]  # where, and what
 
@@ -161,7 +154,7 @@ def _verify(database: Database) -> VerifyReport:
 
 def check_logs(database: Database) -> Iterator[Found]:
     """Is every entry of every log there and whole, and does the log end where it was acknowledged to end?"""
-    for name in SPECS:
+    for name in tables.SPECS:
         files = table_files(database.table_url(name), database.storage_options)
         for problem in log_problems(files):
             what = f"{problem.what}; `featuredb repair` says what can be done"
@@ -213,7 +206,7 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Found]:
     if encoded.row["content_digest"] != row["content_digest"]:
         yield where, "its rows are not those that were committed: content digests differ"
         return
-    if any(encoded.row[name] != row[name] for name in (*BOUNDS, "tiles")):
+    if any(encoded.row[name] != row[name] for name in (*tables.BOUNDS, "tiles")):
         yield where, "its box or its tiles are not those of its coordinates"
     mine = ds.field("write_id") == row["write_id"]
     for name, expected in encoded.children.items():
@@ -242,8 +235,8 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
     levels, coordinates = np.zeros(len(scan.level_points), np.int64), PointsChecksum()
     elsewhere = 0
     try:
-        for batch in scan_batches(database, scan, (*UTM_COORDINATES, "tile", "level")):
-            utm = np.column_stack([batch[name].to_numpy() for name in UTM_COORDINATES])
+        for batch in scan_batches(database, scan, (*tables.UTM_COORDINATES, "tile", "level")):
+            utm = np.column_stack([batch[name].to_numpy() for name in tables.UTM_COORDINATES])
             coordinates.add(utm)
             levels += np.bincount(batch["level"].to_numpy(), minlength=len(levels))[: len(levels)]
             if not np.isfinite(utm).all():
@@ -261,18 +254,97 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Found]:
         yield where, f"{elsewhere} points in another tile than their coordinates'"
 
 
+def check_growth_tables(database: Database) -> list[Found]:
+    """What is wrong with contributed photos and known queries: where, and what. Reads every image.
+
+    Where others commit meanwhile, as a withdrawal does, it looks again for what it has found.
+    """
+
+    def look() -> tuple[list[int], list[Found]]:
+        return versions(), [*_check_candidates(database), *_check_canaries(database)]
+
+    def versions() -> list[int]:
+        return [database.table(name).version for name in database.tables() if name in _GROWTH]
+
+    seen, found = look()
+    while found and seen != versions():
+        seen, again = look()
+        lasting = [problem for problem in found if problem in again]
+        if lasting == found:
+            break
+        found = lasting
+    return found
+
+
+def _check_candidates(database: Database) -> Iterator[Found]:
+    if not database.has(tables.CANDIDATES):
+        return
+    try:
+        events = read_events(database)
+        live = live_maps(database)
+        digests = dict(_stored_digests(database))
+    except (FeatureDbError, OSError, pa.ArrowException) as error:
+        yield "candidates", f"cannot be read: {one_line(error)[:300]}"
+        return
+    whole = by_candidate(events)
+    for event in events:
+        where = f"candidate {event['candidate_id']}"
+        if event["event"] not in EVENTS:
+            yield where, f"an event {event['event']!r} that is none of {', '.join(EVENTS)}"
+        elif event["candidate_id"] not in whole:
+            yield where, f"an event {event['event']!r} of a photo that nobody contributed"
+    for candidate_id, own in whole.items():
+        where, state = f"candidate {candidate_id}", standing_of(own, live).state
+        expected = next(e["sha256"] for e in own if e["event"] == CONTRIBUTED)
+        if not str(expected).startswith(candidate_id):
+            yield where, f"its id is not the beginning of its hash {expected}"
+        if candidate_id not in digests:
+            if state in ("waiting", "used"):
+                yield where, f"it is {state}, but its image is not there"
+        elif state == "withdrawn":
+            yield where, "it is withdrawn, but its image is still there; withdraw it again"
+        elif digests[candidate_id] != expected:
+            yield where, "its image is not the one that was contributed: hashes differ"
+
+
+def _check_canaries(database: Database) -> Iterator[Found]:
+    try:
+        canaries = list_canaries(database)
+    except FeatureDbError as error:
+        yield "canaries", f"cannot be read: {error}"
+        return
+    names = [canary.name for canary in canaries]
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        yield f"canary {name}", "there are several of this name"
+    for canary in canaries:
+        try:
+            load_canary_image(database, canary)
+        except FeatureDbError as error:
+            yield f"canary {canary.name}", str(error)
+
+
+def _stored_digests(database: Database) -> Iterator[Found]:
+    """Candidate and SHA-256 of each stored image, one in memory at a time."""
+    dataset = database.table(tables.CANDIDATE_IMAGES).dataset()
+    batches = dataset.to_batches(
+        columns=["candidate_id", "image"],
+        batch_size=1,
+        batch_readahead=1,
+        fragment_readahead=1,
+        use_threads=False,
+    )
+    for batch in batches:
+        for candidate_id, image in zip(batch["candidate_id"], batch["image"], strict=True):
+            yield candidate_id.as_py(), hashlib.sha256(image.as_buffer()).hexdigest()
+
+
 def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
     return tuple(DatabaseProblem(where=where, what=what) for where, what in problems)
 
 
 def _orphans(database: Database) -> list[str]:
-    first = oldest_kept_version(database.table(MAPS).commits())
-    present: set[str] = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
-    orphans = present - write_ids_of_history(database, first)
-    if database.has(LIDAR):
-        orphans |= set(write_ids_in(database.table(LIDAR_POINTS))) - {
-            r["write_id"] for r in scan_rows(database)
-        }
-    if database.has(CANDIDATES):
-        orphans |= set(write_ids_in(database.table(CANDIDATE_IMAGES))) - named_writes(database)
+    first = oldest_kept_version(database.table(tables.MAPS).commits())
+    orphans: set[str] = set()
+    for name, named in named_writes(database, first):
+        orphans |= write_ids_in(database.table(name)).keys() - named
     return sorted(orphans)

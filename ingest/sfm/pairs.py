@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.descriptor_index import use_threads
-from featuredb.index.photo_index import most_similar
+from featuredb.index.nearest import most_similar
 from featuredb.index.vocabulary import Vocabulary
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.photos.photo import Photo, gps_positions

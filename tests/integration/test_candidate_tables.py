@@ -14,9 +14,7 @@ from featuredb.errors import StoreError
 from featuredb.store import Database
 from featuredb.store import verify as verify_module
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image
-from featuredb.store.candidates import upkeep
-from featuredb.store.candidates.events import append_events
-from featuredb.store.candidates.photos import contribute, list_candidates, withdraw
+from featuredb.store.candidates.photos import append_events, contribute, list_candidates, withdraw
 from featuredb.store.commits import new_write_id
 from featuredb.store.delta import Table
 from featuredb.store.maintenance import VacuumOptions, vacuum
@@ -131,16 +129,15 @@ def test_a_withdrawal_while_it_is_verified(
     database: Database, monkeypatch: pytest.MonkeyPatch, between: str
 ) -> None:
     one, _ = contribute(database, [contribution(1), contribution(2)])
-    place = upkeep if between == "events and images" else verify_module
     name = "_stored_digests" if between == "events and images" else "file_digests"
-    real, calls = getattr(place, name), list[object]()
+    real, calls = getattr(verify_module, name), list[object]()
 
     def meanwhile(value: Any) -> Any:
         if not calls and (between == "events and images" or "candidate_images" in value.base_path):
             calls.append(withdraw(database, [one], "asked"))
         return real(value)
 
-    monkeypatch.setattr(place, name, meanwhile)
+    monkeypatch.setattr(verify_module, name, meanwhile)
     assert verify(database).problems == ()
     assert calls
 
@@ -150,13 +147,13 @@ def test_an_image_that_is_lost_is_found_while_others_commit(
 ) -> None:
     (one,) = contribute(database, [contribution(1)])
     database.table(CANDIDATE_IMAGES).delete_rows("candidate_id", [one])
-    real, seeds = upkeep._stored_digests, iter(range(2, 9))
+    real, seeds = verify_module._stored_digests, iter(range(2, 9))
 
     def meanwhile(database: Database) -> Any:
         contribute(database, [contribution(next(seeds))])
         return real(database)
 
-    monkeypatch.setattr(upkeep, "_stored_digests", meanwhile)
+    monkeypatch.setattr(verify_module, "_stored_digests", meanwhile)
     assert f"candidate {one}" in {problem.where for problem in verify(database).problems}
 
 

@@ -19,8 +19,7 @@ from featuredb.export.dataset.lidar_part import touched_tiles
 from featuredb.export.selection import Selection
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.tiles import tile_of
-from featuredb.lidar.add import add_scan
-from featuredb.lidar.options import AddOptions, ScanLabels
+from featuredb.lidar.add import AddOptions, add_scan
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from featuredb.store.encode import encode_map
@@ -57,9 +56,9 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Database:
         classification=np.full(len(xyz), 2),
         **colours,
     )
-    add_scan(database, [path], KEPT, ScanLabels(name="near", licence="CC-BY-4.0", source="test"))
+    add_scan(database, [path], KEPT, name="near", licence="CC-BY-4.0", source="test")
     far = write_scan(folder / "far.laz", grid_points(2000) + np.array([20_000.0, 0.0, 0.0]))
-    add_scan(database, [far], KEPT, ScanLabels(name="far", licence="CC0-1.0", source="test"))
+    add_scan(database, [far], KEPT, name="far", licence="CC0-1.0", source="test")
     return database
 
 
@@ -158,7 +157,7 @@ def test_scans_need_the_licence_too_and_not_be_retired(tmp_path: Path) -> None:
     database = Database.create(tmp_path / "db")
     database.commit_map(map_there(1))
     path = write_scan(tmp_path / "a.laz", grid_points(3000, spacing=10.0))
-    scan = add_scan(database, [path], KEPT, ScanLabels(name="a", licence="proprietary", source="test")).scan
+    scan = add_scan(database, [path], KEPT, name="a", licence="proprietary", source="test").scan
     export(database, tmp_path / "part", Selection(licences=("cc-by",)), with_lidar=True)
     assert not (tmp_path / "part/lidar").exists()
     assert b"proprietary" not in b"".join(files_of(tmp_path / "part").values())
@@ -176,9 +175,7 @@ def test_tiles_can_be_added_as_a_scan_again(database: Database, tmp_path: Path) 
     (known,) = scans_of(tmp_path / "out")
     target = Database.create(tmp_path / "target.db")
     files = [tmp_path / "out" / t["file"] for t in known["tiles"]]
-    scan = add_scan(
-        target, files, AddOptions(outliers=None), ScanLabels(name="again", licence="", source="")
-    ).scan
+    scan = add_scan(target, files, AddOptions(outliers=None), name="again", licence="", source="").scan
     assert scan.points == sum(t["points"] for t in known["tiles"])
     assert (scan.epsg, scan.height_datum, scan.colour) == (32632, "egm2008", "file")
     assert verify(target).ok

@@ -12,7 +12,7 @@ import pytest
 from featuredb.cli.main import main
 from featuredb.errors import ExportError
 from featuredb.export.dataset import import_dataset, read_dataset
-from featuredb.export.dataset.sums import write_sums
+from featuredb.export.dataset.layout import write_sums
 from featuredb.export.selection import Selection
 from featuredb.store import Database
 from featuredb.store.changes import IMPORTED

@@ -16,8 +16,7 @@ from featuredb.errors import (
     ScanError,
     ScanFileError,
 )
-from featuredb.lidar.add import add_scan
-from featuredb.lidar.options import AddOptions, OrthoChoice
+from featuredb.lidar.add import AddOptions, add_scan
 from featuredb.store import Database
 from tests.support.geotiff import write_geotiff
 from tests.support.las_files import SOUTH, WEST, grid_points, write_scan
@@ -137,7 +136,7 @@ def test_ortho_colours_what_is_seen_from_above(database: Database, tmp_path: Pat
             Database(str(tmp_path / f"{n}.db")),
             [path],
             AddOptions(block_points=n),
-            ortho=OrthoChoice(path=tif),
+            ortho=tif,
         )
         for n in (1_000_000, 2500)
     ]
@@ -177,7 +176,7 @@ def test_a_raster_of_heights_is_a_scan_of_its_cells(database: Database, tmp_path
     write_geotiff(tmp_path / "ortho.tif", grey, **place)
 
     options = AddOptions(height_datum="ellipsoidal")
-    ortho = OrthoChoice(path=tmp_path / "ortho.tif")
+    ortho = tmp_path / "ortho.tif"
     scan = add_scan(database, [tmp_path / "dsm.tif"], options, ortho=ortho).scan
 
     rows, columns = np.nonzero(heights[:, :, 0] != -9999.0)

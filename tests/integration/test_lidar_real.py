@@ -8,9 +8,8 @@ import pytest
 from pyproj import CRS, Transformer
 
 from featuredb.errors import GeodesyError
-from featuredb.lidar.add import add_scan
+from featuredb.lidar.add import AddOptions, add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
-from featuredb.lidar.options import AddOptions
 from featuredb.store import Database
 from featuredb.store.verify import verify
 

@@ -11,9 +11,8 @@ from featuredb.errors import (
     ConflictError,
     ScanError,
 )
-from featuredb.lidar.add import add_scan, work_folder
+from featuredb.lidar.add import AddOptions, add_scan, work_folder
 from featuredb.lidar.load import load_cloud, scan_frame
-from featuredb.lidar.options import AddOptions
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from featuredb.store.verify import verify
@@ -68,7 +67,7 @@ KILLED_JOB = """
 import os, signal, sys
 from pathlib import Path
 from featuredb.lidar.add import add_scan
-from featuredb.lidar.options import AddOptions
+from featuredb.lidar.add import AddOptions
 from featuredb.store import Database
 
 def on_progress(step, done, total):

@@ -16,9 +16,8 @@ from featuredb.errors import (
     ScanNotFoundError,
 )
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.lidar.add import add_scan
+from featuredb.lidar.add import AddOptions, add_scan
 from featuredb.lidar.load import chosen_scans, load_cloud, scan_frame
-from featuredb.lidar.options import AddOptions, ScanLabels
 from featuredb.store import Database
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.scans import find_scan, list_scans, retire_scan
@@ -162,7 +161,7 @@ def test_files_of_one_survey_become_one_scan(database: Database, tmp_path: Path)
         write_scan(tmp_path / "west.laz", xyz[west], red=np.full(west.sum(), 200)),
         write_scan(tmp_path / "east.laz", xyz[~west], point_format=6),
     ]
-    result = add_scan(database, files, labels=ScanLabels(name="both", licence="CC0", source="test"))
+    result = add_scan(database, files, name="both", licence="CC0", source="test")
     assert result.scan.points == 4000
     assert (result.scan.name, result.scan.licence, result.scan.row["source"]) == ("both", "CC0", "test")
     assert [f["points"] for f in result.scan.row["files"]] == [int(west.sum()), int((~west).sum())]
@@ -202,7 +201,7 @@ def test_parts_of_scans_are_loaded(database: Database, tmp_path: Path) -> None:
     enu = frame.enu_from_utm(xyz, 32632)
     box = (-10.0, -5.0, 15.0, 20.0)
     inside = ((enu[:, :2] >= box[:2]) & (enu[:, :2] <= box[2:])).all(axis=1)
-    cloud = load_cloud(database.url, frame, box)
+    cloud = load_cloud(database, frame, box)
     assert inside.sum() <= len(cloud) <= 1.05 * inside.sum()
     distance, _ = cKDTree(cloud.xyz).query(enu[inside])
     assert distance.max() < 2e-3  # the file's millimetre

@@ -12,7 +12,7 @@ import pytest
 from featuredb.errors import StoreError
 from featuredb.store import Database
 from featuredb.store.canaries import list_canaries
-from featuredb.store.durable import local
+from featuredb.store.durable import publish
 from tests.support.bit_flips import flip_bits, outcome, rich_database, seen
 from tests.support.maps import random_map
 
@@ -22,7 +22,7 @@ FLIPS = 15  # `python -m tests.support.bit_flips` makes as many as wanted
 @pytest.fixture(scope="module", autouse=True)
 def _checkpoints_soon() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+        patch.setattr(publish, "CHECKPOINT_INTERVAL", 2)
         yield
 
 

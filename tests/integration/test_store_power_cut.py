@@ -11,7 +11,7 @@ import pytest
 from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute, count_candidates, withdraw
 from featuredb.store.candidates.states import Contribution
-from featuredb.store.durable import local
+from featuredb.store.durable import publish
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.verify import verify
 from tests.support.maps import random_map
@@ -109,7 +109,7 @@ def test_a_new_database_survives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_checkpoints_are_made_and_read(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+    monkeypatch.setattr(publish, "CHECKPOINT_INTERVAL", 2)
     disk = Disk(tmp_path, monkeypatch, lambda: None)
     for seed in range(3, 8):
         database.commit_map(random_map(seed, extent_m=10.0))

@@ -10,7 +10,7 @@ import pytest
 from featuredb.cli.main import main
 from featuredb.errors import StoreError
 from featuredb.store import Database
-from featuredb.store.durable import local
+from featuredb.store.durable import publish
 from featuredb.store.durable.log import DIGEST, acknowledge, acknowledged, entry_name
 from featuredb.store.durable.repair import repair
 from featuredb.store.tables import CHILD_TABLES, MAPS
@@ -176,7 +176,7 @@ def test_the_last_acknowledged_version_is_the_highest(tmp_path: Path) -> None:
 def test_a_broken_checkpoint_is_set_aside(
     database: Database, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+    monkeypatch.setattr(publish, "CHECKPOINT_INTERVAL", 2)
     for seed in (3, 4, 5):
         database.commit_map(random_map(seed, extent_m=10.0))
     broken = Path(database.url, MAPS, "_delta_log", name)
@@ -189,7 +189,7 @@ def test_a_broken_checkpoint_is_set_aside(
 
 
 def test_a_torn_entry_goes_with_its_checkpoint(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+    monkeypatch.setattr(publish, "CHECKPOINT_INTERVAL", 2)
     for seed in (3, 4):
         database.commit_map(random_map(seed, extent_m=10.0))
     torn = entry(database, MAPS, 4)
@@ -204,7 +204,7 @@ def test_a_torn_entry_goes_with_its_checkpoint(database: Database, monkeypatch: 
 def test_a_torn_name_of_the_checkpoint_hinders_no_commit(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+    monkeypatch.setattr(publish, "CHECKPOINT_INTERVAL", 2)
     for seed in (3, 4):
         Path(database.url, MAPS, "_delta_log", "_last_checkpoint").write_bytes(b"{")
         database.commit_map(random_map(seed, extent_m=10.0))

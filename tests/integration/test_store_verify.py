@@ -13,8 +13,8 @@ from deltalake import DeltaTable, write_deltalake
 
 from featuredb.errors import StoreError
 from featuredb.store import Database
-from featuredb.store.durable import local
 from featuredb.store.durable import log as log_module
+from featuredb.store.durable import publish
 from featuredb.store.durable.log import log_problems
 from featuredb.store.verify import DatabaseProblem, VerifyReport, verify
 from tests.support.maps import random_map
@@ -162,7 +162,7 @@ def test_rows_of_an_unknown_write_are_orphans_and_no_damage(database: Database) 
 
 
 def test_each_log_entry_is_read_once(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+    monkeypatch.setattr(publish, "CHECKPOINT_INTERVAL", 2)
     for _ in range(6):
         database.table("maps").compact()
         database.retire("map-1", "wrong")
@@ -220,8 +220,8 @@ def test_a_commit_whose_checkpoint_fails_is_done(
     def full(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 1)
-    monkeypatch.setattr(local, "publish_checkpoint", full)
+    monkeypatch.setattr(publish, "CHECKPOINT_INTERVAL", 1)
+    monkeypatch.setattr(publish, "publish_checkpoint", full)
     assert database.retire("map-1", "wrong") == ("map-1",)
     assert database.snapshot().maps() == []
     assert "no checkpoint" in caplog.text

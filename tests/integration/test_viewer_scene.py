@@ -12,7 +12,6 @@ import pytest
 from featuredb.cli.main import COMMAND_GROUP, main
 from featuredb.export.selection import Selection
 from featuredb.lidar.add import add_scan
-from featuredb.lidar.options import ScanLabels
 from featuredb.store import Database
 from reloc.listening import listen
 from reloc.tracking.trajectory.files import write_trajectory
@@ -114,11 +113,11 @@ def scanned(tmp_path_factory: pytest.TempPathFactory) -> Database:
     database = Database.create(folder / "maps.db")
     xyz = grid_points(3000)
     grey = write_scan(folder / "grey.las", xyz, intensity=np.arange(3000, dtype=np.uint16))
-    add_scan(database, [grey], labels=ScanLabels(name="grey", licence="CC0-1.0"))
+    add_scan(database, [grey], name="grey", licence="CC0-1.0")
     values = {"red": 200, "green": 60, "blue": 40}
     colours = {name: np.full(2000, v * 257, np.uint16) for name, v in values.items()}
     coloured = write_scan(folder / "coloured.las", grid_points(2000, seed=1) + BESIDE, **colours)
-    add_scan(database, [coloured], labels=ScanLabels(name="coloured", licence="secret"))
+    add_scan(database, [coloured], name="coloured", licence="secret")
     return database
 
 

@@ -15,7 +15,7 @@ from featuredb.errors import FeatureDbError
 from featuredb.store import Database
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image
 from featuredb.store.candidates.photos import contribute, list_candidates, load_images
-from featuredb.store.durable import local
+from featuredb.store.durable import publish
 from featuredb.store.encode import content_digest
 from featuredb.store.verify import verify
 from tests.support.contributions import contribution
@@ -82,7 +82,7 @@ def flip_bits(database: Database, copy: Path, flips: int, seed: int) -> Counter[
 
 def main(flips: int, seed: int) -> None:
     os.fsync = lambda fd: None
-    local.CHECKPOINT_INTERVAL = 2
+    publish.CHECKPOINT_INTERVAL = 2
     with tempfile.TemporaryDirectory() as folder:
         found = flip_bits(rich_database(Path(folder, "a.db")), Path(folder, "b.db"), flips, seed)
     for (kind, what), count in sorted(found.items()):

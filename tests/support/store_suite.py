@@ -105,8 +105,6 @@ class StoreSuite:
             place.open()
         place.create().commit_map(random_map(1))
         assert [m.map_id for m in place.create().snapshot().maps()] == ["map-1"]
-        with pytest.raises(StoreError, match="already"):
-            Database.create(place.url, exist_ok=False, storage_options=place.storage_options)
 
     def test_committing_twice_is_committing_once(self, database: Database) -> None:
         first, again = (database.commit_map(random_map(1)) for _ in range(2))

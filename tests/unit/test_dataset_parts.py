@@ -12,7 +12,7 @@ from featuredb.errors import ExportError, GeodesyError, InvalidValueError, Store
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents, Footprint, entry_of, footprint_of
 from featuredb.export.dataset.geoparquet import point_columns, wkb_of
-from featuredb.export.dataset.sums import check_sums, write_sums
+from featuredb.export.dataset.layout import check_sums, write_sums
 from featuredb.export.shots import pose_covariance
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.geo.local_frame import LocalFrame
@@ -186,7 +186,10 @@ def test_checksums_find_each_damage(tmp_path: Path) -> None:
 
 def test_every_column_is_explained() -> None:
     for table in (columns.MAPS, columns.CAMERAS, columns.IMAGES, columns.POINTS, columns.OBSERVATIONS):
-        assert table.schema.names == list(table.meaning)
+        meaning = table.meaning()
+        assert table.schema.names == list(meaning)
+        assert all(meaning.values())
+        assert set(table.words) <= set(meaning)
         assert set(table.repeating) <= set(table.schema.names)
 
 

@@ -4,8 +4,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from featuredb.geo.geopose import geopose_from_camera
-from featuredb.geo.geopose_documents import irregular_series
+from featuredb.geo.geopose import geopose_from_camera, irregular_series
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from schemas import load_schema

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from featuredb.lidar.clean import OutlierOptions, find_outliers, outlier_ratio
 from featuredb.lidar.levels import COARSEST_SPACING_M, finest_level, order_by_level
-from featuredb.lidar.outliers import OutlierOptions, find_outliers, outlier_ratio
 from featuredb.lidar.staged import stretch_of
 from tests.support.las_files import grid_points
 

@@ -7,10 +7,10 @@ from functools import partial
 from pathlib import Path
 
 from featuredb.errors import ExportError
-from featuredb.export.dataset.own_frame import load_own, own_rows
-from featuredb.export.dataset.read import Row, load_map, open_dataset
+from featuredb.export.dataset.read import Row, load_map, load_own, open_dataset, own_rows
 from featuredb.export.job import Told
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
+from featuredb.maps.lineage import reached
 from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
 from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
 from featuredb.store.database import Database
@@ -149,19 +149,11 @@ def _missing_parents(rows: Sequence[Row], live: Mapping[str, Sequence[str]]) -> 
     Args:
         live: parents of the maps that live in the database, by id.
     """
-    parents = dict(live) | {row["map_id"]: tuple(row["parents"]) for row in rows}
+    parents = {**live, **{row["map_id"]: row["parents"] for row in rows}}
     known = [{"map_id": m, "parents": p, "status": ACTIVE} for m, p in parents.items()]
     standing = anchored(known)
-    found = {}
-    for row in rows:
-        if row["status"] == ACTIVE and row["map_id"] not in standing:
-            above, queue = set(), list(row["parents"])
-            while queue:
-                if (name := queue.pop()) not in above:
-                    above.add(name)
-                    queue += parents.get(name, ())
-            found[row["map_id"]] = tuple(sorted(above - parents.keys()))
-    return found
+    fallen = [r["map_id"] for r in rows if r["status"] == ACTIVE and r["map_id"] not in standing]
+    return {map_id: tuple(sorted(reached([map_id], parents) - parents.keys())) for map_id in fallen}
 
 
 def _parents_first(rows: Sequence[Row]) -> list[Row]:

@@ -107,10 +107,6 @@ class MapEntry:
     taken: tuple[datetime, datetime] | None
 
     @property
-    def map_id(self) -> str:
-        return str(self.row["map_id"])
-
-    @property
     def plan_box(self) -> list[float]:
         """Smallest easting and northing, largest ones of its points, metres; empty without points."""
         return [self.row[name] for name in (*BOUNDS[0:2], *BOUNDS[3:5])] if self.row["points"] else []

@@ -5,11 +5,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents
-from featuredb.export.dataset.own_frame import FOLDER
-from featuredb.export.dataset.sums import SUMS
+from featuredb.export.dataset.layout import SUMS
+from featuredb.export.job import ATTRIBUTION
 from featuredb.geo.crs.wkt import utm_projjson
 
 _WIDTH = 110
@@ -51,7 +50,7 @@ def _title(contents: Contents, description: Mapping[str, Any]) -> str:
             (name, f"{contents.total(name):,}")
             for name in ("images", "points", "observations", "descriptors")
         ),
-        ("status of the maps", _counts(contents.count("status"))),
+        ("status of the maps", ", ".join(f"{n:,} {s}" for s, n in sorted(contents.count("status").items()))),
         ("west, south, east, north", f"{west:.6f}, {south:.6f}, {east:.6f}, {north:.6f} (WGS84 degrees)"),
         (
             "photos taken",
@@ -127,7 +126,7 @@ def _files() -> str:
             f"`{layout.STAC}/collection.json` is a STAC 1.0 catalogue with an item for each map, "
             f"`{layout.DESCRIPTION}` says what this is for programs, `{SUMS}` lists every file: "
             f"`sha256sum --check {SUMS}`. Scans, if any, are in `{layout.LIDAR}/scans.json`, maps "
-            f"without a place in `{FOLDER}`."
+            f"without a place in `{layout.OWN_FRAME}`."
         ),
         _prose(
             "Files of points and images are named by zone, height datum and number, since a GeoParquet "
@@ -147,7 +146,7 @@ def _reading(contents: Contents) -> str:
 
 
 def _columns(title: str, table: columns.Columns) -> str:
-    rows = [(f"`{f.name}`", str(f.type), table.meaning[f.name]) for f in table.schema]
+    rows = [(f"`{n}`", str(table.schema.field(n).type), text) for n, text in table.meaning().items()]
     return f"\n### {title}\n" + _table(("column", "type", "what"), rows)
 
 
@@ -164,12 +163,8 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
-def _counts(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count:,} {name}" for name, count in sorted(counts.items()))
-
-
 def _words(value: Any) -> str:
-    return _plain(", ".join(map(str, value)) if isinstance(value, list) else str(value))
+    return _plain(", ".join(map(str, value)) if isinstance(value, tuple) else str(value))
 
 
 def _plain(text: str) -> str:

@@ -1,13 +1,14 @@
-"""Names in a dataset's folder, and the document that says what it is."""
+"""Names in a dataset's folder, the document that says what it is, and the checksums of its files."""
 
 import hashlib
 import json
 import re
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from featuredb.errors import ExportError
+from featuredb.file_digest import file_sha256
 
 FORMAT, FORMAT_VERSION = "featuredb-dataset", 1
 
@@ -16,9 +17,12 @@ MAPS = "maps.parquet"
 CAMERAS = "cameras.parquet"
 POINTS, IMAGES, OBSERVATIONS = "points", "images", "observations"
 DATASHEET = "README.md"
+SUMS = "SHA256SUMS"  # as `sha256sum -c SHA256SUMS` reads it
 STAC = "stac"
 LIDAR = "lidar"
+OWN_FRAME = "own_frame"  # maps without a place: neither GeoParquet nor the catalogue has room for them
 
+_LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 _LONGEST_NAME = 80
 
@@ -33,6 +37,11 @@ class Partition:
     def file(self, table: str, number: int) -> str:
         """Path in the folder of the n-th file, from 0, of a table's rows in this partition."""
         return f"{table}/{self.epsg}-{self.height_datum}-{number:04d}.parquet"
+
+
+def own_path(table: str) -> str:
+    """Where the rows of maps without a place are, as the store has them, in the dataset's folder."""
+    return f"{OWN_FRAME}/{table}.parquet"
 
 
 def file_name(name: str) -> str:
@@ -69,3 +78,48 @@ def read_description(folder: Path) -> dict[str, Any]:
             f"{document.get('format_version')!r}; use the featuredb that wrote it, or a newer one"
         )
     return dict(document)
+
+
+def write_sums(folder: Path) -> None:
+    """List every file below the folder, by path, with its SHA-256."""
+    files = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    text = "".join(f"{file_sha256(folder / name)}  {name}\n" for name in files)
+    (folder / SUMS).write_text(text, encoding="utf-8")
+
+
+def check_sums(folder: Path) -> frozenset[str]:
+    """The files that are listed, after every one has been compared. Files that are not listed do not matter.
+
+    Raises:
+        ExportError: not a folder with SHA256SUMS; a file that is missing or differs, by name.
+    """
+    try:
+        text = (folder / SUMS).read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise ExportError(
+            f"{folder}: expected a dataset's folder with {SUMS}, cannot read that ({error})"
+        ) from error
+    listed: set[str] = set()
+    for number, line in enumerate(text.splitlines(), start=1):
+        match = _LINE.fullmatch(line)
+        if match is None or not _inside(match[2]):
+            raise ExportError(
+                f"{folder / SUMS}, line {number}: expected a SHA-256 and a path, found {line!r:.120}"
+            )
+        digest, name = match.groups()
+        path = folder / name
+        if not path.is_file():
+            raise ExportError(
+                f"{path}: {SUMS} lists this file, and it is missing; copy the dataset once more"
+            )
+        if file_sha256(path) != digest:
+            raise ExportError(
+                f"{path}: the content is not what {SUMS} says; it was damaged or changed, copy it once more"
+            )
+        listed.add(name)
+    return frozenset(listed)
+
+
+def _inside(name: str) -> bool:
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts

@@ -114,7 +114,8 @@ def write_scans(job: ExportJob, contents: Contents, folder: Path) -> list[dict[s
             if points:
                 tiles.append({"tile": tile, "file": name, "points": points})
         if tiles:
-            written.append(_known(scan) | {"tiles": tiles})
+            known = {name: value for name, value in scan.row.items() if name not in ("write_id", "tiles")}
+            written.append(known | {"created_at": scan.created_at.isoformat(), "tiles": tiles})
     if written:
         write_json(folder / SCANS, {"scans": written})
     return written
@@ -143,8 +144,3 @@ def _in_zone(box: list[float], epsg: int, scan: ScanSummary) -> list[float]:
         return []
     plan = utm_from_geodetic(corners, scan.epsg)[:, :2]
     return [*plan.min(axis=0).tolist(), *plan.max(axis=0).tolist()]
-
-
-def _known(scan: ScanSummary) -> dict[str, Any]:
-    row = {name: value for name, value in scan.row.items() if name not in ("write_id", "tiles")}
-    return row | {"created_at": scan.created_at.isoformat()}

@@ -1,5 +1,9 @@
-"""The files that hold the rows of all maps: by zone and height datum, cut before they grow too large."""
+"""The files that hold the rows of all maps: by zone and height datum, cut before they grow too large.
 
+Those of maps without a place are in a folder of their own, as the store has them.
+"""
+
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +12,16 @@ import pyarrow as pa
 
 from featuredb.export.dataset import columns
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, point_columns
-from featuredb.export.dataset.layout import IMAGES, OBSERVATIONS, POINTS, Partition
+from featuredb.export.dataset.layout import IMAGES, OBSERVATIONS, POINTS, Partition, own_path
 from featuredb.export.shots import pose_covariance
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import FeatureMap, MapImage
-from featuredb.store.encode import EncodedMap
+from featuredb.maps.unplaced_map import UnplacedMap
+from featuredb.store.encode import EncodedMap, encode_map, rows_table
+from featuredb.store.snapshot import MapSummary, UnplacedSummary
+from featuredb.store.tables import MAPS, SPECS
 
 COLUMNS = {POINTS: columns.POINTS, IMAGES: columns.IMAGES, OBSERVATIONS: columns.OBSERVATIONS}
 
@@ -23,7 +30,7 @@ COLUMNS = {POINTS: columns.POINTS, IMAGES: columns.IMAGES, OBSERVATIONS: columns
 LARGEST_ROWS = 4_000_000
 
 
-class PartitionFiles:
+class PartitionFiles(AbstractContextManager["PartitionFiles"]):
     """Writes maps one after the other; use it in a `with` block.
 
     A file holds maps of one zone and height datum. A map is in one file of each table, and a row group has
@@ -72,8 +79,31 @@ class PartitionFiles:
         crs = utm_projjson(partition.epsg, partition.height_datum)
         return GeoFile(path, what.schema, what.repeating, crs)
 
-    def __enter__(self) -> "PartitionFiles":
-        return self
+    def __exit__(self, *failed: object) -> None:
+        for file in self._open.values():
+            file.close()
+
+
+class OwnFrameFiles(AbstractContextManager["OwnFrameFiles"]):
+    """Writes maps without a place one after the other; use it in a `with` block. No map, no folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._open: dict[str, TableFile] = {}
+        self.rows: list[dict[str, Any]] = []
+
+    def add(self, unplaced: UnplacedMap, summary: MapSummary | UnplacedSummary) -> None:
+        """A map; a row group has rows of one map only."""
+        encoded = encode_map(unplaced, "", summary.created_at)
+        row = encoded.row | {"status_reason": summary.status_reason}
+        self.rows.append(row)
+        tables = {MAPS: rows_table(MAPS, [row]), **encoded.children}
+        for table, rows in tables.items():
+            if table not in self._open:
+                path = self._folder / own_path(table)
+                self._open[table] = TableFile(path, SPECS[table].schema, ("map_id",))
+            if len(rows):
+                self._open[table].write(rows.cast(SPECS[table].schema))
 
     def __exit__(self, *failed: object) -> None:
         for file in self._open.values():

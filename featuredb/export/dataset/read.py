@@ -12,12 +12,14 @@ import pyarrow.parquet as pq
 from featuredb.errors import ExportError, FeatureDbError
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.columns import CAMERAS, MAPS
+from featuredb.export.dataset.layout import check_sums
 from featuredb.export.dataset.partitions import COLUMNS
-from featuredb.export.dataset.sums import check_sums
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.unplaced_map import MapKind
+from featuredb.maps.unplaced_map import MapKind, UnplacedMap
 from featuredb.store.decode import decode_map
 from featuredb.store.encode import content_digest
+from featuredb.store.tables import CHILD_TABLES
+from featuredb.store.tables import MAPS as STORED_MAPS
 
 Row = dict[str, Any]
 
@@ -119,3 +121,34 @@ def check_listed(name: str, listed: frozenset[str], folder: Path) -> None:
         raise ExportError(
             f"{folder}: SHA256SUMS does not list {name}, which is part of a dataset; copy it again"
         )
+
+
+def own_rows(folder: Path, listed: frozenset[str]) -> list[Row]:
+    """What is known of the maps without a place, by the store's columns; none where the dataset has none.
+
+    Args:
+        listed: files that SHA256SUMS vouches for.
+
+    Raises:
+        ExportError: the table cannot be read.
+    """
+    if layout.own_path(STORED_MAPS) not in listed:
+        return []
+    return list(read_table(folder / layout.own_path(STORED_MAPS)).to_pylist())
+
+
+def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> UnplacedMap:
+    """One map without a place.
+
+    Raises:
+        ExportError: its rows cannot be read, or are not the map that was exported.
+    """
+    for table in CHILD_TABLES:
+        check_listed(layout.own_path(table), listed, folder)
+    only = ds.field("map_id") == row["map_id"]
+    return decoded(
+        folder,
+        dict(row),
+        lambda: {t: read_table(folder / layout.own_path(t), only=only).to_batches() for t in CHILD_TABLES},
+        UnplacedMap,
+    )

@@ -22,24 +22,29 @@ import numpy as np
 import pyarrow as pa
 
 from featuredb.errors import ExportError
-from featuredb.export.attribution import ATTRIBUTION, Attribution, attribution_of, write_attribution
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.contents import Contents, MapEntry, entry_of
 from featuredb.export.dataset.datasheet import write_datasheet
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, wkb_of
+from featuredb.export.dataset.layout import write_sums
 from featuredb.export.dataset.lidar_part import write_scans
-from featuredb.export.dataset.own_frame import OwnFrameFiles
-from featuredb.export.dataset.partitions import PartitionFiles
-from featuredb.export.dataset.sums import write_sums
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_json
+from featuredb.export.dataset.partitions import OwnFrameFiles, PartitionFiles
+from featuredb.export.job import (
+    ATTRIBUTION,
+    Attribution,
+    Exported,
+    ExportJob,
+    attribution_of,
+    whole_or_nothing,
+    write_attribution,
+    write_json,
+)
 from featuredb.extras import require
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store.encode import encode_map
-from featuredb.store.snapshot import MapSummary
 
 # Of maps.parquet, in a row group.
 _ROWS_AT_ONCE = 256
@@ -73,7 +78,7 @@ def write_catalogue(contents: Contents, description: Mapping[str, Any], folder: 
     }
     for tile in (tile for scan in contents.scans for tile in scan["tiles"]):
         assets[tile["file"]] = _asset(f"../{tile['file']}", "LiDAR tile", _LAZ, "data")
-    items = {f"items/{layout.file_name(entry.map_id)}.json": entry for entry in contents.maps}
+    items = {f"items/{layout.file_name(entry.row['map_id'])}.json": entry for entry in contents.maps}
     collection = {
         "type": "Collection",
         "stac_version": STAC_VERSION,
@@ -124,7 +129,7 @@ def _item(entry: MapEntry, collection: str) -> dict[str, Any]:
         "type": "Feature",
         "stac_version": STAC_VERSION,
         "stac_extensions": [PROJECTION],
-        "id": entry.map_id,
+        "id": entry.row["map_id"],
         "collection": collection,
         "geometry": entry.footprint.geometry,
         "bbox": list(entry.footprint.bbox),
@@ -187,8 +192,12 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
             if isinstance(feature_map, UnplacedMap):
                 own.add(feature_map, job.snapshot.get_any(feature_map.map_id))
                 continue
-            row = _write_rows(feature_map, job.snapshot.get(feature_map.map_id), files)
-            row["lineage"] = _lineage_json(lineages[feature_map.map_id])
+            summary, lineage = job.snapshot.get(feature_map.map_id), lineages[feature_map.map_id]
+            encoded = encode_map(feature_map, "", summary.created_at)
+            of_files = {f"{table}_file": path for table, path in files.write(feature_map, encoded).items()}
+            row = encoded.row | {"status_reason": summary.status_reason} | of_files
+            stands_on = {k: v for k, v in asdict(lineage).items() if k != "map_id"} | {"steps": lineage.steps}
+            row["lineage"] = json.dumps(stands_on, sort_keys=True)
             contents.maps.append(entry_of(feature_map, row))
             cameras += _camera_rows(feature_map)
             del feature_map  # before the next one is loaded
@@ -202,15 +211,6 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
     with TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()) as file:
         file.write(pa.Table.from_pylist(cameras, schema=CAMERAS.schema))
     return contents, own
-
-
-def _write_rows(feature_map: FeatureMap, summary: MapSummary, files: PartitionFiles) -> dict[str, Any]:
-    """The map's images, points and observations; returns its row of maps.parquet, in part."""
-    encoded = encode_map(feature_map, "", summary.created_at)
-    encoded.row["status_reason"] = summary.status_reason
-    for table, path in files.write(feature_map, encoded).items():
-        encoded.row[f"{table}_file"] = path
-    return encoded.row
 
 
 def _write_areas(maps: list[MapEntry], folder: Path) -> None:
@@ -237,15 +237,8 @@ def _camera_rows(feature_map: FeatureMap) -> list[dict[str, Any]]:
     ]
 
 
-def _lineage_json(lineage: MapLineage) -> str:
-    document = asdict(lineage) | {"steps": lineage.steps}
-    del document["map_id"]
-    return json.dumps(document, sort_keys=True)
-
-
 def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict[str, Any]:
     """What `dataset.json` says, and the datasheet and the catalogue are made of."""
-    chosen = job.selection
     return {
         "format": layout.FORMAT,
         "format_version": layout.FORMAT_VERSION,
@@ -253,13 +246,7 @@ def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict
         "snapshot": job.snapshot.version,
         "snapshot_time": job.snapshot.timestamp.isoformat(),
         "featuredb": version("featuredb"),
-        "selection": {
-            "maps": list(chosen.maps),
-            "statuses": list(chosen.statuses),
-            "bbox": None if chosen.bbox is None else list(chosen.bbox),
-            "where": chosen.where,
-            "licences": None if chosen.licences is None else list(chosen.licences),
-        },
+        "selection": asdict(job.selection),
         **{name: contents.total(name) for name in ("images", "points", "observations", "descriptors")},
         "maps": len(contents.maps),
         **({"maps_without_a_place": len(own.rows)} if own.rows else {}),

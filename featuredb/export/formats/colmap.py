@@ -15,8 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from featuredb.export.attribution import attribution_of, write_attribution
-from featuredb.export.georeference import GEOREFERENCE, georeference_text
+from featuredb.export.georeference import write_georeference
 from featuredb.export.job import Exported, ExportJob, folder_for_each
 from featuredb.maps.feature_map import MapImage
 from featuredb.maps.unplaced_map import AnyMap
@@ -46,8 +45,7 @@ def write_map(folder: Path, feature_map: AnyMap, *, text: bool = False) -> None:
     else:
         reconstruction.write_binary(str(model))
     write_colmap_database(folder / DATABASE, feature_map, keypoints, names)
-    (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
-    write_attribution(folder, attribution_of(feature_map))
+    write_georeference(folder, feature_map, names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -9,9 +9,17 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from featuredb.errors import ExportError, FeatureDbError, ImageError
-from featuredb.export.attribution import Attribution, attribution_of, write_attribution
 from featuredb.export.formats.colmap import image_names
-from featuredb.export.job import Exported, ExportJob, folder_name, whole_or_nothing, write_csv
+from featuredb.export.job import (
+    Attribution,
+    Exported,
+    ExportJob,
+    attribution_of,
+    folder_name,
+    whole_or_nothing,
+    write_attribution,
+    write_csv,
+)
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
 from featuredb.features.exif.gps import RADIUS_68
 from featuredb.features.exif.write import gps_directory, with_app1, with_gps, with_properties
@@ -60,7 +68,7 @@ def write_exif(job: ExportJob, photos: Path | None) -> Exported:
             names = image_names(feature_map)
             credits = attribution_of(feature_map)
             for shot, name, credit in zip(shots_of(feature_map), names, credits, strict=True):
-                outcome = _copy(part, folder / _safe(name), shot, found.get(shot.sha256))
+                outcome = _copy(part, folder / _safe(name), shot, found.get(shot.image.sha256))
                 files.append(outcome)
                 if not outcome.reason:
                     attribution.append(credit)
@@ -124,29 +132,27 @@ def properties(shot: PosedPhoto) -> dict[str, str]:
         "Camera:GPSZAccuracy": f"{up:.4f}",
         "featuredb:HeightDatum": altitude_of(shot)[1],
         "featuredb:MapId": shot.map_id,
-        "featuredb:OriginalSha256": shot.sha256,
+        "featuredb:OriginalSha256": shot.image.sha256,
+        "featuredb:Owner": shot.image.owner,
+        "featuredb:Licence": shot.licence,
     }
-    if shot.owner:
-        told["featuredb:Owner"] = shot.owner
-    if shot.licence:
-        told["featuredb:Licence"] = shot.licence
-    return told
+    return {name: text for name, text in told.items() if text}
 
 
 def _copy(part: Path, name: Path, shot: PosedPhoto, original: Path | None) -> _File:
-    reason = ""
-    if original is None:
-        reason = "no file of these bytes in the folder"
+    reason, file = "", name.as_posix()
+    try:
+        if original is None:
+            raise ExportError("no file of these bytes in the folder")
+        data = with_pose(original.read_bytes(), shot)
+    except FeatureDbError as error:
+        reason, file = str(error), ""
     else:
-        try:
-            data = with_pose(original.read_bytes(), shot)
-        except FeatureDbError as error:
-            reason = str(error)
-        else:
-            (part / name).parent.mkdir(parents=True, exist_ok=True)
-            (part / name).write_bytes(data)
-    file = "" if reason else name.as_posix()
-    return _File(map_id=shot.map_id, image=shot.name, sha256=shot.sha256, file=file, reason=reason)
+        (part / name).parent.mkdir(parents=True, exist_ok=True)
+        (part / name).write_bytes(data)
+    return _File(
+        map_id=shot.map_id, image=shot.image.name, sha256=shot.image.sha256, file=file, reason=reason
+    )
 
 
 def _safe(name: str) -> Path:

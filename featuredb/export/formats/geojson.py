@@ -45,9 +45,9 @@ def feature(shot: PosedPhoto) -> dict[str, Any]:
         },
         "properties": {
             "map_id": shot.map_id,
-            "image": shot.name,
-            "sha256": shot.sha256,
-            "capture_time": None if shot.capture_time is None else shot.capture_time.isoformat(),
+            "image": shot.image.name,
+            "sha256": shot.image.sha256,
+            "capture_time": None if shot.image.capture_time is None else shot.image.capture_time.isoformat(),
             "heading_deg": round(heading, 5),
             "pitch_deg": round(pitch, 5),
             "roll_deg": round(roll, 5),
@@ -56,7 +56,7 @@ def feature(shot: PosedPhoto) -> dict[str, Any]:
             "height_datum": shot.height_datum,
             "map_height_m": round(shot.map_height_m, 4),
             "map_height_datum": shot.map_height_datum,
-            "owner": shot.owner,
+            "owner": shot.image.owner,
             "licence": shot.licence,
         },
     }

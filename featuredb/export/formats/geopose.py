@@ -8,10 +8,9 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.job import Exported, ExportJob, folder_for_each, folder_name, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.geo.geopose_documents import basic_ypr, irregular_series
+from featuredb.geo.geopose import basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
 
 BASIC, SERIES, MANIFEST = "basic_ypr", "series.json", "manifest.json"
@@ -29,28 +28,32 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
     names = _file_names(shots)
     for shot, name in zip(shots, names, strict=True):
         write_json(folder / BASIC / name, basic_ypr(shot.geopose))
-    timed = [(shot.unix_ms, shot) for shot in shots if shot.unix_ms is not None]
+    times = ((shot.image.capture_time, shot) for shot in shots)
+    # Of photos that say in which time zone they were taken.
+    timed = [(round(1000.0 * time.timestamp()), shot) for time, shot in times if time and time.tzinfo]
     if timed:
-        timed.sort(key=lambda row: (row[0], row[1].number))
+        timed.sort(key=lambda row: (row[0], row[1].image.image_id))
         write_json(folder / SERIES, irregular_series([(unix_ms, shot.geopose) for unix_ms, shot in timed]))
     manifest = {
         "map_id": feature_map.map_id,
         "height_datum": shots[0].height_datum if shots else feature_map.height_datum,
         "body_axes": "x forward, y left, z up",
         "photos": [
-            {"file": name, "image": shot.name, "sha256": shot.sha256, "owner": shot.owner}
+            {"file": name, "image": shot.image.name, "sha256": shot.image.sha256, "owner": shot.image.owner}
             | {"licence": shot.licence, "sigma_enu_m": [round(float(v), 4) for v in shot.sigma_enu_m]}
             | {"sigma_rotation_enu_deg": [round(float(v), 5) for v in shot.sigma_rotation_deg]}
             for shot, name in zip(shots, names, strict=True)
         ],
     }
     write_json(folder / MANIFEST, manifest)
-    write_attribution(folder, attribution_of(feature_map))
 
 
 def _file_names(shots: Sequence[PosedPhoto]) -> list[str]:
-    counts = Counter(shot.name for shot in shots)
+    counts = Counter(shot.image.name for shot in shots)
     return [
-        folder_name(shot.name if counts[shot.name] == 1 else f"{shot.number}_{shot.name}") + ".json"
+        folder_name(
+            shot.image.name if counts[shot.image.name] == 1 else f"{shot.image.image_id}_{shot.image.name}"
+        )
+        + ".json"
         for shot in shots
     ]

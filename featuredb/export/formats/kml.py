@@ -5,7 +5,6 @@ from xml.sax.saxutils import escape
 
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
-from featuredb.maps.feature_map import FeatureMap
 
 _NEAR_M = 10.0  # where the picture hangs ahead of the camera
 
@@ -23,9 +22,11 @@ def write_kml(job: ExportJob) -> Exported:
             )
             for feature_map in job.maps():
                 shots = list(shots_of(feature_map))
+                datum = altitude_of(shots[0])[1] if shots else feature_map.height_datum
+                told = f"map {feature_map.map_id}, {len(shots)} photos; altitudes: {datum}"
                 out.write(
                     f"<Folder><name>{_text(feature_map.name or feature_map.map_id)}</name>"
-                    f"<description>{_text(_told(feature_map, shots))}</description>\n"
+                    f"<description>{_text(told)}</description>\n"
                 )
                 out.writelines(overlay(shot) for shot in shots)
                 out.write("</Folder>\n")
@@ -45,14 +46,14 @@ def overlay(shot: PosedPhoto) -> str:
     left, right, bottom, top = field_of_view_deg(shot)
     where = f"{place.longitude_deg:.10f},{place.latitude_deg:.10f},{altitude:.4f}"
     when = ""
-    if shot.capture_time is not None:  # without a zone where the photo names none
-        when = f"<TimeStamp><when>{shot.capture_time.isoformat(timespec='seconds')}</when></TimeStamp>"
+    if shot.image.capture_time is not None:  # without a zone where the photo names none
+        when = f"<TimeStamp><when>{shot.image.capture_time.isoformat(timespec='seconds')}</when></TimeStamp>"
     data = "".join(
         f'<Data name="{name}"><value>{_text(value)}</value></Data>'
         for name, value in (
             ("map_id", shot.map_id),
-            ("sha256", shot.sha256),
-            ("owner", shot.owner),
+            ("sha256", shot.image.sha256),
+            ("owner", shot.image.owner),
             ("licence", shot.licence),
             ("heading_deg", f"{heading:.5f}"),
             ("pitch_deg", f"{pitch:.5f}"),
@@ -63,12 +64,12 @@ def overlay(shot: PosedPhoto) -> str:
         )
     )
     return (
-        f"<PhotoOverlay><name>{_text(shot.name)}</name>"
+        f"<PhotoOverlay><name>{_text(shot.image.name)}</name>"
         f"<description>{_text(_credit(shot))}</description>"
         f"<Camera><longitude>{place.longitude_deg:.10f}</longitude><latitude>{place.latitude_deg:.10f}</latitude>"
         f"<altitude>{altitude:.4f}</altitude><heading>{heading:.5f}</heading><tilt>{90.0 + pitch:.5f}</tilt>"
         f"<roll>{-roll + 0.0:.5f}</roll><altitudeMode>absolute</altitudeMode></Camera>{when}"
-        f"<ExtendedData>{data}</ExtendedData><Icon><href>{_text(shot.name)}</href></Icon>"
+        f"<ExtendedData>{data}</ExtendedData><Icon><href>{_text(shot.image.name)}</href></Icon>"
         f"<ViewVolume><leftFov>{left:.5f}</leftFov><rightFov>{right:.5f}</rightFov>"
         f"<bottomFov>{bottom:.5f}</bottomFov><topFov>{top:.5f}</topFov><near>{_NEAR_M:g}</near></ViewVolume>"
         f"<Point><altitudeMode>absolute</altitudeMode><coordinates>{where}</coordinates></Point>"
@@ -90,13 +91,8 @@ def field_of_view_deg(shot: PosedPhoto) -> tuple[float, float, float, float]:
     return left, right, bottom, top
 
 
-def _told(feature_map: FeatureMap, shots: list[PosedPhoto]) -> str:
-    datum = altitude_of(shots[0])[1] if shots else feature_map.height_datum
-    return f"map {feature_map.map_id}, {len(shots)} photos; altitudes: {datum}"
-
-
 def _credit(shot: PosedPhoto) -> str:
-    owner, licence = shot.owner or "owner unknown", shot.licence or "licence unknown"
+    owner, licence = shot.image.owner or "owner unknown", shot.licence or "licence unknown"
     horizontal = float((shot.sigma_enu_m[0] ** 2 + shot.sigma_enu_m[1] ** 2) ** 0.5)
     accuracy = f"{horizontal:.2f} m horizontally, {shot.sigma_enu_m[2]:.2f} m vertically"
     return f"{owner}; {licence}; position +- {accuracy}"

@@ -8,10 +8,9 @@ import json
 from pathlib import Path
 from typing import IO, Any
 
-from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.formats.colmap import image_names
 from featuredb.export.formats.opensfm_camera import opensfm_camera
-from featuredb.export.georeference import GEOREFERENCE, georeference_text
+from featuredb.export.georeference import write_georeference
 from featuredb.export.job import Exported, ExportJob, folder_for_each, write_json
 from featuredb.geometry.rotation import so3_log
 from featuredb.maps.feature_map import FeatureMap, MapImage
@@ -38,8 +37,7 @@ def write_map(folder: Path, feature_map: FeatureMap) -> None:
     write_json(folder / "reference_lla.json", reference)
     with (folder / "tracks.csv").open("w", encoding="utf-8", newline="\n") as out:
         _write_tracks(out, feature_map, names)
-    (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
-    write_attribution(folder, attribution_of(feature_map))
+    write_georeference(folder, feature_map, names)
 
 
 def _reference(feature_map: FeatureMap) -> dict[str, float]:

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ExportError
-from featuredb.export.attribution import Attribution, attribution_of, write_attribution
-from featuredb.export.job import write_csv
+from featuredb.export.job import Attribution, attribution_of, write_attribution, write_csv
 from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, PointColumns
@@ -98,12 +97,8 @@ class MapList:
         place: tuple[object, object] = ("", "")
         if isinstance(feature_map, FeatureMap):
             place = feature_map.epsg, feature_map.height_datum
-        self._rows.append(
-            (
-                *(index, feature_map.map_id, feature_map.name, file if points else ""),
-                *(*place, points, licences),
-            )
-        )
+        row = (index, feature_map.map_id, feature_map.name, file if points else "", *place, points, licences)
+        self._rows.append(row)
         self._photos.extend(attribution)
         return index
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 from featuredb.maps.feature_map import FeatureMap, MapImage
-from featuredb.store.candidates.events import by_candidate, read_events
+from featuredb.store.candidates.photos import by_candidate, read_events
 from featuredb.store.candidates.states import ANONYMOUS, CONFIRMED, OPERATOR, USED, contributions_of, owner_of
 from featuredb.store.database import Database
 from featuredb.store.encode import Row

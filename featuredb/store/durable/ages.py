@@ -5,11 +5,10 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
-from urllib.parse import unquote
 
 import pyarrow.fs as fs
 
-from featuredb.store.durable.log import list_entries, utc, whole_entry
+from featuredb.store.durable.log import list_entries, paths_of, utc, whole_entry
 from featuredb.store.durable.publish import SCRATCH, flush
 
 
@@ -55,11 +54,10 @@ def old_files(files: fs.FileSystem, unused: Iterable[str], grace: timedelta) -> 
     """Those of the unused files that were made and dropped from the log longer ago than `grace`."""
     now, times = store_time(files), file_times(files)
     dropped = {
-        unquote(action["remove"]["path"])
+        path
         for version, written in list_entries(files).items()
         if now - written < grace
-        for action in whole_entry(files, version)[1]
-        if "remove" in action
+        for path in paths_of("remove", whole_entry(files, version)[1])
     }
     candidates = {path for path in unused if path in times} - dropped
     return sorted(path for path in candidates if now - times[path] >= grace)
@@ -72,8 +70,10 @@ def old_scratch_folders(files: fs.FileSystem, grace: timedelta) -> list[str]:
         if info.path.startswith(SCRATCH):
             folder = info.path.split("/")[0]
             newest[folder] = max(newest.get(folder, utc(info.mtime)), utc(info.mtime))
-    now = store_time(files) if newest else None
-    return sorted(folder for folder, time in newest.items() if now is not None and now - time >= grace)
+    if not newest:
+        return []
+    now = store_time(files)
+    return sorted(folder for folder, time in newest.items() if now - time >= grace)
 
 
 def remove_files(url: str, files: fs.FileSystem, paths: Iterable[str], folders: Iterable[str]) -> None:

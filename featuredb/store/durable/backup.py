@@ -30,7 +30,7 @@ from featuredb.store.durable.copies import (
     superfluous,
 )
 from featuredb.store.durable.filesystem import sha256_of, store_errors
-from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_name, whole_entry
+from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_name, paths_of, whole_entry
 from featuredb.store.retry import StaleVersionError, retry_stale
 from featuredb.store.tables import CHILDREN, MAPS
 
@@ -141,7 +141,7 @@ def _files_of(table: Table) -> dict[str, str | None]:
     for version in range(table.version + 1):
         content, actions = whole_entry(table.storage, version)
         if version <= kept_from:
-            for path in (unquote(a["remove"]["path"]) for a in actions if "remove" in a):
+            for path in paths_of("remove", actions):
                 files.pop(path, None)
         for add in (a["add"] for a in actions if "add" in a):
             files[unquote(add["path"])] = (add.get("tags") or {}).get(DIGEST)

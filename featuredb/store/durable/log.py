@@ -25,11 +25,13 @@ from featuredb.errors import StoreError
 logger = logging.getLogger(__name__)
 
 LOG, ACKNOWLEDGED, LAST_CHECKPOINT = "_delta_log", "_acknowledged", "_last_checkpoint"
+# Keys of what a commit says about itself.
+OPERATION, CHANGED, REASON = "featuredb.operation", "featuredb.maps", "featuredb.reason"
 # Tag of an added file: of its bytes. In the line commitInfo of an entry: of its actions without this.
 DIGEST = "featuredb.sha256"
 _ENTRY = re.compile(r"(\d{20})\.json")
 _CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
-_NAME = re.compile(r"\d{20}")
+_NAME = re.compile(r"(\d{20})")
 _ADDED, _REMOVED = ("num_added_files", "numFilesAdded"), ("num_removed_files", "numFilesRemoved")
 
 Action = dict[str, Any]
@@ -71,10 +73,9 @@ def read_actions(content: bytes) -> list[Action]:
     if info.get("operation") == "CREATE TABLE" and not any("metaData" in action for action in actions):
         raise ValueError("it is torn: its line metaData is missing")
     metrics = info.get("operationMetrics")
+    metrics = metrics if isinstance(metrics, dict) else {}
     for kind, names in (("add", _ADDED), ("remove", _REMOVED)):
-        expected = (
-            next((metrics[n] for n in names if n in metrics), None) if isinstance(metrics, dict) else None
-        )
+        expected = next((metrics[n] for n in names if n in metrics), None)
         lines = [action[kind] for action in actions if kind in action]
         if not all(isinstance(line, dict) and isinstance(line.get("path"), str) for line in lines):
             raise ValueError(f"it has lines {kind!r} that name no file")
@@ -97,6 +98,11 @@ def actions_digest(actions: Iterable[Action]) -> str:
     return hashlib.sha256(json.dumps(lines, sort_keys=True).encode()).hexdigest()
 
 
+def paths_of(kind: str, actions: Iterable[Action]) -> list[str]:
+    """The files that actions of a kind, "add" or "remove", name."""
+    return [unquote(action[kind]["path"]) for action in actions if kind in action]
+
+
 def named_checkpoint(content: bytes) -> int | None:
     """The version that the file `_last_checkpoint` names; None where it is empty or torn."""
     try:
@@ -117,6 +123,20 @@ class Commit:
     version: int
     timestamp: datetime
     metadata: dict[str, str]
+
+    @property
+    def operation(self) -> str:
+        """Commit, retire, ..."""
+        return self.metadata.get(OPERATION, "" if self.version else "init")
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Ids of the maps or scans that it is about."""
+        return tuple(filter(None, self.metadata.get(CHANGED, "").split("\n")))
+
+    @property
+    def reason(self) -> str:
+        return self.metadata.get(REASON, "")
 
 
 def read_commit(files: fs.FileSystem, version: int) -> Commit:
@@ -153,14 +173,6 @@ def _entry(files: fs.FileSystem, version: int) -> tuple[bytes, list[Action]]:
     return content, read_actions(content)
 
 
-def _entry_problem(files: fs.FileSystem, version: int) -> str | None:
-    try:
-        _entry(files, version)
-    except ValueError as error:
-        return str(error)
-    return None
-
-
 def file_digests(files: fs.FileSystem) -> dict[str, str]:
     """The SHA-256 of each file that a log has ever named, by path; not of files of older releases.
 
@@ -171,9 +183,9 @@ def file_digests(files: fs.FileSystem) -> dict[str, str]:
     return {unquote(add["path"]): add["tags"][DIGEST] for add in adds if DIGEST in (add.get("tags") or {})}
 
 
-def acknowledged(files: fs.FileSystem) -> int | None:
-    """The last version of which a writer was told that it is done; None in tables of older releases."""
-    return max((version for version, _ in _numbered(files, ACKNOWLEDGED, _NAME)), default=None)
+def acknowledged(files: fs.FileSystem) -> int:
+    """The last version of which a writer was told that it is done; -1 in tables of older releases."""
+    return max((version for version, _ in _numbered(files, ACKNOWLEDGED, _NAME)), default=-1)
 
 
 def acknowledge(files: fs.FileSystem, version: int) -> None:
@@ -216,11 +228,12 @@ def check_end(url: str, files: fs.FileSystem, version: int) -> None:
     """
     if "://" in url:
         return
-    head = acknowledged(files)
-    if head is not None and head > version and (problem := _entry_problem(files, head)) is not None:
-        raise damaged(url, LogProblem(entry_name(head), f"{problem}, though it was acknowledged", head))
-    if (problem := _entry_problem(files, version)) is not None:
-        raise damaged(url, LogProblem(entry_name(version), problem, version))
+    for end in sorted({max(acknowledged(files), version), version}, reverse=True):
+        try:
+            _entry(files, end)
+        except ValueError as error:
+            late = ", though it was acknowledged" if end > version else ""
+            raise damaged(url, LogProblem(entry_name(end), f"{error}{late}", end)) from error
 
 
 def damaged(url: str, problem: LogProblem) -> StoreError:
@@ -233,19 +246,21 @@ def damaged(url: str, problem: LogProblem) -> StoreError:
 def log_problems(files: fs.FileSystem) -> Iterator[LogProblem]:
     """What is wrong with a table's log; reads every entry once."""
     # What was written last is read first: others may commit meanwhile.
-    pointer, checkpoints = _pointer(files), _checkpoints(files)
+    try:
+        pointer = _read(files, f"{LOG}/{LAST_CHECKPOINT}")
+    except FileNotFoundError:
+        pointer = None
+    checkpoints = _checkpoints(files)
     head, newest = acknowledged(files), max(list_entries(files), default=-1)
     columns: Action = {}
     live: dict[str, Action] = {}
     whole, of_checkpoints = True, list[LogProblem]()
-    for version in range(max(newest, -1 if head is None else head) + 1):
+    for version in range(max(newest, head) + 1):
         try:
             actions = _entry(files, version)[1]
         except ValueError as error:
             whole = False
-            late = (
-                f", though version {head} was acknowledged" if head is not None and version > newest else ""
-            )
+            late = f", though version {head} was acknowledged" if version > newest else ""
             yield LogProblem(entry_name(version), f"{error}{late}", version)
         else:
             columns = next((a["metaData"] for a in actions if "metaData" in a), columns)
@@ -267,13 +282,6 @@ def log_problems(files: fs.FileSystem) -> Iterator[LogProblem]:
         yield LogProblem(LAST_CHECKPOINT, f"it names checkpoint {named}, which is not there")
 
 
-def _pointer(files: fs.FileSystem) -> bytes | None:
-    try:
-        return _read(files, f"{LOG}/{LAST_CHECKPOINT}")
-    except FileNotFoundError:
-        return None
-
-
 def _checkpoints(files: fs.FileSystem) -> dict[int, list[str]]:
     """Names of the files of checkpoints, by version."""
     found: dict[int, list[str]] = {}
@@ -293,38 +301,29 @@ def _checkpoint_problem(
         whole: False where entries are damaged: then the checkpoint need only be one that can be read.
     """
     try:
-        said = _says(pq.read_table(f"{LOG}/{name}", filesystem=files))
-        return (
-            None if not whole or said == _state(columns, adds) else "it says something else than the entries"
-        )
+        checkpoint = pq.read_table(f"{LOG}/{name}", filesystem=files)
+        (named,) = filter(None, checkpoint["metaData"].to_pylist())
+        said = _state(named, filter(None, checkpoint["add"].to_pylist()))
+        same = not whole or said == _state(columns, adds)
+        return None if same else "it says something else than the entries"
     except (OSError, pa.ArrowException, KeyError, ValueError, TypeError) as error:
         return f"it cannot be read: {' '.join(str(error).split())[:200]}"
 
 
-def _says(checkpoint: pa.Table) -> dict[str, Any]:
-    """What a checkpoint says of columns, and of each live file."""
-    (columns,) = filter(None, checkpoint["metaData"].to_pylist())
-    return _state(columns, filter(None, checkpoint["add"].to_pylist()))
-
-
 def _state(columns: Action, adds: Iterable[Action]) -> dict[str, Any]:
     """What readers go by, in one form: a checkpoint has lists of pairs where an entry has objects."""
-    names = ("description", "schemaString", "partitionColumns")
-    return {"": [columns[name] for name in names], **{add["path"]: _file(add) for add in adds}}
-
-
-def _file(add: Action) -> list[Any]:
-    stats = json.loads(add["stats"]) if add.get("stats") else None
-    return [dict(add["partitionValues"]), add["size"], stats, dict(add.get("tags") or {})]
+    state = {"": [columns[name] for name in ("description", "schemaString", "partitionColumns")]}
+    for add in adds:
+        stats = json.loads(add["stats"]) if add.get("stats") else None
+        state[add["path"]] = [dict(add["partitionValues"]), add["size"], stats, dict(add.get("tags") or {})]
+    return state
 
 
 def _numbered(files: fs.FileSystem, folder: str, name: re.Pattern[str]) -> Iterator[tuple[int, datetime]]:
     """Numbers in the names of a folder's files, and the time of each."""
     for info in files.get_file_info(fs.FileSelector(folder, allow_not_found=True)):
         if match := name.fullmatch(info.base_name):
-            number = re.match(r"\d{20}", match[0])
-            assert number is not None
-            yield int(number[0]), utc(info.mtime)
+            yield int(match[1]), utc(info.mtime)
 
 
 def utc(time: datetime) -> datetime:

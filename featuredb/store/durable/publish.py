@@ -8,13 +8,19 @@ fails where a file is, as deltalake's own commit does: one writer makes a versio
 """
 
 import json
+import logging
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Literal, TypeVar
 from urllib.parse import unquote
+
+import pyarrow as pa
+from deltalake import DeltaTable
+from deltalake.exceptions import DeltaError
 
 from featuredb.errors import StoreError
 from featuredb.file_digest import file_sha256
@@ -26,11 +32,56 @@ from featuredb.store.durable.log import (
     actions_digest,
     entry_name,
     named_checkpoint,
+    paths_of,
     read_actions,
 )
 from featuredb.store.retry import StaleVersionError
 
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+
 SCRATCH = "_scratch-"
+# What an operation looks at: columns; also the list of files; also the rows in them.
+Sight = Literal["columns", "files", "rows"]
+CHECKPOINT_INTERVAL = 100  # deltalake's own: a reader has at most so many entries to read
+
+
+def create_locally(table: Path, create: Callable[[str], None]) -> None:
+    """Run what makes a table at a place.
+
+    Raises:
+        StaleVersionError: there is one already.
+    """
+    make_folder(table / LOG)
+    with scratch(table) as work:
+        create(str(work))
+        publish(_entries(work, 0), work, table, -1)
+
+
+def commit_locally(
+    table: Path, delta: Any, operation: Callable[[Any], T], sight: Sight, *, rebase: bool
+) -> tuple[int, T]:
+    """Run an operation on a table as it was loaded; returns the new version and what the operation gave.
+
+    Args:
+        rebase: let commits that came meanwhile go before, where both hold whichever is first.
+
+    Raises:
+        StaleVersionError: others have committed; nothing of this can be seen.
+    """
+    files = [] if sight == "columns" else pa.table(delta.get_add_actions()).to_pylist()
+    links = [unquote(file["path"]) for file in files] if sight == "rows" else []
+    with scratch(table, [*_columns(delta), *map(_add, files)], links) as work:
+        result = operation(DeltaTable(work))
+        version = publish(_entries(work, 1), work, table, delta.version(), rebase=rebase)
+    if version > delta.version() and version % CHECKPOINT_INTERVAL == 0:
+        try:  # the commit is done, with or without
+            with scratch(table, links=links_of_log(table, version)) as work:
+                DeltaTable(work).create_checkpoint()
+                publish_checkpoint(work, table)
+        except (OSError, DeltaError) as error:
+            logger.warning("%s: no checkpoint of version %d: %s", table, version, error)
+    return version, result
 
 
 @contextmanager
@@ -67,7 +118,7 @@ def publish(entries: Iterable[Path], work: Path, table: Path, version: int, *, r
     """
     for entry in entries:
         actions = read_actions(entry.read_bytes())
-        paths = [path for path in _paths("add", actions) if not (work / path).is_symlink()]
+        paths = [path for path in paths_of("add", actions) if not (work / path).is_symlink()]
         _note_digests(work, entry, actions, paths)
         for path in paths:
             flush(work / path)
@@ -133,10 +184,6 @@ def _note_digests(work: Path, entry: Path, actions: list[Action], paths: list[st
     entry.write_text("".join(json.dumps(action, separators=(",", ":")) + "\n" for action in actions))
 
 
-def _paths(kind: str, actions: Iterable[Action]) -> list[str]:
-    return [unquote(action[kind]["path"]) for action in actions if kind in action]
-
-
 def _link(entry: Path, actions: list[Action], log: Path, version: int, rebase: bool) -> int:
     """Give the entry the first free place from `version` on; returns it."""
     while True:
@@ -158,4 +205,47 @@ def _independent(mine: list[Action], entry: Path) -> bool:
     except ValueError as error:
         raise StoreError(f"cannot commit: log entry {entry}: {error}; run `featuredb repair`") from error
     changed = any("metaData" in action or "protocol" in action for action in theirs)
-    return not changed and not set(_paths("remove", mine)) & set(_paths("remove", theirs))
+    return not changed and not set(paths_of("remove", mine)) & set(paths_of("remove", theirs))
+
+
+def _entries(work: Path, first: int) -> list[Path]:
+    return sorted(path for path in (work / LOG).glob("*.json") if int(path.stem) >= first)
+
+
+def _columns(delta: Any) -> list[Action]:
+    """Protocol and metadata, as a log has them."""
+    protocol, metadata = delta.protocol(), delta.metadata()
+    return [
+        {
+            "protocol": {
+                "minReaderVersion": protocol.min_reader_version,
+                "minWriterVersion": protocol.min_writer_version,
+            }
+        },
+        {
+            "metaData": {
+                "id": metadata.id,
+                "name": metadata.name,
+                "description": metadata.description,
+                "format": {"provider": "parquet", "options": {}},
+                "schemaString": delta.schema().to_json(),
+                "partitionColumns": metadata.partition_columns,
+                "createdTime": metadata.created_time,
+                "configuration": metadata.configuration,
+            }
+        },
+    ]
+
+
+def _add(file: Mapping[str, Any]) -> Action:
+    """A live file, as a log has it; its statistics only help to find rows, and are left out."""
+    partition = file.get("partition") or {}
+    return {
+        "add": {
+            "path": file["path"],
+            "partitionValues": {name: None if v is None else str(v) for name, v in partition.items()},
+            "size": file["size_bytes"],
+            "modificationTime": file["modification_time"],
+            "dataChange": True,
+        }
+    }

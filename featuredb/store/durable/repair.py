@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import pyarrow.fs as fs
 
-from featuredb.errors import StoreError
 from featuredb.store.database import Database
-from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.filesystem import store_errors, table_files
 from featuredb.store.durable.log import (
     LOG,
     LogProblem,
@@ -50,21 +49,14 @@ def repair(database: Database, *, apply: bool = False, give_up_lost: bool = Fals
         DatabaseNotFoundError: there is no database.
         StoreError: the store failed.
     """
-    try:
-        return _repair(database, apply, give_up_lost)
-    except OSError as error:
-        raise StoreError(f"cannot repair {database.url}: {error}") from error
-
-
-def _repair(database: Database, apply: bool, give_up_lost: bool) -> list[RepairStep]:
     steps: list[RepairStep] = []
-    for name in SPECS:
-        files = table_files(database.table_url(name), database.storage_options)
-        problems = list(log_problems(files))
-        if problems:
-            steps += _repair_table(name, files, problems, apply, give_up_lost)
-    if not steps:
-        database.table(MAPS)
+    with store_errors(f"cannot repair {database.url}"):
+        for name in SPECS:
+            files = table_files(database.table_url(name), database.storage_options)
+            if problems := list(log_problems(files)):
+                steps += _repair_table(name, files, problems, apply, give_up_lost)
+        if not steps:
+            database.table(MAPS)
     return steps
 
 
@@ -79,7 +71,7 @@ def _repair_table(
         if version < whole or whole < 0:
             advice = "restore the database from a backup: newer states build on this one"
             yield RepairStep(where=where, what=problem.what, action="", advice=advice)
-        elif head is not None and version <= head and not give_up_lost:
+        elif version <= head and not give_up_lost:
             advice = (
                 "it was acknowledged: restore the database from a backup, or give up what it said with "
                 f"--give-up-lost, which goes back to version {whole} of {name}"
@@ -88,7 +80,7 @@ def _repair_table(
         else:
             action = f"set aside: back to version {whole} of {name}"
             yield _step(files, where, problem, action, apply and version in there)
-            if apply and head is not None and head > whole:
+            if apply and head > whole:
                 forget_acknowledged(files, whole)
     if apply and broken:  # a checkpoint of what was set aside must go, too
         problems = list(log_problems(files))

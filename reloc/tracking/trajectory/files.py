@@ -19,7 +19,7 @@ import numpy as np
 
 from featuredb.atomic import atomic_file
 from featuredb.errors import FeatureDbError, InvalidValueError
-from featuredb.geo.geopose_documents import irregular_series
+from featuredb.geo.geopose import irregular_series
 from featuredb.geometry.rotation import quaternion_from_matrix
 from reloc.localise.result import OwnPose
 from reloc.tracking.ground import EarthPose
