@@ -16,8 +16,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import MapImage
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.together import register
-from ingest.register.anchor.together.evidence import JointEvidence, evidence_of
 from ingest.register.anchor.together.register import register_together
+from ingest.register.frame.dense.confirmation import JointEvidence, evidence_of
 from tests.support.scanned_map import plain_cloud
 
 LENS = Camera(model="PINHOLE", width=480, height=360, params=(400.0, 400.0, 240.0, 180.0))

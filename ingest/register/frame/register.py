@@ -12,15 +12,19 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
-from ingest.register.frame.candidates import Judged, best_candidate, by_agreement, polished
+from ingest.register.frame.candidates import (
+    Judged,
+    agreement_elsewhere,
+    best_candidate,
+    by_agreement,
+    polished,
+)
 from ingest.register.frame.dense.fit import confirmed, dense_fitted
-from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.features.search import FrameHypothesis, pose_options, unmatched
 from ingest.register.frame.prior_fit import CORRELATED_INLIERS, loosened, prior_information, prior_sigmas
 from ingest.register.frame.verdict import (
     MAX_PLACES_ELSEWHERE,
     MAX_PRIOR_SIGMAS,
-    MIN_COVER,
     MIN_INLIERS,
     FrameEvidence,
     asks_elsewhere,
@@ -29,7 +33,7 @@ from ingest.register.frame.verdict import (
     highest_elsewhere,
     verdict,
 )
-from ingest.register.frame.views import MIN_SIDE_PX, FrameOptions, FrameViews, first_look
+from ingest.register.frame.views import DEFAULTS, MIN_COVER, MIN_SIDE_PX, FrameOptions, FrameViews, first_look
 from ingest.register.frame_registration import FramePrior, FrameReason, FrameRegistration, RenderSource
 from reloc.localise.pose import pose_uncertainty
 
@@ -44,7 +48,7 @@ def register_frame(
     camera: Camera,
     prior: FramePrior,
     cloud: PointCloud,
-    options: FrameOptions | None = None,
+    options: FrameOptions = DEFAULTS,
 ) -> FrameRegistration:
     """Find the pose of a photo in a scan, or say why not.
 
@@ -63,12 +67,12 @@ def register_frame(
             f"found {gray.dtype} {gray.shape}"
         )
     clock = StageClock()
-    views = _views(gray, camera, prior, cloud, options or FrameOptions(), clock)
+    views = _views(gray, camera, prior, cloud, options, clock)
     if isinstance(views, FrameRegistration):
         return views
     judged = best_candidate(views, prior, clock)
     if judged is None:
-        return _refused("NO_CONSISTENT_POSE", "no pose has matches behind it", {}, clock)
+        return _refused("NO_CONSISTENT_POSE", "no pose has matches behind it", clock)
     return _verdict(views, prior, judged, clock)
 
 
@@ -101,11 +105,8 @@ def fit_near(
             judged = polished(views, loose, other, clock)
     found, confirmation = judged.found, judged.confirmation
     if not confirmation.confirmed:
-        return _refused("NOT_CONFIRMED", confirmation.message, {}, clock)
-    if len(found.inliers) < MIN_INLIERS:
-        words = f"{len(found.inliers)} independent inliers, {MIN_INLIERS} needed"
-        return _refused("TOO_FEW_MATCHES", words, {}, clock)
-    return _accepted(found, frame_covariance(views, prior, found), {}, clock)
+        return _refused("NOT_CONFIRMED", confirmation.message, clock)
+    return _fitted(views, prior, found, {}, clock)
 
 
 def fit_vouched_for(
@@ -122,21 +123,19 @@ def fit_vouched_for(
         prior: the pose that all photos give together, with how far this one may be off it.
         evidence: of all photos.
     """
-    clock, options = StageClock(), FrameOptions()
-    views = _views(gray, camera, prior, cloud, options, clock)
+    clock = StageClock()
+    views = _views(gray, camera, prior, cloud, DEFAULTS, clock)
     if isinstance(views, FrameRegistration):
         return views
     with clock.stage("fit"):
         start = unmatched(prior.cam_from_local, camera, source)
-        found = dense_fitted(views, loosened(prior), start, options.dense_fit)
-    if found is None or len(found.inliers) < MIN_INLIERS:
-        count = 0 if found is None else len(found.inliers)
-        return _refused("TOO_FEW_MATCHES", f"{count} independent inliers, {MIN_INLIERS} needed", {}, clock)
+        found = dense_fitted(views, loosened(prior), start) or start
+    fitted = _fitted(views, prior, found, evidence, clock)
     away = prior_sigmas(prior, found.pose.cam_from_local)
-    if away > MAX_PRIOR_SIGMAS:
+    if fitted.accepted and away > MAX_PRIOR_SIGMAS:
         words = f"the pose lies {away:.1f} deviations from where all photos together have it"
-        return _refused("CONTRADICTS_PRIOR", words, {}, clock)
-    return _accepted(found, frame_covariance(views, prior, found), evidence, clock)
+        return _refused("CONTRADICTS_PRIOR", words, clock)
+    return fitted
 
 
 def _views(
@@ -154,7 +153,17 @@ def _views(
         return FrameViews(gray, camera, cloud, look, options)
     cover = 0.0 if look is None else look.cover
     words = f"the scan covers {100 * cover:.0f} % of what the prior sees; is it of this place?"
-    return _refused("NO_SCAN", words, {"cover": cover}, clock)
+    return _refused("NO_SCAN", words, clock, {"cover": cover})
+
+
+def _fitted(
+    views: FrameViews, prior: FramePrior, found: FrameHypothesis, evidence: dict[str, Any], clock: StageClock
+) -> FrameRegistration:
+    """A fitted pose that needs no more than inliers."""
+    if len(found.inliers) < MIN_INLIERS:
+        words = f"{len(found.inliers)} independent inliers, {MIN_INLIERS} needed"
+        return _refused("TOO_FEW_MATCHES", words, clock)
+    return _accepted(found, frame_covariance(views, prior, found), evidence, clock)
 
 
 def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageClock) -> FrameRegistration:
@@ -179,7 +188,7 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageC
         "pose_tried": found.pose.cam_from_local.matrix().tolist(),
     }
     if refusal is not None:
-        return _refused(*refusal, figures, clock)
+        return _refused(*refusal, clock, figures)
     return _accepted(found, covariance, figures, clock)
 
 
@@ -260,7 +269,7 @@ def _accepted(
 
 
 def _refused(
-    reason: FrameReason, message: str, evidence: dict[str, object], clock: StageClock
+    reason: FrameReason, message: str, clock: StageClock, evidence: dict[str, Any] | None = None
 ) -> FrameRegistration:
     return FrameRegistration(
         cam_from_local=None,
@@ -270,6 +279,6 @@ def _refused(
         source=None,
         points_local=np.empty((0, 3)),
         pixels=np.empty((0, 2)),
-        evidence=evidence,
+        evidence=evidence or {},
         seconds=clock.seconds,
     )

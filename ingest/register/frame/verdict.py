@@ -13,7 +13,6 @@ from ingest.register.frame_registration import FrameReason
 
 # Where the line is, by right and wrong registrations of the simulated town:
 # docs/measurements/registration.md.
-MIN_COVER = 0.03  # smallest share of a render that shows the scan
 MIN_INLIERS = 20  # fewer independent inliers are never believed
 # Smallest share of the parts of the photo where the scan should be seen that hold inliers.
 _MIN_AGREEMENT = 0.2
@@ -198,15 +197,11 @@ def cells_with_inliers(pixels: FloatArray, valid: NDArray[np.bool_], camera: Cam
     Args:
         pixels: (k, 2) full-size pixels. valid: (h, w) of a render from the pose.
     """
-    height, width = valid.shape
-    rows = np.arange(height) * 10 // height
-    columns = np.arange(width) * 10 // width
-    shown = np.zeros(100)
-    np.add.at(shown, (rows[:, None] * 10 + columns[None]).ravel(), valid.ravel())
-    expected = shown >= 0.5 * width * height / 100.0
+    rows, columns = np.nonzero(valid)
+    shown = rows * 10 // len(valid) * 10 + columns * 10 // valid.shape[1]
+    expected = np.bincount(shown, minlength=100) >= 0.5 * valid.size / 100.0
     held = np.zeros(100, dtype=bool)
-    column = np.clip((pixels[:, 0] * 10 / camera.width).astype(np.int64), 0, 9)
-    row = np.clip((pixels[:, 1] * 10 / camera.height).astype(np.int64), 0, 9)
+    column, row = np.clip((pixels * 10 / (camera.width, camera.height)).astype(np.int64), 0, 9).T
     held[row * 10 + column] = True
     share = float((held & expected).sum() / expected.sum()) if expected.any() else 0.0
     return int(held.sum()), share

@@ -23,7 +23,7 @@ from ingest.register.anchor.ground.parts import parts
 from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit, fitted, laid, shape_of
 from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
 from ingest.register.anchor.ground.street_plan import StreetPlan, street_plan
-from ingest.register.anchor.together.evidence import JointEvidence
+from ingest.register.frame.dense.confirmation import JointEvidence
 
 _LOG = logging.getLogger(__name__)
 

@@ -27,9 +27,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.matching import joined_pools, pool_features
-from ingest.register.frame.sources import available_sources
-from ingest.register.frame.verdict import MIN_COVER
-from ingest.register.frame.views import FEATURES_SPACING_PX
+from ingest.register.frame.views import FEATURES_SPACING_PX, MIN_COVER, available_sources
 from ingest.register.frame_registration import RenderSource
 from reloc.localise.acceptance import log_nfa
 
@@ -118,13 +116,11 @@ def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> Fo
 def _views(cloud: PointCloud, wide_m: float) -> Iterator[Rendering]:
     """The scan from above, north up, from as high as it is wide."""
     camera = Camera.from_focal(_SIDE_PX, _SIDE_PX, float(_SIDE_PX), model="PINHOLE")
-    rotation = np.diag([1.0, -1.0, -1.0])
     low, high = (np.asarray(of, dtype=np.float64) for of in (cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)))
     top = float(np.median(cloud.xyz[:, 2])) + wide_m
     for east in np.arange(low[0], high[0] + wide_m / 2, wide_m / 2):
         for north in np.arange(low[1], high[1] + wide_m / 2, wide_m / 2):
-            center = np.array([east, north, top])
-            pose = Rigid3(rotation=rotation, translation=-rotation @ center)
+            pose = Rigid3.from_center(np.diag([1.0, -1.0, -1.0]), np.array([east, north, top]))
             view = render(cloud, camera, pose)
             if view.valid.mean() >= MIN_COVER:
                 yield view

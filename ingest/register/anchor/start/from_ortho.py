@@ -26,7 +26,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.files import PhotoFiles
 from ingest.register.anchor.start.ortho import FloatImage, OrthoPicture, picture_of_map, picture_of_scan
 from ingest.register.frame.dense.pictures import inner_part, oriented_gradients, plan_spacing_m
-from ingest.register.frame.sources import searched_sources
+from ingest.register.frame.views import searched_sources
 from ingest.register.frame_registration import RenderSource
 
 _CELLS = 440  # along the scan's longer side, at most; with 220 a town's streets all look alike

@@ -15,7 +15,7 @@ from featuredb.maps.feature_map import MapImage
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.frame.sources import source_image
+from ingest.register.frame.views import source_image
 from ingest.register.frame_registration import RenderSource
 
 FloatImage = NDArray[np.float32]
@@ -149,8 +149,7 @@ def picture_of_scan(
     )
     level = float(np.median(cloud.xyz[:, 2]))
     center = np.array([*(low + 0.5 * cell_m * np.array([width, height])), level + away_px * cell_m])
-    rotation = np.diag([1.0, -1.0, -1.0])
-    view = render(cloud, camera, Rigid3(rotation=rotation, translation=-rotation @ center))
+    view = render(cloud, camera, Rigid3.from_center(np.diag([1.0, -1.0, -1.0]), center))
     return OrthoPicture(
         gray=np.ascontiguousarray(source_image(view, source)[::-1], dtype=np.float32),
         valid=view.valid[::-1],

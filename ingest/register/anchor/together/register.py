@@ -23,19 +23,18 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.anchor.start.ortho import picture_of_map
-from ingest.register.anchor.together.evidence import JointEvidence, evidence_of
 from ingest.register.anchor.together.start import starts_from_above
+from ingest.register.frame.dense.confirmation import JointEvidence, evidence_of
 from ingest.register.frame.dense.fit import MAX_SIDE_PX, near_places
 from ingest.register.frame.register import fit_vouched_for
-from ingest.register.frame.sources import searched_sources
-from ingest.register.frame.views import FrameOptions, FrameViews, first_look
+from ingest.register.frame.views import FrameOptions, FrameViews, first_look, searched_sources
 from ingest.register.frame_registration import FramePrior, FrameRegistration, RenderSource
 
 _LOG = logging.getLogger(__name__)
 
 TOGETHER = "together"  # in the evidence of frames that were registered so
 _LOG_RATE = 3.0  # of a thousand maps that lie elsewhere one is placed wrongly
-_LEAST_SHARE = 0.18  # of the places, as of the pieces of one photo (`ConfirmOptions`)
+_LEAST_SHARE = 0.18  # of the places, as of the pieces of one photo (`FrameOptions`)
 # So many photos are asked and fitted as show so many places of the scan, by what one of them shows.
 _LEAST_PHOTOS, _MOST_PHOTOS, _ENOUGH_PLACES = 4, 12, 150
 # What a photo's own pose may differ from the similarity's by, as a map is bent: of the viewing distance, and

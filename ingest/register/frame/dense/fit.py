@@ -22,7 +22,7 @@ from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
 from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.verdict import DECISIVE_LOG_NFA
-from ingest.register.frame.views import DenseFitOptions, FrameViews
+from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import refine_pose
@@ -69,7 +69,7 @@ def near_places(
 
 
 _MIN_PLACES = 12  # twice what six parameters need
-_FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart
+FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart
 MAX_SIDE_PX = 1200  # beyond, pieces of 40 px are too small a part of the picture to have structure
 
 
@@ -78,24 +78,22 @@ def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource)
     found = register_dense(views.gray, views.camera, prior, views.cloud, source)
     return [
         replace(unmatched(pose.cam_from_local, views.camera, source), candidates=pose.pieces)
-        for pose in found[:_FINALISTS]
+        for pose in found[:FINALISTS]
     ]
 
 
-def dense_fitted(
-    views: FrameViews, prior: FramePrior, start: FrameHypothesis, options: DenseFitOptions
-) -> FrameHypothesis | None:
+def dense_fitted(views: FrameViews, prior: FramePrior, start: FrameHypothesis) -> FrameHypothesis | None:
     """The pose fitted to all pieces near it, under the prior, coarse to fine; None with too few.
 
     Features that decide leave less than the coarse round takes up.
     """
     found: FrameHypothesis | None = start
-    rounds = list(zip(options.spacing_px, options.piece_px, options.near_px, strict=True))
+    rounds = views.options.fit_rounds
     decided = start.kind == "features" and start.log_nfa >= DECISIVE_LOG_NFA
     for sizes in rounds[1:] if decided else rounds:
         found = found and _fit_round(views, prior, found, *sizes)
     # A pose that is still on its way may look right already: the pieces that lie near have made it.
-    for _ in range(options.more_rounds):
+    for _ in range(views.options.more_rounds):
         before = found
         found = found and _fit_round(views, prior, found, *rounds[-1])
         if before is None or found is None or _moved_px(views, before, found) < 0.2:
@@ -142,18 +140,14 @@ def _moved_px(views: FrameViews, before: FrameHypothesis, after: FrameHypothesis
     here, there = (
         views.camera.project(found.pose.cam_from_local.act(after.matches.points)) for found in (before, after)
     )
-    side_px = views.side_px(views.options.dense_fit.spacing_px[-1], MAX_SIDE_PX)
+    side_px = views.side_px(views.options.fit_rounds[-1][0], MAX_SIDE_PX)
     moved = float(np.median(np.linalg.norm(here - there, axis=1)))
     return moved * side_px / max(views.camera.width, views.camera.height)
 
 
 def confirmed(views: FrameViews, found: FrameHypothesis) -> PictureConfirmation:
     """What the pictures say of a pose."""
+    pose = found.pose
     return confirm_pose(
-        views.gray,
-        found.pose.camera,
-        found.pose.cam_from_local,
-        views.cloud,
-        found.source,
-        views.options.confirm,
+        views.gray, pose.camera, pose.cam_from_local, views.cloud, found.source, views.options
     )

@@ -20,7 +20,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.dense.pictures import FloatImage, PinholeView, oriented_gradients, with_margin
-from ingest.register.frame.sources import source_image
+from ingest.register.frame.views import source_image
 from ingest.register.frame_registration import RenderSource
 
 # Side of a square piece. Larger ones are more distinct and bear less change of view; 40 pixels found airborne

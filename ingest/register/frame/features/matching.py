@@ -12,7 +12,7 @@ from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.nearest import nearest
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.sources import source_image
+from ingest.register.frame.views import source_image
 from ingest.register.frame_registration import RenderSource
 
 # The product's, with a lower contrast threshold than photos get, since renders are smooth.
