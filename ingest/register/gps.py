@@ -136,11 +136,7 @@ def _judged(
     by: float,
     figures: dict[str, Any],
 ) -> GpsPlacement:
-    """Covariance, figures and tests of an estimated similarity.
-
-    Args:
-        by: `receivers` of the positions that agree.
-    """
+    """Covariance, figures and tests of an estimated similarity; `by`: `receivers` of positions that agree."""
     known = np.isfinite(sigmas)
     residuals = np.where(known, positions - fit.local_from_sfm.act(centers), np.nan)
     stated = np.array([stated_sigma(sigmas[:, k]) for k in range(3)])

@@ -15,8 +15,8 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import MapImage
 from featuredb.render.cloud import PointCloud
-from ingest.register.anchor.together import register
-from ingest.register.anchor.together.register import register_together
+from ingest.register.anchor import together
+from ingest.register.anchor.together import register_together
 from ingest.register.frame.dense.confirmation import JointEvidence, evidence_of
 from tests.support.scanned_map import plain_cloud
 
@@ -121,7 +121,7 @@ def test_where_the_scan_shows_something_else_nothing_is_placed(
         asked.append(evidence_of(*args))
         return asked[-1]
 
-    monkeypatch.setattr(register, "evidence_of", kept)
+    monkeypatch.setattr(together, "evidence_of", kept)
     found = register_together(
         feature_map, feature_map.images, cloud, lambda image: pictures[image.image_id], 2
     )

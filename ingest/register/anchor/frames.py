@@ -16,7 +16,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress, no_progress
 from ingest.register.anchor.proposals import FrameProposal, FrameScore, PhotoReader, propose_frames
 from ingest.register.anchor.start.priors import HeightShift, height_shift, prior_from_map
-from ingest.register.anchor.together.register import TOGETHER, prior_by_others, register_together
+from ingest.register.anchor.together import TOGETHER, prior_by_others, register_together
 from ingest.register.frame.register import fit_vouched_for, register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 
@@ -207,19 +207,10 @@ def _try(
         registration = fit_vouched_for(gray, camera, proposal.prior, cloud, before.source, evidence)
     else:
         registration = register_frame(gray, camera, proposal.prior, cloud)
-    seconds = time.perf_counter() - start
-    _LOG.info(
-        "%s: %s in %.1f s",
-        proposal.image.name,
-        registration.reason or f"registered by {registration.source}",
-        seconds,
-    )
-    return TriedFrame(
-        proposal=proposal,
-        registration=registration,
-        seconds=seconds,
-        cpu_s=time.process_time() - cpu,
-    )
+    seconds, cpu_s = time.perf_counter() - start, time.process_time() - cpu
+    outcome = registration.reason or f"registered by {registration.source}"
+    _LOG.info("%s: %s in %.1f s", proposal.image.name, outcome, seconds)
+    return TriedFrame(proposal=proposal, registration=registration, seconds=seconds, cpu_s=cpu_s)
 
 
 def register_again(
@@ -227,14 +218,13 @@ def register_again(
 ) -> list[TriedFrame]:
     """Register frames anew from where a placed map has them, with its lens."""
     again = []
-    poses = {image.image_id: image for image in feature_map.images}
-    points, observations = feature_map.points_local(cloud.frame), feature_map.observations
+    images = {image.image_id: image for image in feature_map.images}
+    points = feature_map.points_local(cloud.frame)
     for frame in frames:
-        image = poses[frame.image.image_id]
+        image = images[frame.image.image_id]
         prior = FramePrior.around(image.cam_from_local, _AGAIN_SIGMA_M, _AGAIN_SIGMA_DEG)
         if TOGETHER in frame.registration.evidence:
-            seen = observations.point_index[observations.image_id == image.image_id]
-            prior = prior_by_others(image.cam_from_local, points[seen])
+            prior = prior_by_others(image.cam_from_local, points[feature_map.points_in(image)])
         proposal = replace(frame.proposal, image=image, prior=prior)
         tried = _try(feature_map, cloud, proposal, read_gray, {}, frame.registration)
         if tried is not None:

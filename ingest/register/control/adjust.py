@@ -138,9 +138,11 @@ def adjust(task: Task, weights: Weights) -> Adjusted:
     by_poses = similarity_of_change(adjusted)
     poses = 6 * len(adjusted.names)
     located = np.isin(np.arange(len(control.names)), control.point_of[weights.marks])
+    both = zip(adjusted.cam_from_block, start.cam_from_block, strict=True)
+    changes = np.concatenate([(now @ old.inverse()).log() for now, old in both])
     return Adjusted(
         block=adjusted,
-        change=_common_change(start, adjusted),
+        change=Sim3.exp(similarity_of_change(start) @ changes),
         covariance=by_poses @ found.block.shared[:poses, :poses] @ by_poses.T,
         control_xyz=np.where(located[:, None], everything.xyz[count:], np.nan),
         spread=found.point,
@@ -238,15 +240,6 @@ def _anchor(start: Block, vertical: Vertical) -> PointPriors:
         xyz=(start.xyz[row] + lift)[None],
         covariance=np.diag([_LOOSE_M**2, _LOOSE_M**2, vertical.sigma_up_m**2])[None],
     )
-
-
-def _common_change(before: Block, after: Block) -> Sim3:
-    """The similarity nearest to what became of all poses."""
-    changes = [
-        (now @ old.inverse()).log()
-        for now, old in zip(after.cam_from_block, before.cam_from_block, strict=True)
-    ]
-    return Sim3.exp(similarity_of_change(before) @ np.concatenate(changes))
 
 
 def similarity_of_change(block: Block) -> FloatArray:

@@ -100,11 +100,7 @@ def _file_name(name: str) -> str:
 
 
 def _why_not(mark: Mark, block: Block, photos: list[int]) -> str:
-    """Why a mark cannot take part, "" where it can.
-
-    Args:
-        photos: of the block that are called as the mark says.
-    """
+    """Why a mark cannot take part, "" where it can; `photos` of the block are called as the mark says."""
     if not photos:
         return f"no photo {mark.photo} in the map"
     if len(photos) > 1:

@@ -23,8 +23,14 @@ from featuredb.plain_json import plain
 from ingest.register.control.adjust import Adjusted, task_of, with_all_points
 from ingest.register.control.fit import ControlFit, Vertical, fit_similarity, hypotheses
 from ingest.register.control.marks import Control
-from ingest.register.control.residuals import MarkResidual, PointResidual, gps_offset, residuals_of
-from ingest.register.control.snooping import improve, initial_weights
+from ingest.register.control.residuals import (
+    MarkResidual,
+    PointResidual,
+    gps_offset,
+    improve,
+    initial_weights,
+    residuals_of,
+)
 
 GcpReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE", "UPSIDE_DOWN", "CONTRADICTS_GPS"]
 

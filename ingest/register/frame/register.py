@@ -271,14 +271,4 @@ def _accepted(
 def _refused(
     reason: FrameReason, message: str, clock: StageClock, evidence: dict[str, Any] | None = None
 ) -> FrameRegistration:
-    return FrameRegistration(
-        cam_from_local=None,
-        covariance=None,
-        reason=reason,
-        message=message,
-        source=None,
-        points_local=np.empty((0, 3)),
-        pixels=np.empty((0, 2)),
-        evidence=evidence or {},
-        seconds=clock.seconds,
-    )
+    return FrameRegistration(reason=reason, message=message, evidence=evidence or {}, seconds=clock.seconds)

@@ -22,7 +22,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from ingest.anchoring import Anchoring, AnchorRequest, anchor
 from ingest.register.anchor.files import PhotoFiles, find_photos
-from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
+from ingest.register.anchor.page import edge_layer, jpeg, png, scan_view
 from ingest.register.anchor.start.first_place import StartFiles, scans_of_one_zone
 from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
 from ingest.register.anchor.start.picks import focal_sigma_rel, least_picks, prior_of_picks

@@ -144,9 +144,7 @@ def picture_of_scan(
     low, high = box
     width, height = (int(n) for n in np.ceil((high - low) / cell_m) + 1)
     away_px = _AWAY * max(width, height)
-    camera = Camera(
-        model="SIMPLE_PINHOLE", width=width, height=height, params=(away_px, width / 2.0, height / 2.0)
-    )
+    camera = Camera.from_focal(width, height, away_px, model="SIMPLE_PINHOLE")
     level = float(np.median(cloud.xyz[:, 2]))
     center = np.array([*(low + 0.5 * cell_m * np.array([width, height])), level + away_px * cell_m])
     view = render(cloud, camera, Rigid3.from_center(np.diag([1.0, -1.0, -1.0]), center))

@@ -7,7 +7,7 @@ fitted to the same pictures, as many as chance and six free parameters give. The
 tail. It does not ask how the pose was found.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -218,30 +218,25 @@ class JointEvidence:
         return float(max(-tail - np.log10(asked), 0.0))
 
 
-def evidence_of(
-    new_from_old: Sim3,
-    images: Sequence[MapImage],
-    cameras: Sequence[Camera],
-    grays: Mapping[int, NDArray[np.uint8]],
-    cloud: PointCloud,
-    source: RenderSource,
-) -> JointEvidence:
-    """What the photos say of a place of the map.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AskedPhoto:
+    """A photo of a map that is asked with others: pose in the map as it is, lens, grey pixels (h, w)."""
 
-    Args:
-        grays: (h, w) of each image, by id.
-    """
-    asked = [
-        compared_pieces(
-            grays[image.image_id],
-            cameras[image.camera_id],
-            new_from_old.act_on_pose(image.cam_from_local),
-            cloud,
-            source,
-        )
-        for image in images
-    ]
-    asked = [pieces for pieces in asked if len(pieces.near)]
+    image: MapImage
+    camera: Camera
+    gray: NDArray[np.uint8]
+
+
+def evidence_of(
+    new_from_old: Sim3, photos: Sequence[AskedPhoto], cloud: PointCloud, source: RenderSource
+) -> JointEvidence:
+    """What the photos say of a place of the map."""
+    asked = []
+    for photo in photos:
+        pose = new_from_old.act_on_pose(photo.image.cam_from_local)
+        pieces = compared_pieces(photo.gray, photo.camera, pose, cloud, source)
+        if len(pieces.near):
+            asked.append(pieces)
     if not asked:
         return JointEvidence(places=0, agreeing=0.0)
     side_m = _CELL * float(np.median([pieces.side_m for pieces in asked]))

@@ -18,7 +18,7 @@ from ingest.register.frame.dense.confirmation import PictureConfirmation, confir
 from ingest.register.frame.dense.pictures import oriented_gradients
 from ingest.register.frame.dense.score_maps import cut_templates, peaks, search_around
 from ingest.register.frame.dense.search import register_dense, searched_near
-from ingest.register.frame.features.matching import FrameMatches
+from ingest.register.frame.features.matching import NO_MATCHES, FrameMatches
 from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
 from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.verdict import DECISIVE_LOG_NFA
@@ -56,10 +56,9 @@ def near_places(
     photo = oriented_gradients(small, None)
     maps = search_around(templates, photo, rendering.camera, rendering.cam_from_local, _WINDOW_PX)
     if len(maps) == 0:
-        return FrameMatches(pixels=np.empty((0, 2)), points=np.empty((0, 3)))
-    cut = _WINDOW_PX - near_px
-    inner = np.ascontiguousarray(maps.maps[:, cut : maps.maps.shape[1] - cut, cut : maps.maps.shape[2] - cut])
-    places, scores = peaks(inner)
+        return NO_MATCHES
+    cut, size_px = _WINDOW_PX - near_px, 2 * near_px + 1
+    places, scores = peaks(np.ascontiguousarray(maps.maps[:, cut : cut + size_px, cut : cut + size_px]))
     # A place on the rim has its top outside: the piece saw nothing here.
     good = (scores >= _MIN_SCORE) & (np.abs(places - near_px).max(axis=1) < near_px - 0.6)
     scale = np.array([camera.width / size[0], camera.height / size[1]])

@@ -90,11 +90,8 @@ def register_dense(
         refined = [_refined(view, pose, prior, cloud, source) for pose in poses]
         found = sorted((p for p in refined if p is not None), key=lambda p: -p.score)
         distinct = _distinct(found, view.camera, prior)
-        last = octave == len(views) - 1
         poses = [p.cam_from_local for p in distinct[: max(1, _KEPT // 2**octave)]]
-        if last or not poses:
-            return distinct
-    return []
+    return distinct
 
 
 def searched_near(
@@ -123,10 +120,9 @@ def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: Rende
     reach_px = focal * (np.tan(min(tilt, 1.0)) + sideways)
     margin = int(min(reach_px, _MAX_MARGIN * longer))
     offsets = _position_offsets(prior, view.camera, depth)
-    turns = _turns(prior)
     pans = _pan_tilts(reach_px, view.camera)
-    found: list[tuple[float, Rigid3]] = []
-    for turn in turns:
+    found: list[DensePose] = []
+    for turn in _turns(prior):
         start = Rigid3(rotation=so3_exp([0, 0, turn]), translation=np.zeros(3)) @ prior.cam_from_local
         maps = score_maps_of(view, start, margin, cloud, source, None, _MAX_PIECES)
         if len(maps) < 4:
@@ -136,11 +132,9 @@ def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: Rende
             scores = _grid_scores(maps, moved, pans)
             for best in np.argsort(-scores)[:3]:
                 turned = Rigid3(rotation=pans[best], translation=np.zeros(3)) @ moved
-                found.append((float(scores[best]), turned))
-    found.sort(key=lambda item: -item[0])
-    poses = [DensePose(cam_from_local=p, score=s, pieces=0) for s, p in found]
-    distinct = _distinct(poses, view.camera, prior)
-    return [p.cam_from_local for p in distinct]
+                found.append(DensePose(cam_from_local=turned, score=float(scores[best]), pieces=0))
+    found.sort(key=lambda pose: -pose.score)
+    return [p.cam_from_local for p in _distinct(found, view.camera, prior)]
 
 
 def _grid_scores(maps: ScoreMaps, pose: Rigid3, turns: FloatArray) -> FloatArray:
@@ -193,7 +187,7 @@ def _turns(prior: FramePrior) -> list[float]:
     reach = min(REACH_SIGMA * sigma, 180.0)
     if reach >= 180.0 - _TURN_STEP_DEG / 2:
         count = int(np.ceil(360.0 / _TURN_STEP_DEG))
-        return [float(a) for a in 2.0 * np.pi * np.arange(count) / count]
+        return (2.0 * np.pi * np.arange(count) / count).tolist()
     side = int(np.ceil(max(0.0, reach - _TURN_STEP_DEG / 2) / _TURN_STEP_DEG))
     return [float(np.radians(i * _TURN_STEP_DEG)) for i in range(-side, side + 1)]
 
@@ -236,11 +230,8 @@ def _refined(
     )
     moved = Rigid3.exp(result.x * scale) @ pose
     total, pieces = _summed(maps, moved)
-    return DensePose(
-        cam_from_local=moved,
-        score=total / float(np.sqrt(max(pieces, _MIN_PIECES))),
-        pieces=pieces,
-    )
+    score = total / float(np.sqrt(max(pieces, _MIN_PIECES)))
+    return DensePose(cam_from_local=moved, score=score, pieces=pieces)
 
 
 def _summed(maps: ScoreMaps, pose: Rigid3) -> tuple[float, int]:
@@ -255,11 +246,8 @@ def _summed(maps: ScoreMaps, pose: Rigid3) -> tuple[float, int]:
 def _distinct(poses: Sequence[DensePose], camera: Camera, prior: FramePrior) -> list[DensePose]:
     """The first of those that show something else than every better one, as many as are looked into."""
     kept: list[DensePose] = []
-    corners = np.array([(x, y) for y in (0.1, 0.5, 0.9) for x in (0.1, 0.5, 0.9)]) * (
-        camera.width,
-        camera.height,
-    )
-    rays = np.column_stack([camera.unproject(corners), np.ones(len(corners))])
+    grid = np.array([(x, y) for y in (0.1, 0.5, 0.9) for x in (0.1, 0.5, 0.9)])
+    rays = np.column_stack([camera.unproject(grid * (camera.width, camera.height)), np.ones(len(grid))])
     seen: list[FloatArray] = []
     for pose in poses:
         cam_from_prior = pose.cam_from_local @ prior.cam_from_local.inverse()

@@ -21,6 +21,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.matching import (
+    NO_MATCHES,
     FrameMatches,
     joined,
     joined_pools,
@@ -79,12 +80,12 @@ class FrameHypothesis:
 
     pose: PoseHypothesis
     source: RenderSource
-    kind: MatchKind
-    matches: FrameMatches
-    inliers: FrameMatches
-    candidates: int
-    log_nfa: float
-    rival_share: float
+    kind: MatchKind = "dense"
+    matches: FrameMatches = NO_MATCHES
+    inliers: FrameMatches = NO_MATCHES
+    candidates: int = 0
+    log_nfa: float = 0.0
+    rival_share: float = 0.0
 
 
 RenderGroup = tuple[Rigid3, Sequence[Rendering]]
@@ -181,16 +182,7 @@ def unmatched(cam_from_local: Rigid3, camera: Camera, source: RenderSource) -> F
         inliers=np.zeros(0, dtype=bool),
         prior_focal_px=camera.focal_px,
     )
-    return FrameHypothesis(
-        pose=pose,
-        source=source,
-        kind="dense",
-        matches=joined([]),
-        inliers=joined([]),
-        candidates=0,
-        log_nfa=0.0,
-        rival_share=0.0,
-    )
+    return FrameHypothesis(pose=pose, source=source)
 
 
 def pose_options(views: FrameViews) -> PoseOptions:
@@ -205,24 +197,22 @@ def pose_options(views: FrameViews) -> PoseOptions:
 def _hypothesis(
     views: FrameViews, raw: FrameMatches, kept: FrameMatches, source: RenderSource
 ) -> FrameHypothesis | None:
-    settings = pose_options(views)
-    pose = estimate_pose(kept.pixels, kept.points, views.camera, "request", settings)
+    settings, camera = pose_options(views), views.camera
+    pose = estimate_pose(kept.pixels, kept.points, camera, "request", settings)
     if pose is None:
         return None
     pose = refine_pose(kept.pixels, kept.points, pose, settings)
-    tolerance_px = settings.tolerance_px(views.camera)
+    tolerance_px = settings.tolerance_px(camera)
     error = reprojection_errors(raw.pixels, raw.points, pose.camera, pose.cam_from_local)
-    testimony = independent(views.camera, raw.take(error < tolerance_px))
+    testimony = len(independent(camera, raw.take(error < tolerance_px)))
     return FrameHypothesis(
         pose=pose,
         source=source,
         kind="features",
         matches=kept,
-        inliers=independent(views.camera, kept.take(pose.inliers)),
+        inliers=independent(camera, kept.take(pose.inliers)),
         candidates=len(raw),
-        log_nfa=log_nfa(
-            len(raw), len(testimony), tolerance_px, views.camera.width, views.camera.height, sample=3
-        ),
+        log_nfa=log_nfa(len(raw), testimony, tolerance_px, camera.width, camera.height, sample=3),
         rival_share=_rival(views, kept, pose, settings) / max(pose.count, 1),
     )
 
