@@ -277,7 +277,7 @@ class MapParts:
 
     def points_in(self, image: MapImage) -> NDArray[np.int64]:
         """Rows (k,) of the points that an image sees, one for each of its observations, in their order."""
-        return self.observations.point_index[self.observations.image_id == image.image_id]
+        return np.asarray(self.observations.point_index[self.observations.image_id == image.image_id])
 
     def image_sizes(self) -> FloatArray:
         """Width and height (i, 2) of each image, pixels."""

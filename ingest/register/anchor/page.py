@@ -192,8 +192,9 @@ def _placed_section(report: AnchorReport, result: AnchorResult, old: FeatureMap,
         ),
     ]
     centers = cloud.frame.enu_from(new.frame).act([image.cam_from_local.center for image in new.images])
-    points = [of.points_local(cloud.frame) for of in (old, new)]
-    over = picture(map_over_scan_png(cloud, *points, centers), "Map points over the scan, before and after")
+    was_at, is_at = (of.points_local(cloud.frame) for of in (old, new))
+    drawn = map_over_scan_png(cloud, was_at, is_at, centers)
+    over = picture(drawn, "Map points over the scan, before and after")
     far = residuals_png(before.distance_m, after.distance_m)
     distances = picture(far, "Distances of map points to the scan, before and after")
     return f"<h2>The map</h2><section>{table((), facts, names=(0,))}{over}{distances}</section>"

@@ -89,13 +89,8 @@ def _score(feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: P
     spread = len(np.unique(np.floor(cells).clip(0, _GRID - 1), axis=0)) / _GRID**2
     downward = _downward(small, prior.cam_from_local, valid)
     factors = [coverage, downward, min(points / _ENOUGH_POINTS, 1.0), spread]
-    return FrameScore(
-        score=float(np.prod(np.sqrt(factors))),
-        coverage=coverage,
-        downward=downward,
-        points=points,
-        spread=spread,
-    )
+    score = float(np.prod(np.sqrt(factors)))
+    return FrameScore(score=score, coverage=coverage, downward=downward, points=points, spread=spread)
 
 
 def _downward(camera: Camera, pose: Rigid3, valid: NDArray[np.bool_]) -> float:

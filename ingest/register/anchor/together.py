@@ -159,11 +159,7 @@ def _registered(
 
 
 def prior_by_others(pose: Rigid3, seen: FloatArray) -> FramePrior:
-    """Of a photo whose map is placed.
-
-    Args:
-        seen: (n, 3) what it shows of the map.
-    """
+    """Of a photo whose map is placed and that sees points (n, 3) of it."""
     distance_m = float(np.median(np.linalg.norm(seen - pose.center, axis=1)))
     return FramePrior.around(pose, _BENT * distance_m, float(np.degrees(_BENT)))
 
@@ -175,11 +171,7 @@ _Seen = tuple[AskedPhoto, FrameMatches, float]
 def fitted_together(
     start: Sim3, photos: Sequence[AskedPhoto], cloud: PointCloud, source: RenderSource
 ) -> Sim3 | None:
-    """The similarity of the map's frame under which the pieces of all photos fit best; None with too few.
-
-    Args:
-        start: within the deviations above.
-    """
+    """The similarity within `_SIGMAS` of a start under which the pieces of all photos fit best, if enough."""
     new_from_old = start
     for spacing_px, piece_px, near_px in _ROUNDS:
         seen: list[_Seen] = []
@@ -191,7 +183,7 @@ def fitted_together(
             views = FrameViews(photo.gray, camera, cloud, look, FrameOptions(threads=1))
             side_px = views.side_px(spacing_px, MAX_SIDE_PX)
             for rendering in views.renders([pose], side_px):
-                pieces = near_places(photo.gray, camera, rendering, source, piece_px, near_px)
+                pieces = near_places(views, rendering, source, piece_px, near_px)
                 seen.append((photo, pieces, side_px / max(camera.width, camera.height)))
         if sum(len(pieces) for _, pieces, _ in seen) < _LEAST_PIECES:
             return None

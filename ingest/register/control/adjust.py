@@ -1,7 +1,7 @@
 """A block adjusted with control points as targets, in metres in the local frame.
 
 A file does not tell wrong marks and coordinates from right ones: they keep a quadratic loss here, and tests
-name and leave out the wrong ones (`ingest.register.control.snooping`).
+name and leave out the wrong ones (`ingest.register.control.residuals`).
 """
 
 from dataclasses import dataclass, replace
@@ -102,11 +102,7 @@ class Task:
 def task_of(
     placed: Block, control: Control, control_xyz: FloatArray, vertical: Vertical | None, keep_lens: bool
 ) -> Task:
-    """For a block in metres in the local frame, in place but for small changes.
-
-    Args:
-        vertical: what is known of it in that frame. keep_lens: keep all lenses.
-    """
+    """For a block in metres in the local frame, in place but for small changes; `vertical` is in it, too."""
     chosen = _sample(placed, _POINTS_PER_PHOTO)
     variance_px2 = max(block_variance_px2(chosen), _LEAST_PX2)
     share = len(chosen.xy) / len(placed.xy)

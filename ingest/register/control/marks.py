@@ -58,11 +58,7 @@ def control_frame(file: ControlFile) -> LocalFrame:
 
 
 def meet(file: ControlFile, block: Block, frame: LocalFrame) -> Control:
-    """Find the block's photos for the marks.
-
-    Args:
-        frame: of the surveyed positions that come out.
-    """
+    """Find the block's photos for the marks; surveyed positions come out in `frame`."""
     by_name = {name.lower(): [row] for row, name in enumerate(block.names)}
     by_file = defaultdict(list)
     for row, name in enumerate(block.names):

@@ -60,8 +60,7 @@ def initial_weights(
 def improve(task: Task, weights: Weights, sigma_is_given: bool) -> tuple[Adjusted, float]:
     """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none.
 
-    Returns:
-        The last adjustment, and degrees of freedom of the surveyed coordinates.
+    The last adjustment, and degrees of freedom of the surveyed coordinates.
     """
     control = task.control
     for _ in range(_MAX_ROUNDS):

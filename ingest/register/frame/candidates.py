@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.stage_clock import StageClock
 from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
 from ingest.register.frame.dense.fit import (
     FINALISTS,
@@ -47,55 +46,55 @@ class Judged:
     confirmation: PictureConfirmation
 
 
-def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> Judged | None:
+def best_candidate(views: FrameViews, prior: FramePrior) -> Judged | None:
     """The first pose that is beyond doubt, or of all found the one that the pictures confirm most."""
     judged: list[Judged] = []
     loose = loosened(prior)
-    for start in _starts(views, prior, clock):
-        with clock.stage("compare sources"):
+    for start in _starts(views, prior):
+        with views.clock.stage("compare sources"):
             begun = by_agreement(views, start)
         if start.kind == "dense" and begun.confirmation.log_nfa < _PROMISING_LOG_NFA:
             continue
-        judged.append(polished(views, loose, begun.found, clock))
+        judged.append(polished(views, loose, begun.found))
         if beyond_doubt(start.log_nfa, judged[-1].confirmation):
             return judged[-1]
     best = max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
-    return best and _looked_again(views, prior, best, clock)
+    return best and _looked_again(views, prior, best)
 
 
-def _looked_again(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageClock) -> Judged:
+def _looked_again(views: FrameViews, prior: FramePrior, judged: Judged) -> Judged:
     """A pose that is nearly confirmed, searched and fitted in turns: each leaves the other's dead ends."""
     best, start = judged, judged.found
     for _ in range(_MORE_LOOKS):
         if best.confirmation.confirmed or best.confirmation.log_nfa < _PROMISING_LOG_NFA:
             break
-        with clock.stage("look again"):
+        with views.clock.stage("look again"):
             near = searched_again(views, prior, start)
         if near is None:
             break
-        again = polished(views, loosened(prior), near, clock)
+        again = polished(views, loosened(prior), near)
         best, start = max(best, again, key=lambda j: j.confirmation.log_nfa), again.found
     return best
 
 
-def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator[FrameHypothesis]:
+def _starts(views: FrameViews, prior: FramePrior) -> Iterator[FrameHypothesis]:
     """Poses to begin with, made as they are asked for: by source, features first, then dense templates.
 
     Features of colours at the prior's own view come before the star around it: often they decide.
     """
     if views.cloud.rgb is not None:
-        with clock.stage("search prior's view"):
+        with views.clock.stage("search prior's view"):
             found = search(views, [prior_group(views, prior.cam_from_local)], "rgb")
         if found is not None and found.log_nfa >= DECISIVE_LOG_NFA:
             yield found
-    with clock.stage("render star"):
+    with views.clock.stage("render star"):
         groups = list(star_groups(views, prior))
     for source in searched_sources(views.cloud):
-        with clock.stage(f"search {source} features"):
+        with views.clock.stage(f"search {source} features"):
             found = search(views, groups, source)
         if found is not None and found.log_nfa >= _MIN_LOG_NFA:
             yield found
-        with clock.stage(f"search {source} dense"):
+        with views.clock.stage(f"search {source} dense"):
             dense = dense_hypotheses(views, prior, source)
         yield from dense
 
@@ -115,11 +114,11 @@ def by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
     return max(heard, key=lambda j: j.confirmation.log_nfa)
 
 
-def polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock: StageClock) -> Judged:
+def polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> Judged:
     """Fitted to pieces of a render, and shown to the pictures."""
-    with clock.stage("fit"):
+    with views.clock.stage("fit"):
         fitted = dense_fitted(views, prior, found) or found
-    with clock.stage("confirm"):
+    with views.clock.stage("confirm"):
         return Judged(found=fitted, confirmation=confirmed(views, fitted))
 
 
@@ -148,13 +147,11 @@ def agreement_elsewhere(
         if count == max_places or most >= enough:
             break
         count += 1
-        found = register_dense(views.gray, views.camera, other, views.cloud, source)
-        for candidate in found[:FINALISTS]:
+        for candidate in register_dense(views, other, source)[:FINALISTS]:
             there = candidate.cam_from_local
             if other.cam_from_local.angle_to_deg(pose) < 90.0 and _same_view(views, there, pose):
                 continue
-            agreement = confirm_pose(views.gray, views.camera, there, views.cloud, source, views.options)
-            most = max(most, agreement.log_nfa)
+            most = max(most, confirm_pose(views, views.camera, there, source).log_nfa)
     return count, most
 
 

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -21,6 +21,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
 from featuredb.render.shading import shaded_relief
+from featuredb.stage_clock import StageClock
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 MIN_COVER = 0.03  # smallest share of a render that shows the scan
@@ -117,17 +118,15 @@ def first_look(cloud: PointCloud, camera: Camera, cam_from_local: Rigid3) -> Fir
     depth = rendering.depth[rendering.valid]
     if len(depth) == 0:
         return None
-    spacing = _spacing_of_points(cloud, np.unique(rendering.index[rendering.index >= 0]))
-    return FirstLook(depth_m=float(np.median(depth)), cover=float(rendering.valid.mean()), spacing_m=spacing)
-
-
-def _spacing_of_points(cloud: PointCloud, rows: NDArray[np.int32]) -> float:
-    """Spacing of the finest nodes around some points of the cloud."""
+    rows, nodes = np.unique(rendering.index[rendering.index >= 0]), cloud.nodes
     sample = cloud.xyz[rows[:: max(len(rows) // 200, 1)]]
-    nodes = cloud.nodes
     inside = (sample[:, None] >= nodes.box_min).all(axis=2) & (sample[:, None] <= nodes.box_max).all(axis=2)
-    finest = np.where(inside, nodes.spacing_m, np.inf).min(axis=1)
-    return float(np.median(finest[np.isfinite(finest)]))
+    finest = np.where(inside, nodes.spacing_m, np.inf).min(axis=1)  # of the nodes around each
+    return FirstLook(
+        depth_m=float(np.median(depth)),
+        cover=float(rendering.valid.mean()),
+        spacing_m=float(np.median(finest[np.isfinite(finest)])),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +135,7 @@ class FrameViews:
 
     Attributes:
         gray: (h, w) uint8, the photo. camera: of the photo, full size. look: from the prior.
+        clock: of what is done with them.
     """
 
     gray: NDArray[np.uint8]
@@ -143,6 +143,7 @@ class FrameViews:
     cloud: PointCloud
     look: FirstLook
     options: FrameOptions
+    clock: StageClock = field(default_factory=StageClock)
 
     @property
     def threads(self) -> int:

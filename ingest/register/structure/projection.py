@@ -7,7 +7,7 @@ which slides over flat ground, comes the adjustment by the scan's surface (`adju
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -82,11 +82,7 @@ class StructurePlacement:
 def project_structure(
     feature_map: FeatureMap, registered: Registered, cloud: PointCloud
 ) -> StructurePlacement:
-    """Place a map on a scan by frames of the map that were registered to it.
-
-    Args:
-        registered: frames with their poses in the cloud's local frame, at least one.
-    """
+    """Place a map on a scan by frames of the map, one or more, that were registered to it."""
     source = feature_map.points_local(cloud.frame)
     pairs = structure_pairs(feature_map, source, registered, cloud)
     if len(pairs) < _MIN_PAIRS:
@@ -107,15 +103,10 @@ def project_structure(
     fit = refine_similarity(start, kept)
     figures |= _figures_of_fit(fit, kept, feature_map, registered)
     reason, message = _gate_of_fit(fit, distances[near], figures)
+    placed = StructurePlacement(reason=reason, message=message, figures=figures)
     if reason is not None:
-        return StructurePlacement(reason=reason, message=message, figures=figures)
-    return StructurePlacement(
-        reason=None,
-        message="placed on the scan",
-        new_from_old=fit.target_from_source,
-        covariance=fit.covariance,
-        figures=figures,
-    )
+        return placed
+    return replace(placed, new_from_old=fit.target_from_source, covariance=fit.covariance)
 
 
 def _gate_of_pairs(
@@ -191,17 +182,13 @@ def _gate_of_fit(
             f"the map would change its size by {change:.1%}, at most {allowed:.1%} agrees with its present "
             "placement"
         )
-    return None, ""
+    return None, "placed on the scan"
 
 
 def structure_pairs(
     feature_map: FeatureMap, source: FloatArray, registered: Registered, cloud: PointCloud
 ) -> Pairs:
-    """Pairs of all frames.
-
-    Args:
-        source: (n, 3) the map's points in the cloud's local frame, at their present place.
-    """
+    """Pairs of all frames; `source` (n, 3): the map's points at their present place, in the cloud's frame."""
     images = {image.image_id: image for image in feature_map.images}
     uncertainty = full_covariances(feature_map.points.covariance)
     parts = [
@@ -227,14 +214,10 @@ def _pairs_of_frame(
     width = min(_RENDER_WIDTH_PX, camera.width)
     small = camera.scaled_to(width, round(camera.height * width / camera.width))
     rendering = render(cloud, small, pose, RenderOptions(threads=1, attributes=False))
-    observations = feature_map.observations
-    mine = observations.image_id == image.image_id
-    pixels = observations.xy[mine].astype(np.float64) * (
-        small.width / camera.width,
-        small.height / camera.height,
-    )
+    xy = feature_map.observations.xy[feature_map.observations.image_id == image.image_id]
+    pixels = xy.astype(np.float64) * (small.width / camera.width, small.height / camera.height)
     hits = surface_at(rendering, cloud, pixels)
-    points = observations.point_index[mine][hits.rows]
+    points = feature_map.points_in(image)[hits.rows]
     largest = np.linalg.eigvalsh(uncertainty[points])[:, -1]
     own, by_frame = _errors(hits, pose, camera)
     at = pixels[hits.rows] / (small.width, small.height)

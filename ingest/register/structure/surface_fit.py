@@ -144,25 +144,19 @@ class MapResidual:
 
     def as_figures(self) -> dict[str, float]:
         """JSON-able."""
-        if not len(self.distance_m):
-            return {"points": self.points, "compared": 0}
-        p50, p90 = np.percentile(self.distance_m, (50, 90))
-        return {
-            "points": self.points,
-            "compared": len(self.distance_m),
-            "median_m": float(p50),
-            "p90_m": float(p90),
-        }
+        figures: dict[str, float] = {"points": self.points, "compared": len(self.distance_m)}
+        if len(self.distance_m):
+            p50, p90 = np.percentile(self.distance_m, (50, 90)).tolist()
+            figures |= {"median_m": p50, "p90_m": p90}
+        return figures
 
 
 def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
     """From the placements of the same map in one local frame."""
     move = new.placement.local_from_sfm @ old.placement.local_from_sfm.inverse()
-    turn = so3_log(move.rotation)
+    turn, covariance = so3_log(move.rotation), old.placement.covariance
     middle = np.median(old.points_local(), axis=0)
-    shift = move.act(middle) - middle
-    covariance = old.placement.covariance
-    jacobian = point_jacobian(middle)
+    shift, jacobian = move.act(middle) - middle, point_jacobian(middle)
     spread = jacobian @ covariance @ jacobian.T
     heading, tilt = float(abs(turn[2])), float(np.hypot(turn[0], turn[1]))
     return MapMove(
@@ -194,8 +188,6 @@ def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[
     in_plan, _ = cKDTree(scan[:, :2]).query(after[:, :2], distance_upper_bound=_PLAN_REACH_M)
     compared = np.isfinite(in_plan)
     tree = cKDTree(scan)
-    first, second = (
-        MapResidual(distance_m=np.asarray(tree.query(points[compared])[0]), points=len(old.points))
-        for points in (before, after)
-    )
+    far = [np.asarray(tree.query(points[compared])[0]) for points in (before, after)]
+    first, second = (MapResidual(distance_m=one, points=len(old.points)) for one in far)
     return first, second

@@ -91,11 +91,7 @@ class _Tried:
 
 
 def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud) -> GroundPlace:
-    """Place a map of street photos on a scan, or else the first of its parts that lies somewhere.
-
-    Args:
-        cloud: all of the scan on which the map may lie.
-    """
+    """Place a map of street photos on all of a scan, or else the first of its parts that lies somewhere."""
     whole: GroundPlace | None = None
     for number, part in enumerate(parts(unplaced, _LEAST_PHOTOS), start=1):
         found = _place(part, cloud, number * (number + 1))  # the inverses of these add up to one
@@ -202,11 +198,8 @@ def _judged(
         kept = _lie_there(unplaced, plan, shape, sim, rate)
     figures: dict[str, Any] = {"photos": int(kept.sum()), "of": len(kept), "rate": rate}
     if kept.sum() < _LEAST_PHOTOS:
-        return GroundPlace(
-            reason="TOO_FEW_FRAMES",
-            message=f"{int(kept.sum())} of its photos lie on the scan",
-            figures=figures,
-        )
+        few = f"{int(kept.sum())} of its photos lie on the scan"
+        return GroundPlace(reason="TOO_FEW_FRAMES", message=few, figures=figures)
     rows = _rows_seen(unplaced, plan, kept)
     there_m = (one.fit.local_from_own.act(plan.points[rows]) - sim.act(plan.points[rows]) for one in there)
     away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])
@@ -232,7 +225,6 @@ def _judged(
         "rival": max(rivals, default=0.0),
         "camera_height_m": float((centers[:, 2] - shape.ground[shape.cells(centers[:, :2])]).mean()),
     }
-    local_from_own = sim @ plan.upright_from_own
     words = (
         f"{int(kept.sum())} of {len(kept)} photos lie on the scan's outlines: "
         f"{final.evidence.agreeing:.0f} of {final.evidence.places} places agree"
@@ -241,7 +233,7 @@ def _judged(
     found = GroundPlace(
         reason=None,
         message=words,
-        local_from_own=local_from_own,
+        local_from_own=sim @ plan.upright_from_own,
         covariance=covariance,
         image_ids=tuple(i.image_id for i, stays in zip(unplaced.images, kept, strict=True) if stays),
         residual_rms_m=rms_m,

@@ -11,8 +11,7 @@ from featuredb.errors import InvalidValueError, RegistrationError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import chosen_scans, load_cloud
-from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
-from featuredb.maps.move import placed_map
+from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
@@ -24,7 +23,7 @@ from ingest.register.anchor.ground.street_plan import looks_level
 from ingest.register.anchor.start.from_above import MIN_LOG_NFA, found_from_above
 from ingest.register.anchor.start.from_ortho import found_by_ortho
 from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks, read_picks
-from ingest.register.anchor.start.priors import RoughPose, image_named, place_by_photo, read_pose
+from ingest.register.anchor.start.priors import RoughPose, image_named, place_by_photo, placed_on, read_pose
 from ingest.register.frame_registration import FramePrior
 
 # Scan around a map's points and cameras that may be seen, metres: errors of GPS, and what frames show beside
@@ -254,15 +253,9 @@ def _on_outlines(unplaced: UnplacedMap, near: Circle, cloud: PointCloud) -> tupl
             "smaller radius has fewer places that look alike (--near=LAT,LON,RADIUS_M); or say where a photo "
             "is: --page, --picks FILE, --pose FILE"
         )
-    placement = Placement(
-        method="lidar",
-        local_from_sfm=found.local_from_own,
-        covariance=found.covariance,
-        residual_rms_m=found.residual_rms_m,
-        evidence={"outlines": {"near": str(near), "words": found.message, **found.figures}},
-    )
-    kept = only_images(unplaced, found.image_ids)
-    placed = placed_map(kept, placement, cloud.frame, cloud.height_datum)
+    evidence = {"outlines": {"near": str(near), "words": found.message, **found.figures}}
+    kept, sim = only_images(unplaced, found.image_ids), found.local_from_own
+    placed = placed_on(kept, cloud, sim, found.covariance, evidence, found.residual_rms_m)
     return placed, f"placed by outlines: {found.message}"
 
 
@@ -287,21 +280,14 @@ def _found_near(
             f"{words}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show "
             "more than intensities; or say where one photo is: --page, --picks FILE, --pose FILE"
         )
-    placement = Placement(
-        method="lidar",
-        local_from_sfm=found.local_from_own,
-        covariance=found.covariance,
-        residual_rms_m=0.0,
-        evidence={"start": {"near": str(near), "no_place": unplaced.no_place.reason_code}},
-    )
+    evidence = {"start": {"near": str(near), "no_place": unplaced.no_place.reason_code}}
     note = f"{'tried' if by_look else 'found'} near {near.middle}: {found.words}"
     if by_look:
         note += (
             "; if no photo is registered from there, name a smaller circle (--near=LAT,LON,RADIUS_M), or say "
             "where one photo is: --page, --picks FILE, --pose FILE"
         )
-    placed = placed_map(unplaced, placement, cloud.frame, cloud.height_datum)
-    return placed, note, by_look
+    return placed_on(unplaced, cloud, found.local_from_own, found.covariance, evidence), note, by_look
 
 
 def scans_of_one_zone(database: Database, scan_ids: Sequence[str]) -> list[ScanSummary]:

@@ -63,13 +63,10 @@ class FoundPlace:
 
 
 def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundPlace | None:
-    """The best place of a map on a scan; None where nothing of both matches.
+    """The best place of a map on all of a scan; None where nothing of both matches.
 
     Its evidence is minus the decimal logarithm of the number of as good ones that chance gives; one with
     MIN_LOG_NFA is sure.
-
-    Args:
-        cloud: all of the scan on which the map may lie.
     """
     found = [_found(unplaced, cloud, source) for source in available_sources(cloud) if source != "shaded"]
     return max((one for one in found if one is not None), key=lambda one: one.evidence, default=None)
@@ -160,8 +157,7 @@ def _similarities(
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Umeyama's solution for k sets of m pairs (k, m, 3) at once.
 
-    Returns:
-        scale (k,), rotation (k, 3, 3), translation (k, 3), and which sets determine them (k,).
+    Scale (k,), rotation (k, 3, 3), translation (k, 3), and which sets determine them (k,).
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     a, b = source - source_mean[:, None], target - target_mean[:, None]

@@ -120,19 +120,13 @@ class ScanSearch:
             return None
         own = self._back(self._valid * np.conj(self._forward(np.square(channels).sum(axis=0))))
         own = own[:rows, :columns]  # where the scan shows something; less of it agrees more easily
-        score = found * np.sqrt(
-            cover / np.maximum(energy * own, 1e-12), where=usable, out=np.zeros_like(cover)
-        )
-        score = np.where(usable, score, -1.0)
+        share = cover / np.maximum(energy * own, 1e-12)
+        score = np.where(usable, found * np.sqrt(share, where=usable, out=np.zeros_like(cover)), -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
         first = np.array([column - held[1][0], row - held[0][0]])
         at = first + matrix @ np.array([of.gray.shape[1] / 2, of.gray.shape[0] / 2, 1.0])
-        return PictureTry(
-            size=size,
-            turn=turn,
-            middle=self.picture.corner + at * self.picture.cell,
-            correlation=float(score[row, column]),
-        )
+        middle = self.picture.corner + at * self.picture.cell
+        return PictureTry(size=size, turn=turn, middle=middle, correlation=float(score[row, column]))
 
     def _forward(self, of: NDArray[np.generic]) -> NDArray[np.complex64]:
         return np.asarray(fft.rfft2(np.asarray(of, dtype=np.float32), self._shape))
@@ -142,12 +136,9 @@ class ScanSearch:
 
 
 def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles) -> FoundPlace | None:
-    """The best place of a map on a scan; None where its mirror image fits as well.
+    """The best place of a map on all of a scan; None where its mirror image fits as well.
 
     Its evidence is in deviations, as in `best_place`; its covariance by the steps of the search.
-
-    Args:
-        cloud: all of the scan on which the map may lie.
     """
     upright = _upright(unplaced)
     there = [image for image in unplaced.images if image.image_id in photos.paths]

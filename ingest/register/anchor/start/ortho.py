@@ -133,11 +133,7 @@ def _seen(
 def picture_of_scan(
     cloud: PointCloud, source: RenderSource, cell_m: float, box: tuple[FloatArray, FloatArray] | None = None
 ) -> OrthoPicture:
-    """The scan by one of its properties.
-
-    Args:
-        box: least and largest x and y of what is drawn; None: of the scan.
-    """
+    """The scan by one of its properties, all of it or between the least and the largest x and y of a box."""
     if box is None:
         plan = cloud.xyz[:, :2]
         box = np.asarray(plan.min(axis=0), np.float64), np.asarray(plan.max(axis=0), np.float64)

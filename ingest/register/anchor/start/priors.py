@@ -247,12 +247,25 @@ def place_by_photo(
         ]
     )
     at_camera = Sim3(scale=1.0, rotation=np.eye(3), translation=pose.center)
+    evidence = {"start": {"image": image.name, "no_place": unplaced.no_place.reason_code}}
+    return placed_on(unplaced, cloud, local_from_own, at_camera.carried(np.diag(sigmas**2)), evidence)
+
+
+def placed_on(
+    unplaced: UnplacedMap,
+    cloud: PointCloud,
+    local_from_own: Sim3,
+    covariance: FloatArray,
+    evidence: dict[str, Any],
+    residual_rms_m: float = 0.0,
+) -> FeatureMap:
+    """The map where a similarity with this covariance (7, 7) puts it on a scan."""
     placement = Placement(
         method="lidar",
         local_from_sfm=local_from_own,
-        covariance=at_camera.carried(np.diag(sigmas**2)),
-        residual_rms_m=0.0,
-        evidence={"start": {"image": image.name, "no_place": unplaced.no_place.reason_code}},
+        covariance=covariance,
+        residual_rms_m=residual_rms_m,
+        evidence=evidence,
     )
     return placed_map(unplaced, placement, cloud.frame, cloud.height_datum)
 

@@ -23,7 +23,7 @@ from featuredb.maps.feature_map import MapImage
 from featuredb.render.cloud import PointCloud
 from ingest.register.frame.dense.pictures import finest_side_px, pinhole_view
 from ingest.register.frame.dense.score_maps import PIECE_PX, peaks, score_maps_of
-from ingest.register.frame.views import DEFAULTS, FrameOptions
+from ingest.register.frame.views import DEFAULTS, FrameViews
 from ingest.register.frame_registration import RenderSource
 
 _OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not
@@ -86,30 +86,19 @@ class PictureConfirmation:
 
 
 def confirm_pose(
-    photo_gray: NDArray[np.uint8],
-    camera: Camera,
-    cam_from_local: Rigid3,
-    cloud: PointCloud,
-    source: RenderSource,
-    options: FrameOptions = DEFAULTS,
+    views: FrameViews, camera: Camera, cam_from_local: Rigid3, source: RenderSource
 ) -> PictureConfirmation:
-    """Asks the photo's pieces where they belong, at a pose that somebody else found.
-
-    Args:
-        photo_gray: (h, w) uint8 of `camera`'s size.
-    """
-    found = compared_pieces(photo_gray, camera, cam_from_local, cloud, source, options)
+    """Asks the photo's pieces where they belong, at a pose that somebody else found, with its lens."""
+    finest = views.options.finest_spacing
+    found = compared_pieces(views.gray, camera, cam_from_local, views.cloud, source, finest)
     n, near = len(found.near), found.near
     if n < MIN_PIECES:
-        return PictureConfirmation(
-            confirmed=False,
-            pieces=n,
-            message=f"only {n} pieces of the picture have structure, {MIN_PIECES} are needed",
-        )
+        few = f"only {n} pieces of the picture have structure, {MIN_PIECES} are needed"
+        return PictureConfirmation(confirmed=False, pieces=n, message=few)
     agreeing = int(near.sum())
     log_nfa = log_nfa_of(agreeing, n)
     cells = len(np.unique(np.clip((found.pixels[near] * 4).astype(int), 0, 3) @ (4, 1)))
-    message = _objection(agreeing / n, log_nfa, cells, options.min_agreeing) or _layers_differ(found)
+    message = _objection(agreeing / n, log_nfa, cells, views.options.min_agreeing) or _layers_differ(found)
     return PictureConfirmation(
         confirmed=not message, pieces=n, agreeing=agreeing, log_nfa=log_nfa, cells=cells, message=message
     )
@@ -128,14 +117,10 @@ def compared_pieces(
     cam_from_local: Rigid3,
     cloud: PointCloud,
     source: RenderSource,
-    options: FrameOptions = DEFAULTS,
+    finest_spacing: float = DEFAULTS.finest_spacing,
 ) -> Pieces:
-    """Where pieces of a rendering at a pose fit the photo best, beside where the pose puts them.
-
-    Args:
-        photo_gray: (h, w) uint8 of `camera`'s size.
-    """
-    finest = finest_side_px(camera, cam_from_local, cloud, options.finest_spacing)
+    """Where pieces of a rendering at a pose fit the photo (h, w) best, beside where the pose puts them."""
+    finest = finest_side_px(camera, cam_from_local, cloud, finest_spacing)
     view = pinhole_view(photo_gray, camera, min(_SIDE_PX, finest))
     margin_px = PIECE_PX // 2
     maps = score_maps_of(view, cam_from_local, margin_px, cloud, source, _SEARCH_PX, _MAX_PIECES)

@@ -10,9 +10,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from featuredb.geometry.camera import Camera
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
 from ingest.register.frame.dense.pictures import oriented_gradients
@@ -38,21 +36,12 @@ _LEAST_ACROSS = 8  # pieces that are made larger still leave so many along the p
 
 
 def near_places(
-    photo_gray: NDArray[np.uint8],
-    camera: Camera,
-    rendering: Rendering,
-    source: RenderSource,
-    piece_px: int,
-    near_px: int,
+    views: FrameViews, rendering: Rendering, source: RenderSource, piece_px: int, near_px: int
 ) -> FrameMatches:
-    """Pieces of a render, and where in the photo they fit best near where the render's pose puts them.
-
-    Args:
-        photo_gray: (h, w) uint8 of `camera`'s size. rendering: made with that camera, shrunk.
-    """
+    """Pieces of a render, and where in the photo they fit best near where the render's pose puts them."""
     templates = cut_templates(rendering, source, piece_px, _MAX_PIECES)
     size = (rendering.camera.width, rendering.camera.height)
-    small = np.asarray(cv2.resize(photo_gray, size, interpolation=cv2.INTER_AREA))
+    small = np.asarray(cv2.resize(views.gray, size, interpolation=cv2.INTER_AREA))
     photo = oriented_gradients(small, None)
     maps = search_around(templates, photo, rendering.camera, rendering.cam_from_local, _WINDOW_PX)
     if len(maps) == 0:
@@ -61,7 +50,7 @@ def near_places(
     places, scores = peaks(np.ascontiguousarray(maps.maps[:, cut : cut + size_px, cut : cut + size_px]))
     # A place on the rim has its top outside: the piece saw nothing here.
     good = (scores >= _MIN_SCORE) & (np.abs(places - near_px).max(axis=1) < near_px - 0.6)
-    scale = np.array([camera.width / size[0], camera.height / size[1]])
+    scale = np.array([views.camera.width / size[0], views.camera.height / size[1]])
     return FrameMatches(
         pixels=(maps.origin + cut + places)[good] * scale, points=np.asarray(maps.points_local)[good]
     )
@@ -74,7 +63,7 @@ MAX_SIDE_PX = 1200  # beyond, pieces of 40 px are too small a part of the pictur
 
 def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource) -> list[FrameHypothesis]:
     """The best few poses that dense templates find around the prior; no matches behind them yet."""
-    found = register_dense(views.gray, views.camera, prior, views.cloud, source)
+    found = register_dense(views, prior, source)
     return [
         replace(unmatched(pose.cam_from_local, views.camera, source), candidates=pose.pieces)
         for pose in found[:FINALISTS]
@@ -102,8 +91,7 @@ def dense_fitted(views: FrameViews, prior: FramePrior, start: FrameHypothesis) -
 
 def searched_again(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis | None:
     """The dense search's own maximum next to a pose that was fitted; None where there is none."""
-    pose = found.pose.cam_from_local
-    near = searched_near(views.gray, found.pose.camera, pose, prior, views.cloud, found.source)
+    near = searched_near(views, found.pose.camera, found.pose.cam_from_local, prior, found.source)
     if near is None:
         return None
     return replace(found, kind="dense", pose=replace(found.pose, cam_from_local=near.cam_from_local))
@@ -124,7 +112,7 @@ def _fit_round(
     between_px = views.spacing_full_px * side_px / max(views.camera.width, views.camera.height)
     wanted_px = min(_PIECE_POINTS * between_px, side_px / _LEAST_ACROSS)
     piece_px = max(piece_px, 2 * round(0.5 * wanted_px))
-    matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px)
+    matches = near_places(views, renderings[0], start.source, piece_px, near_px)
     if len(matches) < _MIN_PLACES:
         return None
     settings = PoseOptions(tolerance_rel=_TOLERANCE_PX / side_px)
@@ -146,7 +134,4 @@ def _moved_px(views: FrameViews, before: FrameHypothesis, after: FrameHypothesis
 
 def confirmed(views: FrameViews, found: FrameHypothesis) -> PictureConfirmation:
     """What the pictures say of a pose."""
-    pose = found.pose
-    return confirm_pose(
-        views.gray, pose.camera, pose.cam_from_local, views.cloud, found.source, views.options
-    )
+    return confirm_pose(views, found.pose.camera, found.pose.cam_from_local, found.source)

@@ -115,11 +115,7 @@ def cut_templates(rendering: Rendering, source: RenderSource, size: int, max_cou
 
 
 def search_everywhere(templates: Templates, photo: FloatImage, camera: Camera) -> ScoreMaps:
-    """Score maps over the whole photo, and over its border where most of a piece lies inside.
-
-    Args:
-        photo: (k, h, w) channels of the photo's view with the pinhole `camera`.
-    """
+    """Score maps over a pinhole's whole photo (k, h, w), and its border where most of a piece lies inside."""
     size = templates.channels.shape[-1]
     margin = int(size * (1.0 - _MIN_OVERLAP))
     _, h, w = photo.shape

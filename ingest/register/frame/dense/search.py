@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +28,7 @@ from ingest.register.frame.dense.pictures import (
 )
 from ingest.register.frame.dense.score_maps import ScoreMaps, score_maps_of, scores_at
 from ingest.register.frame.prior_fit import prior_sigmas
+from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 # Longer side of the photo's view at each octave, coarse to fine. Octaves finer than the scan's points allow
@@ -74,19 +74,15 @@ class DensePose:
     pieces: int
 
 
-def register_dense(
-    photo_gray: NDArray[np.uint8], camera: Camera, prior: FramePrior, cloud: PointCloud, source: RenderSource
-) -> list[DensePose]:
+def register_dense(views: FrameViews, prior: FramePrior, source: RenderSource) -> list[DensePose]:
     """Poses of a photo, best first; empty where the scan shows nothing that could be searched for.
 
     They are hypotheses: whether the first is right is for `confirm_pose` to say.
-
-    Args:
-        photo_gray: (h, w) uint8 of `camera`'s size.
     """
-    views = [pinhole_view(photo_gray, camera, side) for side in _sides(camera, prior, cloud)]
-    poses = _vote(views[0], prior, cloud, source)
-    for octave, view in enumerate(views):
+    camera, cloud = views.camera, views.cloud
+    octaves = [pinhole_view(views.gray, camera, side) for side in _sides(camera, prior, cloud)]
+    poses = _vote(octaves[0], prior, cloud, source)
+    for octave, view in enumerate(octaves):
         refined = [_refined(view, pose, prior, cloud, source) for pose in poses]
         found = sorted((p for p in refined if p is not None), key=lambda p: -p.score)
         distinct = _distinct(found, view.camera, prior)
@@ -95,16 +91,11 @@ def register_dense(
 
 
 def searched_near(
-    photo_gray: NDArray[np.uint8],
-    camera: Camera,
-    pose: Rigid3,
-    prior: FramePrior,
-    cloud: PointCloud,
-    source: RenderSource,
+    views: FrameViews, camera: Camera, pose: Rigid3, prior: FramePrior, source: RenderSource
 ) -> DensePose | None:
     """The highest sum of score maps near a pose, at the finest octave; None where it shows too little."""
-    view = pinhole_view(photo_gray, camera, _sides(camera, prior, cloud)[-1])
-    return _refined(view, pose, prior, cloud, source)
+    view = pinhole_view(views.gray, camera, _sides(camera, prior, views.cloud)[-1])
+    return _refined(view, pose, prior, views.cloud, source)
 
 
 def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: RenderSource) -> list[Rigid3]:
@@ -187,7 +178,7 @@ def _turns(prior: FramePrior) -> list[float]:
     reach = min(REACH_SIGMA * sigma, 180.0)
     if reach >= 180.0 - _TURN_STEP_DEG / 2:
         count = int(np.ceil(360.0 / _TURN_STEP_DEG))
-        return (2.0 * np.pi * np.arange(count) / count).tolist()
+        return [float(a) for a in 2.0 * np.pi * np.arange(count) / count]
     side = int(np.ceil(max(0.0, reach - _TURN_STEP_DEG / 2) / _TURN_STEP_DEG))
     return [float(np.radians(i * _TURN_STEP_DEG)) for i in range(-side, side + 1)]
 

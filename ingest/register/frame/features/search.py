@@ -140,14 +140,11 @@ def consistent_matches(
         side_px: longer side of the photo. area_px: over which false matches are spread in the reference.
     """
     m = len(photo)
-    finite = np.isfinite(reference).all(axis=1)
-    support = np.zeros(m, np.int64)
-    expected = np.full(m, 1.0)
-    rows = np.flatnonzero(finite)
+    support, expected = np.zeros(m, np.int64), np.full(m, 1.0)
+    rows = np.flatnonzero(np.isfinite(reference).all(axis=1))
     if len(rows) >= 3:
-        tree = cKDTree(photo[rows])
-        k = min(_NEIGHBOURS + 1, len(rows))
-        distance, neighbour = tree.query(photo[rows], k=k, distance_upper_bound=_REACH_REL * side_px)
+        k, reach_px = min(_NEIGHBOURS + 1, len(rows)), _REACH_REL * side_px
+        distance, neighbour = cKDTree(photo[rows]).query(photo[rows], k=k, distance_upper_bound=reach_px)
         neighbour = np.where(np.isfinite(distance), neighbour, -1).astype(np.int64)
         loops = compiled_module("ingest.register.frame.features.consistency_loops")
         support[rows], expected[rows] = loops.neighbour_support(
@@ -161,16 +158,10 @@ def consistent_matches(
             np.log(_MAX_ZOOM),
             area_px,
         )
-    return _log_chance(support, expected, _NEIGHBOURS, m) >= _MIN_LOG_CHANCE
-
-
-def _log_chance(
-    support: NDArray[np.int64], expected: FloatArray, hypotheses: int, matches: int
-) -> FloatArray:
-    """-log10 of matches x hypotheses x P(at least support - 1 of the others by chance)."""
+    # -log10 of matches x hypotheses x P(at least so many of the others by chance).
     others = np.maximum(support - 1, 0)  # the neighbour that gave the hypothesis agrees with itself
     tail = np.where(others > 0, gammainc(np.maximum(others, 1), np.maximum(expected, 1e-12)), 1.0)
-    return np.asarray(-np.log10(np.maximum(tail, 1e-300) * matches * hypotheses), dtype=np.float64)
+    return np.asarray(-np.log10(np.maximum(tail, 1e-300) * m * _NEIGHBOURS) >= _MIN_LOG_CHANCE)
 
 
 def unmatched(cam_from_local: Rigid3, camera: Camera, source: RenderSource) -> FrameHypothesis:
