@@ -85,7 +85,7 @@ def _misplaced(poses: list[Rigid3], points: NDArray[np.float64]) -> Any:
         images=images,
         cameras=(LENS,),
         points_local=lambda _=None: moved,
-        observations=SimpleNamespace(image_id=seen, point_index=np.arange(len(points))),
+        points_in=lambda image: np.flatnonzero(seen == image.image_id),
         placement=SimpleNamespace(covariance=covariance),
         move=move,
     )
