@@ -23,7 +23,7 @@ from tests.support.scanned_map import (
 @pytest.fixture(autouse=True)
 def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seconds, and the same answers."""
-    monkeypatch.setattr("ingest.register.structure.pairs._RENDER_WIDTH_PX", 500)
+    monkeypatch.setattr("ingest.register.structure.projection._RENDER_WIDTH_PX", 500)
 
 
 @pytest.fixture(scope="module")
