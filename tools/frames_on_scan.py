@@ -40,7 +40,7 @@ from featuredb.store.scans import list_scans
 from ingest.register.anchor.anchor_map import place_map
 from ingest.register.anchor.frames import FRAMES, try_frames
 from ingest.register.anchor.start.first_place import plan_box
-from ingest.register.anchor.together.register import register_together
+from ingest.register.anchor.together import register_together
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from tools.anchor_simworld import camera_errors

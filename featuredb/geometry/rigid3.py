@@ -52,6 +52,11 @@ class Rigid3:
         return cls(rotation=np.eye(3), translation=np.zeros(3))
 
     @classmethod
+    def from_center(cls, rotation: FloatArray, center: FloatArray) -> Self:
+        """The pose of a camera with this rotation (3, 3) and this centre (3,) in the source frame."""
+        return cls(rotation=rotation, translation=-rotation @ center)
+
+    @classmethod
     def from_quaternion(cls, xyzw: ArrayLike, translation: ArrayLike) -> Self:
         """From a Hamilton quaternion (x, y, z, w) and a translation (3,)."""
         return cls(

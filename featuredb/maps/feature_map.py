@@ -278,6 +278,10 @@ class MapParts:
         by_id = np.argsort(ids)
         return np.asarray(by_id[np.searchsorted(ids[by_id], image_id)], dtype=np.int64)
 
+    def points_in(self, image: MapImage) -> NDArray[np.int64]:
+        """Rows (k,) of the points that an image sees, one for each of its observations, in their order."""
+        return np.asarray(self.observations.point_index[self.observations.image_id == image.image_id])
+
     def image_sizes(self) -> FloatArray:
         """Width and height (i, 2) of each image, pixels."""
         cameras = [self.cameras[image.camera_id] for image in self.images]

@@ -35,7 +35,6 @@ def model_of_block(model: Model, block: Block) -> Model:
 
 def block_of_map(feature_map: FeatureMap) -> Block:
     """The block of a map, in the map's local frame."""
-    row_of_id = {image.image_id: k for k, image in enumerate(feature_map.images)}
     observations = feature_map.observations
     return Block(
         names=tuple(image.name for image in feature_map.images),
@@ -44,7 +43,7 @@ def block_of_map(feature_map: FeatureMap) -> Block:
         cam_from_block=tuple(image.cam_from_local for image in feature_map.images),
         xyz=feature_map.points_local(),
         point_of=np.asarray(observations.point_index, dtype=np.int64),
-        photo_of=np.array([row_of_id[int(i)] for i in observations.image_id], dtype=np.int64),
+        photo_of=feature_map.image_rows(observations.image_id),
         xy=observations.xy.astype(np.float64),
     )
 

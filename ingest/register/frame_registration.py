@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
@@ -18,6 +20,7 @@ FrameReason = Literal[
     "NOT_CONFIRMED",  # the pictures do not agree at the pose found
 ]
 RenderSource = Literal["rgb", "intensity", "shaded"]
+SIGMAS = ("sigma_horizontal_m", "sigma_vertical_m", "sigma_heading_deg", "sigma_tilt_deg")  # of a prior
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,7 +52,7 @@ class FramePrior:
         )
 
     def __post_init__(self) -> None:
-        for name in ("sigma_horizontal_m", "sigma_vertical_m", "sigma_heading_deg", "sigma_tilt_deg"):
+        for name in SIGMAS:
             value = getattr(self, name)
             if not 0 < value < float("inf"):
                 raise InvalidValueError(f"FramePrior.{name}: expected a finite number > 0, found {value}")
@@ -73,13 +76,13 @@ class FrameRegistration:
         seconds: time by stage, in order.
     """
 
-    cam_from_local: Rigid3 | None
-    covariance: FloatArray | None
     reason: FrameReason | None
     message: str
-    source: RenderSource | None
-    points_local: FloatArray
-    pixels: FloatArray
+    cam_from_local: Rigid3 | None = None
+    covariance: FloatArray | None = None
+    source: RenderSource | None = None
+    points_local: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    pixels: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     camera: Camera | None = None
     evidence: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)

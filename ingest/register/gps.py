@@ -15,6 +15,7 @@ tests, each by a rate of error:
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -136,11 +137,7 @@ def _judged(
     by: float,
     figures: dict[str, Any],
 ) -> GpsPlacement:
-    """Covariance, figures and tests of an estimated similarity.
-
-    Args:
-        by: `receivers` of the positions that agree.
-    """
+    """Covariance, figures and tests of an estimated similarity; `by`: `receivers` of positions that agree."""
     known = np.isfinite(sigmas)
     residuals = np.where(known, positions - fit.local_from_sfm.act(centers), np.nan)
     stated = np.array([stated_sigma(sigmas[:, k]) for k in range(3)])
@@ -177,55 +174,49 @@ def _judged(
         "rms_vertical_m": _rms(residuals[fit.used[:, 1] & known[:, 2], 2:]),
     }
 
-    def outcome(reason: GpsReason | None, message: str, provisional: str = "") -> GpsPlacement:
-        return GpsPlacement(
-            reason=reason,
-            message=message,
-            provisional=provisional,
-            local_from_sfm=fit.local_from_sfm,
-            covariance=covariance,
-            residuals_m=residuals,
-            inliers=inliers,
-            figures=figures,
-        )
-
+    outcome = partial(
+        GpsPlacement,
+        local_from_sfm=fit.local_from_sfm,
+        covariance=covariance,
+        residuals_m=residuals,
+        inliers=inliers,
+        figures=figures,
+    )
     refused = -ndtri(_WRONG if chance <= np.log(_NO_PLACE) else _NO_PLACE)
     if above > refused or inliers.sum() < _LEAST_PHOTOS:
         height = f" and {rms[2]:.0f} m in height" if len(rms) == 3 else ""
-        return outcome(
-            "RESIDUALS",
+        words = (
             f"the photos' GPS does not fit the reconstruction: {inliers.sum()} of {len(inliers)} positions "
             f"agree, noisy by {rms[0]:.0f} m horizontally{height}; positions of other photos would fit as "
-            f"well in {np.exp(chance):.1g} of cases",
+            f"well in {np.exp(chance):.1g} of cases"
         )
+        return outcome(reason="RESIDUALS", message=words)
     if turn_deg > _MAX_TURN_DEG:
-        return outcome(
-            "DEGENERATE_LINE",
+        words = (
             f"the photos lie along a line: their GPS tells the orientation to {turn_deg:.0f} degrees, "
             f"{_MAX_TURN_DEG:.0f} are needed; add photos beside the line or the camera's angles, or "
-            "place it by control points (--gcp) or a scan",
+            "place it by control points (--gcp) or a scan"
         )
+        return outcome(reason="DEGENERATE_LINE", message=words)
     if figures["scale_sigma"] > _MAX_SCALE_SIGMA:
-        return outcome(
-            "SCALE",
+        words = (
             f"the scale is known to {figures['scale_sigma']:.1%} only, {_MAX_SCALE_SIGMA:.0%} is "
-            "needed: the photos are too close together for their GPS",
+            "needed: the photos are too close together for their GPS"
         )
+        return outcome(reason="SCALE", message=words)
+    provisional = ""
     if chance > np.log(_ANSWERS):
-        return outcome(
-            None,
-            "placed by GPS",
+        provisional = (
             f"positions that have nothing to do with these photos would fit as well in {np.exp(chance):.1%} "
-            f"of cases (limit {_ANSWERS:.1%}): too few are left to check the place by",
+            f"of cases (limit {_ANSWERS:.1%}): too few are left to check the place by"
         )
-    if checked_deg > _ANSWERS_TURN_DEG:
-        return outcome(
-            None,
-            "placed by GPS",
+    elif checked_deg > _ANSWERS_TURN_DEG:
+        provisional = (
             f"the photos lie along a line: their GPS tells the turn about it to {checked_deg:.0f} degrees, "
-            f"{_ANSWERS_TURN_DEG:.0f} are needed, and no camera angles do",
+            f"{_ANSWERS_TURN_DEG:.0f} are needed, and no camera angles do"
         )
-    return outcome(None, _words("placed by GPS", figures))
+    message = "placed by GPS" if provisional else _words("placed by GPS", figures)
+    return outcome(reason=None, message=message, provisional=provisional)
 
 
 def _words(placed: str, figures: dict[str, Any]) -> str:

@@ -45,9 +45,7 @@ class TaggedElsewhere:
 def tagged_elsewhere(model: Model, with_gps: Sequence[int], placed: GpsPlacement) -> list[TaggedElsewhere]:
     """Groups of photos that the positions contradict together, and photos without position that hang on them.
 
-    Args:
-        with_gps: photos with a position, by place among the model's rows; rows of the placement's residuals.
-        placed: the model by these positions.
+    Photos `with_gps`, by place among the model's rows, are the rows of the placement's residuals.
     """
     offset_of = {k: r[:2] for k, r in zip(with_gps, placed.residuals_m, strict=True)}
     outside = [k for k, fits in zip(with_gps, placed.inliers.tolist(), strict=True) if not fits]

@@ -16,7 +16,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.lidar.load import PlanBox, chosen_scans, load_cloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary
-from ingest.register.anchor.start.files import RoughPose, read_pose
+from ingest.register.anchor.start.priors import RoughPose, read_pose
 from ingest.track.scan_ground import ScanFinder, ScanGround
 from reloc.localise.candidates import usable_areas
 from reloc.localise.result import LocaliseRequest, OwnPose

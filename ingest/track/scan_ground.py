@@ -18,10 +18,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import skew
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.dense.confirmation import ConfirmOptions
 from ingest.register.frame.register import fit_near, register_frame
-from ingest.register.frame.sources import available_sources
-from ingest.register.frame.views import DenseFitOptions, FrameOptions
+from ingest.register.frame.views import FrameOptions, available_sources
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.structure.depth_filter import surface_at
 from reloc.localise.result import LocaliseRequest, place_on_earth
@@ -41,15 +39,10 @@ _SHOWN_KEYFRAMES = 4
 # the same streets. A frame that a track leads to is asked for what lies between. One that is looked for over
 # metres has more chances to be at a wrong place: frames of that town had 26 to 28 %, and with a limit of 30 %
 # one was believed.
-_CONFIRM_FIRST = ConfirmOptions(finest_spacing=0.5, min_agreeing=0.45)
-_CONFIRM_NEAR = ConfirmOptions(finest_spacing=0.5, min_agreeing=0.33)
-# How a frame is registered from a prior, and from the track: from some pixels off the last round of the dense
-# fit is enough, as often as it moves the pose.
-_FIRST = FrameOptions(confirm=_CONFIRM_FIRST, threads=1)
+# From the track, some pixels off, the last round of the dense fit is enough, as often as it moves the pose.
+_FIRST = FrameOptions(finest_spacing=0.5, min_agreeing=0.45, threads=1)
 _NEAR = FrameOptions(
-    confirm=_CONFIRM_NEAR,
-    dense_fit=DenseFitOptions(spacing_px=(3.75,), piece_px=(40,), near_px=(6,), more_rounds=4),
-    threads=1,
+    finest_spacing=0.5, min_agreeing=0.33, fit_rounds=((3.75, 40, 6),), more_rounds=4, threads=1
 )
 # At most, that are looked for in a keyframe; the depth filter leaves out some. _CORNER_QUALITY: least
 # strength, as a share of the strongest one's. _CORNER_APART_PX: between them, at 1280 px.

@@ -19,7 +19,7 @@ from featuredb.store import Database
 from ingest.register.anchor import frames
 from ingest.register.anchor.files import PhotoFiles
 from ingest.register.anchor.start import first_place
-from ingest.register.anchor.start.from_ortho import FoundByOrtho
+from ingest.register.anchor.start.from_above import FoundPlace
 from tests.support.hill_map import hill_map
 from tests.support.hill_photos import FRAME, hill_photos
 from tests.support.hill_scan import write_hill_scan
@@ -103,18 +103,17 @@ def test_where_its_picture_from_above_agrees_photos_are_registered(
         scale=1.02, rotation=so3_exp(np.radians([1.0, -0.5, 1.5])), translation=np.array([1.5, -1.0, 1])
     )
 
-    def about_there(_: UnplacedMap, cloud: PointCloud, photos: PhotoFiles) -> FoundByOrtho:
+    def about_there(_: UnplacedMap, cloud: PointCloud, photos: PhotoFiles) -> FoundPlace:
         assert len(photos.paths) == len(hill_photos())
         right = Sim3.from_rigid3(cloud.frame.enu_from(frame)) @ off @ OWN_FROM_LOCAL.inverse()
         spread = np.diag(np.square([0.02, 0.03, 0.03, 0.03, 5.0, 5.0, 5.0]))
-        return FoundByOrtho(
-            local_from_own=right, covariance=spread, over_chance=9.5, elsewhere=5.1, source="intensity"
-        )
+        words = "its photos agree with the scan's intensity by 9.5 deviations"
+        return FoundPlace(local_from_own=right, covariance=spread, evidence=9.5, words=words)
 
     monkeypatch.setattr(first_place, "found_from_above", lambda *_: None)
     monkeypatch.setattr(first_place, "found_by_ortho", about_there)
     assert main(words(made, tmp_path, texture=1, laser=True)) == 0
-    assert "agree with the scan's intensity by 9.5 deviations" in capsys.readouterr().out
+    assert "agree with the scan's intensity by 9.5 deviations; if no photo" in capsys.readouterr().out
     _is_where_it_was_made(tmp_path)
 
 

@@ -17,8 +17,7 @@ from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
 from featuredb.simworld.town.town import make_town
 from ingest.register.frame.register import register_frame
-from ingest.register.frame.sources import available_sources
-from ingest.register.frame.views import FrameOptions, turned_about_vertical
+from ingest.register.frame.views import FrameOptions, available_sources, turned_about_vertical
 from ingest.register.frame_registration import FramePrior
 from tools.worlds.clouds import build_cloud
 

@@ -14,8 +14,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import rotation_angle, so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
+from ingest.register.frame.candidates import agreement_elsewhere
 from ingest.register.frame.dense.confirmation import confirm_pose
-from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameOptions, FrameViews, first_look
 from ingest.register.frame_registration import FramePrior
@@ -134,11 +134,18 @@ def test_the_photo_agrees_with_other_places_where_the_pattern_repeats_itself() -
 
 def test_a_pose_that_is_a_few_metres_off_is_not_confirmed() -> None:
     wrong = Rigid3(rotation=TRUTH.rotation, translation=TRUTH.translation + np.array([2.5, 1.0, 0.0]))
-    photo, scan = _photo(0), _ground(0)[0]
-    assert confirm_pose(photo, CAMERA, TRUTH, scan).confirmed
-    assert not confirm_pose(photo, CAMERA, wrong, scan).confirmed
+    views = _views(_photo(0))
+    assert confirm_pose(views, CAMERA, TRUTH, "intensity").confirmed
+    assert not confirm_pose(views, CAMERA, wrong, "intensity").confirmed
 
 
 def test_an_empty_photo_confirms_nothing() -> None:
     flat = np.full((CAMERA.height, CAMERA.width), 90, np.uint8)
-    assert not confirm_pose(flat, CAMERA, TRUTH, _ground(0)[0]).confirmed
+    assert not confirm_pose(_views(flat), CAMERA, TRUTH, "intensity").confirmed
+
+
+def _views(photo: NDArray[np.uint8]) -> FrameViews:
+    scan = _ground(0)[0]
+    look = first_look(scan, CAMERA, TRUTH)
+    assert look is not None
+    return FrameViews(photo, CAMERA, scan, look, FrameOptions(threads=1))

@@ -10,8 +10,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
-from ingest.register.structure.pairs import structure_pairs
-from ingest.register.structure.projection import project_structure
+from ingest.register.structure.projection import project_structure, structure_pairs
 from tests.support.scanned_map import (
     FRAME,
     ScannedMap,
@@ -24,7 +23,7 @@ from tests.support.scanned_map import (
 @pytest.fixture(autouse=True)
 def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seconds, and the same answers."""
-    monkeypatch.setattr("ingest.register.structure.pairs._RENDER_WIDTH_PX", 500)
+    monkeypatch.setattr("ingest.register.structure.projection._RENDER_WIDTH_PX", 500)
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ import pytest
 from featuredb.features.extractor import ExtractorOptions
 from ingest import anchoring, pipeline
 from ingest.cli import video
-from ingest.register.anchor import frames, placing
-from ingest.register.anchor.together import register as together
+from ingest.register.anchor import frames, placing, together
 from tests.support.remembered import remembered
 
 FEATURES = 1500  # of a photo

@@ -10,9 +10,8 @@ from scipy.stats import chi2
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.camera.shot import look_pose
-from ingest.register.anchor.ground.parts import halves, weakest_cut
 from ingest.register.anchor.ground.place import place_on_outlines
-from ingest.register.anchor.ground.street_plan import looks_level
+from ingest.register.anchor.ground.street_plan import halves, looks_level, weakest_cut
 from tests.support.scanned_map import plain_cloud
 from tests.support.street_map import OWN_FROM_LOCAL, few_sizes, joined_wrongly, street_map, street_scan
 

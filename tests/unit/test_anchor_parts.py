@@ -15,13 +15,12 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.files import load_proposals, save_proposals
 from ingest.register.anchor.frames import TriedFrames
-from ingest.register.anchor.page import anchor_page
-from ingest.register.anchor.pictures import edges_of, scan_view
+from ingest.register.anchor.page import anchor_page, edges_of, scan_view
 from ingest.register.anchor.proposals import propose_frames, small_camera
 from ingest.register.anchor.report import AnchorReport
 from ingest.register.block import block_of_map
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from ingest.register.structure.map_move import map_move, map_residuals
+from ingest.register.structure.surface_fit import map_move, map_residuals
 from tests.support.maps import random_map
 from tools.worlds.clouds import build_cloud
 

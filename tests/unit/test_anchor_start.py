@@ -13,14 +13,15 @@ from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from ingest.register.anchor.start.files import RoughPose, read_picks, read_pose
-from ingest.register.anchor.start.picks import Picks, pose_from_picks
+from ingest.register.anchor.start.picks import Picks, pose_from_picks, read_picks
 from ingest.register.anchor.start.priors import (
     MIN_SIGMA_HORIZONTAL_M,
     MIN_SIGMA_VERTICAL_M,
+    RoughPose,
     height_shift,
     image_named,
     prior_from_map,
+    read_pose,
 )
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
 from tools.worlds.clouds import build_cloud
@@ -194,6 +195,7 @@ def test_files_of_picks(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "found none"),
+        ("x,y,easting,northing,height,image\n", "found none"),
         ("1,2,3,4\n", "line 1: expected x, y, easting, northing, height"),
         ("1,2,3,4,five\n", "line 1"),
         ("1,2,3,4,nan\n", "finite"),

@@ -15,9 +15,9 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import MapImage
 from featuredb.render.cloud import PointCloud
-from ingest.register.anchor.together import register
-from ingest.register.anchor.together.evidence import JointEvidence, evidence_of
-from ingest.register.anchor.together.register import register_together
+from ingest.register.anchor import together
+from ingest.register.anchor.together import register_together
+from ingest.register.frame.dense.confirmation import JointEvidence, evidence_of
 from tests.support.scanned_map import plain_cloud
 
 LENS = Camera(model="PINHOLE", width=480, height=360, params=(400.0, 400.0, 240.0, 180.0))
@@ -85,7 +85,7 @@ def _misplaced(poses: list[Rigid3], points: NDArray[np.float64]) -> Any:
         images=images,
         cameras=(LENS,),
         points_local=lambda _=None: moved,
-        observations=SimpleNamespace(image_id=seen, point_index=np.arange(len(points))),
+        points_in=lambda image: np.flatnonzero(seen == image.image_id),
         placement=SimpleNamespace(covariance=covariance),
         move=move,
     )
@@ -121,7 +121,7 @@ def test_where_the_scan_shows_something_else_nothing_is_placed(
         asked.append(evidence_of(*args))
         return asked[-1]
 
-    monkeypatch.setattr(register, "evidence_of", kept)
+    monkeypatch.setattr(together, "evidence_of", kept)
     found = register_together(
         feature_map, feature_map.images, cloud, lambda image: pictures[image.image_id], 2
     )

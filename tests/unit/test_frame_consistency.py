@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ingest.register.frame.features.consistency import consistent_matches
+from ingest.register.frame.features.search import consistent_matches
 
 SIDE, AREA = 1600.0, 1600.0 * 1200.0
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.matching import filled, lift, pool_features
-from ingest.register.frame.sources import source_image
+from ingest.register.frame.views import source_image
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=320, height=240, params=(300.0, 160.0, 120.0, -0.05))
 POSE = Rigid3(rotation=so3_exp([0.2, -0.1, 0.5]), translation=np.array([3.0, -2.0, 5.0]))

@@ -4,7 +4,7 @@ import numpy as np
 
 from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.control.snooping import chance_of
+from ingest.register.control.residuals import chance_of
 
 _RNG = np.random.default_rng(0)
 _BY_UNKNOWNS = _RNG.normal(0, 1, (20, 6))

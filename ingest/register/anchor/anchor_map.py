@@ -26,8 +26,8 @@ from ingest.register.anchor.frames import (
 from ingest.register.anchor.placing import PlaceRound, place_in_rounds
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.block import block_of_map
-from ingest.register.structure.map_move import MapMove, MapResidual, map_move, map_residuals
 from ingest.register.structure.projection import project_structure
+from ingest.register.structure.surface_fit import MapMove, MapResidual, map_move, map_residuals
 
 # How far the map may move in the plane and turn, in standard deviations of its placement. Six, because
 # receivers understate their errors. Heights are not judged: those of GPS have an unknown datum and differ
@@ -102,15 +102,14 @@ def place_map(
         supervised: a person has said where the photos are: the map's placement may be wrong by any distance.
     """
     frames = tried.accepted
-    if not frames:
-        return _nothing_registered(tried)
     clock = StageClock()
     lone, refusals = _alone(feature_map, frames, cloud)
     agreement = frames_that_agree(lone)
     needed = 1 if confirmed else min(_MIN_AGREEING, wanted)
-    refusal = _too_little(frames, lone, refusals, agreement, needed)
+    refusal = _too_little(tried, lone, refusals, agreement, needed)
     if refusal is not None:
-        return replace(refusal, agreement=agreement if lone else None)
+        reason, message = refusal
+        return AnchorResult(reason=reason, message=message, agreement=agreement if lone else None)
     used = [frame for frame in frames if frame.image.image_id in agreement.agreeing]
     clock.lap("agreement")
     placed, rounds, words = place_in_rounds(feature_map, used, cloud, read_gray, progress)
@@ -152,28 +151,11 @@ def on_outlines(feature_map: FeatureMap, cloud: PointCloud) -> AnchorResult:
     )
 
 
-def _nothing_registered(tried: TriedFrames) -> AnchorResult:
-    if not tried.tried:
-        return AnchorResult(
-            reason="NO_SCAN",
-            message="no frame of the map sees enough of the scan from where the map is placed now; "
-            "is it the scan of this place? A rough pose (--pose) or picks (--picks) can start elsewhere",
-        )
-    reasons = "; ".join(
-        f"{f.image.name}: {f.registration.reason}: {f.registration.message}" for f in tried.tried
-    )
-    return AnchorResult(
-        reason="NO_FRAME",
-        message=f"none of {len(tried.tried)} frames was registered to the scan: {reasons}",
-    )
-
-
 def _alone(
     feature_map: FeatureMap, frames: Sequence[TriedFrame], cloud: PointCloud
 ) -> tuple[list[LoneFrame], dict[str, str]]:
     """Where each frame alone sends the map; and why not, by image name, of those that send it nowhere."""
     points = feature_map.points_local(cloud.frame)
-    observations = feature_map.observations
     lone: list[LoneFrame] = []
     refused: dict[str, str] = {}
     for frame in frames:
@@ -182,7 +164,7 @@ def _alone(
         if not structure.accepted or structure.new_from_old is None:
             refused[image.name] = f"{structure.reason}: {structure.message}"
             continue
-        seen = points[np.unique(observations.point_index[observations.image_id == image.image_id])]
+        seen = points[np.unique(feature_map.points_in(image))]
         distance = np.median(np.linalg.norm(seen - image.cam_from_local.center, axis=1))
         lone.append(
             LoneFrame(
@@ -196,37 +178,41 @@ def _alone(
 
 
 def _too_little(
-    frames: Sequence[TriedFrame],
+    tried: TriedFrames,
     lone: Sequence[LoneFrame],
     refusals: Mapping[str, str],
     agreement: FrameAgreement,
     needed: int,
-) -> AnchorResult | None:
-    """The refusal where the frames do not carry a placement, or None."""
-    names = {frame.image.image_id: frame.image.name for frame in frames}
+) -> tuple[AnchorReason, str] | None:
+    """Why the frames do not carry a placement, or None."""
+    names = {frame.image.image_id: frame.image.name for frame in tried.tried}
+    if not tried.tried:
+        return "NO_SCAN", (
+            "no frame of the map sees enough of the scan from where the map is placed now; is it the scan of "
+            "this place? A rough pose (--pose) or picks (--picks) can start elsewhere"
+        )
+    if not tried.accepted:
+        found = [(f.image.name, f.registration) for f in tried.tried]
+        words = "; ".join(f"{name}: {one.reason}: {one.message}" for name, one in found)
+        return "NO_FRAME", f"none of {len(found)} frames was registered to the scan: {words}"
     if not lone:
         words = "; ".join(f"{name}: {why}" for name, why in refusals.items())
-        return AnchorResult(
-            reason="STRUCTURE",
-            message=f"the map's points do not fit the scan through any registered frame: {words}",
-        )
+        return "STRUCTURE", f"the map's points do not fit the scan through any registered frame: {words}"
     if not agreement.agreeing or (len(agreement.agreeing) < needed and len(lone) >= 2):
-        apart = "; ".join(
+        words = "; ".join(
             f"{names[a]} and {names[b]}: {m:.2f} m apart, {agreement.allowed_m[a, b]:.2f} m allowed"
             for (a, b), m in agreement.apart_m.items()
         )
-        return AnchorResult(
-            reason="FRAMES_DISAGREE",
-            message=f"the frames send the map to different places ({apart}); look at them in anchor.html and "
-            "confirm the right one (--confirm)",
+        return "FRAMES_DISAGREE", (
+            f"the frames send the map to different places ({words}); look at them in anchor.html and "
+            "confirm the right one (--confirm)"
         )
     if len(agreement.agreeing) < needed:
-        others = "".join(f"; {name}: {why}" for name, why in refusals.items())
-        return AnchorResult(
-            reason="TOO_FEW_FRAMES",
-            message=f"{len(agreement.agreeing)} frame places the map, {names[agreement.agreeing[0]]}{others}"
+        words = "".join(f"; {name}: {why}" for name, why in refusals.items())
+        return "TOO_FEW_FRAMES", (
+            f"{len(agreement.agreeing)} frame places the map, {names[agreement.agreeing[0]]}{words}"
             f"; {needed} that agree are needed without a person; look at it in anchor.html and confirm it "
-            "(--confirm), or accept one frame (--frames 1)",
+            "(--confirm), or accept one frame (--frames 1)"
         )
     return None
 
@@ -252,20 +238,13 @@ def _judged(
         ],
     }
     found = replace(found, before=before, after=after, checks=checks, message="")
+    now, then = f"{before.median_m:.2f} m (median)", f"{after.median_m:.2f} m"
     if not len(after.distance_m) or after.median_m > most_m:
-        return replace(
-            found,
-            reason="NOT_BETTER",
-            message=f"the map's points would lie {after.median_m:.2f} m (median) from the scan, "
-            f"{most_m:.2f} m allowed",
-        )
+        words = f"the map's points would lie {then} (median) from the scan, {most_m:.2f} m allowed"
+        return replace(found, reason="NOT_BETTER", message=words)
     if after.median_m > max(before.median_m, _GOOD_M):
-        return replace(
-            found,
-            reason="NOT_BETTER",
-            message=f"the map's points lie {before.median_m:.2f} m (median) from the scan now and would lie "
-            f"{after.median_m:.2f} m from it",
-        )
+        words = f"the map's points lie {now} from the scan now and would lie {then} from it"
+        return replace(found, reason="NOT_BETTER", message=words)
     contradiction = None if supervised else _contradiction(move)
     if contradiction is not None:
         return replace(found, reason="CONTRADICTS_PLACEMENT", message=contradiction)

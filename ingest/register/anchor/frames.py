@@ -16,7 +16,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress, no_progress
 from ingest.register.anchor.proposals import FrameProposal, FrameScore, PhotoReader, propose_frames
 from ingest.register.anchor.start.priors import HeightShift, height_shift, prior_from_map
-from ingest.register.anchor.together.register import TOGETHER, prior_by_others, register_together
+from ingest.register.anchor.together import TOGETHER, prior_by_others, register_together
 from ingest.register.frame.register import fit_vouched_for, register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 
@@ -75,17 +75,11 @@ class TriedFrames:
         """Frames that were registered earlier, as they were; their ranks and priors are no longer known."""
         images = {image.image_id: image for image in feature_map.images}
         tried = []
-        for image_id, registration in registrations.items():
-            assert registration.cam_from_local is not None
-            prior = FramePrior.around(registration.cam_from_local, 1.0, 1.0)
-            tried.append(
-                TriedFrame(
-                    proposal=_unranked(images[image_id], prior),
-                    registration=registration,
-                    seconds=sum(registration.seconds.values()),
-                    cpu_s=float("nan"),
-                )
-            )
+        for image_id, found in registrations.items():
+            assert found.cam_from_local is not None
+            proposal = _unranked(images[image_id], FramePrior.around(found.cam_from_local, 1.0, 1.0))
+            seconds, nan = sum(found.seconds.values()), float("nan")
+            tried.append(TriedFrame(proposal=proposal, registration=found, seconds=seconds, cpu_s=nan))
         return cls(shift=None, ranking=(), tried=tuple(tried))
 
 
@@ -162,16 +156,15 @@ def _tried_together(
 ) -> list[TriedFrame]:
     """The frames that all photos together register; none where these do not tell, or too few."""
     start, cpu = time.perf_counter(), time.process_time()
-    proposals = {p.image.image_id: p for p in ranking}
     found = register_together(feature_map, [p.image for p in ranking], cloud, read_gray, wanted)
     if found is None or len(found) < min(wanted, _LEAST_TOGETHER):
         return []
-    seconds = (time.perf_counter() - start) / len(found)
-    cpu_s = (time.process_time() - cpu) / len(found)
-    return [
-        TriedFrame(proposal=proposals[i], registration=registration, seconds=seconds, cpu_s=cpu_s)
-        for i, registration in found.items()
-    ]
+    each = {
+        "seconds": (time.perf_counter() - start) / len(found),
+        "cpu_s": (time.process_time() - cpu) / len(found),
+    }
+    proposals = {p.image.image_id: p for p in ranking}
+    return [TriedFrame(proposal=proposals[i], registration=one, **each) for i, one in found.items()]
 
 
 def _unranked(image: MapImage, prior: FramePrior) -> FrameProposal:
@@ -188,11 +181,9 @@ def _try(
     unreadable: dict[str, str],
     before: FrameRegistration | None = None,
 ) -> TriedFrame | None:
-    """A frame by itself, or where others vouch for it; None where its photo cannot be read.
+    """A frame by itself, or where others vouch for it, as they did `before` with another lens.
 
-    Args:
-        unreadable: takes up why, by the image's name.
-        before: its registration with another lens.
+    None where its photo cannot be read: `unreadable` takes up why, by the image's name.
     """
     try:
         gray = read_gray(proposal.image)
@@ -207,19 +198,10 @@ def _try(
         registration = fit_vouched_for(gray, camera, proposal.prior, cloud, before.source, evidence)
     else:
         registration = register_frame(gray, camera, proposal.prior, cloud)
-    seconds = time.perf_counter() - start
-    _LOG.info(
-        "%s: %s in %.1f s",
-        proposal.image.name,
-        registration.reason or f"registered by {registration.source}",
-        seconds,
-    )
-    return TriedFrame(
-        proposal=proposal,
-        registration=registration,
-        seconds=seconds,
-        cpu_s=time.process_time() - cpu,
-    )
+    seconds, cpu_s = time.perf_counter() - start, time.process_time() - cpu
+    outcome = registration.reason or f"registered by {registration.source}"
+    _LOG.info("%s: %s in %.1f s", proposal.image.name, outcome, seconds)
+    return TriedFrame(proposal=proposal, registration=registration, seconds=seconds, cpu_s=cpu_s)
 
 
 def register_again(
@@ -227,14 +209,13 @@ def register_again(
 ) -> list[TriedFrame]:
     """Register frames anew from where a placed map has them, with its lens."""
     again = []
-    poses = {image.image_id: image for image in feature_map.images}
-    points, observations = feature_map.points_local(cloud.frame), feature_map.observations
+    images = {image.image_id: image for image in feature_map.images}
+    points = feature_map.points_local(cloud.frame)
     for frame in frames:
-        image = poses[frame.image.image_id]
+        image = images[frame.image.image_id]
         prior = FramePrior.around(image.cam_from_local, _AGAIN_SIGMA_M, _AGAIN_SIGMA_DEG)
         if TOGETHER in frame.registration.evidence:
-            seen = observations.point_index[observations.image_id == image.image_id]
-            prior = prior_by_others(image.cam_from_local, points[seen])
+            prior = prior_by_others(image.cam_from_local, points[feature_map.points_in(image)])
         proposal = replace(frame.proposal, image=image, prior=prior)
         tried = _try(feature_map, cloud, proposal, read_gray, {}, frame.registration)
         if tried is not None:

@@ -77,6 +77,7 @@ def place_in_rounds(
             break
         latest = placed_map(feature_map, structure, cloud, adjustment)
         placed = latest if adjustment.accepted else None
+        adjusted = adjustment.figures | {"reason": adjustment.reason}
         rounds.append(
             PlaceRound(
                 frames=tuple(frames),
@@ -84,16 +85,12 @@ def place_in_rounds(
                 structure_cpu_s=structure_cpu_s,
                 adjust_s=adjust_s,
                 focal_px=tuple(camera.focal_px for camera in latest.cameras),
-                figures={
-                    "structure": structure.figures,
-                    "adjustment": adjustment.figures | {"reason": adjustment.reason},
-                },
+                figures={"structure": structure.figures, "adjustment": adjusted},
             )
         )
         progress("place", number + 1, _LENS_ROUNDS)
-        change = max(
-            abs(new.focal_px / old.focal_px - 1.0) for new, old in zip(latest.cameras, lens, strict=True)
-        )
+        both = zip(latest.cameras, lens, strict=True)
+        change = max(abs(new.focal_px / old.focal_px - 1.0) for new, old in both)
         if change < _LENS_SETTLED or number + 1 == _LENS_ROUNDS:
             break
         again = register_again(latest, cloud, frames, read_gray)

@@ -67,12 +67,12 @@ def propose_frames(
     Args:
         priors: of the images to be ranked, by image id, in the cloud's frame.
     """
-    rough = []
-    for image in feature_map.images:
-        if image.image_id in priors:
-            score = _score(feature_map, image, priors[image.image_id], cloud)
-            if score.coverage >= _MIN_COVERAGE:
-                rough.append(FrameProposal(image=image, score=score, prior=priors[image.image_id]))
+    rough = [
+        FrameProposal(image=image, score=_score(feature_map, image, prior, cloud), prior=prior)
+        for image in feature_map.images
+        if (prior := priors.get(image.image_id)) is not None
+    ]
+    rough = [p for p in rough if p.score.coverage >= _MIN_COVERAGE]
     rough.sort(key=lambda p: (-p.score.score, p.image.image_id))
     return _spread_out(feature_map, rough)
 
@@ -83,19 +83,14 @@ def _score(feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: P
     seen = render(cloud, small, prior.cam_from_local, RenderOptions(attributes=False))
     valid = seen.valid
     coverage = float(valid.mean())
-    mine = feature_map.observations.image_id == image.image_id
-    points = len(np.unique(feature_map.observations.point_index[mine]))
-    cells = feature_map.observations.xy[mine] / [camera.width, camera.height] * _GRID
+    points = len(np.unique(feature_map.points_in(image)))
+    xy = feature_map.observations.xy[feature_map.observations.image_id == image.image_id]
+    cells = xy / [camera.width, camera.height] * _GRID
     spread = len(np.unique(np.floor(cells).clip(0, _GRID - 1), axis=0)) / _GRID**2
     downward = _downward(small, prior.cam_from_local, valid)
     factors = [coverage, downward, min(points / _ENOUGH_POINTS, 1.0), spread]
-    return FrameScore(
-        score=float(np.prod(np.sqrt(factors))),
-        coverage=coverage,
-        downward=downward,
-        points=points,
-        spread=spread,
-    )
+    score = float(np.prod(np.sqrt(factors)))
+    return FrameScore(score=score, coverage=coverage, downward=downward, points=points, spread=spread)
 
 
 def _downward(camera: Camera, pose: Rigid3, valid: NDArray[np.bool_]) -> float:
@@ -112,11 +107,7 @@ def _downward(camera: Camera, pose: Rigid3, valid: NDArray[np.bool_]) -> float:
 
 def _spread_out(feature_map: FeatureMap, proposals: Sequence[FrameProposal]) -> list[FrameProposal]:
     """Order by score and by what frames before have not seen."""
-    observations = feature_map.observations
-    sees = {
-        p.image.image_id: np.unique(observations.point_index[observations.image_id == p.image.image_id])
-        for p in proposals
-    }
+    sees = {p.image.image_id: np.unique(feature_map.points_in(p.image)) for p in proposals}
     seen = np.zeros(len(feature_map.points), bool)
     left, ordered = list(proposals), []
     while left:
@@ -137,14 +128,8 @@ def small_camera(camera: Camera, width_px: int) -> Camera:
     The height is rounded to whole pixels; widths that keep the aspect within a tenth of a percent are found
     for any camera of usual size.
     """
-    width = min(width_px, camera.width)
-    while (
-        width < camera.width
-        and abs(_height(camera, width) * camera.width / (width * camera.height) - 1) > 1e-3
-    ):
-        width += 1
-    return camera.scaled_to(width, _height(camera, width))
-
-
-def _height(camera: Camera, width: int) -> int:
-    return max(1, round(width * camera.height / camera.width))
+    for width in range(min(width_px, camera.width), camera.width + 1):
+        height = max(1, round(width * camera.height / camera.width))
+        if abs(height * camera.width / (width * camera.height) - 1) <= 1e-3:
+            break
+    return camera.scaled_to(width, height)

@@ -68,27 +68,17 @@ def frame_rows(report: AnchorReport) -> list[tuple[Any, ...]]:
     rows = []
     for proposal in proposals:
         frame, score = tried.get(proposal.image.image_id), proposal.score
-        verdict, inliers, sigma = "", None, None
+        verdict, inliers, sigma, seconds = "", None, None, None
         if frame is not None:
-            registration = frame.registration
+            registration, seconds = frame.registration, round(frame.seconds, 1)
             verdict = registration.reason or f"registered by {registration.source}"
             if registration.covariance is not None:
                 inliers = len(registration.pixels)
                 sigma = round(float(np.sqrt(np.linalg.eigvalsh(registration.covariance[3:, 3:])[-1])), 3)
             if proposal.image.image_id in used:
                 verdict += ", used"
-        rows.append(
-            (
-                proposal.image.name,
-                _rounded(score.score),
-                _rounded(score.coverage),
-                score.points,
-                verdict,
-                inliers,
-                sigma,
-                None if frame is None else round(frame.seconds, 1),
-            )
-        )
+        figures = (_rounded(score.score), _rounded(score.coverage), score.points)
+        rows.append((proposal.image.name, *figures, verdict, inliers, sigma, seconds))
     return rows
 
 
@@ -97,33 +87,23 @@ FRAME_HEADER = ("frame", "score", "covers", "points", "registration", "inliers",
 
 def report_json(report: AnchorReport) -> dict[str, Any]:
     """Everything as JSON of `schemas/ingest/anchor.json`."""
-    result = report.result
+    result, shift = report.result, report.tried.shift
     of_round = ("structure_s", "structure_cpu_s", "adjust_s", "focal_px", "figures")
     placed = result and {
-        "reason": result.reason,
-        "message": result.message,
-        "used": list(result.used),
-        "checks": result.checks,
-        "seconds": result.seconds,
-        "rounds": [{name: getattr(r, name) for name in of_round} for r in result.rounds],
+        **_named(result, "reason", "message", "used", "checks", "seconds"),
+        "rounds": [_named(r, *of_round) for r in result.rounds],
     }
-    shift = report.tried.shift
     document: dict[str, Any] = plain(
         {
             "schema": SCHEMA_ID,
-            "map_id": report.map_id,
-            "map_name": report.map_name,
-            "database": report.database,
-            "photos": report.photos,
-            "scans": list(report.scan_ids),
-            "epsg": report.epsg,
+            **_named(report, "map_id", "map_name", "database", "photos", "epsg", "notes"),
+            "scans": report.scan_ids,
             "height_datum": {"before": report.datum_before, "after": report.datum_after},
             "height_shift": shift and asdict(shift),
             "times_s": report.times_s(),
             "frames": [_frame_json(frame) for frame in report.tried.tried],
             "ranking": [{"name": p.image.name, **asdict(p.score)} for p in report.tried.ranking],
             "placement": placed,
-            "notes": list(report.notes),
         }
     )
     return document
@@ -134,17 +114,17 @@ def _frame_json(frame: TriedFrame) -> dict[str, Any]:
     pose = registration.cam_from_local
     return {
         "name": frame.image.name,
-        "reason": registration.reason,
-        "message": registration.message,
-        "source": registration.source,
+        **_named(registration, "reason", "message", "source", "covariance", "evidence"),
         "inliers": len(registration.pixels),
         "cam_from_local": None if pose is None else pose.matrix(),
-        "covariance": registration.covariance,
-        "evidence": registration.evidence,
-        "seconds": frame.seconds,
-        "cpu_s": frame.cpu_s,
+        **_named(frame, "seconds", "cpu_s"),
         "stages_s": registration.seconds,
     }
+
+
+def _named(value: object, *names: str) -> dict[str, Any]:
+    """Some attributes of a value."""
+    return {name: getattr(value, name) for name in names}
 
 
 def _rounded(value: float) -> float | None:

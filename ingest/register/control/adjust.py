@@ -1,7 +1,7 @@
 """A block adjusted with control points as targets, in metres in the local frame.
 
 A file does not tell wrong marks and coordinates from right ones: they keep a quadratic loss here, and tests
-name and leave out the wrong ones (`ingest.register.control.snooping`).
+name and leave out the wrong ones (`ingest.register.control.residuals`).
 """
 
 from dataclasses import dataclass, replace
@@ -102,11 +102,7 @@ class Task:
 def task_of(
     placed: Block, control: Control, control_xyz: FloatArray, vertical: Vertical | None, keep_lens: bool
 ) -> Task:
-    """For a block in metres in the local frame, in place but for small changes.
-
-    Args:
-        vertical: what is known of it in that frame. keep_lens: keep all lenses.
-    """
+    """For a block in metres in the local frame, in place but for small changes; `vertical` is in it, too."""
     chosen = _sample(placed, _POINTS_PER_PHOTO)
     variance_px2 = max(block_variance_px2(chosen), _LEAST_PX2)
     share = len(chosen.xy) / len(placed.xy)
@@ -138,9 +134,11 @@ def adjust(task: Task, weights: Weights) -> Adjusted:
     by_poses = similarity_of_change(adjusted)
     poses = 6 * len(adjusted.names)
     located = np.isin(np.arange(len(control.names)), control.point_of[weights.marks])
+    both = zip(adjusted.cam_from_block, start.cam_from_block, strict=True)
+    changes = np.concatenate([(now @ old.inverse()).log() for now, old in both])
     return Adjusted(
         block=adjusted,
-        change=_common_change(start, adjusted),
+        change=Sim3.exp(similarity_of_change(start) @ changes),
         covariance=by_poses @ found.block.shared[:poses, :poses] @ by_poses.T,
         control_xyz=np.where(located[:, None], everything.xyz[count:], np.nan),
         spread=found.point,
@@ -238,15 +236,6 @@ def _anchor(start: Block, vertical: Vertical) -> PointPriors:
         xyz=(start.xyz[row] + lift)[None],
         covariance=np.diag([_LOOSE_M**2, _LOOSE_M**2, vertical.sigma_up_m**2])[None],
     )
-
-
-def _common_change(before: Block, after: Block) -> Sim3:
-    """The similarity nearest to what became of all poses."""
-    changes = [
-        (now @ old.inverse()).log()
-        for now, old in zip(after.cam_from_block, before.cam_from_block, strict=True)
-    ]
-    return Sim3.exp(similarity_of_change(before) @ np.concatenate(changes))
 
 
 def similarity_of_change(block: Block) -> FloatArray:

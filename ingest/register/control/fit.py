@@ -83,7 +83,6 @@ class ControlFit:
 # Marks further from the common intersection disagree. A person marks to one to three pixels, a block may be
 # bent by a few; wrong targets are tens to hundreds off.
 _MAX_MARK_ERROR_PX = 12.0
-_MIN_RAY_ANGLE_DEG = 1.0  # rays closer to parallel than that give no place
 _OUTLIER_SIGMAS = 3.5  # points further out are left out; 3.5 keeps 99.8 % of honest ones in the plane
 _MIN_SIGMA_M = 0.02  # survey and marks are not better than that, so smaller residuals never make outliers
 _ROUNDS = 6  # of choosing and fitting; two or three settle
@@ -96,33 +95,32 @@ def hypotheses(block: Block, control: Control) -> list[Hypothesis]:
     found: list[Hypothesis] = []
     for point in range(len(control.names)):
         rows = control.marks_of(point)
-        seen: set[tuple[int, ...]] = set()
+        places: dict[tuple[int, ...], FloatArray] = {}
         for pair in itertools.islice(itertools.combinations(rows, 2), _MOST_PAIRS):
             consensus = _consensus(block, control, rows, pair)
-            if consensus is not None and consensus[1] not in seen:
-                seen.add(consensus[1])
-                found.append(Hypothesis(point=point, xyz=consensus[0], marks=consensus[1]))
-        for row in rows:
+            if consensus is not None:
+                places.setdefault(*consensus)
+        for row in rows.tolist():
             ground = on_ground(block, int(control.photo_of[row]), control.xy[row])
             if ground is not None:
-                found.append(Hypothesis(point=point, xyz=ground, marks=(int(row),)))
+                places[row,] = ground
+        found += [Hypothesis(point=point, xyz=xyz, marks=marks) for marks, xyz in places.items()]
     return found
 
 
 def _consensus(
     block: Block, control: Control, rows: NDArray[np.int64], pair: Sequence[int]
-) -> tuple[FloatArray, tuple[int, ...]] | None:
-    """The intersection of all marks that agree with a pair; None where the pair does not agree itself."""
-    chosen = np.array(pair)
-    xyz = intersect(block, control.photo_of[chosen], control.xy[chosen], _MIN_RAY_ANGLE_DEG)
+) -> tuple[tuple[int, ...], FloatArray] | None:
+    """All marks that agree with a pair, and their intersection; None where the pair does not agree itself."""
+    xyz = intersect(block, control, np.array(pair))
     if xyz is None:
         return None
     errors = np.linalg.norm(shown(block, control.photo_of[rows], xyz) - control.xy[rows], axis=1)
     agreeing = rows[errors <= _MAX_MARK_ERROR_PX]  # not behind a camera, where it is NaN
     if not set(pair) <= set(agreeing.tolist()):
         return None
-    of_all = intersect(block, control.photo_of[agreeing], control.xy[agreeing], _MIN_RAY_ANGLE_DEG)
-    return None if of_all is None else (of_all, tuple(agreeing.tolist()))
+    of_all = intersect(block, control, agreeing)
+    return None if of_all is None else (tuple(agreeing.tolist()), of_all)
 
 
 def fit_similarity(
@@ -137,10 +135,9 @@ def fit_similarity(
     xyz = np.array([h.xyz for h in found])
     usable, point = np.unique([h.point for h in found], return_inverse=True)
     surveyed = surveyed[usable]
-    start = _least_trimmed(xyz, point, surveyed, vertical)
-    if start is None:
+    sim = _least_trimmed(xyz, point, surveyed, vertical)
+    if sim is None:
         return None
-    sim = start
     for _ in range(_ROUNDS):
         lengths = _distances(sim, xyz, surveyed[point])
         sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical)

@@ -13,6 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from ingest.register.control.control_file import ControlFile, Mark
 
 _NEIGHBOURS = 12  # observations around a mark: enough for a plane, few enough to be near
+_MIN_RAY_ANGLE_DEG = 1.0  # rays closer to parallel than that give no place
 _MAX_DISTANCE_SHARE = 0.1  # of the photo's diagonal; further away the ground may be anything
 
 
@@ -58,11 +59,7 @@ def control_frame(file: ControlFile) -> LocalFrame:
 
 
 def meet(file: ControlFile, block: Block, frame: LocalFrame) -> Control:
-    """Find the block's photos for the marks.
-
-    Args:
-        frame: of the surveyed positions that come out.
-    """
+    """Find the block's photos for the marks; surveyed positions come out in `frame`."""
     by_name = {name.lower(): [row] for row, name in enumerate(block.names)}
     by_file = defaultdict(list)
     for row, name in enumerate(block.names):
@@ -100,11 +97,7 @@ def _file_name(name: str) -> str:
 
 
 def _why_not(mark: Mark, block: Block, photos: list[int]) -> str:
-    """Why a mark cannot take part, "" where it can.
-
-    Args:
-        photos: of the block that are called as the mark says.
-    """
+    """Why a mark cannot take part, "" where it can; `photos` of the block are called as the mark says."""
     if not photos:
         return f"no photo {mark.photo} in the map"
     if len(photos) > 1:
@@ -125,16 +118,14 @@ def ray(block: Block, photo: int, xy: FloatArray) -> tuple[FloatArray, FloatArra
     return pose.center, direction / np.linalg.norm(direction)
 
 
-def intersect(
-    block: Block, photos: NDArray[np.int64], xy: FloatArray, min_angle_deg: float
-) -> FloatArray | None:
-    """The place (3,) next to the rays of pixels (m, 2) of m photos; None where they are nearly parallel."""
-    rays = [ray(block, int(p), pixel) for p, pixel in zip(photos, xy, strict=True)]
+def intersect(block: Block, control: Control, rows: NDArray[np.int64]) -> FloatArray | None:
+    """The place (3,) next to the rays of some marks; None where they are nearly parallel."""
+    rays = [ray(block, int(control.photo_of[row]), control.xy[row]) for row in rows]
     directions = np.array([d for _, d in rays])
     if not np.isfinite(directions).all():
         return None
     cosine = float((directions @ directions.T).min())
-    if cosine > np.cos(np.radians(min_angle_deg)):
+    if cosine > np.cos(np.radians(_MIN_RAY_ANGLE_DEG)):
         return None
     across = [np.eye(3) - np.outer(d, d) for _, d in rays]
     at_centers = np.sum([a @ center for a, (center, _) in zip(across, rays, strict=True)], axis=0)

@@ -2,7 +2,7 @@
 
 1. Marks are intersected and the similarity is found that most points agree on (`fit`).
 2. The block is adjusted with the points as control (`adjust`).
-3. Marks and points that contradict all others are tested, named and left out (`snooping`), and the block
+3. Marks and points that contradict all others are tested, named and left out (`residuals`), and the block
    is adjusted again.
 
 Surveyed heights may be unknown. Then position, heading and scale come from the points; tilt and height come
@@ -23,8 +23,14 @@ from featuredb.plain_json import plain
 from ingest.register.control.adjust import Adjusted, task_of, with_all_points
 from ingest.register.control.fit import ControlFit, Vertical, fit_similarity, hypotheses
 from ingest.register.control.marks import Control
-from ingest.register.control.residuals import MarkResidual, PointResidual, gps_offset, residuals_of
-from ingest.register.control.snooping import improve, initial_weights
+from ingest.register.control.residuals import (
+    MarkResidual,
+    PointResidual,
+    gps_offset,
+    improve,
+    initial_weights,
+    residuals_of,
+)
 
 GcpReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE", "UPSIDE_DOWN", "CONTRADICTS_GPS"]
 
@@ -119,11 +125,7 @@ class GcpPlacement:
         return found
 
     def map_placement(self, block_from_sfm: Sim3) -> Placement:
-        """For the map, where it is accepted.
-
-        Args:
-            block_from_sfm: what had placed the block in its own frame.
-        """
+        """For the map, where it is accepted; `block_from_sfm` had placed the block in its own frame."""
         assert self.local_from_block is not None
         assert self.covariance is not None  # accepted
         return Placement(
@@ -137,8 +139,7 @@ class GcpPlacement:
     def height_datum(self, before: str, said: str) -> str:
         """Datum of the map's heights: the survey's where it gives heights, else what it was before.
 
-        Args:
-            said: of the surveyed heights, where the file's reference system does not say it.
+        What is `said` of surveyed heights counts where the file's reference system does not say it.
         """
         if np.isfinite(self.control.surveyed[:, 2]).sum() < 3:
             return before
@@ -169,9 +170,9 @@ def place_by_gcp(
     usable = sorted({h.point for h in found})
     if len(usable) < _MIN_POINTS:
         message = (
-            f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are "
-            "needed; mark each point in two photos or more"
+            f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are needed"
         )
+        message += "; mark each point in two photos or more"
         return GcpPlacement(control=control, reason="TOO_FEW", message=message)
     notes: tuple[str, ...] = ()
     if not _vertical_is_needed(control, usable):
@@ -209,18 +210,15 @@ def place_by_gcp(
 def level_ground(block: Block, anchor_block: FloatArray, ground_m: tuple[float, float] | None) -> Vertical:
     """The vertical as the normal of the plane through the block's points, on the cameras' side.
 
-    Args:
-        anchor_block: (3,) where the ground has the height `ground_m`, which comes with its sigma.
+    At `anchor_block` (3,) the ground has the height `ground_m`, which comes with its sigma.
     """
     normal = _plane_normal(block.xyz)
     if float((np.median(block.centers(), axis=0) - np.median(block.xyz, axis=0)) @ normal) < 0:
         normal = -normal
-    height = (
-        "their height is not known at all: the control points are put at height 0"
-        if ground_m is None
-        else f"the control points are put at height {ground_m[0]:g} m, as given"
-    )
     up_m, sigma_m = ground_m or _ANY_HEIGHT_M
+    height = f"the control points are put at height {up_m:g} m, as given"
+    if ground_m is None:
+        height = "their height is not known at all: the control points are put at height 0"
     return Vertical(
         up_block=normal,
         tilt_covariance=np.eye(2) * np.radians(_SIGMA_TILT_DEG) ** 2,

@@ -36,11 +36,9 @@ def control_html(placement: GcpPlacement) -> str:
     parts.append(table(_HEADER, points, numbers=(2, 3, 4, 5, 6), names=(0,)))
     marks = [
         (
-            m.mark.point,
-            m.mark.photo,
-            str(m.mark.line),
+            *(m.mark.point, m.mark.photo, str(m.mark.line)),
             *(f"{v:.3f}" if np.isfinite(v) else "" for v in m.residual_px),
-            _word(m.used),
+            "" if m.used else "not used",
         )
         for m in placement.marks
     ]
@@ -85,14 +83,10 @@ def _rows(placement: GcpPlacement) -> list[tuple[object, ...]]:
             p.name,
             f"{p.marks}/{p.marks_given}",
             *map(_decimal, (*p.residual_m, p.horizontal_m, np.hypot(*p.leave_one_out_m[:2]))),
-            _word(p.used),
+            "" if p.used else "not used",
         )
         for p in placement.points
     ]
-
-
-def _word(used: bool) -> str:
-    return "" if used else "not used"
 
 
 def write_control_report(folder: Path, title: str, placement: GcpPlacement) -> None:

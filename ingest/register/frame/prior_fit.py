@@ -14,7 +14,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
 from ingest.register.frame.features.matching import FrameMatches
-from ingest.register.frame_registration import FramePrior
+from ingest.register.frame_registration import SIGMAS, FramePrior
 from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import PoseHypothesis, reprojection_errors
@@ -40,12 +40,8 @@ def prior_residual(pose: Rigid3, prior: FramePrior) -> FloatArray:
         heading = 0.0
     angles = np.degrees([tilt[0], tilt[1], heading])
     level, tilted = prior.sigma_horizontal_m, prior.sigma_tilt_deg
-    return np.concatenate(
-        [
-            moved / (level, level, prior.sigma_vertical_m),
-            angles / (tilted, tilted, prior.sigma_heading_deg),
-        ]
-    )
+    sigmas = (level, level, prior.sigma_vertical_m, tilted, tilted, prior.sigma_heading_deg)
+    return np.concatenate([moved, angles]) / sigmas
 
 
 def prior_sigmas(prior: FramePrior, pose: Rigid3) -> float:
@@ -55,13 +51,7 @@ def prior_sigmas(prior: FramePrior, pose: Rigid3) -> float:
 
 def loosened(prior: FramePrior) -> FramePrior:
     """The prior with deviations as the fit takes them; a heading that was unknown stays unknown."""
-    return replace(
-        prior,
-        sigma_horizontal_m=_PRIOR_SLACK * prior.sigma_horizontal_m,
-        sigma_vertical_m=_PRIOR_SLACK * prior.sigma_vertical_m,
-        sigma_heading_deg=_PRIOR_SLACK * prior.sigma_heading_deg,
-        sigma_tilt_deg=_PRIOR_SLACK * prior.sigma_tilt_deg,
-    )
+    return replace(prior, **{name: _PRIOR_SLACK * getattr(prior, name) for name in SIGMAS})
 
 
 def prior_information(pose: Rigid3, prior: FramePrior) -> FloatArray:
@@ -120,10 +110,7 @@ def _prior_slopes(pose: Rigid3, prior: FramePrior) -> FloatArray:
     """Derivative (6, 6) of the prior's residual by rotations about local axes (rad) and displacement (m)."""
 
     def slope(axis: FloatArray) -> FloatArray:
-        ahead, behind = (
-            prior_residual(pose_step(pose, axis), prior),
-            prior_residual(pose_step(pose, 0.0 - axis), prior),
-        )
+        ahead, behind = (prior_residual(pose_step(pose, step), prior) for step in (axis, 0.0 - axis))
         return (ahead - behind) / 2e-5
 
     return np.stack([slope(np.asarray(axis, dtype=np.float64)) for axis in 1e-5 * np.eye(6)], axis=1)

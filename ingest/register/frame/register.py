@@ -12,15 +12,19 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
-from ingest.register.frame.candidates import Judged, best_candidate, by_agreement, polished
+from ingest.register.frame.candidates import (
+    Judged,
+    agreement_elsewhere,
+    best_candidate,
+    by_agreement,
+    polished,
+)
 from ingest.register.frame.dense.fit import confirmed, dense_fitted
-from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.features.search import FrameHypothesis, pose_options, unmatched
 from ingest.register.frame.prior_fit import CORRELATED_INLIERS, loosened, prior_information, prior_sigmas
 from ingest.register.frame.verdict import (
     MAX_PLACES_ELSEWHERE,
     MAX_PRIOR_SIGMAS,
-    MIN_COVER,
     MIN_INLIERS,
     FrameEvidence,
     asks_elsewhere,
@@ -29,7 +33,7 @@ from ingest.register.frame.verdict import (
     highest_elsewhere,
     verdict,
 )
-from ingest.register.frame.views import MIN_SIDE_PX, FrameOptions, FrameViews, first_look
+from ingest.register.frame.views import DEFAULTS, MIN_COVER, MIN_SIDE_PX, FrameOptions, FrameViews, first_look
 from ingest.register.frame_registration import FramePrior, FrameReason, FrameRegistration, RenderSource
 from reloc.localise.pose import pose_uncertainty
 
@@ -44,7 +48,7 @@ def register_frame(
     camera: Camera,
     prior: FramePrior,
     cloud: PointCloud,
-    options: FrameOptions | None = None,
+    options: FrameOptions = DEFAULTS,
 ) -> FrameRegistration:
     """Find the pose of a photo in a scan, or say why not.
 
@@ -62,14 +66,13 @@ def register_frame(
             f"register_frame: expected uint8 pixels of the camera's size {camera.width}x{camera.height}, "
             f"found {gray.dtype} {gray.shape}"
         )
-    clock = StageClock()
-    views = _views(gray, camera, prior, cloud, options or FrameOptions(), clock)
+    views = _views(gray, camera, prior, cloud, options)
     if isinstance(views, FrameRegistration):
         return views
-    judged = best_candidate(views, prior, clock)
+    judged = best_candidate(views, prior)
     if judged is None:
-        return _refused("NO_CONSISTENT_POSE", "no pose has matches behind it", {}, clock)
-    return _verdict(views, prior, judged, clock)
+        return _refused("NO_CONSISTENT_POSE", "no pose has matches behind it", views.clock)
+    return _verdict(views, prior, judged)
 
 
 def fit_near(
@@ -88,24 +91,20 @@ def fit_near(
         prior: the pose to start from, with how far it may be off.
         source: of the frames before, with which this one is compared first.
     """
-    clock = StageClock()
-    views = _views(gray, camera, prior, cloud, options, clock)
+    views = _views(gray, camera, prior, cloud, options)
     if isinstance(views, FrameRegistration):
         return views
     start, loose = unmatched(prior.cam_from_local, camera, source), loosened(prior)
-    judged = polished(views, loose, start, clock)
+    judged = polished(views, loose, start)
     if not judged.confirmation.confirmed:
         # Other light, other seasons: what agreed for the frames before need not for this one.
         other = by_agreement(views, start).found
         if other.source != source:
-            judged = polished(views, loose, other, clock)
+            judged = polished(views, loose, other)
     found, confirmation = judged.found, judged.confirmation
     if not confirmation.confirmed:
-        return _refused("NOT_CONFIRMED", confirmation.message, {}, clock)
-    if len(found.inliers) < MIN_INLIERS:
-        words = f"{len(found.inliers)} independent inliers, {MIN_INLIERS} needed"
-        return _refused("TOO_FEW_MATCHES", words, {}, clock)
-    return _accepted(found, frame_covariance(views, prior, found), {}, clock)
+        return _refused("NOT_CONFIRMED", confirmation.message, views.clock)
+    return _fitted(views, prior, found, {})
 
 
 def fit_vouched_for(
@@ -122,54 +121,57 @@ def fit_vouched_for(
         prior: the pose that all photos give together, with how far this one may be off it.
         evidence: of all photos.
     """
-    clock, options = StageClock(), FrameOptions()
-    views = _views(gray, camera, prior, cloud, options, clock)
+    views = _views(gray, camera, prior, cloud, DEFAULTS)
     if isinstance(views, FrameRegistration):
         return views
-    with clock.stage("fit"):
+    with views.clock.stage("fit"):
         start = unmatched(prior.cam_from_local, camera, source)
-        found = dense_fitted(views, loosened(prior), start, options.dense_fit)
-    if found is None or len(found.inliers) < MIN_INLIERS:
-        count = 0 if found is None else len(found.inliers)
-        return _refused("TOO_FEW_MATCHES", f"{count} independent inliers, {MIN_INLIERS} needed", {}, clock)
+        found = dense_fitted(views, loosened(prior), start) or start
+    fitted = _fitted(views, prior, found, evidence)
     away = prior_sigmas(prior, found.pose.cam_from_local)
-    if away > MAX_PRIOR_SIGMAS:
+    if fitted.accepted and away > MAX_PRIOR_SIGMAS:
         words = f"the pose lies {away:.1f} deviations from where all photos together have it"
-        return _refused("CONTRADICTS_PRIOR", words, {}, clock)
-    return _accepted(found, frame_covariance(views, prior, found), evidence, clock)
+        return _refused("CONTRADICTS_PRIOR", words, views.clock)
+    return fitted
 
 
 def _views(
-    gray: NDArray[np.uint8],
-    camera: Camera,
-    prior: FramePrior,
-    cloud: PointCloud,
-    options: FrameOptions,
-    clock: StageClock,
+    gray: NDArray[np.uint8], camera: Camera, prior: FramePrior, cloud: PointCloud, options: FrameOptions
 ) -> FrameViews | FrameRegistration:
     """Photo and scan, or the refusal where the scan is not in view."""
+    clock = StageClock()
     with clock.stage("look"):
         look = first_look(cloud, camera, prior.cam_from_local)
     if look is not None and look.cover >= MIN_COVER:
-        return FrameViews(gray, camera, cloud, look, options)
+        return FrameViews(gray, camera, cloud, look, options, clock)
     cover = 0.0 if look is None else look.cover
     words = f"the scan covers {100 * cover:.0f} % of what the prior sees; is it of this place?"
-    return _refused("NO_SCAN", words, {"cover": cover}, clock)
+    return _refused("NO_SCAN", words, clock, {"cover": cover})
 
 
-def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageClock) -> FrameRegistration:
+def _fitted(
+    views: FrameViews, prior: FramePrior, found: FrameHypothesis, evidence: dict[str, Any]
+) -> FrameRegistration:
+    """A fitted pose that needs no more than inliers."""
+    if len(found.inliers) < MIN_INLIERS:
+        words = f"{len(found.inliers)} independent inliers, {MIN_INLIERS} needed"
+        return _refused("TOO_FEW_MATCHES", words, views.clock)
+    return _accepted(views, found, frame_covariance(views, prior, found), evidence)
+
+
+def _verdict(views: FrameViews, prior: FramePrior, judged: Judged) -> FrameRegistration:
     found = judged.found
-    with clock.stage("verdict"):
+    with views.clock.stage("verdict"):
         covariance = frame_covariance(views, prior, found)
         evidence = _evidence(views, prior, judged, covariance)
     if asks_elsewhere(evidence):
-        with clock.stage("search elsewhere"):
+        with views.clock.stage("search elsewhere"):
             bears = highest_elsewhere(evidence.confirmation.log_nfa)
             places, log_nfa = agreement_elsewhere(
                 views, prior, found.pose.cam_from_local, found.source, MAX_PLACES_ELSEWHERE, bears
             )
             evidence = replace(evidence, places_elsewhere=places, elsewhere_log_nfa=log_nfa)
-    with clock.stage("verdict"):
+    with views.clock.stage("verdict"):
         refusal = verdict(evidence)
     figures = asdict(evidence) | {
         "matched_by": found.kind,
@@ -179,8 +181,8 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageC
         "pose_tried": found.pose.cam_from_local.matrix().tolist(),
     }
     if refusal is not None:
-        return _refused(*refusal, figures, clock)
-    return _accepted(found, covariance, figures, clock)
+        return _refused(*refusal, views.clock, figures)
+    return _accepted(views, found, covariance, figures)
 
 
 def frame_covariance(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FloatArray | None:
@@ -243,7 +245,7 @@ def _evidence(
 
 
 def _accepted(
-    found: FrameHypothesis, covariance: FloatArray | None, evidence: dict[str, Any], clock: StageClock
+    views: FrameViews, found: FrameHypothesis, covariance: FloatArray | None, evidence: dict[str, Any]
 ) -> FrameRegistration:
     return FrameRegistration(
         cam_from_local=found.pose.cam_from_local,
@@ -255,21 +257,11 @@ def _accepted(
         points_local=found.inliers.points,
         pixels=found.inliers.pixels,
         evidence=evidence,
-        seconds=clock.seconds,
+        seconds=views.clock.seconds,
     )
 
 
 def _refused(
-    reason: FrameReason, message: str, evidence: dict[str, object], clock: StageClock
+    reason: FrameReason, message: str, clock: StageClock, evidence: dict[str, Any] | None = None
 ) -> FrameRegistration:
-    return FrameRegistration(
-        cam_from_local=None,
-        covariance=None,
-        reason=reason,
-        message=message,
-        source=None,
-        points_local=np.empty((0, 3)),
-        pixels=np.empty((0, 2)),
-        evidence=evidence,
-        seconds=clock.seconds,
-    )
+    return FrameRegistration(reason=reason, message=message, evidence=evidence or {}, seconds=clock.seconds)

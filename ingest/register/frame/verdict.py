@@ -13,7 +13,6 @@ from ingest.register.frame_registration import FrameReason
 
 # Where the line is, by right and wrong registrations of the simulated town:
 # docs/measurements/registration.md.
-MIN_COVER = 0.03  # smallest share of a render that shows the scan
 MIN_INLIERS = 20  # fewer independent inliers are never believed
 # Smallest share of the parts of the photo where the scan should be seen that hold inliers.
 _MIN_AGREEMENT = 0.2
@@ -104,13 +103,9 @@ def weighed_log_nfa(evidence: FrameEvidence) -> float:
     """
     own, relief = evidence.confirmation, evidence.relief
     log_nfa = own.log_nfa
-    if relief is not None and _relief_speaks(evidence):
+    if relief is not None and relief.pieces >= MIN_PIECES:
         log_nfa = min(log_nfa, log_nfa_of(own.agreeing + relief.agreeing, own.pieces + relief.pieces))
     return log_nfa - max(0.0, evidence.prior_sigmas**2 - 6.0) / (2.0 * math.log(10.0))
-
-
-def _relief_speaks(evidence: FrameEvidence) -> bool:
-    return evidence.relief is not None and evidence.relief.pieces >= MIN_PIECES
 
 
 def highest_elsewhere(log_nfa: float) -> float:
@@ -129,24 +124,21 @@ def verdict(evidence: FrameEvidence) -> tuple[FrameReason, str] | None:
     if refusal is not None:
         return refusal
     if e.cells < _MIN_CELLS or e.agreement < _MIN_AGREEMENT:
-        return (
-            "NO_CONSISTENT_POSE",
+        return "NO_CONSISTENT_POSE", (
             f"inliers lie in {e.cells} of a hundred parts of the photo, {100 * e.agreement:.0f} % of those "
-            f"where the scan should be seen; {_MIN_CELLS} and {100 * _MIN_AGREEMENT:.0f} % needed",
+            f"where the scan should be seen; {_MIN_CELLS} and {100 * _MIN_AGREEMENT:.0f} % needed"
         )
     if e.rival_share >= _RIVAL_SHARE:
         return "AMBIGUOUS", f"a pose elsewhere has {100 * e.rival_share:.0f} % of this one's inliers"
     if e.position_sigma_share > _MAX_POSITION_SIGMA_SHARE:
-        return (
-            "NO_CONSISTENT_POSE",
+        return "NO_CONSISTENT_POSE", (
             f"the matches do not determine the pose: position known to {100 * e.position_sigma_share:.1f} % "
-            f"of the distance, {100 * _MAX_POSITION_SIGMA_SHARE:.1f} % needed",
+            f"of the distance, {100 * _MAX_POSITION_SIGMA_SHARE:.1f} % needed"
         )
     if e.prior_sigmas > MAX_PRIOR_SIGMAS:
-        return (
-            "CONTRADICTS_PRIOR",
+        return "CONTRADICTS_PRIOR", (
             f"the pose lies {e.prior_sigmas:.1f} deviations from the prior, {MAX_PRIOR_SIGMAS:.0f} "
-            "allowed; if the prior's deviations are too small, give larger ones",
+            "allowed; if the prior's deviations are too small, give larger ones"
         )
     return None
 
@@ -167,27 +159,23 @@ def _borne_out(log_nfa: float, confirmation: PictureConfirmation) -> bool:
 
 def _against_elsewhere(e: FrameEvidence) -> tuple[FrameReason, str] | None:
     if e.relief_only or e.places_elsewhere < _MIN_PLACES_ELSEWHERE:
-        return (
-            "NOT_CONFIRMED",
+        return "NOT_CONFIRMED", (
             f"the pictures agree too little at a pose that few features speak for: evidence of "
-            f"10^-{e.confirmation.log_nfa:.1f}, 10^-{SURE_CONFIRMATION_LOG_NFA:g} needed",
+            f"10^-{e.confirmation.log_nfa:.1f}, 10^-{SURE_CONFIRMATION_LOG_NFA:g} needed"
         )
     weighed = weighed_log_nfa(e)
     needed, with_relief = _MIN_WEIGHED_LOG_NFA, ""
-    if _relief_speaks(e):
+    if e.relief is not None and e.relief.pieces >= MIN_PIECES:
         needed, with_relief = _MIN_WITH_RELIEF, "with shaded relief, and "
     if weighed < needed:
-        return (
-            "NOT_CONFIRMED",
-            f"the pictures agree with 10^-{e.confirmation.log_nfa:.1f}; {with_relief}"
-            f"{e.prior_sigmas:.1f} deviations from the prior, 10^-{weighed:.1f} is left, "
-            f"10^-{needed:g} needed",
+        return "NOT_CONFIRMED", (
+            f"the pictures agree with 10^-{e.confirmation.log_nfa:.1f}; {with_relief}{e.prior_sigmas:.1f} "
+            f"deviations from the prior, 10^-{weighed:.1f} is left, 10^-{needed:g} needed"
         )
     if e.elsewhere_log_nfa > highest_elsewhere(e.confirmation.log_nfa):
-        return (
-            "AMBIGUOUS",
+        return "AMBIGUOUS", (
             f"evidence of 10^-{e.confirmation.log_nfa:.1f} at the pose found, and of "
-            f"10^-{e.elsewhere_log_nfa:.1f} at a place of the scan where the photo cannot be",
+            f"10^-{e.elsewhere_log_nfa:.1f} at a place of the scan where the photo cannot be"
         )
     return None
 
@@ -198,15 +186,11 @@ def cells_with_inliers(pixels: FloatArray, valid: NDArray[np.bool_], camera: Cam
     Args:
         pixels: (k, 2) full-size pixels. valid: (h, w) of a render from the pose.
     """
-    height, width = valid.shape
-    rows = np.arange(height) * 10 // height
-    columns = np.arange(width) * 10 // width
-    shown = np.zeros(100)
-    np.add.at(shown, (rows[:, None] * 10 + columns[None]).ravel(), valid.ravel())
-    expected = shown >= 0.5 * width * height / 100.0
+    rows, columns = np.nonzero(valid)
+    shown = rows * 10 // len(valid) * 10 + columns * 10 // valid.shape[1]
+    expected = np.bincount(shown, minlength=100) >= 0.5 * valid.size / 100.0
     held = np.zeros(100, dtype=bool)
-    column = np.clip((pixels[:, 0] * 10 / camera.width).astype(np.int64), 0, 9)
-    row = np.clip((pixels[:, 1] * 10 / camera.height).astype(np.int64), 0, 9)
+    column, row = np.clip((pixels * 10 / (camera.width, camera.height)).astype(np.int64), 0, 9).T
     held[row * 10 + column] = True
     share = float((held & expected).sum() / expected.sum()) if expected.any() else 0.0
     return int(held.sum()), share

@@ -6,9 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
@@ -18,11 +20,11 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.dense.confirmation import ConfirmOptions
-from ingest.register.frame.features.matching import Pool, pool_features
-from ingest.register.frame.verdict import MIN_COVER
+from featuredb.render.shading import shaded_relief
+from featuredb.stage_clock import StageClock
 from ingest.register.frame_registration import FramePrior, RenderSource
 
+MIN_COVER = 0.03  # smallest share of a render that shows the scan
 # Renders for features: so many pixels between scan points, since splats show nothing more, and at most that
 # longer side.
 FEATURES_SPACING_PX, _FEATURES_SIDE_PX = 1.5, 960
@@ -32,23 +34,39 @@ _LOOK_SIDE_PX = 200  # of the first look, which only measures distance and cover
 _LOOK_WIDER = 2.0  # and sees so many times as far to every side: the prior may look past the scan
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DenseFitOptions:
-    """How pieces are matched; lengths in pixels of the render.
+def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
+    """What can be rendered of a scan, most telling first."""
+    sources: list[RenderSource] = []
+    if cloud.rgb is not None:
+        sources.append("rgb")
+    if cloud.intensity is not None:
+        sources.append("intensity")
+    return (*sources, "shaded")
 
-    Attributes:
-        spacing_px: distance of neighbouring scan points in the renders, round by round: finer than the scan,
-            since edges between splats are known better than their spacing.
-        piece_px: least side of a piece, round by round.
-        more_rounds: at most, like the last one, until the pose moves less than a fifth of a pixel.
-        near_px: a piece's place is looked for this near, round by round: the first takes up what the search
-            left.
+
+def searched_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
+    """Those in which poses are searched, and not only compared.
+
+    Shaded relief has nothing to match and few edges (docs/measurements/descriptors.md): it is searched where
+    the scan has no more to show.
     """
+    *telling, shaded = available_sources(cloud)
+    return tuple(telling) or (shaded,)
 
-    spacing_px: tuple[float, ...] = (2.4, 3.75, 3.75)
-    piece_px: tuple[int, ...] = (28, 40, 40)
-    more_rounds: int = 8
-    near_px: tuple[int, ...] = (10, 6, 6)
+
+def source_image(rendering: Rendering, source: RenderSource) -> NDArray[np.uint8]:
+    """(h, w) uint8, what the render shows by one of the scan's properties.
+
+    Raises:
+        InvalidValueError: the scan does not have it.
+    """
+    if source == "shaded":
+        return shaded_relief(rendering)
+    if source == "rgb" and rendering.rgb is not None:
+        return np.asarray(cv2.cvtColor(rendering.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    if source == "intensity" and rendering.intensity is not None:
+        return rendering.intensity
+    raise InvalidValueError(f"source_image: expected a scan with {source}, found one without")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,13 +75,23 @@ class FrameOptions:
 
     Attributes:
         threads: for renders and features; 0 takes as many as the process may use, up to four.
-        dense_fit: how a pose is fitted to pieces.
-        confirm: how the pictures are asked.
+        fit_rounds: of fitting a pose to pieces, in pixels of the render: distance of neighbouring scan points
+            there, finer than the scan, since edges between splats are known better than their spacing; least
+            side of a piece; how near its place is looked for: the first takes up what the search left.
+        more_rounds: at most, like the last one, until the pose moves less than a fifth of a pixel.
+        finest_spacing: where pictures are to confirm a pose, a pixel is at least this share of the mean
+            distance between scan points.
+        min_agreeing: smallest share of their pieces that agree.
     """
 
     threads: int = 0
-    dense_fit: DenseFitOptions = field(default_factory=DenseFitOptions)
-    confirm: ConfirmOptions = field(default_factory=ConfirmOptions)
+    fit_rounds: tuple[tuple[float, int, int], ...] = ((2.4, 28, 10), (3.75, 40, 6), (3.75, 40, 6))
+    more_rounds: int = 8
+    finest_spacing: float = 1.2
+    min_agreeing: float = 0.18
+
+
+DEFAULTS = FrameOptions()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,35 +118,37 @@ def first_look(cloud: PointCloud, camera: Camera, cam_from_local: Rigid3) -> Fir
     depth = rendering.depth[rendering.valid]
     if len(depth) == 0:
         return None
-    spacing = _spacing_of_points(cloud, np.unique(rendering.index[rendering.index >= 0]))
-    return FirstLook(depth_m=float(np.median(depth)), cover=float(rendering.valid.mean()), spacing_m=spacing)
-
-
-def _spacing_of_points(cloud: PointCloud, rows: NDArray[np.int32]) -> float:
-    """Spacing of the finest nodes around some points of the cloud."""
+    rows, nodes = np.unique(rendering.index[rendering.index >= 0]), cloud.nodes
     sample = cloud.xyz[rows[:: max(len(rows) // 200, 1)]]
-    nodes = cloud.nodes
     inside = (sample[:, None] >= nodes.box_min).all(axis=2) & (sample[:, None] <= nodes.box_max).all(axis=2)
-    finest = np.where(inside, nodes.spacing_m, np.inf).min(axis=1)
-    return float(np.median(finest[np.isfinite(finest)]))
+    finest = np.where(inside, nodes.spacing_m, np.inf).min(axis=1)  # of the nodes around each
+    return FirstLook(
+        depth_m=float(np.median(depth)),
+        cover=float(rendering.valid.mean()),
+        spacing_m=float(np.median(finest[np.isfinite(finest)])),
+    )
 
 
+@dataclass(frozen=True, eq=False)
 class FrameViews:
     """One photo and one scan; renders and features are made on a small pool of threads.
 
-    Args:
-        gray: (h, w) uint8, the photo. camera: of the photo, full size.
+    Attributes:
+        gray: (h, w) uint8, the photo. camera: of the photo, full size. look: from the prior.
+        clock: of what is done with them.
     """
 
-    def __init__(
-        self,
-        gray: NDArray[np.uint8],
-        camera: Camera,
-        cloud: PointCloud,
-        look: FirstLook,
-        options: FrameOptions,
-    ) -> None:
-        self.gray, self.camera, self.cloud, self.look, self.options = gray, camera, cloud, look, options
+    gray: NDArray[np.uint8]
+    camera: Camera
+    cloud: PointCloud
+    look: FirstLook
+    options: FrameOptions
+    clock: StageClock = field(default_factory=StageClock)
+
+    @property
+    def threads(self) -> int:
+        """So many may be used."""
+        return self.options.threads or min(len(os.sched_getaffinity(0)), 4)
 
     @property
     def spacing_full_px(self) -> float:
@@ -142,7 +172,7 @@ class FrameViews:
         factor = min(side_px / max(camera.width, camera.height), 1.0)
         camera = camera.scaled_to(max(round(camera.width * factor), 1), max(round(camera.height * factor), 1))
         single = RenderOptions(threads=1)
-        with ThreadPoolExecutor(self._threads()) as threads:
+        with ThreadPoolExecutor(self.threads) as threads:
             made = list(threads.map(lambda pose: render(self.cloud, camera, pose, single), poses))
         return [r for r in made if r.valid.mean() >= MIN_COVER]
 
@@ -159,14 +189,6 @@ class FrameViews:
                 upright=True,
             ),
         )
-
-    def pools(self, renderings: Sequence[Rendering], source: RenderSource) -> list[Pool]:
-        """Features of each render with their scan points."""
-        with ThreadPoolExecutor(self._threads()) as threads:
-            return list(threads.map(lambda r: pool_features(r, source), renderings))
-
-    def _threads(self) -> int:
-        return self.options.threads or min(len(os.sched_getaffinity(0)), 4)
 
 
 # Where the scan is looked at from: a star of poses around the prior (paper, section 2.3).
@@ -208,7 +230,7 @@ def star_poses(prior: FramePrior, depth_m: float, camera: Camera) -> list[Rigid3
     zoom = 1.0 + _ARM_SIGMAS * _sigma_along(prior, forward) / depth_m
     zoom = float(np.clip(zoom, _MIN_ZOOM, _MAX_ZOOM))
     offsets += [depth_m * (1.0 - 1.0 / zoom) * forward, -depth_m * (zoom - 1.0) * forward]
-    return [_pose(rotation, center + offset) for offset in offsets]
+    return [Rigid3.from_center(rotation, center + offset) for offset in offsets]
 
 
 def fan_headings_deg(sigma_heading_deg: float) -> list[float]:
@@ -224,13 +246,9 @@ def fan_headings_deg(sigma_heading_deg: float) -> list[float]:
 def turned_about_vertical(cam_from_local: Rigid3, angle_deg: float) -> Rigid3:
     """The camera at the same place, its heading turned clockwise seen from above."""
     turn = so3_exp([0.0, 0.0, np.radians(angle_deg)])
-    return _pose(cam_from_local.rotation @ turn, cam_from_local.center)
+    return Rigid3.from_center(cam_from_local.rotation @ turn, cam_from_local.center)
 
 
 def _sigma_along(prior: FramePrior, axis: FloatArray) -> float:
     sigma = np.array([prior.sigma_horizontal_m, prior.sigma_horizontal_m, prior.sigma_vertical_m])
     return float(np.linalg.norm(sigma * axis))
-
-
-def _pose(rotation: FloatArray, center: FloatArray) -> Rigid3:
-    return Rigid3(rotation=rotation, translation=-rotation @ center)

@@ -8,7 +8,7 @@ import secrets
 from functools import partial
 from importlib import resources
 
-from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -39,33 +39,33 @@ def create_app(session: PickSession, token: str) -> FastAPI:
     """The application; everything lies below /TOKEN/."""
     html = (resources.files(_PACKAGE) / "assets" / "index.html").read_text(encoding="utf-8")
     app, in_thread = local_app("featuredb picks", html, _POLICY, assets_of(_PACKAGE, ""), f"/{token}")
-    below = APIRouter(prefix=f"/{token}")
+    api = f"/{token}/api"
 
-    @below.get("/api/state")
+    @app.get(f"{api}/state")
     async def state() -> Response:
         return JSONResponse(session.state())
 
-    @below.get("/api/ground.png")
+    @app.get(f"{api}/ground.png")
     async def ground() -> Response:
         return Response(await in_thread(session.ground_png), media_type="image/png")
 
-    @below.get("/api/photo/{image}")
+    @app.get(f"{api}/photo/{{image}}")
     async def photo(image: int) -> Response:
         return Response(await in_thread(partial(session.photo_jpeg, image)), media_type="image/jpeg")
 
-    @below.get("/api/overlay/{image}")
+    @app.get(f"{api}/overlay/{{image}}")
     async def overlay(image: int) -> Response:
         return Response(await in_thread(partial(session.overlay_png, image)), media_type="image/png")
 
-    @below.post("/api/solve")
+    @app.post(f"{api}/solve")
     async def solve(picks: _Picks) -> Response:
         return JSONResponse(await in_thread(partial(session.solve, picks.image, picks.picks)))
 
-    @below.post("/api/refine")
+    @app.post(f"{api}/refine")
     async def refine(picks: _Picks) -> Response:
         return JSONResponse(await in_thread(partial(session.refine, picks.image, picks.picks)))
 
-    @below.post("/api/confirm")
+    @app.post(f"{api}/confirm")
     async def confirm(picks: _Picks) -> Response:
         return JSONResponse(await in_thread(partial(session.confirm, picks.image)))
 
@@ -73,5 +73,4 @@ def create_app(session: PickSession, token: str) -> FastAPI:
     async def refused(request: Request, error: FeatureDbError) -> Response:
         return JSONResponse({"message": str(error)}, 400)
 
-    app.include_router(below)
     return app

@@ -22,7 +22,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from ingest.anchoring import Anchoring, AnchorRequest, anchor
 from ingest.register.anchor.files import PhotoFiles, find_photos
-from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
+from ingest.register.anchor.page import edge_layer, jpeg, png, scan_view
 from ingest.register.anchor.start.first_place import StartFiles, scans_of_one_zone
 from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
 from ingest.register.anchor.start.picks import focal_sigma_rel, least_picks, prior_of_picks
@@ -61,9 +61,6 @@ class PickSession:
     def state(self) -> dict[str, Any]:
         """What the page shows first."""
         height, width = self.ground.height.shape
-        counts = np.bincount(
-            self.map.observations.image_id, minlength=max(i.image_id for i in self.map.images) + 1
-        )
         return {
             "map": {
                 "id": self.map.map_id,
@@ -78,7 +75,7 @@ class PickSession:
                     "name": image.name,
                     "width": self.map.cameras[image.camera_id].width,
                     "height": self.map.cameras[image.camera_id].height,
-                    "points": int(counts[image.image_id]),
+                    "points": len(self.map.points_in(image)),
                     "least": least_picks(focal_sigma_rel(self.map, image)),
                 }
                 for image in self.map.images
@@ -169,19 +166,16 @@ class PickSession:
         with self._work:
             self._write_picks(image, spots)
             self._proposed = anchor(self.database, self._request(image))
-            tried = self._proposed.report.tried.tried
-            return {
-                "proposed": list(self._proposed.proposed),
-                "frames": [
-                    {
-                        "name": f.image.name,
-                        "accepted": f.registration.accepted,
-                        "message": f.registration.message or "registered",
-                        "reason": f.registration.reason or "",
-                    }
-                    for f in tried
-                ],
-            }
+            frames = [
+                {
+                    "name": f.image.name,
+                    "accepted": f.registration.accepted,
+                    "message": f.registration.message or "registered",
+                    "reason": f.registration.reason or "",
+                }
+                for f in self._proposed.report.tried.tried
+            ]
+            return {"proposed": list(self._proposed.proposed), "frames": frames}
 
     def confirm(self, image_id: int) -> dict[str, Any]:
         """Place the whole map by the frames that were registered, and commit it."""
@@ -192,16 +186,14 @@ class PickSession:
             done = anchor(self.database, self._request(image, self._proposed.proposed))
             result = done.report.result
             assert result is not None
-            after = None if result.after is None else result.after.median_m
+            undo = f"featuredb rollback {self.database.url} {done.version_before}"
             return {
                 "placed": done.placed,
                 "message": result.message,
                 "reason": result.reason or "",
-                "median_m": after,
+                "median_m": None if result.after is None else result.after.median_m,
                 "version": done.version,
-                "undo": f"featuredb rollback {self.database.url} {done.version_before}"
-                if done.placed
-                else "",
+                "undo": undo if done.placed else "",
                 "report": str(done.page),
             }
 

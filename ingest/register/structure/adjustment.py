@@ -26,8 +26,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.colmap.adjust import AdjustOptions, longest_side, residuals_of
 from ingest.colmap.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.pairs import Registered
-from ingest.register.structure.projection import StructurePlacement
+from ingest.register.structure.projection import Registered, StructurePlacement
 from ingest.register.structure.surface_fit import Surface, nearest_planes, surface_near
 
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
@@ -130,12 +129,7 @@ def adjust_to_scan(
         return LidarAdjustment(reason=reason, message=message, figures=figures)
     poses, lenses = _left_open(block, control, surface, structure, start)
     return LidarAdjustment(
-        reason=reason,
-        message=message,
-        block=block,
-        poses=poses,
-        lenses=lenses,
-        figures=figures,
+        reason=reason, message=message, block=block, poses=poses, lenses=lenses, figures=figures
     )
 
 
@@ -155,11 +149,10 @@ def placed_map(
     assert adjustment.block is not None
     map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
     move = map_from_cloud @ structure.new_from_old @ map_from_cloud.inverse()
-    covariance = map_from_cloud.carried(structure.covariance)
     placement = Placement(
         method="lidar",
         local_from_sfm=move @ feature_map.placement.local_from_sfm,
-        covariance=(covariance + covariance.T) / 2,
+        covariance=map_from_cloud.carried(structure.covariance),
         residual_rms_m=float(adjustment.figures["after"]["surface_rms_m"]),
         evidence={"adjustment": adjustment.figures, "replaces": feature_map.placement.method},
     )
@@ -176,11 +169,10 @@ def placed_map(
 
 def _control_of(feature_map: FeatureMap, registered: Registered) -> Marks:
     """Scan points that the registered frames see, by their correspondences."""
-    row_of_image = {image.image_id: row for row, image in enumerate(feature_map.images)}
     counts = [len(found.pixels) for found in registered.values()]
     return Marks(
         xyz=np.concatenate([found.points_local for found in registered.values()]),
-        photo_of=np.repeat([row_of_image[image_id] for image_id in registered], counts),
+        photo_of=np.repeat(feature_map.image_rows(np.array(list(registered), dtype=np.int32)), counts),
         xy=np.concatenate([found.pixels for found in registered.values()]),
     )
 
@@ -207,19 +199,17 @@ def _terms(
     least_rel: float,
     least_m: float,
 ) -> Terms:
-    """Each kind of residual weighs by its own spread as it is now.
+    """Each kind of residual weighs by its own spread as it is now, but by no less than the least.
 
-    Args:
-        least_rel: least standard deviation in pictures, over the longer side. least_m: from the surface.
+    That is `least_rel` of the longer side in pictures, and `least_m` from the surface.
     """
-    longer = longest_side(block.cameras)
+    least_px = least_rel * longest_side(block.cameras)
     offset, normals = nearest_planes(surface, block.xyz, _REACH_M)
+    control_px = max(least_px, _spread(_control_residuals(block, control)[0]))
     return Terms(
-        keypoint_px=max(least_rel * longer, _spread(residuals_of(block)[0])),
+        keypoint_px=max(least_px, _spread(residuals_of(block)[0])),
         lenses=tuple(lens_prior(camera, _LENS) for camera in lenses),
-        marks=replace(
-            control, sigma_px=max(least_rel * longer, _spread(_control_residuals(block, control)[0]))
-        ),
+        marks=replace(control, sigma_px=control_px),
         points=surface_priors(block.xyz, offset, normals, max(least_m, _spread(offset))),
     )
 
@@ -309,10 +299,8 @@ def _own_pose(block: Block, control: Marks, photo: int) -> Rigid3:
         residual, by_pose = found.residual[seen], found.by_pose[seen]
         relative = (residual**2).sum(axis=1) / max(4.0 * _spread(residual) ** 2, 1e-12)
         root = 1.0 / np.sqrt(1.0 + relative)[:, None]
-        step = np.linalg.lstsq(
-            (by_pose * root[:, None]).reshape(-1, 6), (residual * root).ravel(), rcond=None
-        )
-        pose = Rigid3.exp(step[0]) @ pose
+        weighed = (by_pose * root[:, None]).reshape(-1, 6)
+        pose = Rigid3.exp(np.linalg.lstsq(weighed, (residual * root).ravel(), rcond=None)[0]) @ pose
     return pose
 
 

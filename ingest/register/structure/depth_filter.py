@@ -99,13 +99,9 @@ def surface_at(rendering: Rendering, cloud: PointCloud, pixels: FloatArray) -> S
     inside = (column >= reach) & (row >= reach) & (column < width - reach) & (row < height - reach)
     rows = np.flatnonzero(inside)
     rows = rows[_reliable_at(rendering, row[rows], column[rows], stride)]
-    offset = np.arange(-reach, reach + 1, stride)
-    window = (
-        row[rows, None, None] + offset[None, :, None],
-        column[rows, None, None] + offset[None, None, :],
-    )
-    index = rendering.index[window].reshape(len(rows), _WINDOW**2)
-    depth = rendering.depth[window].reshape(len(rows), _WINDOW**2)
+    down, across = np.meshgrid(*[np.arange(-reach, reach + 1, stride)] * 2, indexing="ij")
+    window = (row[rows, None] + down.ravel(), column[rows, None] + across.ravel())
+    index, depth = rendering.index[window], rendering.depth[window]
     centre = rendering.depth[row[rows], column[rows]]
     near = (index >= 0) & (np.abs(depth / centre[:, None] - 1.0) <= 4 * _MAX_STEP_REL)
     ordered = np.sort(np.where(near, index, -1), axis=1)

@@ -6,19 +6,27 @@ pairs by their own covariance and knows that all pairs of a frame share its pose
 which slides over flat ground, comes the adjustment by the scan's surface (`adjustment.py`).
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.move import full_covariances
 from featuredb.render.cloud import PointCloud
-from ingest.register.structure.pairs import Registered, structure_pairs
+from featuredb.render.renderer import RenderOptions, render
+from ingest.register.frame_registration import FrameRegistration
+from ingest.register.structure.depth_filter import SurfaceHits, surface_at
 from ingest.register.structure.similarity import Pairs, SimilarityFit, ransac_similarity, refine_similarity
 
+Registered = Mapping[int, FrameRegistration]  # accepted, in the local frame of the cloud, by image id
 StructureReason = Literal["TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
 
 # A pair further off, as a share of its distance from the camera, is an outlier of RANSAC: reconstructions
@@ -36,6 +44,16 @@ _MAX_RESIDUAL_REL = 0.01  # root mean square of the inliers' residuals over thei
 # to a tenth or better.
 _MAX_SCALE_CHANGE = 0.05
 _SCALE_SIGMAS = 4.0  # how many sigmas of both placements the scale may differ
+# Of the depth image; about the resolution at which airborne scans have a point in most pixels of a drone's
+# photo. Hits come from keypoints and scan points, whatever the resolution: of 1000 px, the image takes two to
+# three times as long, and maps lie within a fifth of their sigmas of where they do now.
+_RENDER_WIDTH_PX = 600
+# Standard deviation of a keypoint against the scan, as a share of the photo's longer side: a pixel in 2000,
+# what lens models leave.
+_PIXEL_SIGMA_REL = 0.0005
+_SCAN_SIGMA_M = 0.03  # of the scan's points across their surface, beyond what the roughness shows
+_MAX_POINT_SIGMA_REL = 0.05  # map points less certain than this share of their distance are left out
+_CELLS = 6  # per side of the grid of neighbourhoods in a frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,11 +82,7 @@ class StructurePlacement:
 def project_structure(
     feature_map: FeatureMap, registered: Registered, cloud: PointCloud
 ) -> StructurePlacement:
-    """Place a map on a scan by frames of the map that were registered to it.
-
-    Args:
-        registered: frames with their poses in the cloud's local frame, at least one.
-    """
+    """Place a map on a scan by frames of the map, one or more, that were registered to it."""
     source = feature_map.points_local(cloud.frame)
     pairs = structure_pairs(feature_map, source, registered, cloud)
     if len(pairs) < _MIN_PAIRS:
@@ -89,15 +103,10 @@ def project_structure(
     fit = refine_similarity(start, kept)
     figures |= _figures_of_fit(fit, kept, feature_map, registered)
     reason, message = _gate_of_fit(fit, distances[near], figures)
+    placed = StructurePlacement(reason=reason, message=message, figures=figures)
     if reason is not None:
-        return StructurePlacement(reason=reason, message=message, figures=figures)
-    return StructurePlacement(
-        reason=None,
-        message="placed on the scan",
-        new_from_old=fit.target_from_source,
-        covariance=fit.covariance,
-        figures=figures,
-    )
+        return placed
+    return replace(placed, new_from_old=fit.target_from_source, covariance=fit.covariance)
 
 
 def _gate_of_pairs(
@@ -117,20 +126,13 @@ def _gate_of_pairs(
         "ransac_inlier_share": used / len(pairs),
         "spread_rel": spread,
     }
+    needed = f"at least {_MIN_PAIRS} and {_MIN_INLIER_SHARE:.0%} are needed"
     if used < _MIN_PAIRS or used < _MIN_INLIER_SHARE * len(pairs):
-        return (
-            "TOO_FEW_PAIRS",
-            f"{used} of {len(pairs)} pairs agree on a similarity, at least {_MIN_PAIRS} and "
-            f"{_MIN_INLIER_SHARE:.0%} are needed",
-            figures,
-        )
+        words = f"{used} of {len(pairs)} pairs agree on a similarity, {needed}"
+        return "TOO_FEW_PAIRS", words, figures
     if spread < _MIN_SPREAD_REL:
-        return (
-            "NO_SPREAD",
-            f"the pairs lie along a line: {spread:.1%} of their distance across it, at least "
-            f"{_MIN_SPREAD_REL:.0%} are needed",
-            figures,
-        )
+        words = f"the pairs lie along a line: {spread:.1%} of their distance across it"
+        return "NO_SPREAD", f"{words}, at least {_MIN_SPREAD_REL:.0%} are needed", figures
     return None, "", figures
 
 
@@ -180,4 +182,75 @@ def _gate_of_fit(
             f"the map would change its size by {change:.1%}, at most {allowed:.1%} agrees with its present "
             "placement"
         )
-    return None, ""
+    return None, "placed on the scan"
+
+
+def structure_pairs(
+    feature_map: FeatureMap, source: FloatArray, registered: Registered, cloud: PointCloud
+) -> Pairs:
+    """Pairs of all frames; `source` (n, 3): the map's points at their present place, in the cloud's frame."""
+    images = {image.image_id: image for image in feature_map.images}
+    uncertainty = full_covariances(feature_map.points.covariance)
+    parts = [
+        _pairs_of_frame(feature_map, source, uncertainty, images[image_id], registration, row, cloud)
+        for row, (image_id, registration) in enumerate(registered.items())
+    ]
+    return Pairs(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Pairs)})
+
+
+def _pairs_of_frame(
+    feature_map: FeatureMap,
+    source: FloatArray,
+    uncertainty: FloatArray,
+    image: MapImage,
+    registration: FrameRegistration,
+    row: int,
+    cloud: PointCloud,
+) -> Pairs:
+    pose, covariance, camera = registration.cam_from_local, registration.covariance, registration.camera
+    assert pose is not None
+    assert covariance is not None
+    assert camera is not None  # accepted
+    width = min(_RENDER_WIDTH_PX, camera.width)
+    small = camera.scaled_to(width, round(camera.height * width / camera.width))
+    rendering = render(cloud, small, pose, RenderOptions(threads=1, attributes=False))
+    xy = feature_map.observations.xy[feature_map.observations.image_id == image.image_id]
+    pixels = xy.astype(np.float64) * (small.width / camera.width, small.height / camera.height)
+    hits = surface_at(rendering, cloud, pixels)
+    points = feature_map.points_in(image)[hits.rows]
+    largest = np.linalg.eigvalsh(uncertainty[points])[:, -1]
+    own, by_frame = _errors(hits, pose, camera)
+    at = pixels[hits.rows] / (small.width, small.height)
+    grid = np.minimum((at * _CELLS).astype(np.int64), _CELLS - 1)
+    pairs = Pairs(
+        frame_of=np.full(len(points), row, dtype=np.int64),
+        source=source[points],
+        target=hits.points,
+        covariance=own + uncertainty[points],
+        by_frame=by_frame,
+        cell_of=row * _CELLS**2 + grid[:, 1] * _CELLS + grid[:, 0],
+        frame_covariance=covariance[None],
+    )
+    distance = np.linalg.norm(hits.points - pose.center, axis=1)
+    return pairs.of(largest <= (_MAX_POINT_SIGMA_REL * distance) ** 2)
+
+
+def _errors(hits: SurfaceHits, pose: Rigid3, camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """Covariance (n, 3, 3) of each hit by its own errors, and derivative (n, 3, 6) by the frame's pose.
+
+    A ray that turns or shifts by d meets the surface's plane at d - u (n.d)/(n.u), u being its direction.
+    """
+    rays = hits.points - pose.center
+    direction = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    facing = np.einsum("ij,ij->i", hits.normals, direction)
+    slide = np.eye(3) - direction[:, :, None] * hits.normals[:, None, :] / facing[:, None, None]
+    pixel_m = _PIXEL_SIGMA_REL * max(camera.width, camera.height) / camera.focal_px * hits.depths
+    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    shifted = slide @ across
+    own = (pixel_m**2)[:, None, None] * shifted @ np.swapaxes(shifted, 1, 2)
+    along = hits.sigma_ray_m**2 + (_SCAN_SIGMA_M / facing) ** 2
+    own += along[:, None, None] * direction[:, :, None] * direction[:, None, :]
+    # T_true = exp(xi) T moves the point at camera coordinates p by -R' (omega x p + nu).
+    in_camera = pose.act(hits.points)
+    by_pose = np.concatenate([skew(in_camera), np.broadcast_to(-np.eye(3), (len(rays), 3, 3))], axis=2)
+    return own, slide @ (pose.rotation.T @ by_pose)

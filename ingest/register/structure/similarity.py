@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
@@ -119,7 +120,7 @@ def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
     """
     root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(pairs.covariance)), 1, 2)
     cell = np.unique(pairs.cell_of, return_inverse=True)[1]
-    prior = _prior(pairs.frame_covariance)
+    prior = block_diag(np.zeros((7, 7)), *np.linalg.inv(pairs.frame_covariance))  # of the frames' poses
     sim = start
     solution: FloatArray = np.zeros(len(prior))
     for _ in range(2):  # linear about the start, then about what that came to
@@ -154,23 +155,11 @@ def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
     )
 
 
-def _prior(frame_covariance: FloatArray) -> FloatArray:
-    """(7 + 6 f, 7 + 6 f) what is known of the frames' poses, as a normal matrix."""
-    prior = np.zeros((7 + 6 * len(frame_covariance),) * 2)
-    for first, covariance in enumerate(frame_covariance):
-        own = slice(7 + 6 * first, 13 + 6 * first)
-        prior[own, own] = np.linalg.inv(covariance)
-    return prior
-
-
 def _linearised(sim: Sim3, pairs: Pairs, root: FloatArray) -> list[FloatArray]:
-    """(14, 3 m) of each frame's m pairs, whitened: derivatives, and what they are to explain.
+    """(14, 3 m) of each frame's m pairs, whitened by `root` (n, 3, 3): derivatives, what they are to explain.
 
     Derivatives of placed source minus moved target, by the similarity (7) and by the frame (6); then target
     minus placed source.
-
-    Args:
-        root: (n, 3, 3) that whitens.
     """
     placed = sim.act(pairs.source)
     columns = [point_jacobian(placed), -pairs.by_frame, (pairs.target - placed)[:, :, None]]

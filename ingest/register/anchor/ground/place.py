@@ -19,11 +19,10 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
-from ingest.register.anchor.ground.parts import parts
 from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit, fitted, laid, shape_of
 from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
-from ingest.register.anchor.ground.street_plan import StreetPlan, street_plan
-from ingest.register.anchor.together.evidence import JointEvidence
+from ingest.register.anchor.ground.street_plan import StreetPlan, parts, street_plan
+from ingest.register.frame.dense.confirmation import JointEvidence
 
 _LOG = logging.getLogger(__name__)
 
@@ -92,11 +91,7 @@ class _Tried:
 
 
 def place_on_outlines(unplaced: UnplacedMap, cloud: PointCloud) -> GroundPlace:
-    """Place a map of street photos on a scan, or else the first of its parts that lies somewhere.
-
-    Args:
-        cloud: all of the scan on which the map may lie.
-    """
+    """Place a map of street photos on all of a scan, or else the first of its parts that lies somewhere."""
     whole: GroundPlace | None = None
     for number, part in enumerate(parts(unplaced, _LEAST_PHOTOS), start=1):
         found = _place(part, cloud, number * (number + 1))  # the inverses of these add up to one
@@ -124,15 +119,14 @@ def _place(unplaced: UnplacedMap, cloud: PointCloud, tests: int) -> GroundPlace:
 
 def geotags_of(unplaced: UnplacedMap, cloud: PointCloud) -> Geotags | None:
     """Where the map's photos say they were taken; None where fewer than two do."""
-    rows = [k for k, image in enumerate(unplaced.images) if image.gps is not None]
-    tags = [image.gps for image in unplaced.images if image.gps is not None]
-    if len(tags) < 2:
+    told = [(k, image.gps) for k, image in enumerate(unplaced.images) if image.gps is not None]
+    if len(told) < 2:
         return None
-    geodetic = np.array([(tag.latitude_deg, tag.longitude_deg, cloud.frame.height_m) for tag in tags])
+    geodetic = np.array([(tag.latitude_deg, tag.longitude_deg, cloud.frame.height_m) for _, tag in told])
     return Geotags(
-        rows=np.array(rows),
+        rows=np.array([k for k, _ in told]),
         xy=cloud.frame.enu_from_geodetic(geodetic)[:, :2],
-        sigma_m=np.array([max(tag.sigma_horizontal_m, 5.0) for tag in tags]),
+        sigma_m=np.array([max(tag.sigma_horizontal_m, 5.0) for _, tag in told]),
     )
 
 
@@ -204,11 +198,8 @@ def _judged(
         kept = _lie_there(unplaced, plan, shape, sim, rate)
     figures: dict[str, Any] = {"photos": int(kept.sum()), "of": len(kept), "rate": rate}
     if kept.sum() < _LEAST_PHOTOS:
-        return GroundPlace(
-            reason="TOO_FEW_FRAMES",
-            message=f"{int(kept.sum())} of its photos lie on the scan",
-            figures=figures,
-        )
+        few = f"{int(kept.sum())} of its photos lie on the scan"
+        return GroundPlace(reason="TOO_FEW_FRAMES", message=few, figures=figures)
     rows = _rows_seen(unplaced, plan, kept)
     there_m = (one.fit.local_from_own.act(plan.points[rows]) - sim.act(plan.points[rows]) for one in there)
     away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])
@@ -234,16 +225,15 @@ def _judged(
         "rival": max(rivals, default=0.0),
         "camera_height_m": float((centers[:, 2] - shape.ground[shape.cells(centers[:, :2])]).mean()),
     }
-    local_from_own = sim @ plan.upright_from_own
     words = (
         f"{int(kept.sum())} of {len(kept)} photos lie on the scan's outlines: "
         f"{final.evidence.agreeing:.0f} of {final.evidence.places} places agree"
     )
-    covariance, rms_m = _covariance(final.fit)
+    covariance, rms_m = _covariance(final)
     found = GroundPlace(
         reason=None,
         message=words,
-        local_from_own=local_from_own,
+        local_from_own=sim @ plan.upright_from_own,
         covariance=covariance,
         image_ids=tuple(i.image_id for i, stays in zip(unplaced.images, kept, strict=True) if stays),
         residual_rms_m=rms_m,
@@ -311,12 +301,11 @@ def _lie_there(
     share = agreeing / np.maximum(count, 1)
     usual = float(np.average(share, weights=share * count)) if agreeing.sum() > 0 else 0.0
     stays = (share >= 0.5 * (usual + rate)) & (count > 0)
+    seen = np.maximum(np.bincount(image, minlength=len(stays)), 1)
     while stays.any():
         views = np.bincount(row[stays[image]], minlength=len(plan.rows))
         others = views[row] - stays[image] >= 1
-        tied = np.bincount(image, others, minlength=len(stays)) / np.maximum(
-            np.bincount(image, minlength=len(stays)), 1
-        )
+        tied = np.bincount(image, others, minlength=len(stays)) / seen
         left = stays & (tied >= _TIED)
         if (left == stays).all():
             break
@@ -336,9 +325,9 @@ def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: S
     return float(binom.sf(wins - 1, wins + losses, 0.5)) if wins + losses else 1.0
 
 
-def _covariance(fit: SolidFit) -> tuple[FloatArray, float]:
+def _covariance(final: _Tried) -> tuple[FloatArray, float]:
     """(7, 7) of the left perturbation: neighbours err together, outlines by one offset, all within a cell."""
-    agrees = (np.abs(fit.off_m) < _AGREE_M) & (fit.near_m < _NEAR_M)
+    fit, agrees = final.fit, final.agrees
     rms_m = float(np.sqrt(np.mean(np.square(fit.off_m[agrees])))) if agrees.any() else _AGREE_M
     blocks = len(np.unique(np.floor(fit.placed[agrees] / _BLOCK_M).astype(np.int64), axis=0))
     factor = max(1.0, np.count_nonzero(agrees) / max(blocks, 1))

@@ -65,11 +65,7 @@ class ScanShape:
 
 
 def shape_of(cloud: PointCloud, circle: tuple[float, float, float] | None = None) -> ScanShape | None:
-    """The solid that a scan shows; None where it shows no surface.
-
-    Args:
-        circle: x, y, radius of what is asked for.
-    """
+    """The solid that a scan shows within a circle (x, y, radius); None where it shows no surface."""
     shown = ~np.isin(cloud.classification, _VEGETATION)
     if circle is not None:
         shown &= np.hypot(cloud.xyz[:, 0] - circle[0], cloud.xyz[:, 1] - circle[1]) < circle[2]
@@ -80,29 +76,25 @@ def shape_of(cloud: PointCloud, circle: tuple[float, float, float] | None = None
     size = np.ceil((xyz[:, :2].max(axis=0) - corner) / CELL_M).astype(np.int64) + 1
     at = np.floor((xyz[:, :2] - corner) / CELL_M).astype(np.int64)
     flat = at[:, 1] * size[0] + at[:, 0]
-    top = np.full(size[0] * size[1], -np.inf)
-    np.maximum.at(top, flat, xyz[:, 2])
-    lowest = np.full(size[0] * size[1], np.inf)
-    np.minimum.at(lowest, flat, xyz[:, 2])
-    shape = (int(size[1]), int(size[0]))
-    top, lowest = top.reshape(shape), lowest.reshape(shape)
+    top, lowest = np.full(size[::-1], -np.inf), np.full(size[::-1], np.inf)
+    np.maximum.at(top.reshape(-1), flat, xyz[:, 2])
+    np.minimum.at(lowest.reshape(-1), flat, xyz[:, 2])
     seen = np.isfinite(top)
     top, known = _filled(top, seen)
     top = median_filter(top, 3)
     low = median_filter(minimum_filter(_filled(lowest, seen)[0], 3), 5)
     window = int(_WIDEST_M / CELL_M) | 1
     ground = gaussian_filter(grey_opening(low, (window, window)), 4.0)
-    surface, surface_normals = _surfaces(xyz, flat, top, lowest, seen)
     walls = _walls(top, known, corner, xyz)
-    upright, upright_normals = _standing(walls)
-    points = np.vstack([surface, upright])
+    parts = zip(_surfaces(xyz, flat, top, lowest, seen), _standing(walls), strict=True)
+    points, normals = (np.vstack(part) for part in parts)
     return ScanShape(
         corner=corner,
         ground=ground,
         top=top,
         known=known,
         points=points,
-        normals=np.vstack([surface_normals, upright_normals]),
+        normals=normals,
         tree=cKDTree(points),
         walls=walls[:, :4],
     )

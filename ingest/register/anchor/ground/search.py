@@ -55,14 +55,14 @@ class Geotags:
 
     def circle(self, plan: StreetPlan, size: float, turn: float) -> tuple[float, float, float]:
         """x, y and radius of where the middle of the plan's cameras may be."""
-        off = self._offsets(plan, size, turn)
-        x, y = np.median(off, axis=0).tolist()
-        sigma = _LOOSE * float(np.sum(self.sigma_m**-2.0)) ** -0.5
-        return x, y, _SIGMAS * sigma + _NEAR_M
+        return self._about(self._offsets(plan, size, turn), _NEAR_M)
 
     def around(self, reach_m: float) -> tuple[float, float, float]:
         """x, y and radius of what lies within a reach of where the photos may have been taken."""
-        x, y = np.median(self.xy, axis=0).tolist()
+        return self._about(self.xy, reach_m)
+
+    def _about(self, xy: FloatArray, reach_m: float) -> tuple[float, float, float]:
+        x, y = np.median(xy, axis=0).tolist()
         sigma = _LOOSE * float(np.sum(self.sigma_m**-2.0)) ** -0.5
         return x, y, _SIGMAS * sigma + reach_m
 
@@ -86,11 +86,9 @@ class PlanSearch:
         at = np.floor((shape.walls[:, :2] - shape.corner) / _CELL_M).astype(np.int64)
         inside = ((at >= 0) & (at < np.array([columns, rows]))).all(axis=1)
         at, out = at[inside], shape.walls[inside, 2:4]
-        channels = []
-        for values in _harmonics(out):
-            picture = np.zeros(self._shape)
+        channels = np.zeros((len(_harmonics(out)), *self._shape))
+        for picture, values in zip(channels, _harmonics(out), strict=True):
             np.add.at(picture, (at[:, 1], at[:, 0]), values)
-            channels.append(picture)
         strength = gaussian_filter(channels[0], _BLUR_CELLS)
         scale = 1.0 / np.percentile(strength[strength > 1e-3], 75) if (strength > 1e-3).any() else 1.0
         self._channels = [
@@ -182,11 +180,10 @@ def best_tries(tries: Sequence[PlanTry], count: int) -> list[PlanTry]:
 
 
 def _same(one: PlanTry, other: PlanTry) -> bool:
+    away = np.hypot(one.x - other.x, one.y - other.y)
     turn = abs((one.turn - other.turn + np.pi) % (2.0 * np.pi) - np.pi)
     size = abs(np.log(one.size / other.size))
-    return bool(
-        np.hypot(one.x - other.x, one.y - other.y) < _NEAR_M and turn < _NEAR_TURN and size < _NEAR_SIZE
-    )
+    return bool(away < _NEAR_M and turn < _NEAR_TURN and size < _NEAR_SIZE)
 
 
 def _harmonics(out: FloatArray) -> list[FloatArray]:

@@ -11,8 +11,7 @@ from featuredb.errors import InvalidValueError, RegistrationError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import chosen_scans, load_cloud
-from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
-from featuredb.maps.move import placed_map
+from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
@@ -21,13 +20,11 @@ from featuredb.store.scans import ScanSummary
 from ingest.register.anchor.files import PhotoFiles
 from ingest.register.anchor.ground.place import place_on_outlines
 from ingest.register.anchor.ground.street_plan import looks_level
-from ingest.register.anchor.start.files import RoughPose, read_picks, read_pose
-from ingest.register.anchor.start.from_above import FoundFromAbove, found_from_above
-from ingest.register.anchor.start.from_ortho import FoundByOrtho, found_by_ortho
-from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks
-from ingest.register.anchor.start.priors import image_named
+from ingest.register.anchor.start.from_above import MIN_LOG_NFA, found_from_above
+from ingest.register.anchor.start.from_ortho import found_by_ortho
+from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks, read_picks
+from ingest.register.anchor.start.priors import RoughPose, image_named, place_by_photo, placed_on, read_pose
 from ingest.register.frame_registration import FramePrior
-from ingest.register.place_map import place_by_photo
 
 # Scan around a map's points and cameras that may be seen, metres: errors of GPS, and what frames show beside
 # the map's points.
@@ -72,6 +69,11 @@ class Circle:
 
     def __str__(self) -> str:
         return f"{self.lat!r},{self.lon!r},{self.radius_m!r}"
+
+    @property
+    def middle(self) -> str:
+        """For people."""
+        return f"{self.lat:.6f}, {self.lon:.6f}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,40 +156,22 @@ def started_images(
     Raises:
         RegistrationError: no such photo, or picks do not determine a pose.
     """
+    upright = not isinstance(feature_map, UnplacedMap) or feature_map.frame.upright
     started = []
     for one in told:
-        if isinstance(one, Picks):
-            started.append(_by_picks(feature_map, one, frame, epsg))
-            continue
         image = image_named(feature_map, str(one.image))
-        started.append(
-            StartedImage(
-                image=image,
-                prior=one.prior(frame, epsg),
-                camera=feature_map.cameras[image.camera_id],
-                note=f"{image.name} starts from the pose given for it",
-            )
-        )
+        camera = feature_map.cameras[image.camera_id]
+        if isinstance(one, Picks):
+            points, present = frame.enu_from_utm(one.utm, epsg), image.cam_from_local if upright else None
+            prior, fit = pose_from_picks(one, points, camera, present, focal_sigma_rel(feature_map, image))
+            camera, residual_px = fit.camera, float(np.median(fit.distances_px[fit.believed]))
+            note = f"{image.name} starts from {len(one.pixels)} picks, median residual {residual_px:.1f} px"
+            if fit.wrong:
+                note += f"; they contradict the others: line {', '.join(str(i + 1) for i in fit.wrong)}"
+        else:
+            prior, note = one.prior(frame, epsg), f"{image.name} starts from the pose given for it"
+        started.append(StartedImage(image=image, prior=prior, camera=camera, note=note))
     return started
-
-
-def _by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -> StartedImage:
-    image = image_named(feature_map, picks.image)
-    upright = not isinstance(feature_map, UnplacedMap) or feature_map.frame.upright
-    prior, fit = pose_from_picks(
-        picks,
-        frame.enu_from_utm(picks.utm, epsg),
-        feature_map.cameras[image.camera_id],
-        image.cam_from_local if upright else None,
-        focal_sigma_rel(feature_map, image),
-    )
-    note = (
-        f"{image.name} starts from {len(picks.pixels)} picks, median residual "
-        f"{float(np.median(fit.distances_px[fit.believed])):.1f} px"
-    )
-    if fit.wrong:
-        note += f"; they contradict the others: line {', '.join(str(i + 1) for i in fit.wrong)}"
-    return StartedImage(image=image, prior=prior, camera=fit.camera, note=note)
 
 
 def first_place(
@@ -214,17 +198,23 @@ def first_place(
     started: list[StartedImage] = []
     by_look, on_outlines = False, files.near is not None and looks_level(unplaced)
     if files.near is not None:
+        frame = LocalFrame(latitude_deg=files.near.lat, longitude_deg=files.near.lon, height_m=0.0)
+        where = f"{files.near.middle}; `featuredb lidar list` tells where scans lie"
+        cloud = _cloud_within(database, frame, (0.0, 0.0), files.near.radius_m, ids, where)
         if on_outlines:
-            feature_map, note = _on_outlines(database, unplaced, files.near, ids)
+            feature_map, note = _on_outlines(unplaced, files.near, cloud)
         else:
-            feature_map, note, by_look = _found_near(database, unplaced, files.near, ids, photos)
+            feature_map, note, by_look = _found_near(unplaced, files.near, cloud, ids, photos)
         notes: tuple[str, ...] = (note,)
     else:
         told = files.read()
         east, north, up = np.median(np.vstack([one.utm for one in told]), axis=0).tolist()
         frame = LocalFrame.from_utm(east, north, up, epsg)
         started = started_images(unplaced, told, frame, epsg)
-        feature_map = _put_by(database, unplaced, started[0], frame, ids)
+        first = started[0]
+        x, y, _ = first.prior.cam_from_local.center.tolist()
+        cloud = _cloud_within(database, frame, (x, y), _FIRST_REACH_M, ids, "where the photo is put")
+        feature_map = place_by_photo(unplaced, first.image, first.camera, first.prior, cloud)
         notes = tuple(s.note for s in started)
     return FirstPlace(
         feature_map=feature_map,
@@ -237,109 +227,67 @@ def first_place(
     )
 
 
-def _on_outlines(
-    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...]
-) -> tuple[FeatureMap, str]:
-    """The street photos that lie where fronts and the scan's outlines agree, with a line.
+def _cloud_within(
+    database: Database,
+    frame: LocalFrame,
+    xy: tuple[float, float],
+    reach: float,
+    ids: tuple[str, ...],
+    where: str,
+) -> PointCloud:
+    """The scans within metres of a place, of which there must be some; `where` says for people where."""
+    x, y = xy
+    cloud = load_cloud(database, frame, (x - reach, y - reach, x + reach, y + reach), scan_ids=ids)
+    if not len(cloud):
+        raise RegistrationError(f"no scan of {database.url} lies within {reach:.0f} m of {where}")
+    return cloud
 
-    Raises:
-        RegistrationError: they agree nowhere.
-    """
-    cloud = _cloud_near(database, near, scan_ids)
+
+def _on_outlines(unplaced: UnplacedMap, near: Circle, cloud: PointCloud) -> tuple[FeatureMap, str]:
+    """The street photos that lie where fronts and the scan's outlines agree, with a line."""
     found = place_on_outlines(unplaced, cloud)
     if found.local_from_own is None or found.covariance is None or found.reason is not None:
         raise RegistrationError(
             f"map {unplaced.map_id}, of photos from the street, is not found within {near.radius_m:.0f} m of "
-            f"{near.lat:.6f}, {near.lon:.6f} by the fronts that it shows: {found.reason}: {found.message}. A "
+            f"{near.middle} by the fronts that it shows: {found.reason}: {found.message}. A "
             "smaller radius has fewer places that look alike (--near=LAT,LON,RADIUS_M); or say where a photo "
             "is: --page, --picks FILE, --pose FILE"
         )
-    placement = Placement(
-        method="lidar",
-        local_from_sfm=found.local_from_own,
-        covariance=found.covariance,
-        residual_rms_m=found.residual_rms_m,
-        evidence={"outlines": {"near": str(near), "words": found.message, **found.figures}},
-    )
-    kept = only_images(unplaced, found.image_ids)
-    placed = placed_map(kept, placement, cloud.frame, cloud.height_datum)
+    evidence = {"outlines": {"near": str(near), "words": found.message, **found.figures}}
+    kept, sim = only_images(unplaced, found.image_ids), found.local_from_own
+    placed = placed_on(kept, cloud, sim, found.covariance, evidence, found.residual_rms_m)
     return placed, f"placed by outlines: {found.message}"
 
 
-def _cloud_near(database: Database, near: Circle, scan_ids: tuple[str, ...]) -> PointCloud:
-    """The scans within a circle.
-
-    Raises:
-        RegistrationError: there are none.
-    """
-    frame = LocalFrame(latitude_deg=near.lat, longitude_deg=near.lon, height_m=0.0)
-    reach = near.radius_m
-    cloud = load_cloud(database, frame, (-reach, -reach, reach, reach), scan_ids=scan_ids)
-    if not len(cloud):
-        raise RegistrationError(
-            f"no scan of {database.url} lies within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}; "
-            "`featuredb lidar list` tells where scans lie"
-        )
-    return cloud
-
-
 def _found_near(
-    database: Database, unplaced: UnplacedMap, near: Circle, scan_ids: tuple[str, ...], photos: PhotoFiles
+    unplaced: UnplacedMap, near: Circle, cloud: PointCloud, scan_ids: tuple[str, ...], photos: PhotoFiles
 ) -> tuple[FeatureMap, str, bool]:
     """The map where the scans near a place show the same, a line on it, and whether it was only its look."""
-    cloud, reach = _cloud_near(database, near, scan_ids), near.radius_m
     if cloud.rgb is None and cloud.intensity is None:
         raise RegistrationError(
             f"scan {', '.join(scan_ids)} has neither colours nor intensities, and nothing is looked for by "
             "heights alone; say where one photo is: --page, --picks FILE, --pose FILE"
         )
     by_features = found_from_above(unplaced, cloud)
-    found: FoundFromAbove | FoundByOrtho | None = by_features
-    if by_features is None or not by_features.sure:
-        found = found_by_ortho(unplaced, cloud, photos)
+    by_look = by_features is None or by_features.evidence < MIN_LOG_NFA
+    found = found_by_ortho(unplaced, cloud, photos) if by_look else by_features
     if found is None:
         words = "nothing of it matches the scan"
         if by_features is not None:
-            words = f"{by_features.words()}, which chance gives, too"
+            words = f"{by_features.words}, which chance gives, too"
         raise RegistrationError(
-            f"map {unplaced.map_id} is not found within {reach:.0f} m of {near.lat:.6f}, {near.lon:.6f}: "
+            f"map {unplaced.map_id} is not found within {near.radius_m:.0f} m of {near.middle}: "
             f"{words}. A smaller radius shows the scan finer (--near=LAT,LON,RADIUS_M), colours show "
             "more than intensities; or say where one photo is: --page, --picks FILE, --pose FILE"
         )
-    placement = Placement(
-        method="lidar",
-        local_from_sfm=found.local_from_own,
-        covariance=found.covariance,
-        residual_rms_m=0.0,
-        evidence={"start": {"near": str(near), "no_place": unplaced.no_place.reason_code}},
-    )
-    note = f"found near {near.lat:.6f}, {near.lon:.6f}: {found.words()}"
-    if isinstance(found, FoundByOrtho):
-        note = (
-            f"tried near {near.lat:.6f}, {near.lon:.6f}: {found.words()}; if no photo is registered from "
-            "there, name a smaller circle (--near=LAT,LON,RADIUS_M), or say where one photo is: --page, "
-            "--picks FILE, --pose FILE"
+    evidence = {"start": {"near": str(near), "no_place": unplaced.no_place.reason_code}}
+    note = f"{'tried' if by_look else 'found'} near {near.middle}: {found.words}"
+    if by_look:
+        note += (
+            "; if no photo is registered from there, name a smaller circle (--near=LAT,LON,RADIUS_M), or say "
+            "where one photo is: --page, --picks FILE, --pose FILE"
         )
-    placed = placed_map(unplaced, placement, cloud.frame, cloud.height_datum)
-    return placed, note, isinstance(found, FoundByOrtho)
-
-
-def _put_by(
-    database: Database,
-    unplaced: UnplacedMap,
-    started: StartedImage,
-    frame: LocalFrame,
-    scan_ids: tuple[str, ...],
-) -> FeatureMap:
-    """The map where a person has put one of its photos."""
-    reach = _FIRST_REACH_M
-    x, y, _ = started.prior.cam_from_local.center.tolist()
-    cloud = load_cloud(database, frame, (x - reach, y - reach, x + reach, y + reach), scan_ids=scan_ids)
-    if not len(cloud):
-        raise RegistrationError(
-            f"no scan of {database.url} lies within {reach:.0f} m of where the photo is put"
-        )
-    return place_by_photo(unplaced, started.image, started.camera, started.prior, cloud)
+    return placed_on(unplaced, cloud, found.local_from_own, found.covariance, evidence), note, by_look
 
 
 def scans_of_one_zone(database: Database, scan_ids: Sequence[str]) -> list[ScanSummary]:

@@ -27,9 +27,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.matching import joined_pools, pool_features
-from ingest.register.frame.sources import available_sources
-from ingest.register.frame.verdict import MIN_COVER
-from ingest.register.frame.views import FEATURES_SPACING_PX
+from ingest.register.frame.views import FEATURES_SPACING_PX, MIN_COVER, available_sources
 from ingest.register.frame_registration import RenderSource
 from reloc.localise.acceptance import log_nfa
 
@@ -43,53 +41,38 @@ _BATCH, _BATCHES = 2000, 50  # samples of three: with 5 % of right matches a doz
 _MISSED = 1e-3  # chance that no sample was all right, below which no more are drawn
 _SCORED = 300  # matches that score a sample
 _TOLERANCES_PX = (8.0, 16.0, 32.0)  # of the pictures; the one that says most is taken, and three are paid for
-_MIN_LOG_NFA = 3.0  # one map of a thousand would be proposed where it is not
+MIN_LOG_NFA = 3.0  # one map of a thousand would be proposed where it is not
 _ROUNDS = 5  # of matches within the tolerance and the similarity that fits them
 _CORRELATED = 4.0  # matches that are worth one independent: neighbours share relief and the map's bend
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FoundFromAbove:
-    """Where a map lies on a scan; a start for the registration of its photos.
+class FoundPlace:
+    """Where a map may lie on a scan; a start for the registration of its photos.
 
     Attributes:
         local_from_own: similarity. covariance: (7, 7) of its left perturbation.
-        matches: distinct ones. fitting: how many of them the similarity takes within `tolerance_m`.
-        log_nfa: minus the decimal logarithm of the number of as good ones that chance gives.
-        source: what of the scan was drawn.
+        evidence: how much more than chance speaks for it, by the figure of the search that found it.
+        words: on the evidence, for people.
     """
 
     local_from_own: Sim3
     covariance: FloatArray
-    matches: int
-    fitting: int
-    tolerance_m: float
-    log_nfa: float
-    source: RenderSource
-
-    @property
-    def sure(self) -> bool:
-        """Whether chance seldom gives as much."""
-        return self.log_nfa >= _MIN_LOG_NFA
-
-    def words(self) -> str:
-        return (
-            f"{self.fitting} of {self.matches} matches with the scan's {self.source} fit one place to within "
-            f"{self.tolerance_m:.1f} m"
-        )
+    evidence: float
+    words: str
 
 
-def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundFromAbove | None:
-    """The best place of a map on a scan; None where nothing of both matches.
+def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundPlace | None:
+    """The best place of a map on all of a scan; None where nothing of both matches.
 
-    Args:
-        cloud: all of the scan on which the map may lie.
+    Its evidence is minus the decimal logarithm of the number of as good ones that chance gives; one with
+    MIN_LOG_NFA is sure.
     """
     found = [_found(unplaced, cloud, source) for source in available_sources(cloud) if source != "shaded"]
-    return max((one for one in found if one is not None), key=lambda one: one.log_nfa, default=None)
+    return max((one for one in found if one is not None), key=lambda one: one.evidence, default=None)
 
 
-def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> FoundFromAbove | None:
+def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> FoundPlace | None:
     # A picture shows as much as is as fine as the scan's points are dense, in no more than so many pictures.
     plan = np.ptp(cloud.xyz[:, :2], axis=0)
     spacing = float(np.sqrt(np.prod(plan) / len(cloud)))
@@ -100,31 +83,28 @@ def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> Fo
     if not pools:
         return None
     pool = joined_pools(pools)
-    places = pool.points
     point, place = _matched(unplaced, pool.descriptors)
     if len(point) <= _SAMPLE:
         return None
-    own, local = unplaced.points.xyz[point], places[place]
+    own, local = unplaced.points.xyz[point], pool.points[place]
     centers = np.array([image.cam_from_local.center for image in unplaced.images])
     upwards = np.median(centers, axis=0) - np.median(unplaced.points.xyz, axis=0)
-    area_m2 = float(np.prod(np.ptp(places[:, :2], axis=0)))
+    area_m2 = float(np.prod(np.ptp(pool.points[:, :2], axis=0)))
     judged = []
     for tolerance_m in (px * wide_m / _SIDE_PX for px in _TOLERANCES_PX):
         sim = _most_fitting(own, local, upwards, tolerance_m)
         judged.append(_judged(sim, own, local, upwards, point, tolerance_m, area_m2, source))
-    return max((one for one in judged if one is not None), key=lambda one: one.log_nfa, default=None)
+    return max((one for one in judged if one is not None), key=lambda one: one.evidence, default=None)
 
 
 def _views(cloud: PointCloud, wide_m: float) -> Iterator[Rendering]:
     """The scan from above, north up, from as high as it is wide."""
     camera = Camera.from_focal(_SIDE_PX, _SIDE_PX, float(_SIDE_PX), model="PINHOLE")
-    rotation = np.diag([1.0, -1.0, -1.0])
     low, high = (np.asarray(of, dtype=np.float64) for of in (cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)))
     top = float(np.median(cloud.xyz[:, 2])) + wide_m
     for east in np.arange(low[0], high[0] + wide_m / 2, wide_m / 2):
         for north in np.arange(low[1], high[1] + wide_m / 2, wide_m / 2):
-            center = np.array([east, north, top])
-            pose = Rigid3(rotation=rotation, translation=-rotation @ center)
+            pose = Rigid3.from_center(np.diag([1.0, -1.0, -1.0]), np.array([east, north, top]))
             view = render(cloud, camera, pose)
             if view.valid.mean() >= MIN_COVER:
                 yield view
@@ -147,8 +127,7 @@ def _matched(
 def _most_fitting(own: FloatArray, local: FloatArray, upwards: FloatArray, tolerance_m: float) -> Sim3 | None:
     """Of similarities of three matches that which takes most of own (n, 3) to local (n, 3).
 
-    Args:
-        upwards: (3,) from the map's points to its cameras, which must lie above them.
+    Cameras must lie above the map's points: `upwards` (3,) from these.
     """
     rng = np.random.default_rng(0)
     scored = rng.permutation(len(own))[:_SCORED]
@@ -160,10 +139,8 @@ def _most_fitting(own: FloatArray, local: FloatArray, upwards: FloatArray, toler
         usable &= (rotation[:, 2] @ upwards > 0.0) & (scale * wide > tolerance_m)
         if usable.any():
             scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
-            off = (scale[:, None, None] * rotation).reshape(-1, 3) @ own[scored].T + translation.reshape(
-                -1, 1
-            )
-            off = off.reshape(-1, 3, len(scored)) - local[scored].T
+            off = (scale[:, None, None] * rotation).reshape(-1, 3) @ own[scored].T
+            off = (off + translation.reshape(-1, 1)).reshape(-1, 3, len(scored)) - local[scored].T
             fitting = (np.square(off).sum(axis=1) <= tolerance_m**2).sum(axis=1)
             k = int(fitting.argmax())
             if fitting[k] > most:
@@ -180,8 +157,7 @@ def _similarities(
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Umeyama's solution for k sets of m pairs (k, m, 3) at once.
 
-    Returns:
-        scale (k,), rotation (k, 3, 3), translation (k, 3), and which sets determine them (k,).
+    Scale (k,), rotation (k, 3, 3), translation (k, 3), and which sets determine them (k,).
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     a, b = source - source_mean[:, None], target - target_mean[:, None]
@@ -207,7 +183,7 @@ def _judged(
     tolerance_m: float,
     area_m2: float,
     source: RenderSource,
-) -> FoundFromAbove | None:
+) -> FoundPlace | None:
     """Fitted to the matches within the tolerance, with how sure that is; None where too few are.
 
     The fit may turn a place over flat ground upside down: None, too, where it leaves cameras underground.
@@ -232,12 +208,10 @@ def _judged(
     spots = np.unique(np.floor(local[fits, :2] / tolerance_m), axis=0)
     fitting = min(len(np.unique(point[fits])), len(spots))
     evidence = log_nfa(matches, fitting, tolerance_m, area_m2, 1.0, _SAMPLE)
-    return FoundFromAbove(
+    return FoundPlace(
         local_from_own=sim,
         covariance=np.asarray(_CORRELATED * variance * np.linalg.inv(jacobian.T @ jacobian)),
-        matches=matches,
-        fitting=fitting,
-        tolerance_m=tolerance_m,
-        log_nfa=evidence - float(np.log10(len(_TOLERANCES_PX))),
-        source=source,
+        evidence=evidence - float(np.log10(len(_TOLERANCES_PX))),
+        words=f"{fitting} of {matches} matches with the scan's {source} fit one place to within "
+        f"{tolerance_m:.1f} m",
     )

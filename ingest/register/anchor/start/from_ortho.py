@@ -24,9 +24,10 @@ from featuredb.maps.move import moved_image
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.files import PhotoFiles
+from ingest.register.anchor.start.from_above import FoundPlace
 from ingest.register.anchor.start.ortho import FloatImage, OrthoPicture, picture_of_map, picture_of_scan
 from ingest.register.frame.dense.pictures import inner_part, oriented_gradients, plan_spacing_m
-from ingest.register.frame.sources import searched_sources
+from ingest.register.frame.views import searched_sources
 from ingest.register.frame_registration import RenderSource
 
 _CELLS = 440  # along the scan's longer side, at most; with 220 a town's streets all look alike
@@ -51,29 +52,6 @@ _CHANNELS, _POWER_SIGMA, _LEAST_POWER = 2, 3.0, 1e-3
 _TINY = 1e-12
 _INSIDE = 2  # cells from the border of what is shown that show no edge
 _LEAST_SHOWN = 100  # cells inside: fewer agree with anything
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FoundByOrtho:
-    """Where a map's picture agrees best with a scan.
-
-    Attributes:
-        local_from_own: similarity. covariance: (7, 7) of its left perturbation, by the steps of the search.
-        over_chance, elsewhere: as in `best_place`.
-        source: what of the scan was drawn.
-    """
-
-    local_from_own: Sim3
-    covariance: FloatArray
-    over_chance: float
-    elsewhere: float
-    source: RenderSource
-
-    def words(self) -> str:
-        return (
-            f"its photos from above agree with the scan's {self.source} by {self.over_chance:.1f} deviations "
-            f"more than their mirror images, elsewhere by {self.elsewhere:.1f}"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -142,19 +120,13 @@ class ScanSearch:
             return None
         own = self._back(self._valid * np.conj(self._forward(np.square(channels).sum(axis=0))))
         own = own[:rows, :columns]  # where the scan shows something; less of it agrees more easily
-        score = found * np.sqrt(
-            cover / np.maximum(energy * own, 1e-12), where=usable, out=np.zeros_like(cover)
-        )
-        score = np.where(usable, score, -1.0)
+        share = cover / np.maximum(energy * own, 1e-12)
+        score = np.where(usable, found * np.sqrt(share, where=usable, out=np.zeros_like(cover)), -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
         first = np.array([column - held[1][0], row - held[0][0]])
         at = first + matrix @ np.array([of.gray.shape[1] / 2, of.gray.shape[0] / 2, 1.0])
-        return PictureTry(
-            size=size,
-            turn=turn,
-            middle=self.picture.corner + at * self.picture.cell,
-            correlation=float(score[row, column]),
-        )
+        middle = self.picture.corner + at * self.picture.cell
+        return PictureTry(size=size, turn=turn, middle=middle, correlation=float(score[row, column]))
 
     def _forward(self, of: NDArray[np.generic]) -> NDArray[np.complex64]:
         return np.asarray(fft.rfft2(np.asarray(of, dtype=np.float32), self._shape))
@@ -163,11 +135,10 @@ class ScanSearch:
         return np.asarray(fft.irfft2(of, self._shape))
 
 
-def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles) -> FoundByOrtho | None:
-    """The best place of a map on a scan; None where its mirror image fits as well.
+def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles) -> FoundPlace | None:
+    """The best place of a map on all of a scan; None where its mirror image fits as well.
 
-    Args:
-        cloud: all of the scan on which the map may lie.
+    Its evidence is in deviations, as in `best_place`; its covariance by the steps of the search.
     """
     upright = _upright(unplaced)
     there = [image for image in unplaced.images if image.image_id in photos.paths]
@@ -178,17 +149,13 @@ def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles)
     found = [
         _found(picture, cloud, source, upright, unplaced.frame.upright) for source in searched_sources(cloud)
     ]
-    return max((one for one in found if one is not None), key=lambda one: one.over_chance, default=None)
+    return max((one for one in found if one is not None), key=lambda one: one.evidence, default=None)
 
 
 def _found(
     picture: OrthoPicture, cloud: PointCloud, source: RenderSource, upright: Sim3, by_photos: bool
-) -> FoundByOrtho | None:
-    """The best place by one property of the scan.
-
-    Args:
-        upright: own frame to one whose z is up. by_photos: whether photos tell the vertical.
-    """
+) -> FoundPlace | None:
+    """The best place by one property of the scan; `upright` from the own frame, by photos or the ground."""
     extent_m = float(np.ptp(cloud.xyz[:, :2], axis=0).max())
     drawn = picture_of_scan(cloud, source, max(extent_m / _CELLS, plan_spacing_m(cloud)))
     found = best_place(picture, drawn)
@@ -201,12 +168,12 @@ def _found(
     plan_m = float(np.hypot(_PLAN_SIGMA_M, _PLAN_CELLS * drawn.cell))
     sigmas = [_SIZE_SIGMA, tilt, tilt, _TURN_SIGMA, plan_m, plan_m, _HEIGHT_SIGMA_M]
     about = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([*best.middle, up]))
-    return FoundByOrtho(
+    return FoundPlace(
         local_from_own=best.similarity(picture, up) @ upright,
         covariance=about.carried(np.diag(np.square(sigmas))),
-        over_chance=over_chance,
-        elsewhere=elsewhere,
-        source=source,
+        evidence=over_chance,
+        words=f"its photos from above agree with the scan's {source} by {over_chance:.1f} deviations "
+        f"more than their mirror images, elsewhere by {elsewhere:.1f}",
     )
 
 
@@ -226,16 +193,13 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> tuple[PictureTry, 
     chance, other_chance = (_over_chance(of, len(turns)) for of in (mirrored, tries))
     if chance is None or other_chance is None:
         return None
-    again, again_mirrored = (
-        _again(searched, of, among, by)
-        for of, among, by in ((picture, tries, chance), (picture.mirrored(), mirrored, other_chance))
-    )
+    again = _again(searched, picture, tries, chance)
     best = max(again, key=chance)
     others = [chance(one) for one in again if _apart(one, best, longer)]
     # A symmetric building agrees with its mirror image, at the size that is right.
-    others += [
-        other_chance(one) for one in again_mirrored if abs(np.log(one.size / best.size)) > 1.5 * _SIZE_STEP
-    ]
+    for one in _again(searched, picture.mirrored(), mirrored, other_chance):
+        if abs(np.log(one.size / best.size)) > 1.5 * _SIZE_STEP:
+            others.append(other_chance(one))
     return best, chance(best), max(others, default=-np.inf)
 
 
@@ -327,11 +291,11 @@ def _upright(unplaced: UnplacedMap) -> Sim3:
     """The map's own frame turned until z is up: by its photos, or else by the ground that it shows."""
     rotation = np.eye(3)
     if not unplaced.frame.upright:
-        xyz = unplaced.points.xyz - np.median(unplaced.points.xyz, axis=0)
-        across = np.linalg.svd(
-            xyz[np.linalg.norm(xyz, axis=1) < _NEAR_MIDDLE * np.median(np.linalg.norm(xyz, axis=1))],
-            full_matrices=False,
-        )[2][2]
+        middle = np.median(unplaced.points.xyz, axis=0)
+        xyz = unplaced.points.xyz - middle
+        away = np.linalg.norm(xyz, axis=1)
+        near = xyz[away < _NEAR_MIDDLE * np.median(away)]
+        across = np.linalg.svd(near, full_matrices=False)[2][2]
         above = np.mean([image.cam_from_local.center for image in unplaced.images], axis=0)
-        rotation = rotation_to_up(across * np.sign(across @ (above - np.median(unplaced.points.xyz, axis=0))))
+        rotation = rotation_to_up(across * np.sign(across @ (above - middle)))
     return Sim3(scale=1.0, rotation=rotation, translation=np.zeros(3))

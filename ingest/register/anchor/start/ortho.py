@@ -15,7 +15,7 @@ from featuredb.maps.feature_map import MapImage
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.frame.sources import source_image
+from ingest.register.frame.views import source_image
 from ingest.register.frame_registration import RenderSource
 
 FloatImage = NDArray[np.float32]
@@ -133,24 +133,17 @@ def _seen(
 def picture_of_scan(
     cloud: PointCloud, source: RenderSource, cell_m: float, box: tuple[FloatArray, FloatArray] | None = None
 ) -> OrthoPicture:
-    """The scan by one of its properties.
-
-    Args:
-        box: least and largest x and y of what is drawn; None: of the scan.
-    """
+    """The scan by one of its properties, all of it or between the least and the largest x and y of a box."""
     if box is None:
         plan = cloud.xyz[:, :2]
         box = np.asarray(plan.min(axis=0), np.float64), np.asarray(plan.max(axis=0), np.float64)
     low, high = box
     width, height = (int(n) for n in np.ceil((high - low) / cell_m) + 1)
     away_px = _AWAY * max(width, height)
-    camera = Camera(
-        model="SIMPLE_PINHOLE", width=width, height=height, params=(away_px, width / 2.0, height / 2.0)
-    )
+    camera = Camera.from_focal(width, height, away_px, model="SIMPLE_PINHOLE")
     level = float(np.median(cloud.xyz[:, 2]))
     center = np.array([*(low + 0.5 * cell_m * np.array([width, height])), level + away_px * cell_m])
-    rotation = np.diag([1.0, -1.0, -1.0])
-    view = render(cloud, camera, Rigid3(rotation=rotation, translation=-rotation @ center))
+    view = render(cloud, camera, Rigid3.from_center(np.diag([1.0, -1.0, -1.0]), center))
     return OrthoPicture(
         gray=np.ascontiguousarray(source_image(view, source)[::-1], dtype=np.float32),
         valid=view.valid[::-1],

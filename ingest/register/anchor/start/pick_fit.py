@@ -6,7 +6,7 @@ squared whitened residuals is likely for its redundancy, and a pick is called wr
 without it and no other pick's removal does nearly as well.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -24,7 +24,8 @@ from featuredb.geometry.rigid3 import Rigid3
 _STARTS = 60  # triples that P3P is asked for
 _TRIED = 6  # of their poses, best first, that may be another explanation
 _ADJUSTMENT = (50, 1e-9)  # steps, and relative change of the cost
-_EXACT = 1e-5  # sigma of what is taken as known of a lens: all but its focal length
+# Sigmas of what is taken as known of a lens: all but its focal length.
+_KNOWN_LENS = LensWidths(focal_rel=1.0, aspect_rel=1e-5, center_rel=1e-5, radial=1e-5, tangential=1e-5)
 
 _CHANCE = 0.001  # rate at which right picks are called contradictory: one set in a thousand
 # By how much the squared residuals must grow, in chi-square of one pick, until another explanation is out of
@@ -112,36 +113,22 @@ class _Picked:
 
     def fitted(self, start: _Start, rows: list[int]) -> _Fitted | None:
         """Adjusted to some picks; None where no pose has all of them in front of the camera."""
-        count, none = len(rows), np.zeros(0, dtype=np.int64)
+        numbers, zeros, xyz = np.arange(len(rows)), np.zeros(len(rows), dtype=np.int64), self.points[rows]
         block = Block(
             names=("picked",),
             cameras=(start[1],),
-            camera_of=np.zeros(1, dtype=np.int64),
+            camera_of=zeros[:1],
             cam_from_block=(start[0],),
-            xyz=self.points[rows],
-            point_of=none,
-            photo_of=none,
+            xyz=xyz,
+            point_of=zeros[:0],
+            photo_of=zeros[:0],
             xy=np.zeros((0, 2)),
         )
-        survey = PointPriors(
-            point_of=np.arange(count),
-            xyz=self.points[rows],
-            covariance=np.tile(_SIGMA_M**2 * np.eye(3), (count, 1, 1)),
-        )
-        targets = Targets(
-            point_of=np.arange(count),
-            photo_of=np.zeros(count, dtype=np.int64),
-            xy=self.pixels[rows],
-            sigma_px=self.sigma_px,
-            survey=survey,
-        )
-        lens = LensWidths(
-            focal_rel=self.focal_sigma_rel,
-            aspect_rel=_EXACT,
-            center_rel=_EXACT,
-            radial=_EXACT,
-            tangential=_EXACT,
-        )
+        read_off = np.tile(_SIGMA_M**2 * np.eye(3), (len(rows), 1, 1))
+        survey = PointPriors(point_of=numbers, xyz=xyz, covariance=read_off)
+        picked = self.pixels[rows]
+        targets = Targets(point_of=numbers, photo_of=zeros, xy=picked, sigma_px=self.sigma_px, survey=survey)
+        lens = replace(_KNOWN_LENS, focal_rel=self.focal_sigma_rel)
         known = lens_prior(self.camera, lens, robust=False)
         problem = Problem(block, Terms(keypoint_px=1.0, lenses=(known,), targets=targets))
         summary = problem.solve(*_ADJUSTMENT)
@@ -242,9 +229,8 @@ def _starts(picked: _Picked) -> list[_Start]:
                 if np.isfinite(solution.Rt).all():
                     start = (Rigid3.from_matrix(np.vstack([solution.Rt, [0, 0, 0, 1]])), camera)
                     found.append((picked.rough_cost(start, rows), start))
-    found = [f for f in found if np.isfinite(f[0])]
     found.sort(key=lambda f: f[0])
-    return [start for _, start in found]
+    return [start for cost, start in found if np.isfinite(cost)]
 
 
 def _best(picked: _Picked, starts: list[_Start], rows: list[int]) -> _Fitted | None:

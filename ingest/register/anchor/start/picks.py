@@ -1,6 +1,8 @@
-"""A pose from points that a person picked in a photo and in the scan."""
+"""A pose from points that a person picked in a photo and in the scan, and the files (CSV) that hold them."""
 
+import csv
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -28,6 +30,8 @@ _MAX_PICK_SIGMA_DEG = 10.0
 # swapped columns turn the ground upside down.
 _MAX_PICK_TILT_DEG = 45.0
 
+_COLUMNS = ("x", "y", "easting", "northing", "height")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Picks:
@@ -45,6 +49,54 @@ class Picks:
 
     def __post_init__(self) -> None:
         freeze(self, pixels=(None, 2), utm=(len(self.pixels), 3))
+
+
+def read_picks(path: Path, image: str | None) -> list[Picks]:
+    """Picks from a CSV file, grouped by photo in the order of the file.
+
+    Lines hold `x, y, easting, northing, height`: full-size pixels whose top-left one has its centre at (0.5,
+    0.5), then metres. A header may name the columns in another order, and a column `image` besides; empty
+    lines and lines that start with # are skipped.
+
+    Args:
+        image: photo of lines that name none.
+
+    Raises:
+        RegistrationError: unreadable, a line that is not five numbers, or no photo named.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RegistrationError(f"picks {path}: cannot be read as text ({error})") from error
+    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    none = f"picks {path}: expected lines of x, y, easting, northing, height, found none"
+    if not numbered:
+        raise RegistrationError(none)
+    separator = max(",;\t", key=numbered[0][1].count)
+    rows = [next(csv.reader([line], delimiter=separator)) for _, line in numbered]
+    names = [cell.strip().lower() for cell in rows[0]]
+    first = int(set(_COLUMNS) <= set(names))  # 1 behind a header
+    picks: dict[str, list[list[float]]] = {}
+    for (number, _), cells in zip(numbered[first:], rows[first:], strict=True):
+        found = dict(zip(names if first else (*_COLUMNS, "image"), map(str.strip, cells), strict=False))
+        where = f"picks {path}, line {number}"
+        try:
+            values = [float(found[name]) for name in _COLUMNS]
+        except (KeyError, ValueError) as error:
+            words = "expected x, y, easting, northing, height"
+            raise RegistrationError(f"{where}: {words}, found {cells} ({error})") from error
+        if not np.isfinite(values).all():
+            raise RegistrationError(f"{where}: expected finite numbers, found {cells}")
+        name = found.get("image") or image
+        if not name:
+            raise RegistrationError(f"{where}: names no photo; add a column image, or give --image")
+        picks.setdefault(name, []).append(values)
+    if not picks:
+        raise RegistrationError(none)
+    return [
+        Picks(image=name, pixels=np.array(values)[:, :2], utm=np.array(values)[:, 2:])
+        for name, values in picks.items()
+    ]
 
 
 def focal_sigma_rel(feature_map: AnyMap, image: MapImage) -> float:
@@ -89,7 +141,7 @@ def pose_from_picks(
         )
     fit = fit_picks(picks.pixels, points, camera, focal_rel)
     if fit is None:
-        raise RegistrationError(_contradictory(picks.image, ""))
+        raise RegistrationError(f"picks of {picks.image}: {_contradictory('')}")
     return prior_of_picks(picks.image, points, fit, present), fit
 
 
@@ -104,33 +156,10 @@ def prior_of_picks(image: str, points: FloatArray, fit: PickFit, present: Rigid3
     Raises:
         RegistrationError: contradictory or badly spread picks.
     """
+    objection = _objection(points, fit, present)
+    if objection:
+        raise RegistrationError(f"picks of {image}: {objection}")
     pose = fit.cam_from_local
-    if not fit.consistent:
-        far = f"; they miss one pose by up to {fit.distances_px.max():.0f} px"
-        raise RegistrationError(_contradictory(image, far))
-    if fit.doubtful:
-        raise RegistrationError(
-            f"picks of {image}: one of {', '.join(str(i + 1) for i in fit.doubtful)} is wrong, and the "
-            "others do not tell which; add a pick"
-        )
-    if fit.other_pose:
-        raise RegistrationError(
-            f"picks of {image}: two poses explain them equally well; add a pick, best where the ground "
-            "is higher or lower"
-        )
-    if pose.rotation[2, 2] > 0.5 and pose.center[2] < float(points[:, 2].min()):
-        raise RegistrationError(
-            f"picks of {image}: the camera would look at the scan from below; are easting and "
-            "northing, or pixel x and y, swapped?"
-        )
-    if present is not None:
-        cosine = pose.rotation[:, 2] @ present.rotation[:, 2]
-        tilt = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-        if tilt > _MAX_PICK_TILT_DEG:
-            raise RegistrationError(
-                f"picks of {image}: they turn the camera's vertical by {tilt:.0f} degrees against the map; "
-                "are easting and northing, or pixel x and y, swapped?"
-            )
     sigma = np.sqrt(np.diag(of_camera(pose, fit.covariance)))
     angles = np.maximum(np.degrees(sigma[:3]), MIN_SIGMA_ANGLE_DEG)
     prior = FramePrior(
@@ -148,9 +177,29 @@ def prior_of_picks(image: str, points: FloatArray, fit: PickFit, present: Rigid3
     return prior
 
 
-def _contradictory(image: str, far: str) -> str:
+def _objection(points: FloatArray, fit: PickFit, present: Rigid3 | None) -> str:
+    """Why a pose is not to be had by picks, or ""; arguments as those of `prior_of_picks`."""
+    pose, swapped = fit.cam_from_local, "are easting and northing, or pixel x and y, swapped?"
+    if not fit.consistent:
+        return _contradictory(f"; they miss one pose by up to {fit.distances_px.max():.0f} px")
+    if fit.doubtful:
+        numbers = ", ".join(str(i + 1) for i in fit.doubtful)
+        return f"one of {numbers} is wrong, and the others do not tell which; add a pick"
+    if fit.other_pose:
+        return "two poses explain them equally well; add a pick, best where the ground is higher or lower"
+    if pose.rotation[2, 2] > 0.5 and pose.center[2] < float(points[:, 2].min()):
+        return f"the camera would look at the scan from below; {swapped}"
+    if present is not None:
+        cosine = pose.rotation[:, 2] @ present.rotation[:, 2]
+        tilt = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        if tilt > _MAX_PICK_TILT_DEG:
+            return f"they turn the camera's vertical by {tilt:.0f} degrees against the map; {swapped}"
+    return ""
+
+
+def _contradictory(far: str) -> str:
     return (
-        f"picks of {image}: they contradict each other{far}; check the order of the columns "
-        "(pixel x, pixel y, easting, northing, height), the zone, the heights and the photo, or add "
-        "picks: of eight, two wrong ones are found"
+        f"they contradict each other{far}; check the order of the columns (pixel x, pixel y, easting, "
+        "northing, height), the zone, the heights and the photo, or add picks: of eight, two wrong ones are "
+        "found"
     )

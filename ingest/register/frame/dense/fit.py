@@ -10,19 +10,17 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from featuredb.geometry.camera import Camera
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
 from ingest.register.frame.dense.pictures import oriented_gradients
 from ingest.register.frame.dense.score_maps import cut_templates, peaks, search_around
 from ingest.register.frame.dense.search import register_dense, searched_near
-from ingest.register.frame.features.matching import FrameMatches
+from ingest.register.frame.features.matching import NO_MATCHES, FrameMatches
 from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
 from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.verdict import DECISIVE_LOG_NFA
-from ingest.register.frame.views import DenseFitOptions, FrameViews
+from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import refine_pose
@@ -38,64 +36,52 @@ _LEAST_ACROSS = 8  # pieces that are made larger still leave so many along the p
 
 
 def near_places(
-    photo_gray: NDArray[np.uint8],
-    camera: Camera,
-    rendering: Rendering,
-    source: RenderSource,
-    piece_px: int,
-    near_px: int,
+    views: FrameViews, rendering: Rendering, source: RenderSource, piece_px: int, near_px: int
 ) -> FrameMatches:
-    """Pieces of a render, and where in the photo they fit best near where the render's pose puts them.
-
-    Args:
-        photo_gray: (h, w) uint8 of `camera`'s size. rendering: made with that camera, shrunk.
-    """
+    """Pieces of a render, and where in the photo they fit best near where the render's pose puts them."""
     templates = cut_templates(rendering, source, piece_px, _MAX_PIECES)
     size = (rendering.camera.width, rendering.camera.height)
-    small = np.asarray(cv2.resize(photo_gray, size, interpolation=cv2.INTER_AREA))
+    small = np.asarray(cv2.resize(views.gray, size, interpolation=cv2.INTER_AREA))
     photo = oriented_gradients(small, None)
     maps = search_around(templates, photo, rendering.camera, rendering.cam_from_local, _WINDOW_PX)
     if len(maps) == 0:
-        return FrameMatches(pixels=np.empty((0, 2)), points=np.empty((0, 3)))
-    cut = _WINDOW_PX - near_px
-    inner = np.ascontiguousarray(maps.maps[:, cut : maps.maps.shape[1] - cut, cut : maps.maps.shape[2] - cut])
-    places, scores = peaks(inner)
+        return NO_MATCHES
+    cut, size_px = _WINDOW_PX - near_px, 2 * near_px + 1
+    places, scores = peaks(np.ascontiguousarray(maps.maps[:, cut : cut + size_px, cut : cut + size_px]))
     # A place on the rim has its top outside: the piece saw nothing here.
     good = (scores >= _MIN_SCORE) & (np.abs(places - near_px).max(axis=1) < near_px - 0.6)
-    scale = np.array([camera.width / size[0], camera.height / size[1]])
+    scale = np.array([views.camera.width / size[0], views.camera.height / size[1]])
     return FrameMatches(
         pixels=(maps.origin + cut + places)[good] * scale, points=np.asarray(maps.points_local)[good]
     )
 
 
 _MIN_PLACES = 12  # twice what six parameters need
-_FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart
+FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart
 MAX_SIDE_PX = 1200  # beyond, pieces of 40 px are too small a part of the picture to have structure
 
 
 def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource) -> list[FrameHypothesis]:
     """The best few poses that dense templates find around the prior; no matches behind them yet."""
-    found = register_dense(views.gray, views.camera, prior, views.cloud, source)
+    found = register_dense(views, prior, source)
     return [
         replace(unmatched(pose.cam_from_local, views.camera, source), candidates=pose.pieces)
-        for pose in found[:_FINALISTS]
+        for pose in found[:FINALISTS]
     ]
 
 
-def dense_fitted(
-    views: FrameViews, prior: FramePrior, start: FrameHypothesis, options: DenseFitOptions
-) -> FrameHypothesis | None:
+def dense_fitted(views: FrameViews, prior: FramePrior, start: FrameHypothesis) -> FrameHypothesis | None:
     """The pose fitted to all pieces near it, under the prior, coarse to fine; None with too few.
 
     Features that decide leave less than the coarse round takes up.
     """
     found: FrameHypothesis | None = start
-    rounds = list(zip(options.spacing_px, options.piece_px, options.near_px, strict=True))
+    rounds = views.options.fit_rounds
     decided = start.kind == "features" and start.log_nfa >= DECISIVE_LOG_NFA
     for sizes in rounds[1:] if decided else rounds:
         found = found and _fit_round(views, prior, found, *sizes)
     # A pose that is still on its way may look right already: the pieces that lie near have made it.
-    for _ in range(options.more_rounds):
+    for _ in range(views.options.more_rounds):
         before = found
         found = found and _fit_round(views, prior, found, *rounds[-1])
         if before is None or found is None or _moved_px(views, before, found) < 0.2:
@@ -105,8 +91,7 @@ def dense_fitted(
 
 def searched_again(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis | None:
     """The dense search's own maximum next to a pose that was fitted; None where there is none."""
-    pose = found.pose.cam_from_local
-    near = searched_near(views.gray, found.pose.camera, pose, prior, views.cloud, found.source)
+    near = searched_near(views, found.pose.camera, found.pose.cam_from_local, prior, found.source)
     if near is None:
         return None
     return replace(found, kind="dense", pose=replace(found.pose, cam_from_local=near.cam_from_local))
@@ -127,7 +112,7 @@ def _fit_round(
     between_px = views.spacing_full_px * side_px / max(views.camera.width, views.camera.height)
     wanted_px = min(_PIECE_POINTS * between_px, side_px / _LEAST_ACROSS)
     piece_px = max(piece_px, 2 * round(0.5 * wanted_px))
-    matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px)
+    matches = near_places(views, renderings[0], start.source, piece_px, near_px)
     if len(matches) < _MIN_PLACES:
         return None
     settings = PoseOptions(tolerance_rel=_TOLERANCE_PX / side_px)
@@ -142,18 +127,11 @@ def _moved_px(views: FrameViews, before: FrameHypothesis, after: FrameHypothesis
     here, there = (
         views.camera.project(found.pose.cam_from_local.act(after.matches.points)) for found in (before, after)
     )
-    side_px = views.side_px(views.options.dense_fit.spacing_px[-1], MAX_SIDE_PX)
+    side_px = views.side_px(views.options.fit_rounds[-1][0], MAX_SIDE_PX)
     moved = float(np.median(np.linalg.norm(here - there, axis=1)))
     return moved * side_px / max(views.camera.width, views.camera.height)
 
 
 def confirmed(views: FrameViews, found: FrameHypothesis) -> PictureConfirmation:
     """What the pictures say of a pose."""
-    return confirm_pose(
-        views.gray,
-        found.pose.camera,
-        found.pose.cam_from_local,
-        views.cloud,
-        found.source,
-        views.options.confirm,
-    )
+    return confirm_pose(views, found.pose.camera, found.pose.cam_from_local, found.source)

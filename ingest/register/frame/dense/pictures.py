@@ -98,33 +98,17 @@ def pinhole_view(photo_gray: NDArray[np.uint8], camera: Camera, longer_side_px: 
     small = np.asarray(photo_gray, dtype=np.uint8)
     if small.shape != (height, width):
         small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA))
-    view_camera = Camera(
-        model="SIMPLE_PINHOLE",
-        width=width,
-        height=height,
-        params=(camera.focal_px * width / camera.width, width / 2.0, height / 2.0),
-    )
+    focal_px = camera.focal_px * width / camera.width
+    view_camera = Camera.from_focal(width, height, focal_px, model="SIMPLE_PINHOLE")
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = view_camera.unproject(np.stack([x.ravel(), y.ravel()], axis=1))
     pixels = camera.project(np.column_stack([rays, np.ones(len(rays))])).reshape(height, width, 2)
     pixels = pixels * (width / camera.width, height / camera.height) - 0.5  # OpenCV's half pixel
     pixels = np.where(np.isfinite(pixels), pixels, -1e4).astype(np.float32)
-    image = cv2.remap(
-        small, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    x, y = pixels[..., 0], pixels[..., 1]
+    image = cv2.remap(small, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     valid = ((pixels > -0.6) & (pixels < (width - 0.4, height - 0.4))).all(axis=-1)
     return PinholeView(image=np.asarray(image), valid=np.asarray(valid), camera=view_camera)
-
-
-def with_margin(camera: Camera, margin_px: int) -> Camera:
-    """The same pinhole with `margin_px` more on each side."""
-    focal, cx, cy = camera.params
-    return Camera(
-        model="SIMPLE_PINHOLE",
-        width=camera.width + 2 * margin_px,
-        height=camera.height + 2 * margin_px,
-        params=(focal, cx + margin_px, cy + margin_px),
-    )
 
 
 _CELL_M = 2.0  # holds several points of any airborne scan, and is small beside gaps between flight lines

@@ -19,8 +19,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.dense.pictures import FloatImage, PinholeView, oriented_gradients, with_margin
-from ingest.register.frame.sources import source_image
+from ingest.register.frame.dense.pictures import FloatImage, PinholeView, oriented_gradients
+from ingest.register.frame.views import source_image
 from ingest.register.frame_registration import RenderSource
 
 # Side of a square piece. Larger ones are more distinct and bear less change of view; 40 pixels found airborne
@@ -83,7 +83,9 @@ def score_maps_of(
     Args:
         margin_px: by which the render is wider than the photo on each side. max_count: of pieces.
     """
-    rendering = render(cloud, with_margin(view.camera, margin_px), cam_from_local, RenderOptions(threads=1))
+    width, height = view.camera.width + 2 * margin_px, view.camera.height + 2 * margin_px
+    wide = Camera.from_focal(width, height, view.camera.focal_px, model="SIMPLE_PINHOLE")
+    rendering = render(cloud, wide, cam_from_local, RenderOptions(threads=1))
     templates = cut_templates(rendering, source, PIECE_PX, max_count)
     photo = oriented_gradients(view.image, view.valid)
     if radius_px is None:
@@ -98,13 +100,8 @@ def cut_templates(rendering: Rendering, source: RenderSource, size: int, max_cou
         size: of a piece, pixels. max_count: the ones with most structure are kept; bounds the time.
     """
     channels = oriented_gradients(source_image(rendering, source), rendering.valid)
-    height, width = channels.shape[1:]
-    grid = np.meshgrid(
-        np.arange(0, height - size + 1, size // 2),
-        np.arange(0, width - size + 1, size // 2),
-        indexing="ij",
-    )
-    rows, columns = (axis.ravel() for axis in grid)
+    starts = [np.arange(0, n - size + 1, size // 2) for n in channels.shape[1:]]
+    rows, columns = (axis.ravel() for axis in np.meshgrid(*starts, indexing="ij"))
     valid = _window_means(rendering.valid.astype(np.float32), size)[rows, columns]
     structure = _window_means(np.einsum("khw,khw->hw", channels, channels), size)[rows, columns]
     keep = np.flatnonzero((valid >= _MIN_VALID) & (structure >= _MIN_STRUCTURE))
@@ -118,11 +115,7 @@ def cut_templates(rendering: Rendering, source: RenderSource, size: int, max_cou
 
 
 def search_everywhere(templates: Templates, photo: FloatImage, camera: Camera) -> ScoreMaps:
-    """Score maps over the whole photo, and over its border where most of a piece lies inside.
-
-    Args:
-        photo: (k, h, w) channels of the photo's view with the pinhole `camera`.
-    """
+    """Score maps over a pinhole's whole photo (k, h, w), and its border where most of a piece lies inside."""
     size = templates.channels.shape[-1]
     margin = int(size * (1.0 - _MIN_OVERLAP))
     _, h, w = photo.shape

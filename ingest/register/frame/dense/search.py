@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +28,7 @@ from ingest.register.frame.dense.pictures import (
 )
 from ingest.register.frame.dense.score_maps import ScoreMaps, score_maps_of, scores_at
 from ingest.register.frame.prior_fit import prior_sigmas
+from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 # Longer side of the photo's view at each octave, coarse to fine. Octaves finer than the scan's points allow
@@ -74,40 +74,28 @@ class DensePose:
     pieces: int
 
 
-def register_dense(
-    photo_gray: NDArray[np.uint8], camera: Camera, prior: FramePrior, cloud: PointCloud, source: RenderSource
-) -> list[DensePose]:
+def register_dense(views: FrameViews, prior: FramePrior, source: RenderSource) -> list[DensePose]:
     """Poses of a photo, best first; empty where the scan shows nothing that could be searched for.
 
     They are hypotheses: whether the first is right is for `confirm_pose` to say.
-
-    Args:
-        photo_gray: (h, w) uint8 of `camera`'s size.
     """
-    views = [pinhole_view(photo_gray, camera, side) for side in _sides(camera, prior, cloud)]
-    poses = _vote(views[0], prior, cloud, source)
-    for octave, view in enumerate(views):
+    camera, cloud = views.camera, views.cloud
+    octaves = [pinhole_view(views.gray, camera, side) for side in _sides(camera, prior, cloud)]
+    poses = _vote(octaves[0], prior, cloud, source)
+    for octave, view in enumerate(octaves):
         refined = [_refined(view, pose, prior, cloud, source) for pose in poses]
         found = sorted((p for p in refined if p is not None), key=lambda p: -p.score)
         distinct = _distinct(found, view.camera, prior)
-        last = octave == len(views) - 1
         poses = [p.cam_from_local for p in distinct[: max(1, _KEPT // 2**octave)]]
-        if last or not poses:
-            return distinct
-    return []
+    return distinct
 
 
 def searched_near(
-    photo_gray: NDArray[np.uint8],
-    camera: Camera,
-    pose: Rigid3,
-    prior: FramePrior,
-    cloud: PointCloud,
-    source: RenderSource,
+    views: FrameViews, camera: Camera, pose: Rigid3, prior: FramePrior, source: RenderSource
 ) -> DensePose | None:
     """The highest sum of score maps near a pose, at the finest octave; None where it shows too little."""
-    view = pinhole_view(photo_gray, camera, _sides(camera, prior, cloud)[-1])
-    return _refined(view, pose, prior, cloud, source)
+    view = pinhole_view(views.gray, camera, _sides(camera, prior, views.cloud)[-1])
+    return _refined(view, pose, prior, views.cloud, source)
 
 
 def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: RenderSource) -> list[Rigid3]:
@@ -123,10 +111,9 @@ def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: Rende
     reach_px = focal * (np.tan(min(tilt, 1.0)) + sideways)
     margin = int(min(reach_px, _MAX_MARGIN * longer))
     offsets = _position_offsets(prior, view.camera, depth)
-    turns = _turns(prior)
     pans = _pan_tilts(reach_px, view.camera)
-    found: list[tuple[float, Rigid3]] = []
-    for turn in turns:
+    found: list[DensePose] = []
+    for turn in _turns(prior):
         start = Rigid3(rotation=so3_exp([0, 0, turn]), translation=np.zeros(3)) @ prior.cam_from_local
         maps = score_maps_of(view, start, margin, cloud, source, None, _MAX_PIECES)
         if len(maps) < 4:
@@ -136,11 +123,9 @@ def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: Rende
             scores = _grid_scores(maps, moved, pans)
             for best in np.argsort(-scores)[:3]:
                 turned = Rigid3(rotation=pans[best], translation=np.zeros(3)) @ moved
-                found.append((float(scores[best]), turned))
-    found.sort(key=lambda item: -item[0])
-    poses = [DensePose(cam_from_local=p, score=s, pieces=0) for s, p in found]
-    distinct = _distinct(poses, view.camera, prior)
-    return [p.cam_from_local for p in distinct]
+                found.append(DensePose(cam_from_local=turned, score=float(scores[best]), pieces=0))
+    found.sort(key=lambda pose: -pose.score)
+    return [p.cam_from_local for p in _distinct(found, view.camera, prior)]
 
 
 def _grid_scores(maps: ScoreMaps, pose: Rigid3, turns: FloatArray) -> FloatArray:
@@ -236,11 +221,8 @@ def _refined(
     )
     moved = Rigid3.exp(result.x * scale) @ pose
     total, pieces = _summed(maps, moved)
-    return DensePose(
-        cam_from_local=moved,
-        score=total / float(np.sqrt(max(pieces, _MIN_PIECES))),
-        pieces=pieces,
-    )
+    score = total / float(np.sqrt(max(pieces, _MIN_PIECES)))
+    return DensePose(cam_from_local=moved, score=score, pieces=pieces)
 
 
 def _summed(maps: ScoreMaps, pose: Rigid3) -> tuple[float, int]:
@@ -255,11 +237,8 @@ def _summed(maps: ScoreMaps, pose: Rigid3) -> tuple[float, int]:
 def _distinct(poses: Sequence[DensePose], camera: Camera, prior: FramePrior) -> list[DensePose]:
     """The first of those that show something else than every better one, as many as are looked into."""
     kept: list[DensePose] = []
-    corners = np.array([(x, y) for y in (0.1, 0.5, 0.9) for x in (0.1, 0.5, 0.9)]) * (
-        camera.width,
-        camera.height,
-    )
-    rays = np.column_stack([camera.unproject(corners), np.ones(len(corners))])
+    grid = np.array([(x, y) for y in (0.1, 0.5, 0.9) for x in (0.1, 0.5, 0.9)])
+    rays = np.column_stack([camera.unproject(grid * (camera.width, camera.height)), np.ones(len(grid))])
     seen: list[FloatArray] = []
     for pose in poses:
         cam_from_prior = pose.cam_from_local @ prior.cam_from_local.inverse()

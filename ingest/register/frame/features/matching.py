@@ -12,7 +12,7 @@ from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.nearest import nearest
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.sources import source_image
+from ingest.register.frame.views import source_image
 from ingest.register.frame_registration import RenderSource
 
 # The product's, with a lower contrast threshold than photos get, since renders are smooth.
@@ -133,11 +133,14 @@ class FrameMatches:
         return FrameMatches(pixels=self.pixels[rows], points=self.points[rows])
 
 
+NO_MATCHES = FrameMatches(pixels=np.empty((0, 2)), points=np.empty((0, 3)))
+
+
 def joined(parts: Sequence[FrameMatches]) -> FrameMatches:
     """All matches of all parts; none for no parts."""
+    parts = [NO_MATCHES, *parts]
     return FrameMatches(
-        pixels=np.concatenate([np.empty((0, 2)), *(p.pixels for p in parts)]),
-        points=np.concatenate([np.empty((0, 3)), *(p.points for p in parts)]),
+        pixels=np.concatenate([p.pixels for p in parts]), points=np.concatenate([p.points for p in parts])
     )
 
 
@@ -147,7 +150,7 @@ def pooled_matches(features: Features, pool: Pool, same_place_m: float, max_rati
     One place appears in several renders of the pool: those do not compete.
     """
     if len(features) == 0 or len(pool) == 0:
-        return joined([])
+        return NO_MATCHES
     squared, row = nearest(features.descriptors, pool.descriptors, _NEIGHBOURS)
     place = pool.points[row]
     apart = (np.linalg.norm(place - place[:, :1], axis=2) > same_place_m) & (row >= 0)
