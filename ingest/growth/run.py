@@ -125,10 +125,8 @@ class _Run:
         asked.pop(frozenset(), None)
         for fresh, again in asked.items():
             areas = self.localiser.areas_of(tuple(sorted(write_ids[w] for w in fresh)))
-            worth += localise_photos(new.photos, again, new.features_of, areas, threads)[0]
-        self.localised, reasons = localise_photos(
-            new.photos, sorted(worth), new.features_of, self.localiser.areas, threads
-        )
+            worth += localise_photos(new, again, areas, threads)[0]
+        self.localised, reasons = localise_photos(new, sorted(worth), self.localiser.areas, threads)
         for row in rows:
             if row not in self.localised:
                 reason = reasons.get(row) or before[row]["reason"]
@@ -148,7 +146,7 @@ class _Run:
                 self._try_model(part, _SPLIT_LINKS)
         left = {row: photo for row, photo in self.localised.items() if row not in self.map_of}
         lone = with_shared_lenses(left, {row: shared_key(new.photos[row], "shared") for row in left})
-        groups, waiting = lone_groups(lone, new.features_of, new.overlaps, new.geometry_of)
+        groups, waiting = lone_groups(lone, new)
         self.posed |= lone
         for group in groups:
             self._try_model(group, ())
@@ -221,9 +219,8 @@ class _Run:
 
         Where its photos are at several places, its parts, split at `links`, weakest first.
         """
-        new, areas = self.new, self.localiser.areas
         maps, budget_m = placed_maps(self.database.snapshot()), self.options.drift_budget_m
-        grown = grow_within_budget(model, new.photos, new.features_of, self.posed, areas, maps, budget_m)
+        grown = grow_within_budget(model, self.new, self.posed, self.localiser.areas, maps, budget_m)
         if isinstance(grown, GrownMap):
             self._take(grown)
             return

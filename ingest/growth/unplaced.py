@@ -8,9 +8,8 @@ import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from featuredb.errors import ConflictError
 from featuredb.maps.feature_map import FeatureMap, MapImage
@@ -24,9 +23,9 @@ from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.growth_report import GrownEntry, grown_entry, refused_entry
 from ingest.growth.place.component import GrownMap
 from ingest.growth.place.localised import localise_photos
-from ingest.growth.place.map_images import model_of, observed_features, observed_rows
+from ingest.growth.place.map_images import features_and_points, model_of
 from ingest.growth.trust.scan_check import NOT_ASKED, checked_by_scan
-from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, Refused
+from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, GrowthPhotos, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
@@ -110,31 +109,26 @@ def _grown(
     snapshot: Snapshot, unplaced: UnplacedMap, areas: Sequence[IndexedArea], options: GrowthOptions
 ) -> GrownMap | Refused:
     """The map where the others put it, by what it keeps of its photos."""
-    rows = [observed_rows(unplaced, image, described=False) for image in unplaced.images]
-    photos = [_photo(unplaced, image) for image in unplaced.images]
     named = ("map_id", "name", "source", "licence", "provenance")
     identity = MapIdentity(**{name: getattr(unplaced, name) for name in named})
 
-    def features_of(row: int) -> PhotoFeatures:
-        features = observed_features(unplaced, unplaced.images[row], rows[row])
-        rgb = unplaced.points.rgb[unplaced.observations.point_index[rows[row]]]
-        return PhotoFeatures(features=features, rgb=rgb)
+    def features_of(row: int, *, described: bool = False) -> PhotoFeatures:
+        """Those that can be matched come first, so that they have the same rows alone."""
+        features, points = features_and_points(unplaced, unplaced.images[row], described=described)
+        return PhotoFeatures(features=features, rgb=unplaced.points.rgb[points])
 
-    def described_of(row: int) -> PhotoFeatures:
-        """Those that can be matched; they have the same rows."""
-        whole = features_of(row)
-        these = np.arange(int(unplaced.observations.has_descriptor[rows[row]].sum()))
-        return PhotoFeatures(features=whole.features.take(these), rgb=whole.rgb[these])
-
+    photos = [_photo(unplaced, image) for image in unplaced.images]
     # A lens that nobody lends is about what the reconstruction made of it.
     hinted = [
         replace(photo, focal_px=unplaced.cameras[image.camera_id].focal_px)
         for photo, image in zip(photos, unplaced.images, strict=True)
     ]
-    localised, _ = localise_photos(hinted, range(len(hinted)), described_of, areas, options.threads)
+    asked = GrowthPhotos(photos=hinted, features_of=partial(features_of, described=True))
+    localised, _ = localise_photos(asked, range(len(hinted)), areas, options.threads)
+    new = GrowthPhotos(photos=photos, features_of=features_of)
     model = model_of(unplaced, unplaced.images, described=False)
     maps, budget_m = placed_maps(snapshot), options.drift_budget_m
-    return grow_within_budget(model, photos, features_of, localised, areas, maps, budget_m, identity)
+    return grow_within_budget(model, new, localised, areas, maps, budget_m, identity)
 
 
 def left_over(

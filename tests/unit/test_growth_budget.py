@@ -14,6 +14,7 @@ from ingest.growth.graph import map_graph
 from ingest.growth.graph.map_graph import rows_within, with_drift
 from ingest.growth.map_places import drift_m, places_of, turns_about, with_growth
 from ingest.growth.place.component import GrownMap
+from ingest.growth.values import GrowthPhotos
 from tests.support.growth_box import grown_map
 from tests.support.scenes import box_points, looking_at, random_descriptors, ring, scene_map
 
@@ -93,7 +94,7 @@ def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(map_graph, "rows_within", lambda *_: [0, 1, 2, 4])
     monkeypatch.setattr(map_graph, "keep_photos", cut)
     monkeypatch.setattr(map_graph, "grow_component", grown)
-    found = map_graph.grow_within_budget(whole, [], {}.get, {}, [], {}, BUDGET_M)  # type: ignore[arg-type]
+    found = map_graph.grow_within_budget(whole, GrowthPhotos(), {}, [], {}, BUDGET_M)
     assert isinstance(found, GrownMap)
     codes = {row: code for row, (code, _) in found.left_out.items()}
     assert codes == {3: "WEAK_LINK", 4: "DRIFT_BUDGET", 5: "DRIFT_BUDGET"}

@@ -22,9 +22,8 @@ from ingest.growth import gates
 from ingest.growth.graph.pose_graph import WORLD, GraphSolution, solve_pose_graph
 from ingest.growth.map_places import drift_m, growth_of, inflated, map_drift_m, with_growth
 from ingest.growth.place.component import GrownMap, grow_component
-from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
+from ingest.growth.values import LEAST_PHOTOS, Edge, GrowthPhotos, LocalisedPhoto, Refused, tied_together
 from ingest.map_builder import MapIdentity
-from ingest.photos.photo import Photo
 from ingest.sfm.links import keep_photos
 from reloc.localise.candidates import IndexedArea
 
@@ -151,8 +150,7 @@ def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
 
 def grow_within_budget(
     model: Model,
-    photos: Sequence[Photo],
-    features_of: FeaturesOf,
+    new: GrowthPhotos,
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     maps: Mapping[str, PlacedMap],
@@ -167,7 +165,7 @@ def grow_within_budget(
     beyond: dict[int, tuple[str, str]] = {}
     for _ in range(_TRIES):
         try:
-            grown = grow_component(part, photos, features_of, localised, areas, identity, budget_m)
+            grown = grow_component(part, new, localised, areas, identity, budget_m)
         except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
             _LOG.exception("a reconstruction of %d photos", len(model.rows))
             text = f"{type(error).__name__}: {error}; the log tells where. Please report it"

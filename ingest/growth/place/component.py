@@ -6,7 +6,7 @@ geometry, estimated without any pose, fits the two poses, two independent statem
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 
@@ -31,7 +31,7 @@ from ingest.growth.values import (
     DRIFT_BUDGET_M,
     LEAST_PHOTOS,
     TOLERANCE_PX,
-    FeaturesOf,
+    GrowthPhotos,
     LocalisedPhoto,
     Refused,
     tied_together,
@@ -66,8 +66,7 @@ class GrownMap(Refinement):
 
 def grow_component(
     model: Model,
-    photos: Sequence[Photo],
-    features_of: FeaturesOf,
+    new: GrowthPhotos,
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     identity: MapIdentity | None,
@@ -76,8 +75,8 @@ def grow_component(
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
 
     Args:
-        model: a connected reconstruction; its rows are rows of `photos`.
-        localised: new photos that the maps localise, by row; others than the model's are ignored.
+        model: a connected reconstruction of new photos.
+        localised: those that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
         identity: of the map; None: it is named by the photos that were tried.
         max_bound_m: photos that may be further off (95 %) are left out.
@@ -87,12 +86,12 @@ def grow_component(
     if not own:
         return Refused(reason="NOT_LOCALISED", message=f"none of {len(rows)} photos is localised by a map")
     frame, near = _meeting_place(own, areas)
-    keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
-    model, lenses = adopt_lenses(model, photos, near, keypoints)
+    keypoints = [new.features_of(r).features.xy.astype(np.float64) for r in rows]
+    model, lenses = adopt_lenses(model, new.photos, near, keypoints)
     cameras = [model.cameras[c] for c in model.camera_of.tolist()]
     own = {k: with_lens(in_frame(photo, frame), cameras[k]) for k, photo in own.items()}
     correspondences = find_correspondences(model, own, keypoints)
-    placement = place_by_maps(model, own, correspondences, photos, near, frame)
+    placement = place_by_maps(model, own, correspondences, new.photos, near, frame)
     if isinstance(placement, Refused):
         return placement
     refusal = gates.first_refusal(placement.gates)
@@ -101,8 +100,7 @@ def grow_component(
     refined = refine_placed(model, placement, correspondences, own, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
-    named = identity or _named([photos[r] for r in rows])
-    return _assembled(refined, photos, features_of, near, named)
+    return _assembled(refined, new, near, identity or _named([new.photos[r] for r in rows]))
 
 
 def _meeting_place(
@@ -119,11 +117,7 @@ def _meeting_place(
 
 
 def _assembled(
-    refined: Refinement,
-    photos: Sequence[Photo],
-    features_of: FeaturesOf,
-    areas: Sequence[Area],
-    identity: MapIdentity,
+    refined: Refinement, new: GrowthPhotos, areas: Sequence[Area], identity: MapIdentity
 ) -> GrownMap | Refused:
     """The map of a refined model, with what growth knows of it as evidence."""
     model, placement = refined.model, refined.placement
@@ -143,8 +137,8 @@ def _assembled(
             residual_rms_m=placement.residual_rms_m,
         ),
         placement.frame,
-        [photos[r] for r in rows],
-        [features_of(r) for r in rows],
+        [new.photos[r] for r in rows],
+        [new.features_of(r) for r in rows],
         identity,
         replace(_MAPS, height_datum=parents[0][0].height_datum),
     )
@@ -194,16 +188,13 @@ def split(model: Model, links: Sequence[float]) -> tuple[float, list[Model]]:
 
 
 def lone_groups(
-    localised: Mapping[int, LocalisedPhoto],
-    features_of: FeaturesOf,
-    overlaps: Collection[Pair],
-    geometry_of: Callable[[Pair], TwoView],
+    localised: Mapping[int, LocalisedPhoto], new: GrowthPhotos
 ) -> tuple[list[Model], dict[int, str]]:
     """Groups among localised photos that no reconstruction holds, and for those in none the reason.
 
     Args:
         localised: the lone photos by row, those of one camera with one lens.
-        overlaps: pairs of rows with verified matches. geometry_of: theirs, in which no pose takes part.
+        new: with the geometry of overlaps, in which no pose takes part.
 
     Returns:
         A model of each group, of its matches alone, with the lenses of the localisations.
@@ -213,9 +204,9 @@ def lone_groups(
     frame = next(iter(localised.values())).frame
     photos = {r: in_frame(p, frame) for r, p in sorted(localised.items())}
     geometries: dict[Pair, TwoView] = {}
-    for a, b in sorted(pair for pair in overlaps if photos.keys() >= set(pair)):
-        view = geometry_of((a, b))
-        pixels = [features_of(r).features.xy[view.inliers[:, k]] for k, r in enumerate((a, b))]
+    for a, b in sorted(pair for pair in new.overlaps if photos.keys() >= set(pair)):
+        view = new.geometry_of((a, b))
+        pixels = [new.features_of(r).features.xy[view.inliers[:, k]] for k, r in enumerate((a, b))]
         if poses_fit(photos[a], photos[b], pixels[0].astype(np.float64), pixels[1].astype(np.float64)):
             geometries[a, b] = view
     alone = photos.keys() - set(chain(*geometries))
@@ -225,7 +216,7 @@ def lone_groups(
         rows = np.array(list(photos))[group_of == group].tolist()
         if len(rows) >= 2:
             own = {pair: view for pair, view in geometries.items() if pair[0] in rows}
-            groups.append(_triangulated(rows, photos, own, features_of))
+            groups.append(_triangulated(rows, photos, own, new))
     return groups, dict.fromkeys(alone, "ALONE: no other photo bears its pose out")
 
 
@@ -262,7 +253,7 @@ def _triangulated(
     rows: Sequence[int],
     photos: Mapping[int, LocalisedPhoto],
     geometries: Mapping[Pair, TwoView],
-    features_of: FeaturesOf,
+    new: GrowthPhotos,
 ) -> Model:
     """A model of the group, from the localisations' poses adjusted to its verified matches alone.
 
@@ -271,7 +262,7 @@ def _triangulated(
     cameras = list(dict.fromkeys(photos[r].camera for r in rows))
     sfm = []
     for r in rows:
-        camera_row, xy = cameras.index(photos[r].camera), features_of(r).features.xy
+        camera_row, xy = cameras.index(photos[r].camera), new.features_of(r).features.xy
         sfm.append(SfmPhoto(name=str(r), camera_row=camera_row, keypoints=xy))
     views = {(rows.index(a), rows.index(b)): view for (a, b), view in geometries.items()}
     model = triangulate_posed(cameras, sfm, [photos[r].cam_from_local for r in rows], views)

@@ -13,7 +13,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from featuredb.index.descriptor_index import use_threads
-from ingest.growth.values import QUERY, FeaturesOf, LocalisedPhoto
+from ingest.growth.values import QUERY, GrowthPhotos, LocalisedPhoto
 from ingest.photos.photo import Photo
 from reloc.localise.acceptance import agreement
 from reloc.localise.candidates import IndexedArea
@@ -42,16 +42,11 @@ _MOST_LENSES = 5  # that are tried for one camera; those of the photos with most
 
 
 def localise_photos(
-    photos: Sequence[Photo],
-    rows: Sequence[int],
-    features_of: FeaturesOf,
-    areas: Sequence[IndexedArea],
-    threads: int = 1,
+    new: GrowthPhotos, rows: Sequence[int], areas: Sequence[IndexedArea], threads: int = 1
 ) -> tuple[dict[int, LocalisedPhoto], dict[int, str]]:
-    """Localise photos in the areas of the active maps, each for itself.
+    """Localise the photos of these rows in the areas of the active maps, each for itself.
 
     Args:
-        photos: all new photos. rows: those to be localised.
         threads: photos at a time; the work is done outside of Python's lock, and results are the same.
 
     Returns:
@@ -59,7 +54,7 @@ def localise_photos(
     """
 
     def one(row: int) -> LocalisedPhoto | str:
-        return localise_photo(photos[row], features_of(row).features, areas)
+        return localise_photo(new.photos[row], new.features_of(row).features, areas)
 
     if threads <= 1 or len(rows) < 2:
         outcomes = dict(zip(rows, map(one, rows), strict=True))

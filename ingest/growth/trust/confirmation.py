@@ -168,7 +168,7 @@ def corroborate(
         if photos[row].sha256 not in names and source.speaks_to(own):
             asked[row] = source
     unheard = [row for row in asked if (write_id, row) not in new.heard]
-    said = localise_photos(photos, unheard, new.given.features_of, [indexed], threads)[0]
+    said = localise_photos(new.given, unheard, [indexed], threads)[0]
     new.heard.update({(write_id, row): said.get(row) for row in unheard})
     for row, source in asked.items():
         found, known_here = new.heard[write_id, row], None
