@@ -25,7 +25,6 @@ def fit_of(spread: float = 1.0, neighbours_factor: float = 1.0) -> FittedSimilar
     return FittedSimilarity(
         local_from_sfm=Sim3.identity(),
         covariance=np.eye(7) * 1e-8,
-        errors_px=np.zeros(0),
         spread=spread,
         neighbours_factor=neighbours_factor,
     )

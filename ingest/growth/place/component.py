@@ -26,7 +26,6 @@ from ingest.growth import gates
 from ingest.growth.place.localised import in_frame, with_lens
 from ingest.growth.place.placement import parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
-from ingest.growth.place.similarity_fit import find_correspondences
 from ingest.growth.values import (
     DRIFT_BUDGET_M,
     LEAST_PHOTOS,
@@ -47,7 +46,7 @@ from reloc.localise.pose import reprojection_errors
 _VERSION = "grown-1"
 # Points of two photos carry descriptors: a handful of photos has hardly longer tracks, and the next photo
 # needs them to be localised.
-_MAPS = MapOptions(min_track_length=2)
+_LEAST_TRACK = 2
 # What a reconstruction is refused for whose photos are at several places. Not CONTRADICTS_GPS: to cut until
 # the geotags of a part agree is to choose the photos of whoever lies. Of a block copied elsewhere, half of
 # whose tags were at its twin, the parts with those tags were left over, small enough for one forged photo to
@@ -90,14 +89,13 @@ def grow_component(
     model, lenses = adopt_lenses(model, new.photos, near, keypoints)
     cameras = [model.cameras[c] for c in model.camera_of.tolist()]
     own = {k: with_lens(in_frame(photo, frame), cameras[k]) for k, photo in own.items()}
-    correspondences = find_correspondences(model, own, keypoints)
-    placement = place_by_maps(model, own, correspondences, new.photos, near, frame)
+    placement = place_by_maps(model, own, keypoints, new.photos, near, frame)
     if isinstance(placement, Refused):
         return placement
-    refusal = gates.first_refusal(placement.gates)
+    refusal = next((gate for gate in placement.gates if not gate.passes), None)
     if refusal is not None:
         return Refused(reason=refusal.reason, message=refusal.message, gates=placement.gates)
-    refined = refine_placed(model, placement, correspondences, own, keypoints, lenses, max_bound_m)
+    refined = refine_placed(model, placement, own, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
     return _assembled(refined, new, near, identity or _named([new.photos[r] for r in rows]))
@@ -122,9 +120,9 @@ def _assembled(
     """The map of a refined model, with what growth knows of it as evidence."""
     model, placement = refined.model, refined.placement
     maps = {m.map_id: m for area in areas for m in area.maps}
-    parents = [(maps[e.map_id], e.shared_points) for e in placement.edges]
+    parents = [maps[e.map_id] for e in placement.edges]
     on_earth, to_anchors = (
-        placement.covariance + parents_covariance(parents, placement.frame, relative=relative)
+        placement.covariance + parents_covariance(placement.edges, areas, placement.frame, relative=relative)
         for relative in (False, True)
     )
     rows = model.rows.tolist()
@@ -140,7 +138,7 @@ def _assembled(
         [new.photos[r] for r in rows],
         [new.features_of(r) for r in rows],
         identity,
-        replace(_MAPS, height_datum=parents[0][0].height_datum),
+        MapOptions(min_track_length=_LEAST_TRACK, height_datum=parents[0].height_datum),
     )
     if feature_map is None:
         message = "no point is placed well enough: the photos' rays are parallel"
@@ -153,8 +151,8 @@ def _assembled(
     grown = replace(
         feature_map,
         status="quarantined",
-        generation=1 + max(m.generation for m, _ in parents),
-        parents=tuple(m.map_id for m, _ in parents),
+        generation=1 + max(m.generation for m in parents),
+        parents=tuple(m.map_id for m in parents),
         placement=replace(feature_map.placement, evidence={GROWTH: growth}),
         images=images,
         provenance=without_modes(feature_map.provenance),

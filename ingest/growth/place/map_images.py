@@ -16,7 +16,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.unplaced_map import AnyMap
 from ingest.colmap.bridge import Model
 from ingest.growth.place.localised import in_frame, localise_photo
-from ingest.growth.place.similarity_fit import agreed_similarity, find_correspondences
+from ingest.growth.place.similarity_fit import agreed_similarity
 from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
@@ -91,13 +91,12 @@ def measure_overlap(
         return f"{len(localised)} of {len(images)} images are found, {LEAST_PHOTOS} are needed"
     model = model_of(feature_map, images, described=True)
     keypoints = [features_and_points(feature_map, image)[0].xy.astype(float) for image in images]
-    correspondences = find_correspondences(model, localised, keypoints)
-    found = agreed_similarity(model, localised, correspondences, [Sim3.identity()])
+    found = agreed_similarity(model, localised, keypoints, [Sim3.identity()])
     if found is None:
         return "no image agrees with another"
-    fit, agree, used = found
-    used &= np.isin(correspondences.photo_of, list(agree))  # and not those carried into images that do not
-    points = len(np.unique(correspondences.point_of[used]))
+    fit, agree, held = found
+    # Without those carried into images that do not agree.
+    points = len(np.unique(held.point_of[np.isin(held.photo_of, list(agree))]))
     if len(agree) < LEAST_PHOTOS or points < _LEAST_POINTS:
         return f"{len(agree)} images and {points} points agree, {LEAST_PHOTOS} and {_LEAST_POINTS} are needed"
     return Edge(

@@ -102,7 +102,6 @@ def adopt_lenses(
 def refine_placed(
     model: Model,
     placement: MapsPlacement,
-    correspondences: Correspondences,
     localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
     lenses: Lenses,
@@ -125,11 +124,12 @@ def refine_placed(
     weak = weak_photos(model, list(left_out), [k for k in placement.agreeing if k not in left_out])
     left_out |= {k: ("WEAK_LINK", message) for k, message in weak.items()}
     for _ in range(_ROUNDS):
-        good = correspondences.take(placement.used & ~np.isin(correspondences.photo_of, list(left_out)))
+        good = placement.held.take(~np.isin(placement.held.photo_of, list(left_out)))
         good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)  # those that hold anything
         adjusted, fixed = _refined(placed, list(left_out), good, lenses, keypoints)
         spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
-        fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
+        held = good.take(adjusted.fixed_kept)
+        fit = fit_similarity(adjusted.model, Sim3.identity(), held)
         inside = {k: localised[k] for k in placement.agreeing if k not in left_out}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
         left_out |= {k: (_CONTRADICTS, message) for k, message in against.items()}
@@ -145,7 +145,7 @@ def refine_placed(
         if named:
             message = f"{what}: {next(iter(named.values()))}"
             return Refused(reason=reason, message=message, gates=placement.gates)
-    edges = edges_of(adjusted.model, fit, good, adjusted.fixed_kept)
+    edges = edges_of(adjusted.model, fit, held)
     if {e.map_id for e in edges} != {e.map_id for e in placement.edges}:
         edges = placement.edges  # a parent that hardly held: as it was
     whole = _with_existing(adjusted, fixed, good, [e.map_id for e in edges])

@@ -85,9 +85,7 @@ class CanaryRun:
         if count:
             first = self.regressions[0]
             message = f"{count} of {len(self.checks)} canaries regress: {first.name}: {first.regression}"
-        return Gate(
-            name="canaries", reason="CANARY", figure=count, limit=0, passes=not count, message=message
-        )
+        return Gate.at_most("canaries", "CANARY", count, 0, message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

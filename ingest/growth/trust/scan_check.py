@@ -175,14 +175,8 @@ class _Laid:
 
 def _gate(chi2: float, what: str) -> Gate:
     limit = sigmas_limit(6)
-    return Gate(
-        name="scan",
-        reason="CONTRADICTS_SCAN",
-        figure=chi2,
-        limit=limit,
-        passes=chi2 <= limit,
-        message=f"{what} (chi-square {chi2:.1f}, {limit:.1f} allowed); it waits until maps and scan agree",
-    )
+    message = f"{what} (chi-square {chi2:.1f}, {limit:.1f} allowed); it waits until maps and scan agree"
+    return Gate.at_most("scan", "CONTRADICTS_SCAN", chi2, limit, message)
 
 
 def _points(feature_map: FeatureMap) -> FloatArray:
