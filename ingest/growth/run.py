@@ -157,8 +157,13 @@ class _Run:
 
         A map that goes back to quarantine and is promoted again, round by round, would keep the run going.
         """
-        rows = self._open_rows()
-        outside = NewPhotos(given=self.new, rows=rows, localised=self.localised, heard=self.heard)
+        outside = NewPhotos(
+            given=self.new,
+            rows=self._open_rows(),
+            threads=self.options.threads,
+            localised=self.localised,
+            heard=self.heard,
+        )
         outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside)
         for outcome in outcomes:
             self.promotions[outcome.map_id] = outcome

@@ -20,7 +20,7 @@ from featuredb.store.tables import BOUNDS
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.graph.pose_graph import WORLD, GraphSolution, solve_pose_graph
-from ingest.growth.map_places import drift_m, growth_of, inflated, map_drift_m, with_growth
+from ingest.growth.map_places import drift_m, growth_of, inflated, with_growth, with_overlaps
 from ingest.growth.place.component import GrownMap, grow_component
 from ingest.growth.values import LEAST_PHOTOS, Edge, GrowthPhotos, LocalisedPhoto, Refused, tied_together
 from ingest.map_builder import MapIdentity
@@ -192,29 +192,19 @@ def with_drift(
     grown: GrownMap, maps: Mapping[str, PlacedMap], budget_m: float
 ) -> tuple[FeatureMap, float, FloatArray]:
     """The map with its overlaps by the graph of maps, its drift (m) and covariance (7, 7) to anchors."""
-    feature_map = grown.feature_map
+    feature_map, me = grown.feature_map, grown.feature_map.map_id
     growth = growth_of(feature_map.placement.evidence)
     held = [edge for edge in grown.placement.edges if edge.map_id in maps]
     held = [replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn) for edge in held]
     edges = no_surer_than(held, grown.placement.covariance)
-    covariance = feature_map.placement.covariance
-    relative = np.reshape(growth["covariance_relative"], (7, 7))
-    others = {m: placed for m, placed in maps.items() if m != feature_map.map_id}
-    solution = solve_maps(others, {feature_map.map_id: edges}, feature_map.frame)
-    if feature_map.map_id in solution.covariance:
-        covariance = solution.covariance[feature_map.map_id]
-        relative = solution.covariance_relative[feature_map.map_id]
-    drift = map_drift_m(feature_map, relative)
-    placed = with_growth(
-        feature_map,
-        drift_m=round(drift, 6),
-        budget_m=budget_m,
-        covariance_relative=relative.ravel().tolist(),
-        edges=[edge.as_json() for edge in edges],
-        gates=growth["gates"] | gates.figures([gates.drift(drift, budget_m)]),
-    )
-    placed = replace(placed, placement=replace(placed.placement, covariance=covariance))
-    return inflated(placed), drift, relative
+    others = {m: placed for m, placed in maps.items() if m != me}
+    solution = solve_maps(others, {me: edges}, feature_map.frame)
+    covariance = solution.covariance.get(me, feature_map.placement.covariance)
+    relative = solution.covariance_relative.get(me, np.reshape(growth["covariance_relative"], (7, 7)))
+    placed = replace(feature_map, placement=replace(feature_map.placement, covariance=covariance))
+    noted, drift = with_overlaps(placed, relative, edges, budget_m)
+    told = growth["gates"] | gates.figures([gates.drift(drift, budget_m)])
+    return inflated(with_growth(noted, gates=told)), drift, relative
 
 
 def rows_within(

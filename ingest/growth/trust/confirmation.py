@@ -112,15 +112,16 @@ class NewPhotos:
     """New photos that may corroborate.
 
     Attributes:
-        rows: of the given photos that may be asked.
+        rows: of the given photos that may be asked. threads: how many at a time.
         localised: those that the active maps localise, by row.
         heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
             map is examined again whenever another one changes, and its own photos are the same.
     """
 
-    given: GrowthPhotos
-    rows: Sequence[int]
-    localised: Mapping[int, LocalisedPhoto]
+    given: GrowthPhotos = field(default_factory=GrowthPhotos)
+    rows: Sequence[int] = ()
+    threads: int = 1
+    localised: Mapping[int, LocalisedPhoto] = field(default_factory=dict)
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
 
     def that_may_see(self, feature_map: FeatureMap) -> list[int]:
@@ -137,11 +138,10 @@ class NewPhotos:
 def corroborate(
     feature_map: FeatureMap,
     others: Sequence[FeatureMap],
-    new: NewPhotos | None,
+    new: NewPhotos,
     sources: Sources,
     *,
     write_id: str,
-    threads: int = 1,
 ) -> list[OutsidePhoto]:
     """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 
@@ -160,15 +160,13 @@ def corroborate(
             known = pose.center, _center_variance(other, image)
             name = f"{image.name} of map {other.map_id}"
             heard.append(_heard(feature_map, found, source, name, known))
-    if new is None:
-        return heard
     photos, asked = new.given.photos, dict[int, Source]()
     for row in new.that_may_see(feature_map):
         source = sources.of_owner(photos[row].contributor or OPERATOR)
         if photos[row].sha256 not in names and source.speaks_to(own):
             asked[row] = source
     unheard = [row for row in asked if (write_id, row) not in new.heard]
-    said = localise_photos(new.given, unheard, [indexed], threads)[0]
+    said = localise_photos(new.given, unheard, [indexed], new.threads)[0]
     new.heard.update({(write_id, row): said.get(row) for row in unheard})
     for row, source in asked.items():
         found, known_here = new.heard[write_id, row], None
@@ -236,7 +234,6 @@ class Confirmation:
     """How far a map is confirmed: when the gate passes, it is.
 
     Attributes:
-        owners: of the photos that confirm each other, or are proven.
         confirmed: image ids of the map.
         earned: those of the map's that make a record for their owner: proven themselves, or confirmed by a
             proven photo, or by photos of two other owners on record.
@@ -245,7 +242,6 @@ class Confirmation:
     """
 
     gate: Gate
-    owners: tuple[str, ...]
     confirmed: tuple[int, ...]
     earned: tuple[int, ...]
     points: NDArray[np.bool_]
@@ -271,10 +267,9 @@ def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[Outside
     by_two = np.asarray(sees.multiply(others).sum(axis=0)).ravel() > 0
     by_proven = np.asarray(sees[np.flatnonzero(proven[:own])].sum(axis=0)).ravel() > 0
     ids = [image.image_id for image in feature_map.images]
-    owners = tuple(dict.fromkeys(s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes))
+    owners = {s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes}
     return Confirmation(
         gate=_gate(int(confirmed[:own].sum()), len(owners), pairs, bool(proven[:own].any()), against),
-        owners=owners,
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
         earned=tuple(i for k, i in enumerate(ids) if _earns(k, everyone, sees_same, apart)),
         points=(by_two | by_proven)[: len(feature_map.points)],
