@@ -104,10 +104,10 @@ class _Run:
         replaced = replace_descendants(self.database, self.work, budget_m=self.options.drift_budget_m)
         self.replacements += [replaced] if replaced else []
         self.localiser = Localiser.open(self.database, previous=self.localiser if self.rounds > 1 else None)
-        placed, self.unplaced, notes = place_unplaced_maps(
-            self.database, self.localiser.areas, self.work, self.options
-        )
-        self.entries |= {entry.map_id: entry for entry in placed}
+        areas = self.localiser.areas
+        tried, notes = place_unplaced_maps(self.database, areas, self.work, self.options)
+        self.unplaced = [entry for entry in tried if entry.status == "unplaced"]
+        self.entries |= {entry.map_id: entry for entry in tried if entry.status != "unplaced"}
         self.notes |= dict.fromkeys(notes)
 
     def localise(self) -> None:
@@ -256,13 +256,11 @@ class _Run:
             self._note(Refused(reason="RETIRED_MAP", message=message), grown.model)
             return
         used = [self.new.candidate_ids[r] for r in rows if r in self.new.candidate_ids]
-        if used:
-            mark_used(self.database, used, feature_map.map_id)
+        mark_used(self.database, used, feature_map.map_id)
         self.database.commit_map(feature_map)
-        self.map_of.update(dict.fromkeys(rows, feature_map.map_id))
-        for row in rows:
-            self.why.pop(row, None)
-        self.why.update({row: why for row, why in grown.left_out.items() if row not in self.map_of})
+        self.map_of |= dict.fromkeys(rows, feature_map.map_id)
+        reasons = {**self.why, **grown.left_out}
+        self.why = {row: why for row, why in reasons.items() if row not in self.map_of}
         self.entries[feature_map.map_id] = grown_entry(feature_map)
         _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
 

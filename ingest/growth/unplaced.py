@@ -36,11 +36,11 @@ _LOG = logging.getLogger(__name__)
 
 def place_unplaced_maps(
     database: Database, areas: Sequence[IndexedArea], work: Path, options: GrowthOptions
-) -> tuple[list[GrownEntry], list[GrownEntry], list[str]]:
+) -> tuple[list[GrownEntry], list[str]]:
     """Try every map without a place in the active areas; a question is not asked twice.
 
     Returns:
-        Maps that have a place now, in quarantine; those that still have none, and why; notes for people.
+        Maps that have a place now, in quarantine, and those that are "unplaced" still; notes for people.
 
     Raises:
         StoreError: the database cannot be read or written; what is committed stands.
@@ -50,23 +50,22 @@ def place_unplaced_maps(
     active = sorted({m.map_id for indexed in areas for m in indexed.area.maps})
     write_ids = sorted(snapshot.get(m).write_id for m in active) if waiting else []
     asks = options_fingerprint(replace(options, threads=1))
-    placed: list[GrownEntry] = []
-    unplaced: list[GrownEntry] = []
+    tried: list[GrownEntry] = []
     notes: list[str] = []
     for summary in waiting:
         asked = digest(asks, summary.write_id, *write_ids)
         known = recall(work, "maps", summary.map_id, asked)
         if known is not None:
-            unplaced.append(GrownEntry(**known))
+            tried.append(GrownEntry(**known))
             continue
         outcome = _place(database, snapshot, summary, areas, options, notes)
         if isinstance(outcome, FeatureMap):
-            placed.append(grown_entry(outcome))
+            tried.append(grown_entry(outcome))
             continue
-        unplaced.append(refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points))
+        tried.append(refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points))
         if outcome.reason not in ("CONFLICT", NOT_ASKED):
-            remember(work, "maps", summary.map_id, asdict(unplaced[-1]), asked)
-    return placed, unplaced, notes
+            remember(work, "maps", summary.map_id, asdict(tried[-1]), asked)
+    return tried, notes
 
 
 def _place(

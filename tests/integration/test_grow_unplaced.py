@@ -56,8 +56,8 @@ def test_a_map_without_a_place_is_placed_by_one_that_shows_the_same(
     unplaced = _unplaced("loose", range(4))
     before = database.commit_map(unplaced).version
     areas, options = Localiser.open(database).areas, GrowthOptions()
-    done, _, _ = place_unplaced_maps(database, areas, tmp_path / "work", options)
-    assert [entry.map_id for entry in done] == ["loose"], done
+    done, _ = place_unplaced_maps(database, areas, tmp_path / "work", options)
+    assert [(entry.map_id, entry.status) for entry in done] == [("loose", "quarantined")], done
     placed = database.snapshot().load_map("loose")
     assert (placed.status, placed.generation, placed.parents) == ("quarantined", 1, ("old",))
     assert (placed.placement.method, placed.name) == ("map", "loose")

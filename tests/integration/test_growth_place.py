@@ -42,6 +42,11 @@ from tools.growth_gates import read_judgements, recorded
 _PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 
+def _left_out(grown: GrownMap) -> dict[int, str]:
+    """What the placement left out, by place in the model, and the codes of the reasons."""
+    return {k: code for k, (code, _) in grown.placement.left_out.items()}
+
+
 @pytest.fixture(scope="module")
 def area() -> IndexedArea:
     return indexed(existing())
@@ -181,7 +186,7 @@ def test_a_photo_that_contradicts_the_others_is_left_out(
     )
     grown = grow_component(new.model, new.given, {**localised, 1: liar}, [area], identity())
     assert isinstance(grown, GrownMap), grown
-    assert grown.placement.disagreeing == (1,)
+    assert _left_out(grown) == {1: "CONTRADICTS"}
     assert 1 not in grown.model.rows
     assert centers_error(grown, new).max() < 0.05
 
@@ -258,12 +263,12 @@ def test_a_single_blind_photo_is_left_out(
     bare, kept = _cornered(new, localised, [1])
     grown = grow_component(bare, new.given, kept, [area], identity())
     assert isinstance(grown, GrownMap), grown
-    assert grown.placement.blind == (1,)
+    assert _left_out(grown) == {1: "NOT_VISIBLE"}
     assert grown.left_out[1][0] == "NOT_VISIBLE"
     assert 1 not in grown.model.rows
     whole = grow_component(new.model, new.given, localised, [area], identity())
     assert isinstance(whole, GrownMap), whole
-    assert whole.placement.blind == ()
+    assert _left_out(whole) == {}
     assert 1 in whole.model.rows
 
 
@@ -280,11 +285,11 @@ def test_a_photo_that_shows_little_of_what_its_neighbours_see_is_left_out(
     bare = with_observations(new.model, seen & (views[new.model.point_of] >= 2))
     lone = grow_component(bare, new.given, others, [area], identity())
     assert isinstance(lone, GrownMap), lone
-    assert lone.placement.blind == (4,)
+    assert _left_out(lone) == {4: "NOT_VISIBLE"}
     assert lone.left_out[4][0] == "NOT_VISIBLE"
     grown = grow_component(new.model, new.given, others, [area], identity())
     assert isinstance(grown, GrownMap), grown
-    assert grown.placement.blind == ()
+    assert _left_out(grown) == {}
     assert 4 in grown.model.rows
 
 

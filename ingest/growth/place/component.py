@@ -214,7 +214,7 @@ def lone_groups(
         rows = np.array(list(photos))[group_of == group].tolist()
         if len(rows) >= 2:
             own = {pair: view for pair, view in geometries.items() if pair[0] in rows}
-            groups.append(_triangulated(rows, photos, own, new))
+            groups.append(_triangulated({r: photos[r] for r in rows}, own, new))
     return groups, dict.fromkeys(alone, "ALONE: no other photo bears its pose out")
 
 
@@ -248,22 +248,19 @@ def intersections(
 
 
 def _triangulated(
-    rows: Sequence[int],
-    photos: Mapping[int, LocalisedPhoto],
-    geometries: Mapping[Pair, TwoView],
-    new: GrowthPhotos,
+    photos: Mapping[int, LocalisedPhoto], geometries: Mapping[Pair, TwoView], new: GrowthPhotos
 ) -> Model:
     """A model of the group, from the localisations' poses adjusted to its verified matches alone.
 
     Whether it still fits the localisations is asked when it is placed, as of any reconstruction.
     """
-    cameras = list(dict.fromkeys(photos[r].camera for r in rows))
+    rows, cameras = list(photos), list(dict.fromkeys(photo.camera for photo in photos.values()))
     sfm = []
-    for r in rows:
-        camera_row, xy = cameras.index(photos[r].camera), new.features_of(r).features.xy
+    for r, photo in photos.items():
+        camera_row, xy = cameras.index(photo.camera), new.features_of(r).features.xy
         sfm.append(SfmPhoto(name=str(r), camera_row=camera_row, keypoints=xy))
     views = {(rows.index(a), rows.index(b)): view for (a, b), view in geometries.items()}
-    model = triangulate_posed(cameras, sfm, [photos[r].cam_from_local for r in rows], views)
+    model = triangulate_posed(cameras, sfm, [photo.cam_from_local for photo in photos.values()], views)
     keypoints = [sfm[int(k)].keypoints.astype(np.float64) for k in model.rows]
     lenses = Lenses(held=range(len(model.cameras)))
     free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses).model

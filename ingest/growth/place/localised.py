@@ -216,12 +216,9 @@ def with_shared_lenses(
         by_matches = sorted(rows, key=lambda r: -len(localised[r].pixels))
         lenses = list(dict.fromkeys(localised[r].camera for r in by_matches))[:_MOST_LENSES]
         if len(lenses) > 1:
-            tries = [[with_lens(localised[r], lens) for r in rows] for lens in lenses]
-            fits = [
-                sum(_fitting(photo) for photo in tried if photo.camera == lens)
-                for tried, lens in zip(tries, lenses, strict=True)
-            ]
-            found.update(zip(rows, tries[int(np.argmax(fits))], strict=True))
+            tries = {lens: [with_lens(localised[r], lens) for r in rows] for lens in lenses}
+            best = max(tries, key=lambda lens: sum(_fitting(p) for p in tries[lens] if p.camera == lens))
+            found.update(zip(rows, tries[best], strict=True))
     return found
 
 

@@ -34,6 +34,9 @@ from reloc.localise.matching import EXPECTED_DEG, visible_points
 # re-upload 13.3 m off showed 0.17; right photos of that database 0.32 and more, of the one that grew with
 # this limit 0.23 and more.
 _LEAST_SHOWN = 0.25
+CONTRADICTS = "CONTRADICTS"  # reason of photos that their own localisation has elsewhere
+_SHOWS_LITTLE = "the photo shows too little of what existing maps say it should show from where it would be"
+_ELSEWHERE = "the photo by itself sees existing points elsewhere than the others put it"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,9 +46,9 @@ class MapsPlacement:
     Attributes:
         frame: local frame in which `fit` places the model.
         covariance: (7, 7) of the similarity's left perturbation, relative to the existing maps.
-        agreeing, disagreeing: localised photos that agree with the placement, and those that do not, by
-            their place in the model. Photos that no map localises are in neither.
-        blind: those that show too little of what existing maps, or the others' points, say they should.
+        agreeing: localised photos that agree with the placement, by their place in the model.
+        left_out: reason and message of those that do not, and of any that show too little of what existing
+            maps, or the others' points, say they should.
         edges: one for each existing map that holds it, most shared points first: the correction that this
             map alone would apply to the placed one.
         fit: over the correspondences that agree, `held`.
@@ -56,8 +59,7 @@ class MapsPlacement:
     frame: LocalFrame
     covariance: FloatArray
     agreeing: tuple[int, ...]
-    disagreeing: tuple[int, ...]
-    blind: tuple[int, ...]
+    left_out: Mapping[int, tuple[str, str]]
     edges: tuple[Edge, ...]
     fit: FittedSimilarity
     held: Correspondences
@@ -82,7 +84,7 @@ def place_by_maps(
         photos: all new photos, for their positions.
         areas: that hold the existing maps.
     """
-    found = agreed_similarity(model, own, keypoints)
+    found = agreed_similarity(model, own, keypoints, ())
     edges = edges_of(model, found[0], found[2]) if found else ()
     if not found or not edges:
         gate = gates.agreement(0, len(own))
@@ -90,10 +92,10 @@ def place_by_maps(
     fit, agree, held = found
     on_earth, sim = parents_covariance(edges, areas, frame), fit.local_from_sfm
     existing, with_own = _shown_parts(model, sim, held, areas, frame)
-    disagree = own.keys() - agree
-    # Those that disagree are left out as such.
-    blind = set(np.flatnonzero(with_own < _LEAST_SHOWN).tolist()) - disagree
+    left_out = dict.fromkeys(sorted(own.keys() - agree), (CONTRADICTS, _ELSEWHERE))
+    blind = {*np.flatnonzero(with_own < _LEAST_SHOWN).tolist()} - left_out.keys()
     blind |= {k for k in agree if existing[k] < gates.LEAST_VISIBLE}
+    left_out |= dict.fromkeys(sorted(blind), ("NOT_VISIBLE", _SHOWS_LITTLE))
     centers = sim.act(model.centers())
     squared_m2 = [((own[k].cam_from_local.center - centers[k]) ** 2).sum() for k in agree]
     positions = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
@@ -101,14 +103,13 @@ def place_by_maps(
         frame=frame,
         covariance=fit.covariance,
         agreeing=tuple(sorted(agree)),
-        disagreeing=tuple(sorted(disagree)),
-        blind=tuple(sorted(blind)),
+        left_out=left_out,
         edges=edges,
         fit=fit,
         held=held,
         residual_rms_m=float(np.sqrt(np.mean(squared_m2))),
         gates=(
-            gates.agreement(len(agree), len(disagree)),
+            gates.agreement(len(agree), len(own) - len(agree)),
             gates.geotags(*positions, by=", ".join(e.map_id for e in edges)),
             gates.visibility(existing[np.isfinite(existing)]),
         ),

@@ -27,16 +27,13 @@ from ingest.growth.place.drift import (
     shared_turn,
     turning_covariance,
 )
-from ingest.growth.place.placement import MapsPlacement, edges_of
+from ingest.growth.place.placement import CONTRADICTS, MapsPlacement, edges_of
 from ingest.growth.place.similarity_fit import Correspondences, FittedSimilarity, fit_similarity
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from ingest.sfm.links import bottleneck_share, select_photos
 
-# Reasons of photos that nothing holds well enough, and of those that their own localisation has elsewhere.
-_LOOSE, _CONTRADICTS = "DRIFT_BUDGET", "CONTRADICTS"
-_SHOWS_LITTLE = "the photo shows too little of what existing maps say it should show from where it would be"
-_ELSEWHERE = "the photo by itself sees existing points elsewhere than the others put it"
+_LOOSE = "DRIFT_BUDGET"  # reason of photos that nothing holds well enough
 # `bottleneck_share` that photos need which are not localised themselves. In simulated communities photos tied
 # to look-alike halls, 68 and 78 m off, had 0.15 and 0.04; right photos nearly all 0.46 and more, single ones
 # 0.14. Those wait, and are localised by themselves once their neighbours are in an active map.
@@ -119,10 +116,8 @@ def refine_placed(
     sim = placement.fit.local_from_sfm
     poses = tuple(sim.act_on_pose(pose) for pose in model.cam_from_sfm)
     placed = replace(model, cam_from_sfm=poses, xyz=sim.act(model.xyz))  # in metres
-    left_out = dict.fromkeys(placement.disagreeing, (_CONTRADICTS, _ELSEWHERE))
-    left_out |= dict.fromkeys(placement.blind, ("NOT_VISIBLE", _SHOWS_LITTLE))
-    weak = weak_photos(model, list(left_out), [k for k in placement.agreeing if k not in left_out])
-    left_out |= {k: ("WEAK_LINK", message) for k, message in weak.items()}
+    left_out = dict(placement.left_out)
+    left_out |= weak_photos(model, list(left_out), [k for k in placement.agreeing if k not in left_out])
     for _ in range(_ROUNDS):
         good = placement.held.take(~np.isin(placement.held.photo_of, list(left_out)))
         good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)  # those that hold anything
@@ -132,26 +127,24 @@ def refine_placed(
         fit = fit_similarity(adjusted.model, Sim3.identity(), held)
         inside = {k: localised[k] for k in placement.agreeing if k not in left_out}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
-        left_out |= {k: (_CONTRADICTS, message) for k, message in against.items()}
         loose = loose_photos(adjusted.model, spread.poses, max_bound_m)
-        loose = {k: message for k, message in loose.items() if k not in left_out}
-        left_out |= {k: (_LOOSE, message) for k, message in loose.items()}
+        loose = {k: why for k, why in loose.items() if k not in left_out and k not in against}
+        left_out |= against | loose
         if not (against or loose) or len(left_out) > len(rows) - 2:
             break
-    for reason, named, what in (
-        (_LOOSE, loose, "hardly a photo is held well enough"),
-        (_CONTRADICTS, against, "photos contradict the others again and again"),
-    ):
-        if named:
-            message = f"{what}: {next(iter(named.values()))}"
-            return Refused(reason=reason, message=message, gates=placement.gates)
+    if loose or against:
+        what = (
+            "hardly a photo is held well enough" if loose else "photos contradict the others again and again"
+        )
+        reason, message = next(iter((loose or against).values()))
+        return Refused(reason=reason, message=f"{what}: {message}", gates=placement.gates)
     edges = edges_of(adjusted.model, fit, held)
     if {e.map_id for e in edges} != {e.map_id for e in placement.edges}:
         edges = placement.edges  # a parent that hardly held: as it was
     whole = _with_existing(adjusted, fixed, good, [e.map_id for e in edges])
     for k in sorted(set(range(len(rows))) - set(left_out) - set(whole.photo_of.tolist())):
         left_out[k] = _LOOSE, "the photo shows nothing that another photo of the map shows as well"
-    disagreeing = sum(reason == _CONTRADICTS for reason, _ in left_out.values())
+    disagreeing = sum(reason == CONTRADICTS for reason, _ in left_out.values())
     gate = gates.agreement(len(set(placement.agreeing) - set(left_out)), disagreeing)
     if not gate.passes:
         message = f"once refined, {gate.message}"
@@ -177,8 +170,8 @@ def contradicting_photos(
     localised: Mapping[int, LocalisedPhoto],
     spread: FloatArray,
     fits: Sequence[FittedSimilarity],
-) -> dict[int, str]:
-    """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.
+) -> dict[int, tuple[str, str]]:
+    """Photos of the model whose own localisation is elsewhere, by their place in it, and why.
 
     Asked of the refined model: as it comes, one of a few photos is bent by more than localised poses are
     uncertain. The sigmas are those of the localisation, times the spread and the neighbours factor of the
@@ -192,7 +185,7 @@ def contradicting_photos(
     """
     limit = gates.sigmas_limit(6)
     dilution = max(max(fit.spread, 1.0) ** 2 * fit.neighbours_factor for fit in fits)
-    found: dict[int, str] = {}
+    found: dict[int, tuple[str, str]] = {}
     for k, photo in sorted(localised.items()):
         pose, own_pose = model.cam_from_sfm[k], photo.cam_from_local
         turn = so3_log(own_pose.rotation.T @ pose.rotation)
@@ -205,10 +198,11 @@ def contradicting_photos(
         square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
         if square > limit:
             off_m, off_deg = np.linalg.norm(offset[3:]), np.degrees(np.linalg.norm(offset[:3]))
-            found[k] = (
+            message = (
                 f"the photo by itself is {off_m:.2f} m and {off_deg:.2f} degrees from where the others put "
                 f"it, chi-square {square:.0f}, {limit:.0f} is allowed"
             )
+            found[k] = CONTRADICTS, message
     return found
 
 
@@ -236,19 +230,17 @@ def pose_by_lens(photo: LocalisedPhoto, lens: Camera) -> FloatArray:
     return np.asarray(np.linalg.lstsq(by_pose, moved_px[good].reshape(-1), rcond=None)[0])
 
 
-def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> dict[int, str]:
-    """Photos that hang on those that are held by too little, and how little; `outside` do not count."""
+def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> dict[int, tuple[str, str]]:
+    """Photos that hang on those that are held by too little, and why; `outside` do not count."""
     firm = bottleneck_share(model, held, outside)
-    return {
-        k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
-        f"{100 * LEAST_LINK:.0f} % needed: look-alike places tie photos so"
-        for k in np.flatnonzero(firm < LEAST_LINK).tolist()
-        if k not in outside
-    }
+    needed = f"{100 * LEAST_LINK:.0f} % needed: look-alike places tie photos so"
+    tied = "% of its points tie the photo to those that are localised"
+    weak = [k for k in np.flatnonzero(firm < LEAST_LINK).tolist() if k not in outside]
+    return {k: ("WEAK_LINK", f"{100 * firm[k]:.1f} {tied}, {needed}") for k in weak}
 
 
-def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, str]:
-    """Photos that may be further off than the bound (95 %) against the existing points, and how far.
+def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, tuple[str, str]]:
+    """Photos that may be further off than the bound (95 %) against the existing points, and why.
 
     Args:
         spread: (k, 6, 6) of `PhotoSpread`; photos that see nothing any more are loose, unless none was asked.
@@ -259,10 +251,8 @@ def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[i
     seen = np.isfinite(spread[:, 0, 0])
     centers = center_covariances(model, spread)[seen]
     bounds[seen] = SIGMAS_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
-    return {
-        k: f"the photo may be {bounds[k]:.2f} m off, {max_bound_m:.2f} m are allowed"
-        for k in np.flatnonzero(bounds > max_bound_m).tolist()
-    }
+    loose, allowed = np.flatnonzero(bounds > max_bound_m).tolist(), f"{max_bound_m:.2f} m are allowed"
+    return {k: (_LOOSE, f"the photo may be {bounds[k]:.2f} m off, {allowed}") for k in loose}
 
 
 def _refined(

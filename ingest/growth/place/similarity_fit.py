@@ -151,10 +151,7 @@ class FittedSimilarity:
 
 
 def agreed_similarity(
-    model: Model,
-    own: Mapping[int, LocalisedPhoto],
-    keypoints: Sequence[FloatArray],
-    more: Sequence[Sim3] = (),
+    model: Model, own: Mapping[int, LocalisedPhoto], keypoints: Sequence[FloatArray], more: Sequence[Sim3]
 ) -> tuple[FittedSimilarity, set[int], Correspondences] | None:
     """The fit to the photos that agree with it, these, and the correspondences that do; or None.
 
