@@ -157,12 +157,9 @@ class _Run:
 
         A map that goes back to quarantine and is promoted again, round by round, would keep the run going.
         """
+        rows, threads = self._open_rows(), self.options.threads
         outside = NewPhotos(
-            given=self.new,
-            rows=self._open_rows(),
-            threads=self.options.threads,
-            localised=self.localised,
-            heard=self.heard,
+            given=self.new, rows=rows, threads=threads, localised=self.localised, heard=self.heard
         )
         outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside)
         for outcome in outcomes:

@@ -136,12 +136,7 @@ class NewPhotos:
 
 
 def corroborate(
-    feature_map: FeatureMap,
-    others: Sequence[FeatureMap],
-    new: NewPhotos,
-    sources: Sources,
-    *,
-    write_id: str,
+    feature_map: FeatureMap, others: Sequence[FeatureMap], new: NewPhotos, sources: Sources, *, write_id: str
 ) -> list[OutsidePhoto]:
     """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 

@@ -19,13 +19,7 @@ from ingest.growth import gates
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.place.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import (
-    NewPhotos,
-    Sources,
-    answering_with,
-    confirm,
-    corroborate,
-)
+from ingest.growth.trust.confirmation import NewPhotos, Sources, answering_with, confirm, corroborate
 from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
 
