@@ -74,11 +74,19 @@ def centers_error(grown: GrownMap, new: NewPhotos) -> FloatArray:
     return np.linalg.norm(grown.model.centers() - to_frame.act(truth), axis=1)
 
 
-def grown_map(feature_map: FeatureMap, model: Any, *, bending_m: float = 0.0, left_out: Any = ()) -> GrownMap:
+def grown_map(
+    feature_map: FeatureMap,
+    model: Any,
+    *,
+    relative: FloatArray | None = None,
+    bending_m: float = 0.0,
+    left_out: Any = (),
+) -> GrownMap:
     """A grown map of a model, without gates, overlaps or anything that its refinement knows."""
     none: Any = dict.fromkeys(Correspondences.__slots__[1:], np.zeros(0))
     return GrownMap(
         feature_map=feature_map,
+        relative=np.zeros((7, 7)) if relative is None else relative,
         placement=MapsPlacement(
             frame=feature_map.frame,
             covariance=np.zeros((7, 7)),
@@ -99,5 +107,4 @@ def grown_map(feature_map: FeatureMap, model: Any, *, bending_m: float = 0.0, le
         left_out=dict(left_out),
         poses=np.zeros((0, 6, 6)),
         bending_m=bending_m,
-        shared_turn=np.zeros((7, 3)),
     )

@@ -193,17 +193,15 @@ def with_drift(
 ) -> tuple[FeatureMap, float, FloatArray]:
     """The map with its overlaps by the graph of maps, its drift (m) and covariance (7, 7) to anchors."""
     feature_map, me = grown.feature_map, grown.feature_map.map_id
-    growth = growth_of(feature_map.placement.evidence)
-    held = [edge for edge in grown.placement.edges if edge.map_id in maps]
-    held = [replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn) for edge in held]
+    held = [replace(e, place=maps[e.map_id].place) for e in grown.placement.edges if e.map_id in maps]
     edges = no_surer_than(held, grown.placement.covariance)
     others = {m: placed for m, placed in maps.items() if m != me}
     solution = solve_maps(others, {me: edges}, feature_map.frame)
     covariance = solution.covariance.get(me, feature_map.placement.covariance)
-    relative = solution.covariance_relative.get(me, np.reshape(growth["covariance_relative"], (7, 7)))
+    relative = solution.covariance_relative.get(me, grown.relative)
     placed = replace(feature_map, placement=replace(feature_map.placement, covariance=covariance))
     noted, drift = with_overlaps(placed, relative, edges, budget_m)
-    told = growth["gates"] | gates.figures([gates.drift(drift, budget_m)])
+    told = gates.figures([*grown.placement.gates, gates.drift(drift, budget_m)])
     return inflated(with_growth(noted, gates=told)), drift, relative
 
 

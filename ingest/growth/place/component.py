@@ -18,7 +18,6 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
-from featuredb.maps.lineage import GROWTH
 from ingest.colmap.anchored import FixedPoints, Lenses, adjust_anchored, pixel_scale, triangulate_posed
 from ingest.colmap.bridge import Model, SfmPhoto, TwoView
 from ingest.fingerprint import digest
@@ -44,7 +43,7 @@ from reloc.localise.pose import reprojection_errors
 
 # Part of the id of every map that is named by its photos; raised when the same photos would give another map.
 _VERSION = "grown-1"
-# Points of two photos carry descriptors: a handful of photos has hardly longer tracks, and the next photo
+# Photos of a point that carries descriptors: a handful of photos has hardly longer tracks, and the next photo
 # needs them to be localised.
 _LEAST_TRACK = 2
 # What a reconstruction is refused for whose photos are at several places. Not CONTRADICTS_GPS: to cut until
@@ -61,6 +60,7 @@ class GrownMap(Refinement):
     """A refined reconstruction and its map, ready to be committed in quarantine."""
 
     feature_map: FeatureMap
+    relative: FloatArray  # (7, 7) covariance of its place relative to the anchors
 
 
 def grow_component(
@@ -117,14 +117,12 @@ def _meeting_place(
 def _assembled(
     refined: Refinement, new: GrowthPhotos, areas: Sequence[Area], identity: MapIdentity
 ) -> GrownMap | Refused:
-    """The map of a refined model, with what growth knows of it as evidence."""
-    model, placement = refined.model, refined.placement
+    """The map of a refined model."""
+    model, placement, edges = refined.model, refined.placement, refined.placement.edges
     maps = {m.map_id: m for area in areas for m in area.maps}
-    parents = [maps[e.map_id] for e in placement.edges]
-    on_earth, to_anchors = (
-        placement.covariance + parents_covariance(placement.edges, areas, placement.frame, relative=relative)
-        for relative in (False, True)
-    )
+    parents = [maps[edge.map_id] for edge in edges]
+    on_earth = placement.covariance + parents_covariance(edges, areas, placement.frame)
+    relative = placement.covariance + parents_covariance(edges, areas, placement.frame, relative=True)
     rows = model.rows.tolist()
     feature_map = build_map(
         model,
@@ -143,7 +141,6 @@ def _assembled(
     if feature_map is None:
         message = "no point is placed well enough: the photos' rays are parallel"
         return Refused(reason="NO_POINTS", message=message, gates=placement.gates)
-    growth = {"covariance_relative": to_anchors.ravel().tolist(), "gates": gates.figures(placement.gates)}
     images = tuple(  # they know what their lenses leave open; as they were where nothing is known
         replace(image, covariance=own) if np.isfinite(own).all() else image
         for image, own in zip(feature_map.images, refined.poses, strict=True)
@@ -153,11 +150,11 @@ def _assembled(
         status="quarantined",
         generation=1 + max(m.generation for m in parents),
         parents=tuple(m.map_id for m in parents),
-        placement=replace(feature_map.placement, evidence={GROWTH: growth}),
         images=images,
         provenance=without_modes(feature_map.provenance),
     )
-    return GrownMap(feature_map=grown, **{f.name: getattr(refined, f.name) for f in fields(refined)})
+    as_refined = {f.name: getattr(refined, f.name) for f in fields(refined)}
+    return GrownMap(feature_map=grown, relative=relative, **as_refined)
 
 
 def _named(photos: Sequence[Photo]) -> MapIdentity:
@@ -190,12 +187,11 @@ def lone_groups(
 ) -> tuple[list[Model], dict[int, str]]:
     """Groups among localised photos that no reconstruction holds, and for those in none the reason.
 
+    A group's model is of its matches alone, with the lenses of the localisations.
+
     Args:
         localised: the lone photos by row, those of one camera with one lens.
         new: with the geometry of overlaps, in which no pose takes part.
-
-    Returns:
-        A model of each group, of its matches alone, with the lenses of the localisations.
     """
     if not localised:
         return [], {}

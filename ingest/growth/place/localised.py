@@ -44,13 +44,10 @@ _MOST_LENSES = 5  # that are tried for one camera; those of the photos with most
 def localise_photos(
     new: GrowthPhotos, rows: Sequence[int], areas: Sequence[IndexedArea], threads: int = 1
 ) -> tuple[dict[int, LocalisedPhoto], dict[int, str]]:
-    """Localise the photos of these rows in the areas of the active maps, each for itself.
+    """By row the photos that the active maps' areas localise, each by itself, and why the others are not.
 
     Args:
         threads: photos at a time; the work is done outside of Python's lock, and results are the same.
-
-    Returns:
-        What was localised by row, and for the others the reason by row.
     """
 
     def one(row: int) -> LocalisedPhoto | str:

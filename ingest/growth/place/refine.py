@@ -55,7 +55,6 @@ class Refinement:
         placement: with the gates asked here and the covariances of the refined model.
         poses: (k, 6, 6) of `PhotoSpread`, of the photos that are kept.
         bending_m: what the photos' positions lack beyond the similarity, one sigma along the worst axis.
-        shared_turn: (7, 3) of `drift.shared_turn`.
         left_out: photos that are not kept although they agree, by row, with reason and message.
     """
 
@@ -63,7 +62,6 @@ class Refinement:
     placement: MapsPlacement
     poses: FloatArray
     bending_m: float
-    shared_turn: FloatArray
     left_out: Mapping[int, tuple[str, str]]
 
 
@@ -154,13 +152,13 @@ def refine_placed(
     turning = turning_covariance(adjusted.model, fit.covariance, spread)
     bending_m2 = bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
     covariance = fit.covariance + turning + np.diag([0.0] * 4 + [bending_m2] * 3)
+    edges = tuple(replace(edge, shared=shared_turn(adjusted.model, spread)) for edge in edges)
     kept = [k for k in range(len(rows)) if k not in left_out]
     return Refinement(
         model=select_photos(whole, [rows[k] for k in kept]),
         placement=replace(placement, edges=edges, covariance=covariance),
         poses=spread.poses[kept],
         bending_m=float(np.sqrt(bending_m2)),
-        shared_turn=shared_turn(adjusted.model, spread),
         left_out={rows[k]: why for k, why in left_out.items()},
     )
 

@@ -47,10 +47,9 @@ _LEAST_GAIN = 0.1
 
 
 def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Refused, str]:
-    """The map with the gate's figure in its evidence, or the refusal of a scan.
+    """The map with the gate's figure in its evidence, or its refusal.
 
-    Returns:
-        The second is why a scan that is there could not be compared, "" otherwise.
+    And why a scan that is there could not be compared, "" otherwise.
 
     Raises:
         StoreError: the scans cannot be read.
