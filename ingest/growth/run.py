@@ -54,8 +54,7 @@ def grow(
     """
     started, clock = datetime.now(UTC), time.perf_counter()
     extractor = new.features_of(0).features.fingerprint if new.photos else ""  # of all of them
-    options = options or GrowthOptions()
-    run = _Run(database=database, new=new, work=work, options=options, extractor=extractor)
+    run = _Run(database=database, new=new, work=work, options=options or GrowthOptions(), extractor=extractor)
     while True:  # each round but the last promotes a map that no round before it did
         run.start_round()
         run.localise()

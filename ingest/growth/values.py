@@ -168,8 +168,7 @@ class GrowthPhotos:
     """New photos, matched and reconstructed; without any, quarantined maps and new anchors are looked at.
 
     Attributes:
-        features_of: features of the photo of a row; called when they are needed, so that not all are in
-            memory.
+        features_of: of the photo of a row; called when they are needed, so that not all are in memory.
         models: their reconstructions, called once a round; rows of a model are rows of `photos`.
         candidate_ids: of contributed photos, by row.
         overlaps: pairs of rows whose matches were verified. geometry_of: of such a pair.

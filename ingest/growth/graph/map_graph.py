@@ -3,7 +3,7 @@
 import hashlib
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
 
 import numpy as np
@@ -12,7 +12,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, Placement
-from featuredb.store import Snapshot
+from featuredb.store import MapSummary, Snapshot
 from featuredb.store.changes import is_imported
 from featuredb.store.decode import frame_of, placement_of
 from featuredb.store.encode import Row
@@ -34,8 +34,8 @@ OWN = "own_placement"  # key of an anchor's evidence of growth, once a graph has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlacedMap:
-    """A map's place, as its row has it, without its points.
+class PlacedMap(MapSummary):
+    """A map with its place, as its row has it, without its points.
 
     Attributes:
         place: digest of where it lies.
@@ -43,12 +43,6 @@ class PlacedMap:
         edges: overlaps that were measured when it was placed.
     """
 
-    map_id: str
-    write_id: str
-    status: str
-    status_reason: str
-    generation: int
-    parents: tuple[str, ...]
     frame: LocalFrame
     placement: Placement
     place: str
@@ -71,19 +65,18 @@ class PlacedMap:
 
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
     """Maps with a place, by id, but retired ones and imports that nobody vouches for: edges may be forged."""
-    placed = {m.map_id for m in snapshot.maps() if not is_imported(m.status, m.status_reason)}
-    return {row["map_id"]: _placed(row) for row in snapshot.rows() if row["map_id"] in placed}
+    placed = {m.map_id: m for m in snapshot.maps() if not is_imported(m.status, m.status_reason)}
+    return {m: _placed(placed[m], row) for row in snapshot.rows() if (m := row["map_id"]) in placed}
 
 
-def _placed(row: Row) -> PlacedMap:
+def _placed(summary: MapSummary, row: Row) -> PlacedMap:
     frame, placement = frame_of(row), placement_of(row)
     corners = np.zeros((0, 3))
     if row[BOUNDS[0]] is not None:
         low_and_high = np.reshape([row[name] for name in BOUNDS], (2, 3))
         corners = frame.enu_from_utm(list(product(*low_and_high.T)), row["epsg"])
     return PlacedMap(
-        **{name: row[name] for name in ("map_id", "write_id", "status", "status_reason", "generation")},
-        parents=tuple(row["parents"]),
+        **{field.name: getattr(summary, field.name) for field in fields(summary)},
         frame=frame,
         placement=placement,
         place=place_key(frame, placement),

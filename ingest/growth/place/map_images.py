@@ -76,8 +76,7 @@ def measure_overlap(
 ) -> Edge | str:
     """Images of `feature_map` localised in `other`, and the similarity that they agree upon; or why not.
 
-    Args:
-        images: those that are asked; None: the ones that should see the other map by both placements.
+    Without `images` those are asked that should see the other map by both placements.
     """
     if feature_map.extractor_fingerprint != other.extractor_fingerprint:
         return "descriptors of different extractors"

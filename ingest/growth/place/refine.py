@@ -20,13 +20,7 @@ from ingest.colmap.bridge import Model, with_observations
 from ingest.colmap.precision import linearise
 from ingest.growth import gates
 from ingest.growth.map_places import SIGMAS_95
-from ingest.growth.place.drift import (
-    bending_variance_m2,
-    center_covariances,
-    photo_covariances,
-    shared_turn,
-    turning_covariance,
-)
+from ingest.growth.place import drift
 from ingest.growth.place.placement import CONTRADICTS, MapsPlacement, edges_of
 from ingest.growth.place.similarity_fit import Correspondences, FittedSimilarity, fit_similarity
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused
@@ -84,8 +78,7 @@ def adopt_lenses(
         lens = next((own for area in areas if key and (own := area.camera_for_key(key))), None)
         if lens is not None and (lens.width, lens.height) == (camera.width, camera.height):
             lent[c] = lens
-        focal_px = told.pop() if len(told) == 1 else None  # none where EXIF tells several
-        if focal_px is not None:
+        if len(told) == 1 and (focal_px := told.pop()) is not None:  # none where EXIF tells several
             focals[c] = focal_px
     lenses = Lenses(lent=lent, focal_px=focals)
     if not lent:
@@ -120,7 +113,7 @@ def refine_placed(
         good = placement.held.take(~np.isin(placement.held.photo_of, list(left_out)))
         good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)  # those that hold anything
         adjusted, fixed = _refined(placed, list(left_out), good, lenses, keypoints)
-        spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
+        spread = drift.photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
         held = good.take(adjusted.fixed_kept)
         fit = fit_similarity(adjusted.model, Sim3.identity(), held)
         inside = {k: localised[k] for k in placement.agreeing if k not in left_out}
@@ -149,10 +142,11 @@ def refine_placed(
         return Refused(reason=gate.reason, message=message, gates=placement.gates)
     # Until now the reconstruction was bent as it came, and its residuals said more of that than of where it
     # lies.
-    turning = turning_covariance(adjusted.model, fit.covariance, spread)
-    bending_m2 = bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
+    turning = drift.turning_covariance(adjusted.model, fit.covariance, spread)
+    bending_m2 = drift.bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
     covariance = fit.covariance + turning + np.diag([0.0] * 4 + [bending_m2] * 3)
-    edges = tuple(replace(edge, shared=shared_turn(adjusted.model, spread)) for edge in edges)
+    shared = drift.shared_turn(adjusted.model, spread)
+    edges = tuple(replace(edge, shared=shared) for edge in edges)
     kept = [k for k in range(len(rows)) if k not in left_out]
     return Refinement(
         model=select_photos(whole, [rows[k] for k in kept]),
@@ -247,7 +241,7 @@ def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[i
         return {}
     bounds = np.full(len(spread), np.inf)
     seen = np.isfinite(spread[:, 0, 0])
-    centers = center_covariances(model, spread)[seen]
+    centers = drift.center_covariances(model, spread)[seen]
     bounds[seen] = SIGMAS_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
     loose, allowed = np.flatnonzero(bounds > max_bound_m).tolist(), f"{max_bound_m:.2f} m are allowed"
     return {k: (_LOOSE, f"the photo may be {bounds[k]:.2f} m off, {allowed}") for k in loose}

@@ -19,14 +19,8 @@ from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import SIGMAS, Gate
 from ingest.growth.map_places import centers_of, place_sigmas_m
+from ingest.growth.place import map_images
 from ingest.growth.place.localised import in_frame, localise_photos
-from ingest.growth.place.map_images import (
-    LEAST_FEATURES,
-    MOST_IMAGES,
-    NEAR_M,
-    features_and_points,
-    localise_image,
-)
 from ingest.growth.values import DRIFT_BUDGET_M, QUERY, GrowthPhotos, LocalisedPhoto
 from reloc.localise.candidates import IndexedArea
 
@@ -140,8 +134,7 @@ def corroborate(
 ) -> list[OutsidePhoto]:
     """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 
-    Args:
-        others: maps around it, active or quarantined. write_id: of the map as it is.
+    They are the new ones, and images of others: maps around it, active or quarantined. `write_id` is its own.
     """
     indexed, own = IndexedArea.of([feature_map]), set(sources.of_map(feature_map))
     if not len(indexed.area.points):
@@ -149,7 +142,7 @@ def corroborate(
     names = {image.sha256 for image in feature_map.images}
     heard: list[OutsidePhoto] = []
     for other, image, source in _images_around(feature_map, others, own, sources):
-        found = None if image.sha256 in names else localise_image(other, image, [indexed])
+        found = None if image.sha256 in names else map_images.localise_image(other, image, [indexed])
         if found is not None:
             pose = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
             known = pose.center, _center_variance(other, image)
@@ -210,7 +203,7 @@ def _images_around(
 ) -> list[tuple[FeatureMap, MapImage, Source]]:
     """Images of other maps whose owners' word counts, nearest to the map's cameras first."""
     centers = centers_of(feature_map)
-    reach = NEAR_M + 0.5 * float(np.linalg.norm(np.ptp(centers, axis=0)))
+    reach = map_images.NEAR_M + 0.5 * float(np.linalg.norm(np.ptp(centers, axis=0)))
     found: list[tuple[float, str, FeatureMap, MapImage, Source]] = []
     for other in others:
         here_from_other = feature_map.frame.enu_from(other.frame)
@@ -220,8 +213,9 @@ def _images_around(
             if distance <= reach and source.speaks_to(own):
                 found.append((distance, f"{other.map_id} {image.name}", other, image, source))
     nearest = (entry[2:] for entry in sorted(found, key=lambda e: e[:2]))
-    described = (e for e in nearest if len(features_and_points(e[0], e[1])[1]) >= LEAST_FEATURES)
-    return list(islice(described, MOST_IMAGES))
+    kept = map_images.features_and_points
+    described = (e for e in nearest if len(kept(e[0], e[1])[0]) >= map_images.LEAST_FEATURES)
+    return list(islice(described, map_images.MOST_IMAGES))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
