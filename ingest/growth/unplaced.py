@@ -39,7 +39,7 @@ def place_unplaced_maps(
 ) -> tuple[list[GrownEntry], list[str]]:
     """Try every map without a place in the active areas; a question is not asked twice.
 
-    Which have a place now, in quarantine, and which are "unplaced" still; and notes for people.
+    An entry for each: now it has a place, in quarantine, or it is "unplaced" still. And notes for people.
 
     Raises:
         StoreError: the database cannot be read or written; what is committed stands.

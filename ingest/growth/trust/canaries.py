@@ -59,7 +59,7 @@ class CanaryCheck:
 
     def as_json(self) -> dict[str, Any]:
         told = {name: getattr(self, name) for name in ("name", "before", "after", "regression")}
-        return plain({**told, "error_m": round(self.error_m, 4)})
+        return {**told, "error_m": plain(round(self.error_m, 4))}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -134,7 +134,7 @@ def corroborate(
 ) -> list[OutsidePhoto]:
     """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 
-    They are the new ones, and images of others: maps around it, active or quarantined. `write_id` is its own.
+    Asked are new ones, and images of `others`: maps around it, active or quarantined. `write_id` is its own.
     """
     indexed, own = IndexedArea.of([feature_map]), set(sources.of_map(feature_map))
     if not len(indexed.area.points):
