@@ -16,7 +16,7 @@ from featuredb.store.candidates.states import Candidate
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.growth.growth_report import GrowthReport, PhotoFate
 from ingest.growth.run import grow
-from ingest.growth.values import GrowthOptions, GrowthPhotos, no_photos
+from ingest.growth.values import GrowthOptions, GrowthPhotos
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
@@ -174,7 +174,7 @@ def _prepared(
 ) -> tuple[GrowthPhotos, dict[str, tuple[str, str]]]:
     """Features, matches and reconstructions of the waiting photos; and those that cannot be read."""
     if not photos:
-        return no_photos(), {}
+        return GrowthPhotos(), {}
     done = reconstruct_photos(photos, Workspace(root=work), options.making, executor, progress=progress)
     rows = {row: Path(photo.name).stem for row, photo in enumerate(done.usable)}
     unreadable = {Path(name).stem: ("UNREADABLE", reason) for name, reason in done.unreadable.items()}

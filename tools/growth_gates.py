@@ -90,8 +90,8 @@ class _Note:
         self._photos: Sequence[Photo] = ()
 
     def placing(self, step: Any) -> Any:
-        def place_by_maps(model: Any, localised: Any, correspondences: Any, photos: Any, *more: Any) -> Any:
-            placement = step(model, localised, correspondences, photos, *more)
+        def place_by_maps(model: Any, localised: Any, keypoints: Any, photos: Any, *more: Any) -> Any:
+            placement = step(model, localised, keypoints, photos, *more)
             self._photos = photos
             self._model("place", model, placement, _said(placement.gates))
             return placement

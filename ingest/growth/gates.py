@@ -38,6 +38,12 @@ class Gate:
     passes: bool
     message: str
 
+    @classmethod
+    def at_most(cls, name: str, reason: str, figure: float, limit: float, message: str) -> "Gate":
+        """A gate that figures up to the limit pass."""
+        passes = bool(figure <= limit)
+        return cls(name=name, reason=reason, figure=figure, limit=limit, passes=passes, message=message)
+
     def as_json(self) -> dict[str, Any]:
         figure = None if not np.isfinite(self.figure) else round(float(self.figure), 6)
         return {"figure": figure, "limit": self.limit, "passes": self.passes}
@@ -48,11 +54,6 @@ def figures(gates: Iterable[Gate]) -> dict[str, Any]:
     return {gate.name: gate.as_json() for gate in gates}
 
 
-def first_refusal(gates: Iterable[Gate]) -> Gate | None:
-    """The first gate that does not pass."""
-    return next((gate for gate in gates if not gate.passes), None)
-
-
 def sigmas_limit(degrees: int) -> float:
     """Chi-square that is exceeded as seldom as a single normal figure exceeds `SIGMAS`."""
     return float(chdtri(degrees, chdtrc(1, SIGMAS**2)))
@@ -61,7 +62,7 @@ def sigmas_limit(degrees: int) -> float:
 def agreement(agreeing: int, disagreeing: int) -> Gate:
     """Photos whose own localisation agrees with the placement: most must."""
     total = agreeing + disagreeing
-    found = agreeing / total if total else 0.0
+    found = agreeing / max(total, 1)
     return Gate(
         name="agreement",
         reason="TOO_FEW_AGREE" if agreeing < LEAST_AGREEING else "PHOTOS_DISAGREE",
@@ -81,15 +82,13 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gat
         covariances: (n, 2, 2) of both together.
         by: the maps that place the photos.
     """
-    against, where = 0, ""
-    if len(offsets_m):
-        solved = np.linalg.solve(covariances, offsets_m[:, :, None])[:, :, 0]
-        contradict = np.einsum("ni,ni->n", offsets_m, solved) > sigmas_limit(2)
-        against = int(contradict.sum())
-        if against:
-            way = way_words(*np.median(offsets_m[contradict], axis=0))
-            where = f" by {by}" * bool(by) + f", which is {way} of them"
-    chance = float(bdtrc(against - 1, len(offsets_m), _WRONG_TAGS)) if against else 1.0
+    solved = np.linalg.solve(covariances, offsets_m[:, :, None])[:, :, 0]
+    contradict = np.einsum("ni,ni->n", offsets_m, solved) > sigmas_limit(2)
+    against, where = int(contradict.sum()), ""
+    if against:
+        way = way_words(*np.median(offsets_m[contradict], axis=0))
+        where = f" by {by}" * bool(by) + f", which is {way} of them"
+    chance = float(bdtrc(against - 1, len(offsets_m), _WRONG_TAGS))  # 1 for none
     return Gate(
         name="geotags",
         reason="CONTRADICTS_GPS",
@@ -105,26 +104,14 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gat
 def visibility(shown: FloatArray) -> Gate:
     """Share of the photos that show less of existing maps than they should, by what each does show (n,)."""
     blind, most = int((shown < LEAST_VISIBLE).sum()), round(1.0 - AGREEING_SHARE, 2)
-    share = blind / len(shown) if len(shown) else 0.0
-    return Gate(
-        name="visibility",
-        reason="NOT_VISIBLE",
-        figure=share,
-        limit=most,
-        passes=share <= most,
-        message=f"{blind} of {len(shown)} photos show less than {LEAST_VISIBLE:.0%} of what they should see "
-        f"of existing maps, a share of {most:.0%} is allowed",
+    message = (
+        f"{blind} of {len(shown)} photos show less than {LEAST_VISIBLE:.0%} of what they should see of "
+        f"existing maps, a share of {most:.0%} is allowed"
     )
+    return Gate.at_most("visibility", "NOT_VISIBLE", blind / max(len(shown), 1), most, message)
 
 
 def drift(drift_m: float, budget_m: float) -> Gate:
     """Whether a map is near enough to its anchors: a bound of 95 % on its errors against them."""
-    return Gate(
-        name="drift",
-        reason="DRIFT_BUDGET",
-        figure=drift_m,
-        limit=budget_m,
-        passes=drift_m <= budget_m,
-        message=f"it may have drifted {drift_m:.2f} m from its anchors, {budget_m:.2f} m are allowed; it "
-        "waits for an anchor",
-    )
+    message = f"it may have drifted {drift_m:.2f} m from its anchors, {budget_m:.2f} m are allowed"
+    return Gate.at_most("drift", "DRIFT_BUDGET", drift_m, budget_m, f"{message}; it waits for an anchor")

@@ -1,6 +1,6 @@
 """How far a map may be off at the places that it answers for, and what growth has noted of it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.place_bounds import NO_HEIGHT_M
+from ingest.growth.values import Edge
 
 SIGMAS_95 = 1.96  # 95 % of a normal error along the worst axis
 # Of the points of oblique photos a few lie far beyond the scene, at the end of nearly parallel rays.
@@ -25,15 +26,6 @@ def drift_m(covariance_relative: FloatArray, places: FloatArray) -> float:
         covariance_relative: (7, 7) relative to the anchors. places: (n, 3) in the same frame.
     """
     return SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
-
-
-def map_drift_m(feature_map: FeatureMap, covariance_relative: FloatArray) -> float:
-    """`drift_m` of a map, metres, and no less than at any of its photos' centres.
-
-    These are few among thousands of places, and may all be in the hundredth that is left out.
-    """
-    at_photos_m = place_sigmas_m(covariance_relative, centers_of(feature_map)).max(initial=0.0)
-    return max(SIGMAS_95 * float(at_photos_m), drift_m(covariance_relative, places_of(feature_map)))
 
 
 def centers_of(feature_map: FeatureMap) -> FloatArray:
@@ -69,6 +61,26 @@ def with_growth(feature_map: FeatureMap, **figures: Any) -> FeatureMap:
     placement = feature_map.placement
     growth = {**growth_of(placement.evidence), **figures}
     return replace(feature_map, placement=replace(placement, evidence={**placement.evidence, GROWTH: growth}))
+
+
+def with_overlaps(
+    feature_map: FeatureMap, relative: FloatArray, edges: Sequence[Edge], budget_m: float
+) -> tuple[FeatureMap, float]:
+    """The map with these overlaps and its drift (m), by its covariance (7, 7) to anchors, in its evidence.
+
+    The drift is no less than at any of its photos' centres: these are few among thousands of places, and may
+    all be in the hundredth that `drift_m` leaves out.
+    """
+    at_photos_m = SIGMAS_95 * float(place_sigmas_m(relative, centers_of(feature_map)).max(initial=0.0))
+    drift = max(at_photos_m, drift_m(relative, places_of(feature_map)))
+    noted = with_growth(
+        feature_map,
+        drift_m=round(drift, 6),
+        budget_m=budget_m,
+        covariance_relative=relative.ravel().tolist(),
+        edges=[edge.as_json() for edge in edges],
+    )
+    return noted, drift
 
 
 def inflated(feature_map: FeatureMap) -> FeatureMap:

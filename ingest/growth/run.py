@@ -54,8 +54,7 @@ def grow(
     """
     started, clock = datetime.now(UTC), time.perf_counter()
     extractor = new.features_of(0).features.fingerprint if new.photos else ""  # of all of them
-    options = options or GrowthOptions()
-    run = _Run(database=database, new=new, work=work, options=options, extractor=extractor)
+    run = _Run(database=database, new=new, work=work, options=options or GrowthOptions(), extractor=extractor)
     while True:  # each round but the last promotes a map that no round before it did
         run.start_round()
         run.localise()
@@ -104,10 +103,10 @@ class _Run:
         replaced = replace_descendants(self.database, self.work, budget_m=self.options.drift_budget_m)
         self.replacements += [replaced] if replaced else []
         self.localiser = Localiser.open(self.database, previous=self.localiser if self.rounds > 1 else None)
-        placed, self.unplaced, notes = place_unplaced_maps(
-            self.database, self.localiser.areas, self.work, self.options
-        )
-        self.entries |= {entry.map_id: entry for entry in placed}
+        areas = self.localiser.areas
+        tried, notes = place_unplaced_maps(self.database, areas, self.work, self.options)
+        self.unplaced = [entry for entry in tried if entry.status == "unplaced"]
+        self.entries |= {entry.map_id: entry for entry in tried if entry.status != "unplaced"}
         self.notes |= dict.fromkeys(notes)
 
     def localise(self) -> None:
@@ -125,10 +124,8 @@ class _Run:
         asked.pop(frozenset(), None)
         for fresh, again in asked.items():
             areas = self.localiser.areas_of(tuple(sorted(write_ids[w] for w in fresh)))
-            worth += localise_photos(new.photos, again, new.features_of, areas, threads)[0]
-        self.localised, reasons = localise_photos(
-            new.photos, sorted(worth), new.features_of, self.localiser.areas, threads
-        )
+            worth += localise_photos(new, again, areas, threads)[0]
+        self.localised, reasons = localise_photos(new, sorted(worth), self.localiser.areas, threads)
         for row in rows:
             if row not in self.localised:
                 reason = reasons.get(row) or before[row]["reason"]
@@ -148,7 +145,7 @@ class _Run:
                 self._try_model(part, _SPLIT_LINKS)
         left = {row: photo for row, photo in self.localised.items() if row not in self.map_of}
         lone = with_shared_lenses(left, {row: shared_key(new.photos[row], "shared") for row in left})
-        groups, waiting = lone_groups(lone, new.features_of, new.overlaps, new.geometry_of)
+        groups, waiting = lone_groups(lone, new)
         self.posed |= lone
         for group in groups:
             self._try_model(group, ())
@@ -159,8 +156,10 @@ class _Run:
 
         A map that goes back to quarantine and is promoted again, round by round, would keep the run going.
         """
-        rows = self._open_rows()
-        outside = NewPhotos(given=self.new, rows=rows, localised=self.localised, heard=self.heard)
+        rows, threads = self._open_rows(), self.options.threads
+        outside = NewPhotos(
+            given=self.new, rows=rows, threads=threads, localised=self.localised, heard=self.heard
+        )
         outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside)
         for outcome in outcomes:
             self.promotions[outcome.map_id] = outcome
@@ -221,9 +220,8 @@ class _Run:
 
         Where its photos are at several places, its parts, split at `links`, weakest first.
         """
-        new, areas = self.new, self.localiser.areas
         maps, budget_m = placed_maps(self.database.snapshot()), self.options.drift_budget_m
-        grown = grow_within_budget(model, new.photos, new.features_of, self.posed, areas, maps, budget_m)
+        grown = grow_within_budget(model, self.new, self.posed, self.localiser.areas, maps, budget_m)
         if isinstance(grown, GrownMap):
             self._take(grown)
             return
@@ -254,13 +252,11 @@ class _Run:
             self._note(Refused(reason="RETIRED_MAP", message=message), grown.model)
             return
         used = [self.new.candidate_ids[r] for r in rows if r in self.new.candidate_ids]
-        if used:
-            mark_used(self.database, used, feature_map.map_id)
+        mark_used(self.database, used, feature_map.map_id)
         self.database.commit_map(feature_map)
-        self.map_of.update(dict.fromkeys(rows, feature_map.map_id))
-        for row in rows:
-            self.why.pop(row, None)
-        self.why.update({row: why for row, why in grown.left_out.items() if row not in self.map_of})
+        self.map_of |= dict.fromkeys(rows, feature_map.map_id)
+        reasons = {**self.why, **grown.left_out}
+        self.why = {row: why for row, why in reasons.items() if row not in self.map_of}
         self.entries[feature_map.map_id] = grown_entry(feature_map)
         _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
 

@@ -8,9 +8,8 @@ import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from featuredb.errors import ConflictError
 from featuredb.maps.feature_map import FeatureMap, MapImage
@@ -24,9 +23,9 @@ from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.growth_report import GrownEntry, grown_entry, refused_entry
 from ingest.growth.place.component import GrownMap
 from ingest.growth.place.localised import localise_photos
-from ingest.growth.place.map_images import model_of, observed_features, observed_rows
+from ingest.growth.place.map_images import features_and_points, model_of
 from ingest.growth.trust.scan_check import NOT_ASKED, checked_by_scan
-from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, Refused
+from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, GrowthPhotos, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
@@ -37,11 +36,10 @@ _LOG = logging.getLogger(__name__)
 
 def place_unplaced_maps(
     database: Database, areas: Sequence[IndexedArea], work: Path, options: GrowthOptions
-) -> tuple[list[GrownEntry], list[GrownEntry], list[str]]:
+) -> tuple[list[GrownEntry], list[str]]:
     """Try every map without a place in the active areas; a question is not asked twice.
 
-    Returns:
-        Maps that have a place now, in quarantine; those that still have none, and why; notes for people.
+    An entry for each: now it has a place, in quarantine, or it is "unplaced" still. And notes for people.
 
     Raises:
         StoreError: the database cannot be read or written; what is committed stands.
@@ -51,23 +49,22 @@ def place_unplaced_maps(
     active = sorted({m.map_id for indexed in areas for m in indexed.area.maps})
     write_ids = sorted(snapshot.get(m).write_id for m in active) if waiting else []
     asks = options_fingerprint(replace(options, threads=1))
-    placed: list[GrownEntry] = []
-    unplaced: list[GrownEntry] = []
+    tried: list[GrownEntry] = []
     notes: list[str] = []
     for summary in waiting:
         asked = digest(asks, summary.write_id, *write_ids)
         known = recall(work, "maps", summary.map_id, asked)
         if known is not None:
-            unplaced.append(GrownEntry(**known))
+            tried.append(GrownEntry(**known))
             continue
         outcome = _place(database, snapshot, summary, areas, options, notes)
         if isinstance(outcome, FeatureMap):
-            placed.append(grown_entry(outcome))
+            tried.append(grown_entry(outcome))
             continue
-        unplaced.append(refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points))
+        tried.append(refused_entry(outcome, "unplaced", map_id=summary.map_id, points=summary.points))
         if outcome.reason not in ("CONFLICT", NOT_ASKED):
-            remember(work, "maps", summary.map_id, asdict(unplaced[-1]), asked)
-    return placed, unplaced, notes
+            remember(work, "maps", summary.map_id, asdict(tried[-1]), asked)
+    return tried, notes
 
 
 def _place(
@@ -110,31 +107,26 @@ def _grown(
     snapshot: Snapshot, unplaced: UnplacedMap, areas: Sequence[IndexedArea], options: GrowthOptions
 ) -> GrownMap | Refused:
     """The map where the others put it, by what it keeps of its photos."""
-    rows = [observed_rows(unplaced, image, described=False) for image in unplaced.images]
-    photos = [_photo(unplaced, image) for image in unplaced.images]
     named = ("map_id", "name", "source", "licence", "provenance")
     identity = MapIdentity(**{name: getattr(unplaced, name) for name in named})
 
-    def features_of(row: int) -> PhotoFeatures:
-        features = observed_features(unplaced, unplaced.images[row], rows[row])
-        rgb = unplaced.points.rgb[unplaced.observations.point_index[rows[row]]]
-        return PhotoFeatures(features=features, rgb=rgb)
+    def features_of(row: int, *, described: bool = False) -> PhotoFeatures:
+        """Those that can be matched come first, so that they have the same rows alone."""
+        features, points = features_and_points(unplaced, unplaced.images[row], described=described)
+        return PhotoFeatures(features=features, rgb=unplaced.points.rgb[points])
 
-    def described_of(row: int) -> PhotoFeatures:
-        """Those that can be matched; they have the same rows."""
-        whole = features_of(row)
-        these = np.arange(int(unplaced.observations.has_descriptor[rows[row]].sum()))
-        return PhotoFeatures(features=whole.features.take(these), rgb=whole.rgb[these])
-
+    photos = [_photo(unplaced, image) for image in unplaced.images]
     # A lens that nobody lends is about what the reconstruction made of it.
     hinted = [
         replace(photo, focal_px=unplaced.cameras[image.camera_id].focal_px)
         for photo, image in zip(photos, unplaced.images, strict=True)
     ]
-    localised, _ = localise_photos(hinted, range(len(hinted)), described_of, areas, options.threads)
+    asked = GrowthPhotos(photos=hinted, features_of=partial(features_of, described=True))
+    localised, _ = localise_photos(asked, range(len(hinted)), areas, options.threads)
+    new = GrowthPhotos(photos=photos, features_of=features_of)
     model = model_of(unplaced, unplaced.images, described=False)
     maps, budget_m = placed_maps(snapshot), options.drift_budget_m
-    return grow_within_budget(model, photos, features_of, localised, areas, maps, budget_m, identity)
+    return grow_within_budget(model, new, localised, areas, maps, budget_m, identity)
 
 
 def left_over(

@@ -24,9 +24,7 @@ from reloc.localise.lens_prior import LensPriors
 from reloc.localise.options import LocaliseOptions, PoseOptions
 from reloc.localise.result import LocaliseResult
 
-FeaturesOf = Callable[[int], PhotoFeatures]
-"""Features of the photo of a row; called when they are needed, so that not all are in memory."""
-
+_OF_NONE: Any = {}.__getitem__
 DRIFT_BUDGET_M = 0.5  # what a survey's points are usually wanted for
 # Of a reconstruction, of a map without a place, of those by which two maps overlap, and of those that see a
 # point that is asked for what is there: two leave it along a ray.
@@ -116,26 +114,23 @@ class Edge:
 
     def as_json(self) -> dict[str, Any]:
         return {
-            "map_id": self.map_id,
-            "place": self.place,
+            **{name: getattr(self, name) for name in _TOLD_OF_EDGE},
             "parent_from_new": self.other_from_map.log().tolist(),
             "covariance": self.covariance.ravel().tolist(),
-            "shared_points": self.shared_points,
-            "photos": self.photos,
             "shared": self.shared.ravel().tolist(),
         }
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> "Edge":
         return cls(
-            map_id=str(value["map_id"]),
-            place=str(value.get("place", "")),
+            **{name: value[name] for name in _TOLD_OF_EDGE if name in value},
             other_from_map=Sim3.exp(value.get("parent_from_new") or np.zeros(7)),
             covariance=np.reshape(value["covariance"], (7, 7)),
-            shared_points=int(value.get("shared_points", 0)),
-            photos=int(value.get("photos", 0)),
             shared=np.reshape(value.get("shared") or np.zeros(21), (7, 3)),
         )
+
+
+_TOLD_OF_EDGE = ("map_id", "place", "shared_points", "photos")  # as they are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -170,23 +165,18 @@ class GrowthOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GrowthPhotos:
-    """New photos, matched and reconstructed.
+    """New photos, matched and reconstructed; without any, quarantined maps and new anchors are looked at.
 
     Attributes:
+        features_of: of the photo of a row; called when they are needed, so that not all are in memory.
         models: their reconstructions, called once a round; rows of a model are rows of `photos`.
         candidate_ids: of contributed photos, by row.
         overlaps: pairs of rows whose matches were verified. geometry_of: of such a pair.
     """
 
-    photos: Sequence[Photo]
-    features_of: FeaturesOf
-    models: Callable[[], Iterable[Model]]
-    overlaps: Collection[Pair]
-    geometry_of: Callable[[Pair], TwoView]
+    photos: Sequence[Photo] = ()
+    features_of: Callable[[int], PhotoFeatures] = _OF_NONE
+    models: Callable[[], Iterable[Model]] = tuple
+    overlaps: Collection[Pair] = ()
+    geometry_of: Callable[[Pair], TwoView] = _OF_NONE
     candidate_ids: Mapping[int, str] = field(default_factory=dict)
-
-
-def no_photos() -> GrowthPhotos:
-    """Nothing new: old quarantined maps are examined, and new anchors looked for."""
-    of_none: Any = {}.__getitem__
-    return GrowthPhotos(photos=(), features_of=of_none, models=tuple, overlaps=(), geometry_of=of_none)

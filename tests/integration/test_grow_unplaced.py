@@ -16,7 +16,7 @@ from featuredb.store import Database
 from featuredb.store.encode import content_digest
 from ingest.growth.run import grow
 from ingest.growth.unplaced import left_over, place_unplaced_maps
-from ingest.growth.values import GrowthOptions, no_photos
+from ingest.growth.values import GrowthOptions, GrowthPhotos
 from ingest.map_builder import MapOptions, build_unplaced_map
 from reloc.localiser import Localiser
 from tests.support.growth_box import DESCRIPTORS, FRAME, KEY, POINTS, existing, walk
@@ -56,8 +56,8 @@ def test_a_map_without_a_place_is_placed_by_one_that_shows_the_same(
     unplaced = _unplaced("loose", range(4))
     before = database.commit_map(unplaced).version
     areas, options = Localiser.open(database).areas, GrowthOptions()
-    done, _, _ = place_unplaced_maps(database, areas, tmp_path / "work", options)
-    assert [entry.map_id for entry in done] == ["loose"], done
+    done, _ = place_unplaced_maps(database, areas, tmp_path / "work", options)
+    assert [(entry.map_id, entry.status) for entry in done] == [("loose", "quarantined")], done
     placed = database.snapshot().load_map("loose")
     assert (placed.status, placed.generation, placed.parents) == ("quarantined", 1, ("old",))
     assert (placed.placement.method, placed.name) == ("map", "loose")
@@ -92,7 +92,7 @@ def test_what_the_gates_refuse_stays_without_a_place(database: Database, tmp_pat
     """One photo that shows the placed map proves nothing; the other map shows another place."""
     database.commit_maps([_unplaced("hardly", {1}), _unplaced("elsewhere", ())])
     for _ in range(2):  # the second run remembers
-        report = grow(database, no_photos(), tmp_path / "work")
+        report = grow(database, GrowthPhotos(), tmp_path / "work")
         found = {entry.map_id: entry.reason_code for entry in report.maps}
         assert found == {"hardly": "TOO_FEW_AGREE", "elsewhere": "NOT_LOCALISED"}, report.as_text()
     assert "has no place still: TOO_FEW_AGREE" in report.as_text()

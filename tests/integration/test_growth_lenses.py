@@ -28,10 +28,10 @@ def test_a_small_model_takes_the_maps_lens(area: IndexedArea) -> None:
     """Structure from motion of a few photos found a focal length 12 % too short; the map knows the camera."""
     poses = walk(4)
     new = take_photos(np.random.default_rng(9), POINTS, DESCRIPTORS, poses, camera_key=KEY)
-    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    found, _ = localise_photos(new.given, range(4), [area])
     wrong = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(790.0, 500.0, 400.0, 0.03))
     bent = replace(new.model, cameras=(wrong,))
-    grown = grow_component(bent, new.photos, new.features_of, found, [area], identity())
+    grown = grow_component(bent, new.given, found, [area], identity())
     assert isinstance(grown, GrownMap), grown
     assert grown.model.cameras[0].focal_px == pytest.approx(CAMERA.focal_px, rel=1e-3)
     assert centers_error(grown, new).max() < 0.05
@@ -40,11 +40,11 @@ def test_a_small_model_takes_the_maps_lens(area: IndexedArea) -> None:
 def test_a_camera_none_of_whose_photos_is_localised_takes_the_maps_lens(area: IndexedArea) -> None:
     """They hang on photos of another camera; the map knows theirs by its EXIF key all the same."""
     new = take_photos(np.random.default_rng(9), POINTS, DESCRIPTORS, walk(6), camera_key=KEY)
-    found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
+    found, _ = localise_photos(new.given, range(3), [area])
     assert len(found) == 3
     wrong = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(880.0, 500.0, 400.0, 0.02))
     two = replace(new.model, cameras=(CAMERA, wrong), camera_of=np.array([0, 0, 0, 1, 1, 1]))
-    grown = grow_component(two, new.photos, new.features_of, found, [area], identity())
+    grown = grow_component(two, new.given, found, [area], identity())
     assert isinstance(grown, GrownMap), grown
     focals = [camera.focal_px for camera in grown.model.cameras]
     assert focals == pytest.approx([CAMERA.focal_px] * len(focals), rel=1e-3)
@@ -71,10 +71,10 @@ def test_existing_points_tell_a_lens_better_than_the_map_that_lent_it(
     new = take_photos(
         np.random.default_rng(9), POINTS, DESCRIPTORS, walk(4), camera_key=KEY, camera=real, noise_px=0.15
     )
-    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    found, _ = localise_photos(new.given, range(4), [area])
     assert {p.camera for p in found.values()} == {CAMERA}
     lent = replace(new.model, cameras=(CAMERA,))
-    grown = grow_component(lent, new.photos, new.features_of, found, [area], identity())
+    grown = grow_component(lent, new.given, found, [area], identity())
     assert isinstance(grown, GrownMap), grown
     (camera,) = grown.model.cameras
     assert camera.focal_px == pytest.approx(real.focal_px, rel=2e-3)
@@ -85,7 +85,7 @@ def test_existing_points_tell_a_lens_better_than_the_map_that_lent_it(
 
 def test_lone_photos_of_one_camera_have_one_lens(new: NewPhotos, area: IndexedArea) -> None:
     """One of them came with a focal length a quarter too long and stands as much farther away."""
-    found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
+    found, _ = localise_photos(new.given, range(3), [area])
     long = CAMERA.with_focal(1.25 * CAMERA.focal_px)
     pose = found[1].cam_from_local
     back = pose.center + 0.25 * (pose.center - np.median(found[1].points, axis=0))

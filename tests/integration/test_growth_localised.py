@@ -19,7 +19,7 @@ from ingest.growth.place.localised import (
 from ingest.growth.place.refine import pose_by_lens
 from ingest.growth.trust.confirmation import NewPhotos as CorroboratingPhotos
 from ingest.growth.trust.confirmation import Sources, corroborate
-from ingest.growth.values import LocalisedPhoto, no_photos
+from ingest.growth.values import GrowthPhotos, LocalisedPhoto
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import Localised
 from reloc.localise.options import LocaliseOptions
@@ -45,7 +45,7 @@ def new() -> NewPhotos:
 
 @pytest.fixture(scope="module")
 def localised(new: NewPhotos, area: IndexedArea) -> dict[int, LocalisedPhoto]:
-    found, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area])
+    found, reasons = localise_photos(new.given, range(len(new.photos)), [area])
     assert not reasons
     return found
 
@@ -66,7 +66,7 @@ def test_each_photo_is_localised_by_itself(
 def test_two_threads_localise_as_one_does(
     new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
 ) -> None:
-    again, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area], threads=2)
+    again, reasons = localise_photos(new.given, range(len(new.photos)), [area], threads=2)
     assert not reasons
     assert list(again) == list(localised)
     for row, photo in localised.items():
@@ -77,7 +77,7 @@ def test_two_threads_localise_as_one_does(
 def test_what_a_photo_sees_of_a_map_is_asked_once(new: NewPhotos) -> None:
     """Photos of another owner, whose word counts, see the map; the second time the answers are the same."""
     photos = [replace(photo, contributor="somebody") for photo in new.photos]
-    given = replace(no_photos(), photos=photos, features_of=new.features_of)
+    given = GrowthPhotos(photos=photos, features_of=new.features_of)
     asked = CorroboratingPhotos(given=given, rows=range(len(photos)), localised={})
     here, sources = existing(), Sources(trusted=("somebody",))
     first = corroborate(here, [], asked, sources, write_id="w1")
@@ -95,7 +95,7 @@ def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> No
     made_of = [replace(image, sha256=photos[0].sha256) for image in existing().images[:1]]
     here = replace(existing(), images=(*made_of, *existing().images[1:]))
     overlaps = {(0, 2), (0, 3), (1, 4)}
-    given = replace(no_photos(), photos=photos, features_of=new.features_of, overlaps=overlaps)
+    given = GrowthPhotos(photos=photos, features_of=new.features_of, overlaps=overlaps)
     asked = CorroboratingPhotos(given=given, rows=range(1, len(photos)), localised={})
     # Other images of the map are not among the photos: nobody knows what overlaps with them.
     assert asked.that_may_see(here) == list(asked.rows)

@@ -16,6 +16,7 @@ from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from featuredb.store.changes import IMPORTED
 from featuredb.store.verify import verify
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
+from ingest.growth.trust.confirmation import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
@@ -45,7 +46,9 @@ def _add(database: Database, feature_map: FeatureMap, owner: str = "") -> None:
 
 def _promoted(database: Database, *trusted: str) -> dict[str, Promotion]:
     work = Path(tempfile.mkdtemp(dir=database.url))
-    found = promote_confirmed(database, Localiser.open(database), GrowthOptions(trusted=trusted), work)
+    found = promote_confirmed(
+        database, Localiser.open(database), GrowthOptions(trusted=trusted), work, NewPhotos()
+    )
     return {outcome.map_id: outcome for outcome in found}
 
 

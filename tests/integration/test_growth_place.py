@@ -42,6 +42,11 @@ from tools.growth_gates import read_judgements, recorded
 _PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 
+def _left_out(grown: GrownMap) -> dict[int, str]:
+    """What the placement left out, by place in the model, and the codes of the reasons."""
+    return {k: code for k, (code, _) in grown.placement.left_out.items()}
+
+
 @pytest.fixture(scope="module")
 def area() -> IndexedArea:
     return indexed(existing())
@@ -54,7 +59,7 @@ def new() -> NewPhotos:
 
 @pytest.fixture(scope="module")
 def localised(new: NewPhotos, area: IndexedArea) -> dict[int, LocalisedPhoto]:
-    found, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area])
+    found, reasons = localise_photos(new.given, range(len(new.photos)), [area])
     assert not reasons
     return found
 
@@ -66,7 +71,7 @@ def test_what_the_gates_say_is_recorded_beside_the_truth(
     true = {photo.name: pose.center for photo, pose in zip(new.photos, new.poses, strict=True)}
     del true[new.photos[0].name]
     with recorded(tmp_path / "gates.jsonl", FRAME, true.get):
-        grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
+        grow_component(new.model, new.given, localised, [area], identity())
     placed, refined = read_judgements([tmp_path / "gates.jsonl"])
     assert (placed.step, refined.step) == ("place", "refine")
     assert (placed.right, placed.wrong, placed.refused_by) == (len(new.photos) - 1, 1, [])
@@ -76,7 +81,7 @@ def test_what_the_gates_say_is_recorded_beside_the_truth(
 def test_a_reconstruction_is_placed_and_becomes_a_map(
     new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
 ) -> None:
-    grown = grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
+    grown = grow_component(new.model, new.given, localised, [area], identity())
     assert isinstance(grown, GrownMap), grown
     feature_map = grown.feature_map
     assert centers_error(grown, new).max() < 0.05
@@ -85,10 +90,8 @@ def test_a_reconstruction_is_placed_and_becomes_a_map(
     assert feature_map.parents == ("old",)
     assert feature_map.placement.method == "map"
     assert feature_map.height_datum == "ellipsoidal"
-    growth = feature_map.placement.evidence["growth"]
-    assert all(gate["passes"] for gate in growth["gates"].values())
-    relative = np.reshape(growth["covariance_relative"], (7, 7))
-    assert 0.0 < drift_m(relative, places_of(feature_map)) < 0.5
+    assert all(gate.passes for gate in grown.placement.gates)
+    assert 0.0 < drift_m(grown.relative, places_of(feature_map)) < 0.5
     # On Earth it is as uncertain as its parent, and a little more.
     earth = np.sqrt(np.diag(feature_map.placement.covariance)[4:])
     assert (earth > 0.5).all()
@@ -109,11 +112,10 @@ def test_the_bound_of_drift_holds(area: IndexedArea, seeds: range) -> None:
     for seed in seeds:
         rng = np.random.default_rng(100 + seed)
         new = take_photos(rng, POINTS, DESCRIPTORS, walk(4), camera_key=KEY)
-        found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
-        grown = grow_component(new.model, new.photos, new.features_of, found, [area], identity())
+        found, _ = localise_photos(new.given, range(4), [area])
+        grown = grow_component(new.model, new.given, found, [area], identity())
         assert isinstance(grown, GrownMap)
-        growth = grown.feature_map.placement.evidence["growth"]
-        bound = drift_m(np.reshape(growth["covariance_relative"], (7, 7)), places_of(grown.feature_map))
+        bound = drift_m(grown.relative, places_of(grown.feature_map))
         beyond += int(centers_error(grown, new).max() > bound)
     assert beyond <= len(seeds) // 2
 
@@ -121,13 +123,13 @@ def test_the_bound_of_drift_holds(area: IndexedArea, seeds: range) -> None:
 def test_one_localised_photo_is_not_enough(
     new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
 ) -> None:
-    grown = grow_component(new.model, new.photos, new.features_of, {2: localised[2]}, [area], identity())
+    grown = grow_component(new.model, new.given, {2: localised[2]}, [area], identity())
     assert isinstance(grown, Refused)
     assert grown.reason == "TOO_FEW_AGREE"
 
 
 def test_nothing_localised(new: NewPhotos, area: IndexedArea) -> None:
-    grown = grow_component(new.model, new.photos, new.features_of, {}, [area], identity())
+    grown = grow_component(new.model, new.given, {}, [area], identity())
     assert isinstance(grown, Refused)
     assert grown.reason == "NOT_LOCALISED"
 
@@ -143,7 +145,7 @@ def test_what_no_step_foresaw_costs_this_reconstruction_only(
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr("ingest.growth.place.component.place_by_maps", singular)
-    refused = grow_within_budget(new.model, new.photos, new.features_of, localised, [area], {}, 0.5)
+    refused = grow_within_budget(new.model, new.given, localised, [area], {}, 0.5)
     assert isinstance(refused, Refused)
     assert refused.reason == "FAILED"
     assert "LinAlgError: Singular matrix" in refused.message
@@ -165,7 +167,7 @@ def test_photos_that_contradict_each_other_are_refused(
         )
         for r, p in localised.items()
     }
-    grown = grow_component(new.model, new.photos, new.features_of, wrong, [area], identity())
+    grown = grow_component(new.model, new.given, wrong, [area], identity())
     assert isinstance(grown, Refused)
     assert grown.reason == "PHOTOS_DISAGREE"
 
@@ -179,9 +181,9 @@ def test_a_photo_that_contradicts_the_others_is_left_out(
         cam_from_local=turned.act_on_pose(localised[1].cam_from_local),
         points=turned.act(localised[1].points),
     )
-    grown = grow_component(new.model, new.photos, new.features_of, {**localised, 1: liar}, [area], identity())
+    grown = grow_component(new.model, new.given, {**localised, 1: liar}, [area], identity())
     assert isinstance(grown, GrownMap), grown
-    assert grown.placement.disagreeing == (1,)
+    assert _left_out(grown) == {1: "CONTRADICTS"}
     assert 1 not in grown.model.rows
     assert centers_error(grown, new).max() < 0.05
 
@@ -197,7 +199,7 @@ def test_photos_that_see_a_look_alike_elsewhere_refuse_it(
         if r in (0, 1)
     }
     some = {r: localised[r] for r in (2, 3, 4)} | there
-    grown = grow_component(new.model, new.photos, new.features_of, some, [area], identity())
+    grown = grow_component(new.model, new.given, some, [area], identity())
     assert isinstance(grown, Refused)
     assert {g.name for g in grown.gates if not g.passes} >= {"agreement"}
 
@@ -208,9 +210,9 @@ def test_positions_that_lie(area: IndexedArea, liars: int, refused: bool) -> Non
     poses = walk(6)
     gps = [prior(p, (150.0, 0.0) if k < liars else (2.0, 1.0)) for k, p in enumerate(poses)]
     new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, poses, camera_key=KEY, gps=gps)
-    found, _ = localise_photos(new.photos, range(6), new.features_of, [area])
+    found, _ = localise_photos(new.given, range(6), [area])
     assert len(found) == 6
-    grown = grow_component(new.model, new.photos, new.features_of, found, [area], identity())
+    grown = grow_component(new.model, new.given, found, [area], identity())
     if refused:
         assert isinstance(grown, Refused)
         assert grown.reason == "CONTRADICTS_GPS"
@@ -247,7 +249,7 @@ def test_photos_blind_for_what_they_should_show(
     new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
 ) -> None:
     bare, kept = _cornered(new, localised, list(localised))
-    grown = grow_component(bare, new.photos, new.features_of, kept, [area], identity())
+    grown = grow_component(bare, new.given, kept, [area], identity())
     assert isinstance(grown, Refused)
     assert "visibility" in {g.name for g in grown.gates if not g.passes}
 
@@ -256,14 +258,14 @@ def test_a_single_blind_photo_is_left_out(
     new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
 ) -> None:
     bare, kept = _cornered(new, localised, [1])
-    grown = grow_component(bare, new.photos, new.features_of, kept, [area], identity())
+    grown = grow_component(bare, new.given, kept, [area], identity())
     assert isinstance(grown, GrownMap), grown
-    assert grown.placement.blind == (1,)
+    assert _left_out(grown) == {1: "NOT_VISIBLE"}
     assert grown.left_out[1][0] == "NOT_VISIBLE"
     assert 1 not in grown.model.rows
-    whole = grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
+    whole = grow_component(new.model, new.given, localised, [area], identity())
     assert isinstance(whole, GrownMap), whole
-    assert whole.placement.blind == ()
+    assert _left_out(whole) == {}
     assert 1 in whole.model.rows
 
 
@@ -278,13 +280,13 @@ def test_a_photo_that_shows_little_of_what_its_neighbours_see_is_left_out(
     seen[of_it] = (pixels < 0.4 * np.array([CAMERA.width, CAMERA.height])).all(axis=1)
     views = np.bincount(new.model.point_of[seen], minlength=len(new.model.xyz))
     bare = with_observations(new.model, seen & (views[new.model.point_of] >= 2))
-    lone = grow_component(bare, new.photos, new.features_of, others, [area], identity())
+    lone = grow_component(bare, new.given, others, [area], identity())
     assert isinstance(lone, GrownMap), lone
-    assert lone.placement.blind == (4,)
+    assert _left_out(lone) == {4: "NOT_VISIBLE"}
     assert lone.left_out[4][0] == "NOT_VISIBLE"
-    grown = grow_component(new.model, new.photos, new.features_of, others, [area], identity())
+    grown = grow_component(new.model, new.given, others, [area], identity())
     assert isinstance(grown, GrownMap), grown
-    assert grown.placement.blind == ()
+    assert _left_out(grown) == {}
     assert 4 in grown.model.rows
 
 
@@ -304,8 +306,8 @@ def test_overlaps_with_two_maps_tell_how_these_differ(new: NewPhotos) -> None:
         seed=4,
     )
     both = indexed(existing(), move_map(east, shift))
-    found, _ = localise_photos(new.photos, range(len(new.photos)), new.features_of, [both])
-    grown = grow_component(new.model, new.photos, new.features_of, found, [both], identity())
+    found, _ = localise_photos(new.given, range(len(new.photos)), [both])
+    grown = grow_component(new.model, new.given, found, [both], identity())
     assert isinstance(grown, GrownMap), grown
     assert set(grown.feature_map.parents) == {"old", "east"}
     edges = {edge.map_id: edge.other_from_map for edge in grown.placement.edges}
@@ -316,10 +318,10 @@ def test_overlaps_with_two_maps_tell_how_these_differ(new: NewPhotos) -> None:
 
 def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> None:
     """No reconstruction at all: localised photos whose matches fit their poses become a map."""
-    found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
-    (group,), waiting = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
+    found, _ = localise_photos(new.given, range(3), [area])
+    (group,), waiting = lone_groups(found, replace(new.given, overlaps=_PAIRS))
     assert not waiting
-    made = grow_component(group, new.photos, new.features_of, found, [area], identity())
+    made = grow_component(group, new.given, found, [area], identity())
     assert isinstance(made, GrownMap), made
     assert sorted(made.model.rows.tolist()) == [0, 1, 2]
     assert centers_error(made, new).max() < 0.1
@@ -327,21 +329,21 @@ def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> 
 
 
 def test_a_lone_photo_waits(new: NewPhotos, area: IndexedArea) -> None:
-    found, _ = localise_photos(new.photos, [0], new.features_of, [area])
-    groups, waiting = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
+    found, _ = localise_photos(new.given, [0], [area])
+    groups, waiting = lone_groups(found, replace(new.given, overlaps=_PAIRS))
     assert not groups
     assert waiting[0].startswith("ALONE")
 
 
 def test_lone_photos_whose_matches_contradict_their_poses_wait(new: NewPhotos, area: IndexedArea) -> None:
-    found, _ = localise_photos(new.photos, range(2), new.features_of, [area])
+    found, _ = localise_photos(new.given, range(2), [area])
     away = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.05, 1.5, 0.0, 0.0]))
     found[1] = replace(
         found[1],
         cam_from_local=away.act_on_pose(found[1].cam_from_local),
         points=away.act(found[1].points),
     )
-    (group,), _ = lone_groups(found, new.features_of, _PAIRS, new.geometry_of)
-    refused = grow_component(group, new.photos, new.features_of, found, [area], identity())
+    (group,), _ = lone_groups(found, replace(new.given, overlaps=_PAIRS))
+    refused = grow_component(group, new.given, found, [area], identity())
     assert isinstance(refused, Refused)
     assert refused.reason == "TOO_FEW_AGREE"

@@ -7,7 +7,7 @@ import pytest
 from featuredb.store import Database
 from ingest.growth import run
 from ingest.growth.trust.promotion import Promotion
-from ingest.growth.values import no_photos
+from ingest.growth.values import GrowthPhotos
 from tests.support.few_canaries import few_canaries as few_canaries
 from tests.support.growth_box import existing
 
@@ -26,6 +26,6 @@ def test_a_run_ends_though_maps_are_promoted_again_and_again(
     monkeypatch.setattr(run, "promote_confirmed", one_of_two)
     database = Database.create(tmp_path / "db")
     database.commit_map(existing())
-    report = run.grow(database, no_photos(), tmp_path / "work")
+    report = run.grow(database, GrowthPhotos(), tmp_path / "work")
     assert report.rounds == 3
     assert report.promoted == ("a",)

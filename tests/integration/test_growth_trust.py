@@ -18,6 +18,7 @@ from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.graph.replacing import replace_descendants
 from ingest.growth.place.map_images import features_and_points, measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, own_canaries, run_canaries
+from ingest.growth.trust.confirmation import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from ingest.growth.values import Edge, GrowthOptions
 from reloc.localise.localise import localise_features
@@ -62,7 +63,9 @@ def _add(database: Database, feature_map: FeatureMap) -> None:
 
 def _promoted(database: Database, trusted: tuple[str, ...] = ()) -> dict[str, Promotion]:
     work = Path(tempfile.mkdtemp(dir=database.url))
-    found = promote_confirmed(database, Localiser.open(database), GrowthOptions(trusted=trusted), work)
+    found = promote_confirmed(
+        database, Localiser.open(database), GrowthOptions(trusted=trusted), work, NewPhotos()
+    )
     return {outcome.map_id: outcome for outcome in found}
 
 
@@ -106,7 +109,7 @@ def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytes
     put_on_record(database, "anna")
 
     def ask() -> Promotion:
-        return promote_confirmed(database, Localiser.open(database), GrowthOptions(), work)[0]
+        return promote_confirmed(database, Localiser.open(database), GrowthOptions(), work, NewPhotos())[0]
 
     first = ask()
     with monkeypatch.context() as patch:
@@ -209,6 +212,15 @@ def test_an_image_need_not_show_what_a_new_map_adds_around_its_points(tmp_path: 
     run = run_canaries(database, before, after, [more])
     assert [check.before for check in run.checks] == ["right"] * 6
     assert run.regressions == ()
+
+
+def test_images_of_maps_by_another_extractor_are_not_asked(tmp_path: Path) -> None:
+    """No query finds anything in such a map, and to ask there is an error."""
+    older = replace(strip_map("B", 150.0, owners=["survey"], seed=3), extractor_fingerprint="older")
+    database = _database(tmp_path, _ANCHOR, older)
+    localiser = Localiser.open(database)
+    run = run_canaries(database, localiser, localiser, [])
+    assert {check.name.rpartition(" ")[2] for check in run.checks} == {"A"}
 
 
 def test_canaries_are_the_same_in_every_run(tmp_path: Path) -> None:

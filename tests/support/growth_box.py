@@ -11,7 +11,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from ingest.growth.place.component import GrownMap
 from ingest.growth.place.placement import MapsPlacement
-from ingest.growth.place.similarity_fit import FittedSimilarity
+from ingest.growth.place.similarity_fit import Correspondences, FittedSimilarity
 from tests.support.new_photos import FINGERPRINT, NewPhotos
 from tests.support.scenes import (
     EASTING,
@@ -74,25 +74,32 @@ def centers_error(grown: GrownMap, new: NewPhotos) -> FloatArray:
     return np.linalg.norm(grown.model.centers() - to_frame.act(truth), axis=1)
 
 
-def grown_map(feature_map: FeatureMap, model: Any, *, bending_m: float = 0.0, left_out: Any = ()) -> GrownMap:
+def grown_map(
+    feature_map: FeatureMap,
+    model: Any,
+    *,
+    relative: FloatArray | None = None,
+    bending_m: float = 0.0,
+    left_out: Any = (),
+) -> GrownMap:
     """A grown map of a model, without gates, overlaps or anything that its refinement knows."""
+    none: Any = dict.fromkeys(Correspondences.__slots__[1:], np.zeros(0))
     return GrownMap(
         feature_map=feature_map,
+        relative=np.zeros((7, 7)) if relative is None else relative,
         placement=MapsPlacement(
             frame=feature_map.frame,
             covariance=np.zeros((7, 7)),
             agreeing=(),
-            disagreeing=(),
-            blind=(),
+            left_out={},
             edges=(),
             fit=FittedSimilarity(
                 local_from_sfm=Sim3.identity(),
                 covariance=np.zeros((7, 7)),
-                errors_px=np.zeros(0),
                 spread=1.0,
                 neighbours_factor=1.0,
             ),
-            used=np.zeros(0, dtype=np.bool_),
+            held=Correspondences(map_ids=(), **none),
             residual_rms_m=0.0,
             gates=(),
         ),
@@ -100,5 +107,4 @@ def grown_map(feature_map: FeatureMap, model: Any, *, bending_m: float = 0.0, le
         left_out=dict(left_out),
         poses=np.zeros((0, 6, 6)),
         bending_m=bending_m,
-        shared_turn=np.zeros((7, 3)),
     )

@@ -15,6 +15,7 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model, TwoView, verify_pair
+from ingest.growth.values import GrowthPhotos
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
@@ -41,6 +42,11 @@ class NewPhotos:
     poses: list[Rigid3]
     model: Model
     world_of: list[NDArray[np.int64]]
+
+    @property
+    def given(self) -> GrowthPhotos:
+        """As growth takes them."""
+        return GrowthPhotos(photos=self.photos, features_of=self.features_of, geometry_of=self.geometry_of)
 
     def features_of(self, row: int) -> PhotoFeatures:
         return self.features[row]

@@ -48,7 +48,6 @@ def _confirm(
 def test_two_owners_on_record_confirm_each_other() -> None:
     found = _confirm(_owned(["anna", "ben"]))
     assert found.gate.passes
-    assert set(found.owners) == {"anna", "ben"}
     assert len(found.confirmed) == 8
     assert "8 photos confirmed by 2 owners" in found.gate.message
 

@@ -12,8 +12,9 @@ from featuredb.maps.feature_map import FeatureMap
 from ingest.growth import gates
 from ingest.growth.graph import map_graph
 from ingest.growth.graph.map_graph import rows_within, with_drift
-from ingest.growth.map_places import drift_m, places_of, turns_about, with_growth
+from ingest.growth.map_places import drift_m, places_of, turns_about
 from ingest.growth.place.component import GrownMap
+from ingest.growth.values import GrowthPhotos
 from tests.support.growth_box import grown_map
 from tests.support.scenes import box_points, looking_at, random_descriptors, ring, scene_map
 
@@ -65,8 +66,7 @@ def test_photos_far_from_what_they_show_keep_the_budget_like_its_points() -> Non
     far = [looking_at(np.array([x, 0.0, 40.0]), np.array([0.0, 0.0, 3.0])) for x in (-400.0, 400.0)]
     plain = scene_map(points=points, descriptors=random_descriptors(RNG, 2000), poses=[*ring(4), *far])
     turn = turns_about(np.zeros(3)) @ turns_about(np.zeros(3)).T * 1e-3**2
-    told = with_growth(plain, covariance_relative=turn.ravel().tolist(), gates={})
-    grown = grown_map(told, SimpleNamespace())
+    grown = grown_map(plain, SimpleNamespace(), relative=turn)
     assert drift_m(turn, places_of(plain)) < 0.11
     feature_map, drift, relative = with_drift(grown, {}, BUDGET_M)
     assert drift == pytest.approx(1.96e-3 * np.hypot(400.0, 40.0), rel=1e-6)
@@ -93,7 +93,7 @@ def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(map_graph, "rows_within", lambda *_: [0, 1, 2, 4])
     monkeypatch.setattr(map_graph, "keep_photos", cut)
     monkeypatch.setattr(map_graph, "grow_component", grown)
-    found = map_graph.grow_within_budget(whole, [], {}.get, {}, [], {}, BUDGET_M)  # type: ignore[arg-type]
+    found = map_graph.grow_within_budget(whole, GrowthPhotos(), {}, [], {}, BUDGET_M)
     assert isinstance(found, GrownMap)
     codes = {row: code for row, (code, _) in found.left_out.items()}
     assert codes == {3: "WEAK_LINK", 4: "DRIFT_BUDGET", 5: "DRIFT_BUDGET"}

@@ -25,7 +25,6 @@ def fit_of(spread: float = 1.0, neighbours_factor: float = 1.0) -> FittedSimilar
     return FittedSimilarity(
         local_from_sfm=Sim3.identity(),
         covariance=np.eye(7) * 1e-8,
-        errors_px=np.zeros(0),
         spread=spread,
         neighbours_factor=neighbours_factor,
     )
@@ -95,7 +94,7 @@ def test_only_photos_that_are_asked_are_named_and_with_figures() -> None:
     spread = np.tile(REFINED, (3, 1, 1))
     named = contradicting_photos(model, {1: localised_photo(away)}, spread, [fit_of()])
     assert list(named) == [1]
-    assert "3.00 m and 0.00 degrees" in named[1]
+    assert "3.00 m and 0.00 degrees" in named[1][1]
     assert contradicting_photos(model, {}, spread, [fit_of()]) == {}
 
 

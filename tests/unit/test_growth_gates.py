@@ -74,11 +74,6 @@ def test_limit_of_three_sigmas_by_degrees_of_freedom() -> None:
     assert gates.sigmas_limit(6) == pytest.approx(20.062, abs=1e-3)
 
 
-def test_first_refusal_and_json() -> None:
-    asked = (gates.agreement(3, 0), gates.drift(0.9, 0.5))
-    refusal = gates.first_refusal(asked)
-    assert refusal is not None
-    assert refusal.name == "drift"
-    assert gates.first_refusal(asked[:1]) is None
-    assert asked[1].as_json() == {"figure": 0.9, "limit": 0.5, "passes": False}
+def test_figures_as_json_has_them() -> None:
+    assert gates.drift(0.9, 0.5).as_json() == {"figure": 0.9, "limit": 0.5, "passes": False}
     assert gates.drift(float("nan"), 0.5).as_json()["figure"] is None

@@ -13,7 +13,7 @@ def test_photos_that_hang_by_little_are_named_and_held_ones_are_not() -> None:
     model = model_of(range(100), range(50, 150), range(146, 246), range(146, 246))
     weak = weak_photos(model, [], [0])
     assert sorted(weak) == [2, 3]
-    assert "4.0 % of its points" in weak[2]
+    assert "4.0 % of its points" in weak[2][1]
     assert weak_photos(model, [], [0, 2]) == {}
     assert sorted(weak_photos(model, [3], [0])) == [2]  # one that is out already is not named again
     assert weak_photos(model_of(range(100), range(50, 150), range(120, 220)), [], [0]) == {}
@@ -31,7 +31,7 @@ def test_photos_beyond_the_bound_are_named() -> None:
     spread = np.stack([np.diag([1e-6] * 3 + [s**2] * 3) for s in (0.01, 0.3, 0.2)])
     loose = loose_photos(model, spread, 0.5)
     assert list(loose) == [1]
-    assert "0.59 m off, 0.50 m are allowed" in loose[1]
+    assert "0.59 m off, 0.50 m are allowed" in loose[1][1]
     assert loose_photos(model, spread, 0.6) == {}
 
 

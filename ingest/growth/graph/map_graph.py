@@ -3,7 +3,7 @@
 import hashlib
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
 
 import numpy as np
@@ -12,7 +12,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, Placement
-from featuredb.store import Snapshot
+from featuredb.store import MapSummary, Snapshot
 from featuredb.store.changes import is_imported
 from featuredb.store.decode import frame_of, placement_of
 from featuredb.store.encode import Row
@@ -20,11 +20,10 @@ from featuredb.store.tables import BOUNDS
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.graph.pose_graph import WORLD, GraphSolution, solve_pose_graph
-from ingest.growth.map_places import drift_m, growth_of, inflated, map_drift_m, with_growth
+from ingest.growth.map_places import drift_m, growth_of, inflated, with_growth, with_overlaps
 from ingest.growth.place.component import GrownMap, grow_component
-from ingest.growth.values import LEAST_PHOTOS, Edge, FeaturesOf, LocalisedPhoto, Refused, tied_together
+from ingest.growth.values import LEAST_PHOTOS, Edge, GrowthPhotos, LocalisedPhoto, Refused, tied_together
 from ingest.map_builder import MapIdentity
-from ingest.photos.photo import Photo
 from ingest.sfm.links import keep_photos
 from reloc.localise.candidates import IndexedArea
 
@@ -35,8 +34,8 @@ OWN = "own_placement"  # key of an anchor's evidence of growth, once a graph has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlacedMap:
-    """A map's place, as its row has it, without its points.
+class PlacedMap(MapSummary):
+    """A map with its place, as its row has it, without its points.
 
     Attributes:
         place: digest of where it lies.
@@ -44,12 +43,6 @@ class PlacedMap:
         edges: overlaps that were measured when it was placed.
     """
 
-    map_id: str
-    write_id: str
-    status: str
-    status_reason: str
-    generation: int
-    parents: tuple[str, ...]
     frame: LocalFrame
     placement: Placement
     place: str
@@ -72,19 +65,18 @@ class PlacedMap:
 
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
     """Maps with a place, by id, but retired ones and imports that nobody vouches for: edges may be forged."""
-    placed = {m.map_id for m in snapshot.maps() if not is_imported(m.status, m.status_reason)}
-    return {row["map_id"]: _placed(row) for row in snapshot.rows() if row["map_id"] in placed}
+    placed = {m.map_id: m for m in snapshot.maps() if not is_imported(m.status, m.status_reason)}
+    return {m: _placed(placed[m], row) for row in snapshot.rows() if (m := row["map_id"]) in placed}
 
 
-def _placed(row: Row) -> PlacedMap:
+def _placed(summary: MapSummary, row: Row) -> PlacedMap:
     frame, placement = frame_of(row), placement_of(row)
     corners = np.zeros((0, 3))
     if row[BOUNDS[0]] is not None:
         low_and_high = np.reshape([row[name] for name in BOUNDS], (2, 3))
         corners = frame.enu_from_utm(list(product(*low_and_high.T)), row["epsg"])
     return PlacedMap(
-        **{name: row[name] for name in ("map_id", "write_id", "status", "status_reason", "generation")},
-        parents=tuple(row["parents"]),
+        **{field.name: getattr(summary, field.name) for field in fields(summary)},
         frame=frame,
         placement=placement,
         place=place_key(frame, placement),
@@ -151,8 +143,7 @@ def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
 
 def grow_within_budget(
     model: Model,
-    photos: Sequence[Photo],
-    features_of: FeaturesOf,
+    new: GrowthPhotos,
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     maps: Mapping[str, PlacedMap],
@@ -167,7 +158,7 @@ def grow_within_budget(
     beyond: dict[int, tuple[str, str]] = {}
     for _ in range(_TRIES):
         try:
-            grown = grow_component(part, photos, features_of, localised, areas, identity, budget_m)
+            grown = grow_component(part, new, localised, areas, identity, budget_m)
         except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
             _LOG.exception("a reconstruction of %d photos", len(model.rows))
             text = f"{type(error).__name__}: {error}; the log tells where. Please report it"
@@ -194,29 +185,17 @@ def with_drift(
     grown: GrownMap, maps: Mapping[str, PlacedMap], budget_m: float
 ) -> tuple[FeatureMap, float, FloatArray]:
     """The map with its overlaps by the graph of maps, its drift (m) and covariance (7, 7) to anchors."""
-    feature_map = grown.feature_map
-    growth = growth_of(feature_map.placement.evidence)
-    held = [edge for edge in grown.placement.edges if edge.map_id in maps]
-    held = [replace(edge, place=maps[edge.map_id].place, shared=grown.shared_turn) for edge in held]
+    feature_map, me = grown.feature_map, grown.feature_map.map_id
+    held = [replace(e, place=maps[e.map_id].place) for e in grown.placement.edges if e.map_id in maps]
     edges = no_surer_than(held, grown.placement.covariance)
-    covariance = feature_map.placement.covariance
-    relative = np.reshape(growth["covariance_relative"], (7, 7))
-    others = {m: placed for m, placed in maps.items() if m != feature_map.map_id}
-    solution = solve_maps(others, {feature_map.map_id: edges}, feature_map.frame)
-    if feature_map.map_id in solution.covariance:
-        covariance = solution.covariance[feature_map.map_id]
-        relative = solution.covariance_relative[feature_map.map_id]
-    drift = map_drift_m(feature_map, relative)
-    placed = with_growth(
-        feature_map,
-        drift_m=round(drift, 6),
-        budget_m=budget_m,
-        covariance_relative=relative.ravel().tolist(),
-        edges=[edge.as_json() for edge in edges],
-        gates=growth["gates"] | gates.figures([gates.drift(drift, budget_m)]),
-    )
-    placed = replace(placed, placement=replace(placed.placement, covariance=covariance))
-    return inflated(placed), drift, relative
+    others = {m: placed for m, placed in maps.items() if m != me}
+    solution = solve_maps(others, {me: edges}, feature_map.frame)
+    covariance = solution.covariance.get(me, feature_map.placement.covariance)
+    relative = solution.covariance_relative.get(me, grown.relative)
+    placed = replace(feature_map, placement=replace(feature_map.placement, covariance=covariance))
+    noted, drift = with_overlaps(placed, relative, edges, budget_m)
+    told = gates.figures([*grown.placement.gates, gates.drift(drift, budget_m)])
+    return inflated(with_growth(noted, gates=told)), drift, relative
 
 
 def rows_within(

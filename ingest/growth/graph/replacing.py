@@ -18,7 +18,7 @@ from featuredb.store.commits import write_time
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import OWN, PlacedMap, holds, place_key, placed_maps, solve_maps
 from ingest.growth.graph.pose_graph import GraphSolution
-from ingest.growth.map_places import growth_of, inflated, map_drift_m, with_growth
+from ingest.growth.map_places import growth_of, inflated, with_growth, with_overlaps
 from ingest.growth.place.map_images import measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, check_known
 from ingest.growth.trust.promotion import PARENT_MOVED
@@ -219,19 +219,12 @@ def _with_evidence(
     """The moved map with its drift, overlaps and parents; and its drift."""
     map_id, own = feature_map.map_id, feature_map.frame
     relative = covariance_in_frame(solution.covariance_relative[map_id], frame, own)
-    drift = map_drift_m(feature_map, relative)
+    noted, drift = with_overlaps(feature_map, relative, edges, budget_m)
     if before.is_anchor:
         was = before.own_place
         total = in_frame(solution.corrections[map_id], frame, own) @ was.other_from_map.inverse()
         placed = {"covariance": was.covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
         return with_growth(feature_map, **{OWN: placed}), drift
-    noted = with_growth(
-        feature_map,
-        drift_m=round(drift, 6),
-        budget_m=budget_m,
-        covariance_relative=relative.ravel().tolist(),
-        edges=[edge.as_json() for edge in edges],
-    )
     held = [edge.map_id for edge in edges]
     # Only anchors join the parents: a map never becomes its own ancestor.
     parents = tuple(dict.fromkeys([*(m for m in before.parents if m in held), *held])) or before.parents

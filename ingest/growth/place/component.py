@@ -6,7 +6,7 @@ geometry, estimated without any pose, fits the two poses, two independent statem
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 
@@ -18,7 +18,6 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
-from featuredb.maps.lineage import GROWTH
 from ingest.colmap.anchored import FixedPoints, Lenses, adjust_anchored, pixel_scale, triangulate_posed
 from ingest.colmap.bridge import Model, SfmPhoto, TwoView
 from ingest.fingerprint import digest
@@ -26,12 +25,11 @@ from ingest.growth import gates
 from ingest.growth.place.localised import in_frame, with_lens
 from ingest.growth.place.placement import parents_covariance, place_by_maps
 from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
-from ingest.growth.place.similarity_fit import find_correspondences
 from ingest.growth.values import (
     DRIFT_BUDGET_M,
     LEAST_PHOTOS,
     TOLERANCE_PX,
-    FeaturesOf,
+    GrowthPhotos,
     LocalisedPhoto,
     Refused,
     tied_together,
@@ -45,9 +43,9 @@ from reloc.localise.pose import reprojection_errors
 
 # Part of the id of every map that is named by its photos; raised when the same photos would give another map.
 _VERSION = "grown-1"
-# Points of two photos carry descriptors: a handful of photos has hardly longer tracks, and the next photo
+# Photos of a point that carries descriptors: a handful of photos has hardly longer tracks, and the next photo
 # needs them to be localised.
-_MAPS = MapOptions(min_track_length=2)
+_LEAST_TRACK = 2
 # What a reconstruction is refused for whose photos are at several places. Not CONTRADICTS_GPS: to cut until
 # the geotags of a part agree is to choose the photos of whoever lies. Of a block copied elsewhere, half of
 # whose tags were at its twin, the parts with those tags were left over, small enough for one forged photo to
@@ -62,12 +60,12 @@ class GrownMap(Refinement):
     """A refined reconstruction and its map, ready to be committed in quarantine."""
 
     feature_map: FeatureMap
+    relative: FloatArray  # (7, 7) covariance of its place relative to the anchors
 
 
 def grow_component(
     model: Model,
-    photos: Sequence[Photo],
-    features_of: FeaturesOf,
+    new: GrowthPhotos,
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     identity: MapIdentity | None,
@@ -76,8 +74,8 @@ def grow_component(
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
 
     Args:
-        model: a connected reconstruction; its rows are rows of `photos`.
-        localised: new photos that the maps localise, by row; others than the model's are ignored.
+        model: a connected reconstruction of new photos.
+        localised: those that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
         identity: of the map; None: it is named by the photos that were tried.
         max_bound_m: photos that may be further off (95 %) are left out.
@@ -87,22 +85,20 @@ def grow_component(
     if not own:
         return Refused(reason="NOT_LOCALISED", message=f"none of {len(rows)} photos is localised by a map")
     frame, near = _meeting_place(own, areas)
-    keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
-    model, lenses = adopt_lenses(model, photos, near, keypoints)
+    keypoints = [new.features_of(r).features.xy.astype(np.float64) for r in rows]
+    model, lenses = adopt_lenses(model, new.photos, near, keypoints)
     cameras = [model.cameras[c] for c in model.camera_of.tolist()]
     own = {k: with_lens(in_frame(photo, frame), cameras[k]) for k, photo in own.items()}
-    correspondences = find_correspondences(model, own, keypoints)
-    placement = place_by_maps(model, own, correspondences, photos, near, frame)
+    placement = place_by_maps(model, own, keypoints, new.photos, near, frame)
     if isinstance(placement, Refused):
         return placement
-    refusal = gates.first_refusal(placement.gates)
+    refusal = next((gate for gate in placement.gates if not gate.passes), None)
     if refusal is not None:
         return Refused(reason=refusal.reason, message=refusal.message, gates=placement.gates)
-    refined = refine_placed(model, placement, correspondences, own, keypoints, lenses, max_bound_m)
+    refined = refine_placed(model, placement, own, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
-    named = identity or _named([photos[r] for r in rows])
-    return _assembled(refined, photos, features_of, near, named)
+    return _assembled(refined, new, near, identity or _named([new.photos[r] for r in rows]))
 
 
 def _meeting_place(
@@ -119,20 +115,14 @@ def _meeting_place(
 
 
 def _assembled(
-    refined: Refinement,
-    photos: Sequence[Photo],
-    features_of: FeaturesOf,
-    areas: Sequence[Area],
-    identity: MapIdentity,
+    refined: Refinement, new: GrowthPhotos, areas: Sequence[Area], identity: MapIdentity
 ) -> GrownMap | Refused:
-    """The map of a refined model, with what growth knows of it as evidence."""
-    model, placement = refined.model, refined.placement
+    """The map of a refined model."""
+    model, placement, edges = refined.model, refined.placement, refined.placement.edges
     maps = {m.map_id: m for area in areas for m in area.maps}
-    parents = [(maps[e.map_id], e.shared_points) for e in placement.edges]
-    on_earth, to_anchors = (
-        placement.covariance + parents_covariance(parents, placement.frame, relative=relative)
-        for relative in (False, True)
-    )
+    parents = [maps[edge.map_id] for edge in edges]
+    on_earth = placement.covariance + parents_covariance(edges, areas, placement.frame)
+    relative = placement.covariance + parents_covariance(edges, areas, placement.frame, relative=True)
     rows = model.rows.tolist()
     feature_map = build_map(
         model,
@@ -143,15 +133,14 @@ def _assembled(
             residual_rms_m=placement.residual_rms_m,
         ),
         placement.frame,
-        [photos[r] for r in rows],
-        [features_of(r) for r in rows],
+        [new.photos[r] for r in rows],
+        [new.features_of(r) for r in rows],
         identity,
-        replace(_MAPS, height_datum=parents[0][0].height_datum),
+        MapOptions(min_track_length=_LEAST_TRACK, height_datum=parents[0].height_datum),
     )
     if feature_map is None:
         message = "no point is placed well enough: the photos' rays are parallel"
         return Refused(reason="NO_POINTS", message=message, gates=placement.gates)
-    growth = {"covariance_relative": to_anchors.ravel().tolist(), "gates": gates.figures(placement.gates)}
     images = tuple(  # they know what their lenses leave open; as they were where nothing is known
         replace(image, covariance=own) if np.isfinite(own).all() else image
         for image, own in zip(feature_map.images, refined.poses, strict=True)
@@ -159,13 +148,13 @@ def _assembled(
     grown = replace(
         feature_map,
         status="quarantined",
-        generation=1 + max(m.generation for m, _ in parents),
-        parents=tuple(m.map_id for m, _ in parents),
-        placement=replace(feature_map.placement, evidence={GROWTH: growth}),
+        generation=1 + max(m.generation for m in parents),
+        parents=tuple(m.map_id for m in parents),
         images=images,
         provenance=without_modes(feature_map.provenance),
     )
-    return GrownMap(feature_map=grown, **{f.name: getattr(refined, f.name) for f in fields(refined)})
+    as_refined = {f.name: getattr(refined, f.name) for f in fields(refined)}
+    return GrownMap(feature_map=grown, relative=relative, **as_refined)
 
 
 def _named(photos: Sequence[Photo]) -> MapIdentity:
@@ -194,28 +183,24 @@ def split(model: Model, links: Sequence[float]) -> tuple[float, list[Model]]:
 
 
 def lone_groups(
-    localised: Mapping[int, LocalisedPhoto],
-    features_of: FeaturesOf,
-    overlaps: Collection[Pair],
-    geometry_of: Callable[[Pair], TwoView],
+    localised: Mapping[int, LocalisedPhoto], new: GrowthPhotos
 ) -> tuple[list[Model], dict[int, str]]:
     """Groups among localised photos that no reconstruction holds, and for those in none the reason.
 
+    A group's model is of its matches alone, with the lenses of the localisations.
+
     Args:
         localised: the lone photos by row, those of one camera with one lens.
-        overlaps: pairs of rows with verified matches. geometry_of: theirs, in which no pose takes part.
-
-    Returns:
-        A model of each group, of its matches alone, with the lenses of the localisations.
+        new: with the geometry of overlaps, in which no pose takes part.
     """
     if not localised:
         return [], {}
     frame = next(iter(localised.values())).frame
     photos = {r: in_frame(p, frame) for r, p in sorted(localised.items())}
     geometries: dict[Pair, TwoView] = {}
-    for a, b in sorted(pair for pair in overlaps if photos.keys() >= set(pair)):
-        view = geometry_of((a, b))
-        pixels = [features_of(r).features.xy[view.inliers[:, k]] for k, r in enumerate((a, b))]
+    for a, b in sorted(pair for pair in new.overlaps if photos.keys() >= set(pair)):
+        view = new.geometry_of((a, b))
+        pixels = [new.features_of(r).features.xy[view.inliers[:, k]] for k, r in enumerate((a, b))]
         if poses_fit(photos[a], photos[b], pixels[0].astype(np.float64), pixels[1].astype(np.float64)):
             geometries[a, b] = view
     alone = photos.keys() - set(chain(*geometries))
@@ -225,7 +210,7 @@ def lone_groups(
         rows = np.array(list(photos))[group_of == group].tolist()
         if len(rows) >= 2:
             own = {pair: view for pair, view in geometries.items() if pair[0] in rows}
-            groups.append(_triangulated(rows, photos, own, features_of))
+            groups.append(_triangulated({r: photos[r] for r in rows}, own, new))
     return groups, dict.fromkeys(alone, "ALONE: no other photo bears its pose out")
 
 
@@ -259,22 +244,19 @@ def intersections(
 
 
 def _triangulated(
-    rows: Sequence[int],
-    photos: Mapping[int, LocalisedPhoto],
-    geometries: Mapping[Pair, TwoView],
-    features_of: FeaturesOf,
+    photos: Mapping[int, LocalisedPhoto], geometries: Mapping[Pair, TwoView], new: GrowthPhotos
 ) -> Model:
     """A model of the group, from the localisations' poses adjusted to its verified matches alone.
 
     Whether it still fits the localisations is asked when it is placed, as of any reconstruction.
     """
-    cameras = list(dict.fromkeys(photos[r].camera for r in rows))
+    rows, cameras = list(photos), list(dict.fromkeys(photo.camera for photo in photos.values()))
     sfm = []
-    for r in rows:
-        camera_row, xy = cameras.index(photos[r].camera), features_of(r).features.xy
+    for r, photo in photos.items():
+        camera_row, xy = cameras.index(photo.camera), new.features_of(r).features.xy
         sfm.append(SfmPhoto(name=str(r), camera_row=camera_row, keypoints=xy))
     views = {(rows.index(a), rows.index(b)): view for (a, b), view in geometries.items()}
-    model = triangulate_posed(cameras, sfm, [photos[r].cam_from_local for r in rows], views)
+    model = triangulate_posed(cameras, sfm, [photo.cam_from_local for photo in photos.values()], views)
     keypoints = [sfm[int(k)].keypoints.astype(np.float64) for k in model.rows]
     lenses = Lenses(held=range(len(model.cameras)))
     free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses).model

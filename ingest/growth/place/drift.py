@@ -174,12 +174,10 @@ def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray
     position is good to centimetres; a factor that covers this would make metres of it at the far end.
     """
     seen = np.isfinite(spread[:, 0, 0])
-    if not seen.any():
-        return 0.0
     jacobian = point_jacobian(model.centers()[seen])
     claimed = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
     excess = center_covariances(model, spread)[seen] - claimed
-    return float(max(0.0, np.linalg.eigvalsh(excess)[:, -1].max()))
+    return float(np.linalg.eigvalsh(excess)[:, -1].max(initial=0.0))
 
 
 def center_covariances(model: Model, spread: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from featuredb.index.descriptor_index import use_threads
-from ingest.growth.values import QUERY, FeaturesOf, LocalisedPhoto
+from ingest.growth.values import QUERY, GrowthPhotos, LocalisedPhoto
 from ingest.photos.photo import Photo
 from reloc.localise.acceptance import agreement
 from reloc.localise.candidates import IndexedArea
@@ -42,24 +42,16 @@ _MOST_LENSES = 5  # that are tried for one camera; those of the photos with most
 
 
 def localise_photos(
-    photos: Sequence[Photo],
-    rows: Sequence[int],
-    features_of: FeaturesOf,
-    areas: Sequence[IndexedArea],
-    threads: int = 1,
+    new: GrowthPhotos, rows: Sequence[int], areas: Sequence[IndexedArea], threads: int = 1
 ) -> tuple[dict[int, LocalisedPhoto], dict[int, str]]:
-    """Localise photos in the areas of the active maps, each for itself.
+    """By row the photos that the active maps' areas localise, each by itself, and why the others are not.
 
     Args:
-        photos: all new photos. rows: those to be localised.
         threads: photos at a time; the work is done outside of Python's lock, and results are the same.
-
-    Returns:
-        What was localised by row, and for the others the reason by row.
     """
 
     def one(row: int) -> LocalisedPhoto | str:
-        return localise_photo(photos[row], features_of(row).features, areas)
+        return localise_photo(new.photos[row], new.features_of(row).features, areas)
 
     if threads <= 1 or len(rows) < 2:
         outcomes = dict(zip(rows, map(one, rows), strict=True))
@@ -221,12 +213,9 @@ def with_shared_lenses(
         by_matches = sorted(rows, key=lambda r: -len(localised[r].pixels))
         lenses = list(dict.fromkeys(localised[r].camera for r in by_matches))[:_MOST_LENSES]
         if len(lenses) > 1:
-            tries = [[with_lens(localised[r], lens) for r in rows] for lens in lenses]
-            fits = [
-                sum(_fitting(photo) for photo in tried if photo.camera == lens)
-                for tried, lens in zip(tries, lenses, strict=True)
-            ]
-            found.update(zip(rows, tries[int(np.argmax(fits))], strict=True))
+            tries = {lens: [with_lens(localised[r], lens) for r in rows] for lens in lenses}
+            best = max(tries, key=lambda lens: sum(_fitting(p) for p in tries[lens] if p.camera == lens))
+            found.update(zip(rows, tries[best], strict=True))
     return found
 
 

@@ -16,7 +16,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.unplaced_map import AnyMap
 from ingest.colmap.bridge import Model
 from ingest.growth.place.localised import in_frame, localise_photo
-from ingest.growth.place.similarity_fit import agreed_similarity, find_correspondences
+from ingest.growth.place.similarity_fit import agreed_similarity
 from ingest.growth.values import LEAST_PHOTOS, LEAST_SHARED_POINTS, Edge, LocalisedPhoto
 from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
@@ -28,18 +28,18 @@ MOST_IMAGES = 24  # that are asked of a map or around one, nearest first; more o
 _LEAST_POINTS = 2 * LEAST_SHARED_POINTS  # behind an overlap; fewer leave scale and tilt open
 
 
-def observed_rows(any_map: AnyMap, image: MapImage, *, described: bool) -> NDArray[np.int64]:
-    """Rows (n,) of a map's observations of one image, those with descriptors first, or alone; large first."""
-    seen = any_map.observations
+def features_and_points(
+    any_map: AnyMap, image: MapImage, *, described: bool = True
+) -> tuple[Features, NDArray[np.int64]]:
+    """What a map keeps of one of its photos, and the rows (n,) of the points that its features see.
+
+    Features with descriptors come first, or alone; then large ones.
+    """
+    seen, camera = any_map.observations, any_map.cameras[image.camera_id]
     rows = np.flatnonzero(seen.image_id == image.image_id)
     rows = rows[np.lexsort((-seen.scale[rows], ~seen.has_descriptor[rows]))]
-    return rows[seen.has_descriptor[rows]] if described else rows
-
-
-def observed_features(any_map: AnyMap, image: MapImage, rows: NDArray[np.int64]) -> Features:
-    """Rows (n,) of a map's observations, all of one image, as features of that photo, best first."""
-    seen, camera = any_map.observations, any_map.cameras[image.camera_id]
-    return Features(
+    rows = rows[seen.has_descriptor[rows]] if described else rows
+    features = Features(
         xy=seen.xy[rows],
         scale=seen.scale[rows],
         angle=seen.angle[rows],
@@ -49,21 +49,15 @@ def observed_features(any_map: AnyMap, image: MapImage, rows: NDArray[np.int64])
         height=camera.height,
         fingerprint=any_map.extractor_fingerprint,
     )
-
-
-def features_and_points(feature_map: FeatureMap, image: MapImage) -> tuple[Features, NDArray[np.int64]]:
-    """What a map keeps of one of its photos, and the row of its points (n,) that each feature observes."""
-    rows = observed_rows(feature_map, image, described=True)
-    return observed_features(feature_map, image, rows), feature_map.observations.point_index[rows]
+    return features, seen.point_index[rows]
 
 
 def model_of(any_map: AnyMap, images: Sequence[MapImage], *, described: bool) -> Model:
-    """Images of a map as a reconstruction in its frame; keypoints of an image are its `observed_rows`."""
-    rows = [observed_rows(any_map, image, described=described) for image in images]
-    counts = [len(r) for r in rows]
+    """Images of a map as a reconstruction in its frame; keypoints as in `features_and_points`."""
+    seen = [features_and_points(any_map, image, described=described)[1] for image in images]
+    counts = [len(points) for points in seen]
     photo_of = np.repeat(np.arange(len(images), dtype=np.int64), counts)
-    points = any_map.observations.point_index[np.concatenate(rows)]
-    used, point_of = np.unique(points, return_inverse=True)
+    used, point_of = np.unique(np.concatenate(seen), return_inverse=True)
     order = np.lexsort((photo_of, point_of))
     return Model(
         cameras=any_map.cameras,
@@ -82,8 +76,7 @@ def measure_overlap(
 ) -> Edge | str:
     """Images of `feature_map` localised in `other`, and the similarity that they agree upon; or why not.
 
-    Args:
-        images: those that are asked; None: the ones that should see the other map by both placements.
+    Without `images` those are asked that should see the other map by both placements.
     """
     if feature_map.extractor_fingerprint != other.extractor_fingerprint:
         return "descriptors of different extractors"
@@ -97,13 +90,12 @@ def measure_overlap(
         return f"{len(localised)} of {len(images)} images are found, {LEAST_PHOTOS} are needed"
     model = model_of(feature_map, images, described=True)
     keypoints = [features_and_points(feature_map, image)[0].xy.astype(float) for image in images]
-    correspondences = find_correspondences(model, localised, keypoints)
-    found = agreed_similarity(model, localised, correspondences, [Sim3.identity()])
+    found = agreed_similarity(model, localised, keypoints, [Sim3.identity()])
     if found is None:
         return "no image agrees with another"
-    fit, agree, used = found
-    used &= np.isin(correspondences.photo_of, list(agree))  # and not those carried into images that do not
-    points = len(np.unique(correspondences.point_of[used]))
+    fit, agree, held = found
+    # Without those carried into images that do not agree.
+    points = len(np.unique(held.point_of[np.isin(held.photo_of, list(agree))]))
     if len(agree) < LEAST_PHOTOS or points < _LEAST_POINTS:
         return f"{len(agree)} images and {points} points agree, {LEAST_PHOTOS} and {_LEAST_POINTS} are needed"
     return Edge(

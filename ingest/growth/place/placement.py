@@ -8,14 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.view_cones import in_view, view_cones
 from featuredb.index.area import Area
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import covariance_in_frame
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
@@ -36,6 +34,9 @@ from reloc.localise.matching import EXPECTED_DEG, visible_points
 # re-upload 13.3 m off showed 0.17; right photos of that database 0.32 and more, of the one that grew with
 # this limit 0.23 and more.
 _LEAST_SHOWN = 0.25
+CONTRADICTS = "CONTRADICTS"  # reason of photos that their own localisation has elsewhere
+_SHOWS_LITTLE = "the photo shows too little of what existing maps say it should show from where it would be"
+_ELSEWHERE = "the photo by itself sees existing points elsewhere than the others put it"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,12 +46,12 @@ class MapsPlacement:
     Attributes:
         frame: local frame in which `fit` places the model.
         covariance: (7, 7) of the similarity's left perturbation, relative to the existing maps.
-        agreeing, disagreeing: localised photos that agree with the placement, and those that do not, by
-            their place in the model. Photos that no map localises are in neither.
-        blind: those that show too little of what existing maps, or the others' points, say they should.
+        agreeing: localised photos that agree with the placement, by their place in the model.
+        left_out: reason and message of those that do not, and of any that show too little of what existing
+            maps, or the others' points, say they should.
         edges: one for each existing map that holds it, most shared points first: the correction that this
             map alone would apply to the placed one.
-        fit: over the correspondences that agree, `used` (m,).
+        fit: over the correspondences that agree, `held`.
         residual_rms_m: of the agreeing photos' centres, placed minus localised, metres.
         gates: every gate with its figure, in the order they were asked.
     """
@@ -58,11 +59,10 @@ class MapsPlacement:
     frame: LocalFrame
     covariance: FloatArray
     agreeing: tuple[int, ...]
-    disagreeing: tuple[int, ...]
-    blind: tuple[int, ...]
+    left_out: Mapping[int, tuple[str, str]]
     edges: tuple[Edge, ...]
     fit: FittedSimilarity
-    used: NDArray[np.bool_]
+    held: Correspondences
     residual_rms_m: float
     gates: tuple[Gate, ...]
 
@@ -70,7 +70,7 @@ class MapsPlacement:
 def place_by_maps(
     model: Model,
     own: Mapping[int, LocalisedPhoto],
-    correspondences: Correspondences,
+    keypoints: Sequence[FloatArray],
     photos: Sequence[Photo],
     areas: Sequence[Area],
     frame: LocalFrame,
@@ -79,24 +79,23 @@ def place_by_maps(
 
     Args:
         model: with the lenses that it keeps.
-        own: the model's localised photos, by place among them, in `frame`; so are the correspondences.
+        own: the model's localised photos, by place among them, in `frame`.
+        keypoints: pixels of all features of each photo of the model.
         photos: all new photos, for their positions.
         areas: that hold the existing maps.
     """
-    found = agreed_similarity(model, own, correspondences)
-    edges = edges_of(model, found[0], correspondences, found[2]) if found else ()
+    found = agreed_similarity(model, own, keypoints, ())
+    edges = edges_of(model, found[0], found[2]) if found else ()
     if not found or not edges:
         gate = gates.agreement(0, len(own))
         return replace(Refused.by(gate), message=f"no placement: {gate.message}")
-    fit, agree, used = found
-    maps = {m.map_id: m for area in areas for m in area.maps}
-    on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
-    sim, held = fit.local_from_sfm, correspondences.take(np.flatnonzero(used))
+    fit, agree, held = found
+    on_earth, sim = parents_covariance(edges, areas, frame), fit.local_from_sfm
     existing, with_own = _shown_parts(model, sim, held, areas, frame)
-    disagree = own.keys() - agree
-    # Those that disagree are left out as such.
-    blind = set(np.flatnonzero(with_own < _LEAST_SHOWN).tolist()) - disagree
+    left_out = dict.fromkeys(sorted(own.keys() - agree), (CONTRADICTS, _ELSEWHERE))
+    blind = {*np.flatnonzero(with_own < _LEAST_SHOWN).tolist()} - left_out.keys()
     blind |= {k for k in agree if existing[k] < gates.LEAST_VISIBLE}
+    left_out |= dict.fromkeys(sorted(blind), ("NOT_VISIBLE", _SHOWS_LITTLE))
     centers = sim.act(model.centers())
     squared_m2 = [((own[k].cam_from_local.center - centers[k]) ** 2).sum() for k in agree]
     positions = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
@@ -104,14 +103,13 @@ def place_by_maps(
         frame=frame,
         covariance=fit.covariance,
         agreeing=tuple(sorted(agree)),
-        disagreeing=tuple(sorted(disagree)),
-        blind=tuple(sorted(blind)),
+        left_out=left_out,
         edges=edges,
         fit=fit,
-        used=used,
+        held=held,
         residual_rms_m=float(np.sqrt(np.mean(squared_m2))),
         gates=(
-            gates.agreement(len(agree), len(disagree)),
+            gates.agreement(len(agree), len(own) - len(agree)),
             gates.geotags(*positions, by=", ".join(e.map_id for e in edges)),
             gates.visibility(existing[np.isfinite(existing)]),
         ),
@@ -138,18 +136,15 @@ def _against_positions(
     return np.array(offsets).reshape(-1, 2), np.array(spreads).reshape(-1, 2, 2)
 
 
-def edges_of(
-    model: Model, fit: FittedSimilarity, correspondences: Correspondences, used: NDArray[np.bool_]
-) -> tuple[Edge, ...]:
+def edges_of(model: Model, fit: FittedSimilarity, held: Correspondences) -> tuple[Edge, ...]:
     """How each existing map holds the model, by its own points alone where they suffice."""
     found: list[Edge] = []
-    for m, map_id in enumerate(correspondences.map_ids):
-        mine = used & (correspondences.map_of == m)
-        points = len(np.unique(correspondences.point_of[mine]))
-        photos = len(np.unique(correspondences.photo_of[mine]))
+    for m, map_id in enumerate(held.map_ids):
+        mine = held.take(held.map_of == m)
+        points, photos = len(np.unique(mine.point_of)), len(np.unique(mine.photo_of))
         if points < LEAST_SHARED_POINTS or photos < gates.LEAST_AGREEING:
             continue
-        alone = fit_similarity(model, fit.local_from_sfm, correspondences, mine)
+        alone = fit_similarity(model, fit.local_from_sfm, mine)
         found.append(
             Edge(
                 map_id=map_id,
@@ -163,23 +158,25 @@ def edges_of(
 
 
 def parents_covariance(
-    parents: Sequence[tuple[FeatureMap, int]], frame: LocalFrame, *, relative: bool = False
+    edges: Sequence[Edge], areas: Sequence[Area], frame: LocalFrame, *, relative: bool = False
 ) -> FloatArray:
-    """(7, 7) of the parents' placements in `frame`, weighted by the shared points that each comes with.
+    """(7, 7) of the placements of the edges' maps in `frame`, weighted by the shared points.
 
     The mean of covariances bounds that of a mean from above however the parents' errors are correlated.
 
     Args:
+        areas: that hold these maps.
         relative: to their anchors, nothing for anchors; else on Earth.
     """
-    covariance = np.zeros((7, 7))
-    for parent, points in parents:
+    maps, covariance = {m.map_id: m for area in areas for m in area.maps}, np.zeros((7, 7))
+    for edge in edges:
+        parent = maps[edge.map_id]
         own = parent.placement.covariance
         if relative:
             told = growth_of(parent.placement.evidence).get("covariance_relative", np.zeros(49))
             own = np.reshape(told, (7, 7))
-        covariance += points * covariance_in_frame(own, parent.frame, frame)
-    return covariance / sum(points for _, points in parents)
+        covariance += edge.shared_points * covariance_in_frame(own, parent.frame, frame)
+    return covariance / sum(edge.shared_points for edge in edges)
 
 
 def _shown_parts(

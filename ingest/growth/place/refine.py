@@ -20,23 +20,14 @@ from ingest.colmap.bridge import Model, with_observations
 from ingest.colmap.precision import linearise
 from ingest.growth import gates
 from ingest.growth.map_places import SIGMAS_95
-from ingest.growth.place.drift import (
-    bending_variance_m2,
-    center_covariances,
-    photo_covariances,
-    shared_turn,
-    turning_covariance,
-)
-from ingest.growth.place.placement import MapsPlacement, edges_of
+from ingest.growth.place import drift
+from ingest.growth.place.placement import CONTRADICTS, MapsPlacement, edges_of
 from ingest.growth.place.similarity_fit import Correspondences, FittedSimilarity, fit_similarity
 from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
 from ingest.sfm.links import bottleneck_share, select_photos
 
-# Reasons of photos that nothing holds well enough, and of those that their own localisation has elsewhere.
-_LOOSE, _CONTRADICTS = "DRIFT_BUDGET", "CONTRADICTS"
-_SHOWS_LITTLE = "the photo shows too little of what existing maps say it should show from where it would be"
-_ELSEWHERE = "the photo by itself sees existing points elsewhere than the others put it"
+_LOOSE = "DRIFT_BUDGET"  # reason of photos that nothing holds well enough
 # `bottleneck_share` that photos need which are not localised themselves. In simulated communities photos tied
 # to look-alike halls, 68 and 78 m off, had 0.15 and 0.04; right photos nearly all 0.46 and more, single ones
 # 0.14. Those wait, and are localised by themselves once their neighbours are in an active map.
@@ -58,7 +49,6 @@ class Refinement:
         placement: with the gates asked here and the covariances of the refined model.
         poses: (k, 6, 6) of `PhotoSpread`, of the photos that are kept.
         bending_m: what the photos' positions lack beyond the similarity, one sigma along the worst axis.
-        shared_turn: (7, 3) of `drift.shared_turn`.
         left_out: photos that are not kept although they agree, by row, with reason and message.
     """
 
@@ -66,7 +56,6 @@ class Refinement:
     placement: MapsPlacement
     poses: FloatArray
     bending_m: float
-    shared_turn: FloatArray
     left_out: Mapping[int, tuple[str, str]]
 
 
@@ -89,8 +78,7 @@ def adopt_lenses(
         lens = next((own for area in areas if key and (own := area.camera_for_key(key))), None)
         if lens is not None and (lens.width, lens.height) == (camera.width, camera.height):
             lent[c] = lens
-        focal_px = told.pop() if len(told) == 1 else None  # none where EXIF tells several
-        if focal_px is not None:
+        if len(told) == 1 and (focal_px := told.pop()) is not None:  # none where EXIF tells several
             focals[c] = focal_px
     lenses = Lenses(lent=lent, focal_px=focals)
     if not lent:
@@ -102,7 +90,6 @@ def adopt_lenses(
 def refine_placed(
     model: Model,
     placement: MapsPlacement,
-    correspondences: Correspondences,
     localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
     lenses: Lenses,
@@ -120,54 +107,52 @@ def refine_placed(
     sim = placement.fit.local_from_sfm
     poses = tuple(sim.act_on_pose(pose) for pose in model.cam_from_sfm)
     placed = replace(model, cam_from_sfm=poses, xyz=sim.act(model.xyz))  # in metres
-    left_out = dict.fromkeys(placement.disagreeing, (_CONTRADICTS, _ELSEWHERE))
-    left_out |= dict.fromkeys(placement.blind, ("NOT_VISIBLE", _SHOWS_LITTLE))
-    weak = weak_photos(model, list(left_out), [k for k in placement.agreeing if k not in left_out])
-    left_out |= {k: ("WEAK_LINK", message) for k, message in weak.items()}
+    left_out = dict(placement.left_out)
+    left_out |= weak_photos(model, list(left_out), [k for k in placement.agreeing if k not in left_out])
     for _ in range(_ROUNDS):
-        good = correspondences.take(placement.used & ~np.isin(correspondences.photo_of, list(left_out)))
+        good = placement.held.take(~np.isin(placement.held.photo_of, list(left_out)))
         good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)  # those that hold anything
         adjusted, fixed = _refined(placed, list(left_out), good, lenses, keypoints)
-        spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
-        fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
+        spread = drift.photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses)
+        held = good.take(adjusted.fixed_kept)
+        fit = fit_similarity(adjusted.model, Sim3.identity(), held)
         inside = {k: localised[k] for k in placement.agreeing if k not in left_out}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
-        left_out |= {k: (_CONTRADICTS, message) for k, message in against.items()}
         loose = loose_photos(adjusted.model, spread.poses, max_bound_m)
-        loose = {k: message for k, message in loose.items() if k not in left_out}
-        left_out |= {k: (_LOOSE, message) for k, message in loose.items()}
+        loose = {k: why for k, why in loose.items() if k not in left_out and k not in against}
+        left_out |= against | loose
         if not (against or loose) or len(left_out) > len(rows) - 2:
             break
-    for reason, named, what in (
-        (_LOOSE, loose, "hardly a photo is held well enough"),
-        (_CONTRADICTS, against, "photos contradict the others again and again"),
-    ):
-        if named:
-            message = f"{what}: {next(iter(named.values()))}"
-            return Refused(reason=reason, message=message, gates=placement.gates)
-    edges = edges_of(adjusted.model, fit, good, adjusted.fixed_kept)
+    if loose or against:
+        what = (
+            "hardly a photo is held well enough" if loose else "photos contradict the others again and again"
+        )
+        reason, message = next(iter((loose or against).values()))
+        return Refused(reason=reason, message=f"{what}: {message}", gates=placement.gates)
+    edges = edges_of(adjusted.model, fit, held)
     if {e.map_id for e in edges} != {e.map_id for e in placement.edges}:
         edges = placement.edges  # a parent that hardly held: as it was
     whole = _with_existing(adjusted, fixed, good, [e.map_id for e in edges])
     for k in sorted(set(range(len(rows))) - set(left_out) - set(whole.photo_of.tolist())):
         left_out[k] = _LOOSE, "the photo shows nothing that another photo of the map shows as well"
-    disagreeing = sum(reason == _CONTRADICTS for reason, _ in left_out.values())
+    disagreeing = sum(reason == CONTRADICTS for reason, _ in left_out.values())
     gate = gates.agreement(len(set(placement.agreeing) - set(left_out)), disagreeing)
     if not gate.passes:
         message = f"once refined, {gate.message}"
         return Refused(reason=gate.reason, message=message, gates=placement.gates)
     # Until now the reconstruction was bent as it came, and its residuals said more of that than of where it
     # lies.
-    turning = turning_covariance(adjusted.model, fit.covariance, spread)
-    bending_m2 = bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
+    turning = drift.turning_covariance(adjusted.model, fit.covariance, spread)
+    bending_m2 = drift.bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
     covariance = fit.covariance + turning + np.diag([0.0] * 4 + [bending_m2] * 3)
+    shared = drift.shared_turn(adjusted.model, spread)
+    edges = tuple(replace(edge, shared=shared) for edge in edges)
     kept = [k for k in range(len(rows)) if k not in left_out]
     return Refinement(
         model=select_photos(whole, [rows[k] for k in kept]),
         placement=replace(placement, edges=edges, covariance=covariance),
         poses=spread.poses[kept],
         bending_m=float(np.sqrt(bending_m2)),
-        shared_turn=shared_turn(adjusted.model, spread),
         left_out={rows[k]: why for k, why in left_out.items()},
     )
 
@@ -177,8 +162,8 @@ def contradicting_photos(
     localised: Mapping[int, LocalisedPhoto],
     spread: FloatArray,
     fits: Sequence[FittedSimilarity],
-) -> dict[int, str]:
-    """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.
+) -> dict[int, tuple[str, str]]:
+    """Photos of the model whose own localisation is elsewhere, by their place in it, and why.
 
     Asked of the refined model: as it comes, one of a few photos is bent by more than localised poses are
     uncertain. The sigmas are those of the localisation, times the spread and the neighbours factor of the
@@ -192,7 +177,7 @@ def contradicting_photos(
     """
     limit = gates.sigmas_limit(6)
     dilution = max(max(fit.spread, 1.0) ** 2 * fit.neighbours_factor for fit in fits)
-    found: dict[int, str] = {}
+    found: dict[int, tuple[str, str]] = {}
     for k, photo in sorted(localised.items()):
         pose, own_pose = model.cam_from_sfm[k], photo.cam_from_local
         turn = so3_log(own_pose.rotation.T @ pose.rotation)
@@ -205,10 +190,11 @@ def contradicting_photos(
         square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
         if square > limit:
             off_m, off_deg = np.linalg.norm(offset[3:]), np.degrees(np.linalg.norm(offset[:3]))
-            found[k] = (
+            message = (
                 f"the photo by itself is {off_m:.2f} m and {off_deg:.2f} degrees from where the others put "
                 f"it, chi-square {square:.0f}, {limit:.0f} is allowed"
             )
+            found[k] = CONTRADICTS, message
     return found
 
 
@@ -236,19 +222,17 @@ def pose_by_lens(photo: LocalisedPhoto, lens: Camera) -> FloatArray:
     return np.asarray(np.linalg.lstsq(by_pose, moved_px[good].reshape(-1), rcond=None)[0])
 
 
-def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> dict[int, str]:
-    """Photos that hang on those that are held by too little, and how little; `outside` do not count."""
+def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> dict[int, tuple[str, str]]:
+    """Photos that hang on those that are held by too little, and why; `outside` do not count."""
     firm = bottleneck_share(model, held, outside)
-    return {
-        k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
-        f"{100 * LEAST_LINK:.0f} % needed: look-alike places tie photos so"
-        for k in np.flatnonzero(firm < LEAST_LINK).tolist()
-        if k not in outside
-    }
+    needed = f"{100 * LEAST_LINK:.0f} % needed: look-alike places tie photos so"
+    tied = "% of its points tie the photo to those that are localised"
+    weak = [k for k in np.flatnonzero(firm < LEAST_LINK).tolist() if k not in outside]
+    return {k: ("WEAK_LINK", f"{100 * firm[k]:.1f} {tied}, {needed}") for k in weak}
 
 
-def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, str]:
-    """Photos that may be further off than the bound (95 %) against the existing points, and how far.
+def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, tuple[str, str]]:
+    """Photos that may be further off than the bound (95 %) against the existing points, and why.
 
     Args:
         spread: (k, 6, 6) of `PhotoSpread`; photos that see nothing any more are loose, unless none was asked.
@@ -257,12 +241,10 @@ def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[i
         return {}
     bounds = np.full(len(spread), np.inf)
     seen = np.isfinite(spread[:, 0, 0])
-    centers = center_covariances(model, spread)[seen]
+    centers = drift.center_covariances(model, spread)[seen]
     bounds[seen] = SIGMAS_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
-    return {
-        k: f"the photo may be {bounds[k]:.2f} m off, {max_bound_m:.2f} m are allowed"
-        for k in np.flatnonzero(bounds > max_bound_m).tolist()
-    }
+    loose, allowed = np.flatnonzero(bounds > max_bound_m).tolist(), f"{max_bound_m:.2f} m are allowed"
+    return {k: (_LOOSE, f"the photo may be {bounds[k]:.2f} m off, {allowed}") for k in loose}
 
 
 def _refined(

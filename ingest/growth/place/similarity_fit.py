@@ -139,7 +139,6 @@ class FittedSimilarity:
     """
     Attributes:
         covariance: (7, 7) of the similarity's left perturbation.
-        errors_px: (m,) `correspondence_errors` of all.
         spread: how many times its claimed sigma the typical residual is.
         neighbours_factor: how many times the variance of what neighbours say exceeds that of independent
             errors.
@@ -147,23 +146,20 @@ class FittedSimilarity:
 
     local_from_sfm: Sim3
     covariance: FloatArray
-    errors_px: FloatArray
     spread: float
     neighbours_factor: float
 
 
 def agreed_similarity(
-    model: Model,
-    own: Mapping[int, LocalisedPhoto],
-    correspondences: Correspondences,
-    more: Sequence[Sim3] = (),
-) -> tuple[FittedSimilarity, set[int], NDArray[np.bool_]] | None:
-    """The fit to the photos that agree with it, these, and the correspondences (m,) that do; or None.
+    model: Model, own: Mapping[int, LocalisedPhoto], keypoints: Sequence[FloatArray], more: Sequence[Sim3]
+) -> tuple[FittedSimilarity, set[int], Correspondences] | None:
+    """The fit to the photos that agree with it, these, and the correspondences that do; or None.
 
     Args:
-        own: localised photos, by place among the model's, in order.
+        own, keypoints: as in `find_correspondences`.
         more: similarities that are tried beside those that single photos propose.
     """
+    correspondences = find_correspondences(model, own, keypoints)
     best = _best_proposal(model, own, correspondences, more)
     if best is None or not best[1]:
         return None
@@ -172,16 +168,17 @@ def agreed_similarity(
     for _ in range(5):  # the set of photos settles in two or three rounds
         if near.sum() < 4:
             return None
-        fit = fit_similarity(model, sim, correspondences, near)
+        fit = fit_similarity(model, sim, correspondences.take(near))
         sim, before = fit.local_from_sfm, chosen
-        chosen = agreeing_photos(fit.errors_px, TOLERANCE_PX, correspondences) & own.keys()
+        errors_px = correspondence_errors(model, sim, correspondences)
+        chosen = agreeing_photos(errors_px, TOLERANCE_PX, correspondences) & own.keys()
         if not chosen:
             return None
         held = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
-        near = held & (fit.errors_px < 2.0 * TOLERANCE_PX)
+        near = held & (errors_px < 2.0 * TOLERANCE_PX)
         if chosen == before:
             break
-    return fit, chosen, held & (fit.errors_px < TOLERANCE_PX)
+    return fit, chosen, correspondences.take(held & (errors_px < TOLERANCE_PX))
 
 
 def _best_proposal(
@@ -239,19 +236,16 @@ def agreeing_photos(errors_px: FloatArray, tolerance_px: float, correspondences:
     return set(np.flatnonzero((total > 0) & (2 * near >= total)).tolist())
 
 
-def fit_similarity(
-    model: Model, start: Sim3, correspondences: Correspondences, use: NDArray[np.bool_]
-) -> FittedSimilarity:
-    """Robust least squares over the pixels of the correspondences in `use` (m,), Gauss-Newton on SIM(3).
+def fit_similarity(model: Model, start: Sim3, correspondences: Correspondences) -> FittedSimilarity:
+    """Robust least squares over the pixels of the correspondences, Gauss-Newton on SIM(3).
 
     Geman-McClure weights at the residuals' robust spread. The covariance is the inverse of the normal
     equations times the squared spread times how far neighbours err alike. What nothing holds (the scale,
     where all photos stand at one place) stays as in `start`, and has standard deviations of `_OPEN`.
     """
-    chosen = correspondences.take(np.flatnonzero(use))
     sim, covariance, spread, factor = start, np.eye(7), 1.0, 1.0
     for _ in range(_ROUNDS):
-        residual, jacobian, information = _equations(model, sim, chosen)
+        residual, jacobian, information = _equations(model, sim, correspondences)
         squared = np.einsum("mi,mij,mj->m", residual, information, residual)
         spread = float(np.sqrt(max(np.median(squared) / _CHI2_2_MEDIAN, 1e-8)))
         weights = 1.0 / (1.0 + squared / (_CHI2_2_95 * spread**2)) ** 2
@@ -260,7 +254,7 @@ def fit_similarity(
         score = np.einsum("mai,mi->ma", weighted, residual)
         inverse = np.linalg.inv(normal + np.diag(1.0 / _OPEN**2))
         step = -inverse @ score.sum(axis=0)
-        factor = neighbours_factor(score, inverse, chosen)
+        factor = neighbours_factor(score, inverse, correspondences)
         covariance = inverse * max(spread, 1.0) ** 2 * factor
         sim = Sim3.exp(step) @ sim
         if step @ normal @ step < 1e-6:  # a thousandth of a sigma
@@ -268,7 +262,6 @@ def fit_similarity(
     return FittedSimilarity(
         local_from_sfm=sim,
         covariance=np.asarray((covariance + covariance.T) / 2),
-        errors_px=correspondence_errors(model, sim, correspondences),
         spread=spread,
         neighbours_factor=factor,
     )

@@ -18,6 +18,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.plain_json import plain
 from featuredb.store import Database
 from featuredb.store.canaries import TOLERANCE_DEG, Canary, KnownPose, list_canaries, load_canary_image
 from ingest.growth.gates import SIGMAS, Gate
@@ -57,13 +58,8 @@ class CanaryCheck:
     regression: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "before": self.before,
-            "after": self.after,
-            "error_m": None if np.isnan(self.error_m) else round(self.error_m, 4),
-            "regression": self.regression,
-        }
+        told = {name: getattr(self, name) for name in ("name", "before", "after", "regression")}
+        return {**told, "error_m": plain(round(self.error_m, 4))}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,9 +81,7 @@ class CanaryRun:
         if count:
             first = self.regressions[0]
             message = f"{count} of {len(self.checks)} canaries regress: {first.name}: {first.regression}"
-        return Gate(
-            name="canaries", reason="CANARY", figure=count, limit=0, passes=not count, message=message
-        )
+        return Gate.at_most("canaries", "CANARY", count, 0, message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,13 +146,8 @@ def answer_now(database: Database, image: bytes) -> tuple[KnownPose | None, int]
     result = localiser.localise(gray, localise_request(LocaliseWireRequest(), image, header), header.size)
     if result.pose is None:
         return None, localiser.snapshot
-    known = KnownPose(
-        epsg=result.pose.epsg,
-        utm=result.pose.utm,
-        height_datum=result.pose.height_datum,
-        cam_from_utm_xyzw=result.pose.cam_from_utm_xyzw,
-    )
-    return known, localiser.snapshot
+    told = ("epsg", "utm", "height_datum", "cam_from_utm_xyzw")
+    return KnownPose(**{name: getattr(result.pose, name) for name in told}), localiser.snapshot
 
 
 def _verdict(miss: _Miss | None, metres: float, degrees: float) -> Verdict:
@@ -175,8 +164,7 @@ def own_canaries(
 
     The choice hangs on the images' names only, so that another run asks the same.
     """
-    near: list[tuple[str, str, MapImage]] = []
-    far: list[tuple[str, str, MapImage]] = []
+    found: dict[bool, list[tuple[str, str, MapImage]]] = {True: [], False: []}  # around the new maps or not
     boxes = []  # in plan, (2, 2), of the maps' points without the few wild ones, with a margin
     for m in new_maps:
         if len(m.points):
@@ -184,6 +172,8 @@ def own_canaries(
             boxes.append((m.frame, low - NEAR_M, high + NEAR_M))
     snapshot = database.snapshot(before.snapshot)
     for indexed in before.areas:
+        if indexed.area.extractor_fingerprint != _OWN_FEATURES.extractor.fingerprint:
+            continue  # no query finds anything there
         own = snapshot.images_of([m.map_id for m in indexed.area.maps])
         images = [(m, image) for m in indexed.area.maps for image in own[m.map_id]]
         for (feature_map, image), described in zip(images, np.diff(indexed.area.image_start), strict=True):
@@ -194,9 +184,8 @@ def own_canaries(
             for frame, low, high in boxes:
                 there = frame.enu_from(feature_map.frame).act(image.cam_from_local.center)[:2]
                 around |= bool(((there >= low) & (there <= high)).all())
-            (near if around else far).append((key, feature_map.map_id, image))
-    near.sort(key=lambda e: e[0])
-    far.sort(key=lambda e: e[0])
+            found[around].append((key, feature_map.map_id, image))
+    near, far = (sorted(found[around], key=lambda e: e[0]) for around in (True, False))
     load = cache(snapshot.load_map)
     return [(load(map_id), image) for _, map_id, image in near[:_OWN_NEAR] + far[: _OWN_NEAR // 2]]
 
@@ -210,9 +199,8 @@ def _check_own(
     """
     features, _ = features_and_points(feature_map, image)
     request = LocaliseRequest(camera=feature_map.cameras[image.camera_id])
-    asked = ((before, None), (after, None), (after, new_ids))
     results = []
-    for localiser, map_ids in asked:
+    for localiser, map_ids in ((before, None), (after, None), (after, new_ids)):
         areas = localiser.areas_of(map_ids)
         areas = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
         results.append(localise_features(features, request, areas, _OWN_FEATURES).result)
@@ -231,15 +219,15 @@ def _checked(
 ) -> CanaryCheck:
     """What became of an answer: verdicts and misses before and after, and the result after."""
     (before, after), regression = verdicts, ""
+    before_m, error_m = (float("nan") if miss is None else miss.metres for miss in misses[:2])
     if before in ("right", "not_found") and after not in ("right", "not_found"):
         regression = f"now {misses[1]} off"
         if after == "found":
             regression = "a photo of elsewhere now finds a place"
         elif misses[1] is None:
             regression = f"no longer localised: {result.reason}: {result.detail}"
-    was_m, is_m = (float("nan") if miss is None else miss.metres for miss in misses[:2])
-    check = CanaryCheck(name=name, before=before, after=after, regression=regression)
-    return replace(check, error_before_m=was_m, error_m=is_m)
+    told = {"error_before_m": before_m, "error_m": error_m}
+    return CanaryCheck(name=name, before=before, after=after, regression=regression, **told)
 
 
 def _miss(pose: LocalisedPose | None, frame: LocalFrame, cam_from_local: Rigid3) -> _Miss | None:

@@ -19,14 +19,8 @@ from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import SIGMAS, Gate
 from ingest.growth.map_places import centers_of, place_sigmas_m
+from ingest.growth.place import map_images
 from ingest.growth.place.localised import in_frame, localise_photos
-from ingest.growth.place.map_images import (
-    LEAST_FEATURES,
-    MOST_IMAGES,
-    NEAR_M,
-    features_and_points,
-    localise_image,
-)
 from ingest.growth.values import DRIFT_BUDGET_M, QUERY, GrowthPhotos, LocalisedPhoto
 from reloc.localise.candidates import IndexedArea
 
@@ -112,15 +106,16 @@ class NewPhotos:
     """New photos that may corroborate.
 
     Attributes:
-        rows: of the given photos that may be asked.
+        rows: of the given photos that may be asked. threads: how many at a time.
         localised: those that the active maps localise, by row.
         heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
             map is examined again whenever another one changes, and its own photos are the same.
     """
 
-    given: GrowthPhotos
-    rows: Sequence[int]
-    localised: Mapping[int, LocalisedPhoto]
+    given: GrowthPhotos = field(default_factory=GrowthPhotos)
+    rows: Sequence[int] = ()
+    threads: int = 1
+    localised: Mapping[int, LocalisedPhoto] = field(default_factory=dict)
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
 
     def that_may_see(self, feature_map: FeatureMap) -> list[int]:
@@ -135,18 +130,11 @@ class NewPhotos:
 
 
 def corroborate(
-    feature_map: FeatureMap,
-    others: Sequence[FeatureMap],
-    new: NewPhotos | None,
-    sources: Sources,
-    *,
-    write_id: str,
-    threads: int = 1,
+    feature_map: FeatureMap, others: Sequence[FeatureMap], new: NewPhotos, sources: Sources, *, write_id: str
 ) -> list[OutsidePhoto]:
     """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 
-    Args:
-        others: maps around it, active or quarantined. write_id: of the map as it is.
+    Asked are new ones, and images of `others`: maps around it, active or quarantined. `write_id` is its own.
     """
     indexed, own = IndexedArea.of([feature_map]), set(sources.of_map(feature_map))
     if not len(indexed.area.points):
@@ -154,21 +142,19 @@ def corroborate(
     names = {image.sha256 for image in feature_map.images}
     heard: list[OutsidePhoto] = []
     for other, image, source in _images_around(feature_map, others, own, sources):
-        found = None if image.sha256 in names else localise_image(other, image, [indexed])
+        found = None if image.sha256 in names else map_images.localise_image(other, image, [indexed])
         if found is not None:
             pose = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
             known = pose.center, _center_variance(other, image)
             name = f"{image.name} of map {other.map_id}"
             heard.append(_heard(feature_map, found, source, name, known))
-    if new is None:
-        return heard
     photos, asked = new.given.photos, dict[int, Source]()
     for row in new.that_may_see(feature_map):
         source = sources.of_owner(photos[row].contributor or OPERATOR)
         if photos[row].sha256 not in names and source.speaks_to(own):
             asked[row] = source
     unheard = [row for row in asked if (write_id, row) not in new.heard]
-    said = localise_photos(photos, unheard, new.given.features_of, [indexed], threads)[0]
+    said = localise_photos(new.given, unheard, [indexed], new.threads)[0]
     new.heard.update({(write_id, row): said.get(row) for row in unheard})
     for row, source in asked.items():
         found, known_here = new.heard[write_id, row], None
@@ -217,7 +203,7 @@ def _images_around(
 ) -> list[tuple[FeatureMap, MapImage, Source]]:
     """Images of other maps whose owners' word counts, nearest to the map's cameras first."""
     centers = centers_of(feature_map)
-    reach = NEAR_M + 0.5 * float(np.linalg.norm(np.ptp(centers, axis=0)))
+    reach = map_images.NEAR_M + 0.5 * float(np.linalg.norm(np.ptp(centers, axis=0)))
     found: list[tuple[float, str, FeatureMap, MapImage, Source]] = []
     for other in others:
         here_from_other = feature_map.frame.enu_from(other.frame)
@@ -227,8 +213,9 @@ def _images_around(
             if distance <= reach and source.speaks_to(own):
                 found.append((distance, f"{other.map_id} {image.name}", other, image, source))
     nearest = (entry[2:] for entry in sorted(found, key=lambda e: e[:2]))
-    described = (e for e in nearest if len(features_and_points(e[0], e[1])[1]) >= LEAST_FEATURES)
-    return list(islice(described, MOST_IMAGES))
+    kept = map_images.features_and_points
+    described = (e for e in nearest if len(kept(e[0], e[1])[0]) >= map_images.LEAST_FEATURES)
+    return list(islice(described, map_images.MOST_IMAGES))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -236,7 +223,6 @@ class Confirmation:
     """How far a map is confirmed: when the gate passes, it is.
 
     Attributes:
-        owners: of the photos that confirm each other, or are proven.
         confirmed: image ids of the map.
         earned: those of the map's that make a record for their owner: proven themselves, or confirmed by a
             proven photo, or by photos of two other owners on record.
@@ -245,7 +231,6 @@ class Confirmation:
     """
 
     gate: Gate
-    owners: tuple[str, ...]
     confirmed: tuple[int, ...]
     earned: tuple[int, ...]
     points: NDArray[np.bool_]
@@ -271,10 +256,9 @@ def confirm(feature_map: FeatureMap, sources: Sources, outside: Sequence[Outside
     by_two = np.asarray(sees.multiply(others).sum(axis=0)).ravel() > 0
     by_proven = np.asarray(sees[np.flatnonzero(proven[:own])].sum(axis=0)).ravel() > 0
     ids = [image.image_id for image in feature_map.images]
-    owners = tuple(dict.fromkeys(s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes))
+    owners = {s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes}
     return Confirmation(
         gate=_gate(int(confirmed[:own].sum()), len(owners), pairs, bool(proven[:own].any()), against),
-        owners=owners,
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
         earned=tuple(i for k, i in enumerate(ids) if _earns(k, everyone, sees_same, apart)),
         points=(by_two | by_proven)[: len(feature_map.points)],

@@ -19,14 +19,7 @@ from ingest.growth import gates
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.place.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import (
-    Confirmation,
-    NewPhotos,
-    Sources,
-    answering_with,
-    confirm,
-    corroborate,
-)
+from ingest.growth.trust.confirmation import NewPhotos, Sources, answering_with, confirm, corroborate
 from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
 
@@ -40,13 +33,13 @@ class ExaminedMap:
     """A map that others confirm, as `summary` has it in the database.
 
     Attributes:
-        feature_map: with descriptors only where they confirm it.
+        feature_map: with descriptors only where they confirm it. gate: of the confirmation.
         earned: candidate ids of its photos that make a record for their owners.
     """
 
     summary: MapSummary
     feature_map: FeatureMap
-    confirmation: Confirmation
+    gate: gates.Gate
     earned: frozenset[str]
 
 
@@ -62,7 +55,7 @@ class Promotion:
 
 
 def promote_confirmed(
-    database: Database, localiser: Localiser, options: GrowthOptions, work: Path, new: NewPhotos | None = None
+    database: Database, localiser: Localiser, options: GrowthOptions, work: Path, new: NewPhotos
 ) -> list[Promotion]:
     """Try every quarantined map that growth has made; those that have drifted beyond the budget stay.
 
@@ -90,7 +83,8 @@ def promote_confirmed(
             outcomes.append(stays)
 
     def examine(waiting: Sequence[MapSummary]) -> list[ExaminedMap | Promotion]:
-        return _examined(waiting, snapshot, _sources(database, options), new, options.threads)
+        sources = Sources(owners=read_owners(database, database.snapshot()), trusted=options.trusted)
+        return _examined(waiting, snapshot, sources, new)
 
     examined = examine(open_maps) if open_maps else []
     stay = [one for one in examined if isinstance(one, Promotion)]
@@ -109,17 +103,12 @@ def _remember(work: Path, outcomes: Sequence[Promotion], asked: str) -> None:
             remember(work, "maps", one.map_id, asdict(one), asked)
 
 
-def _sources(database: Database, options: GrowthOptions) -> Sources:
-    """Whose word counts now."""
-    return Sources(owners=read_owners(database, database.snapshot()), trusted=options.trusted)
-
-
 def _examined(
-    waiting: Sequence[MapSummary], snapshot: Snapshot, sources: Sources, new: NewPhotos | None, threads: int
+    waiting: Sequence[MapSummary], snapshot: Snapshot, sources: Sources, new: NewPhotos
 ) -> list[ExaminedMap | Promotion]:
     """All of them, with the records that they make for each other: lost descriptors do not come back."""
     while True:
-        found = [_examine(summary, snapshot, sources, new, threads) for summary in waiting]
+        found = [_examine(summary, snapshot, sources, new) for summary in waiting]
         earned = [c for one in found if isinstance(one, ExaminedMap) for c in one.earned]
         more = sources.with_records(sources.owners.givers.get(c, ANONYMOUS) for c in earned)
         if more == sources:
@@ -127,15 +116,14 @@ def _examined(
         sources = more
 
 
-def _question(snapshot: Snapshot, database: Database, options: GrowthOptions, new: NewPhotos | None) -> str:
+def _question(snapshot: Snapshot, database: Database, options: GrowthOptions, new: NewPhotos) -> str:
     """Digest of all that an examination depends on: live maps, canaries, photos, whose word counts."""
     maps = sorted(f"{m.write_id} {m.status}" for m in snapshot.maps())
     canaries = [f"{c.name} {c.created_at.isoformat()}" for c in list_canaries(database)]
-    photos = [] if new is None else [new.given.photos[row].sha256 for row in new.rows]
-    sources = _sources(database, options)
-    records = [f"{owner} is on record" for owner in sources.owners.on_record]
-    trusted = [f"{owner} is trusted" for owner in sources.trusted]
-    return digest(*maps, "|", *canaries, "|", *sorted([*photos, *records, *trusted]))
+    whose = [new.given.photos[row].sha256 for row in new.rows]
+    whose += [f"{owner} is on record" for owner in read_owners(database, database.snapshot()).on_record]
+    whose += [f"{owner} is trusted" for owner in options.trusted]
+    return digest(*maps, "|", *canaries, "|", *sorted(whose))
 
 
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
@@ -161,21 +149,19 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
 
 
 def _examine(
-    summary: MapSummary, snapshot: Snapshot, sources: Sources, new: NewPhotos | None, threads: int
+    summary: MapSummary, snapshot: Snapshot, sources: Sources, new: NewPhotos
 ) -> ExaminedMap | Promotion:
     """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
     feature_map, others = snapshot.load_map(summary.map_id), _others(summary, snapshot)
-    heard = corroborate(feature_map, others, new, sources, write_id=summary.write_id, threads=threads)
+    heard = corroborate(feature_map, others, new, sources, write_id=summary.write_id)
     confirmation = confirm(feature_map, sources, heard)
     if not confirmation.gate.passes:
         return _stays(feature_map.map_id, confirmation.gate)
     contributed = sources.owners.made_of.get(feature_map.map_id, frozenset())
-    earned = {i.sha256[:32] for i in feature_map.images if i.image_id in confirmation.earned}
+    earned = {i.sha256[:32] for i in feature_map.images if i.image_id in confirmation.earned} & contributed
+    answering = answering_with(feature_map, confirmation.points)
     return ExaminedMap(
-        summary=summary,
-        feature_map=answering_with(feature_map, confirmation.points),
-        confirmation=confirmation,
-        earned=frozenset(earned & contributed),
+        summary=summary, feature_map=answering, gate=confirmation.gate, earned=frozenset(earned)
     )
 
 
@@ -204,13 +190,9 @@ def _others(me: MapSummary, snapshot: Snapshot) -> list[FeatureMap]:
     """Maps around one, active or quarantined."""
     if me.box is None:
         return []
-    near = snapshot.maps_in(
-        me.epsg,
-        me.box.min_easting - _AROUND_M,
-        me.box.min_northing - _AROUND_M,
-        me.box.max_easting + _AROUND_M,
-        me.box.max_northing + _AROUND_M,
-    )
+    west, south = me.box.min_easting - _AROUND_M, me.box.min_northing - _AROUND_M
+    east, north = me.box.max_easting + _AROUND_M, me.box.max_northing + _AROUND_M
+    near = snapshot.maps_in(me.epsg, west, south, east, north)
     heard = [m for m in near if m.map_id != me.map_id and not is_imported(m.status, m.status_reason)]
     same = [m for m in heard if m.extractor_fingerprint == me.extractor_fingerprint]
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
@@ -263,7 +245,7 @@ def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) ->
 def _decide(
     database: Database, before: Localiser, ready: Sequence[ExaminedMap], run: CanaryRun
 ) -> list[Promotion]:
-    asked = {found.feature_map.map_id: (found.confirmation.gate, run.gate) for found in ready}
+    asked = {found.feature_map.map_id: (found.gate, run.gate) for found in ready}
 
     def outcomes(code: str, reason: str, *, promoted: bool = False) -> list[Promotion]:
         told: dict[str, Any] = {"promoted": promoted, "reason_code": code, "reason": reason}
@@ -271,7 +253,7 @@ def _decide(
 
     if not run.gate.passes:
         return outcomes(run.gate.reason, run.gate.message)
-    confirmed = "; ".join(dict.fromkeys(found.confirmation.gate.message for found in ready))
+    confirmed = "; ".join(dict.fromkeys(found.gate.message for found in ready))
     reason = f"{confirmed}; {run.gate.message}"
     active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
     for found in ready:

@@ -47,10 +47,9 @@ _LEAST_GAIN = 0.1
 
 
 def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Refused, str]:
-    """The map with the gate's figure in its evidence, or the refusal of a scan.
+    """The map with the gate's figure in its evidence, or its refusal.
 
-    Returns:
-        The second is why a scan that is there could not be compared, "" otherwise.
+    And why a scan that is there could not be compared, "" otherwise.
 
     Raises:
         StoreError: the scans cannot be read.
@@ -175,14 +174,8 @@ class _Laid:
 
 def _gate(chi2: float, what: str) -> Gate:
     limit = sigmas_limit(6)
-    return Gate(
-        name="scan",
-        reason="CONTRADICTS_SCAN",
-        figure=chi2,
-        limit=limit,
-        passes=chi2 <= limit,
-        message=f"{what} (chi-square {chi2:.1f}, {limit:.1f} allowed); it waits until maps and scan agree",
-    )
+    message = f"{what} (chi-square {chi2:.1f}, {limit:.1f} allowed); it waits until maps and scan agree"
+    return Gate.at_most("scan", "CONTRADICTS_SCAN", chi2, limit, message)
 
 
 def _points(feature_map: FeatureMap) -> FloatArray:
