@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import skew
@@ -14,7 +13,7 @@ from featuredb.index.area import Area
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
 from reloc.localise.jacobians import pixel_jacobians
-from reloc.localise.lens_prior import lens_of, opencv_by_lens
+from reloc.localise.lens_prior import lens_for, lens_of, opencv_by_lens
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import Inliers, LocalisedPose, place_on_earth
 from reloc.localise.self_calibration import joint_jacobians, lens_jacobians
@@ -252,14 +251,11 @@ def _moved_points(
 
 def _lender(feature_map: FeatureMap, camera: Camera) -> int | None:
     """The map's camera that this is, of pictures of any size; None if it is none."""
-    for c, own in enumerate(feature_map.cameras):
-        try:
-            same = own.model == "OPENCV" and own.scaled_to(camera.width, camera.height) == camera
-        except InvalidValueError:  # of another shape
-            continue
-        if same:
-            return c
-    return None
+    found = [
+        own.model == "OPENCV" and lens_for(own, camera.width, camera.height) == camera
+        for own in feature_map.cameras
+    ]
+    return found.index(True) if any(found) else None
 
 
 def _as_lens_of(camera: Camera, modes: FloatArray, zoom: float = 1.0) -> FloatArray:

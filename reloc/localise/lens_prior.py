@@ -145,6 +145,14 @@ def is_lens_of_a_map(camera: Camera, of_map: Camera, lenses: LensUncertainty) ->
     return bool(np.abs(off).max() <= -ndtri(0.5 * _SAME_LENS_RATE / len(off)))
 
 
+def lens_for(camera: Camera, width: int, height: int) -> Camera | None:
+    """The lens for another size of its pictures; None where that is of another shape."""
+    try:
+        return camera.scaled_to(width, height)
+    except InvalidValueError:
+        return None
+
+
 def lens_of(camera: Camera) -> FloatArray:
     """Parameters of a lens, (4,) of SIMPLE_RADIAL or (8,) of OPENCV: f, cx, cy, k1, aspect, k2, p1, p2.
 

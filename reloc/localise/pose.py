@@ -1,6 +1,6 @@
 """Absolute pose from 2D-3D matches: LO-RANSAC, focal length where unknown, refinement, covariance."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -60,12 +60,10 @@ def estimate_pose(
     if len(pixels) < options.min_matches:
         return None
     tolerance_px = options.tolerance_px(camera)
-    tries = [
-        _ransac(pixels, points, guess, tolerance_px, options)
-        for guess in _guesses(camera, source, options.lens)
-    ]
+    asked = (pixels, points, tolerance_px, options)
+    tries = [_ransac(guess, *asked) for guess in _guesses(camera, source, options.lens)]
     if source in ("exif", "estimated"):
-        tries.append(_ransac_focal(pixels, points, camera, tolerance_px, options))
+        tries.append(_ransac_focal(camera, *asked))
     found = [
         PoseHypothesis(
             cam_from_local=cam_from_local,
@@ -93,12 +91,12 @@ def _guesses(camera: Camera, source: CameraSource, lens: LensPriors) -> list[Cam
 
 
 def _ransac(
-    pixels: FloatArray, points: FloatArray, camera: Camera, tolerance_px: float, options: PoseOptions
+    camera: Camera, pixels: FloatArray, points: FloatArray, tolerance_px: float, options: PoseOptions
 ) -> tuple[Rigid3, Camera] | None:
     pose, info = poselib.estimate_absolute_pose(
         pixels,
         points,
-        _poselib_camera(camera),
+        asdict(camera),
         {
             "max_reproj_error": tolerance_px,
             "seed": options.seed,
@@ -115,7 +113,7 @@ def _ransac(
 
 
 def _ransac_focal(
-    pixels: FloatArray, points: FloatArray, camera: Camera, tolerance_px: float, options: PoseOptions
+    camera: Camera, pixels: FloatArray, points: FloatArray, tolerance_px: float, options: PoseOptions
 ) -> tuple[Rigid3, Camera] | None:
     settings = pycolmap.AbsolutePoseEstimationOptions()
     settings.estimate_focal_length = True
@@ -188,8 +186,8 @@ def _refine_with_lens(
         priors = options.lens
         rel = priors.exif_focal_rel if start.camera_source == "exif" else priors.unknown_focal_rel
         prior = priors.around(start.camera, start.prior_focal_px, rel)
-    found = calibrate(pixels, points, start.cam_from_local, start.camera, prior, 0.25 * tolerance_px)
-    return replace(start, cam_from_local=found.cam_from_local, camera=found.camera, lens_prior=prior)
+    pose, camera = calibrate(pixels, points, start.cam_from_local, start.camera, prior, 0.25 * tolerance_px)
+    return replace(start, cam_from_local=pose, camera=camera, lens_prior=prior)
 
 
 def reprojection_errors(
@@ -279,15 +277,6 @@ def _price_of_robustness(residual: FloatArray, scale_px: float, parameters: int)
     few = 1.0 + parameters / residual.size * variation
     # A dozen residuals may be small by luck; the lower bound keeps that from being taken for precision.
     return float(np.clip(few**2 * np.mean(weight**2 * squared) / spread / slope**2, 0.1, 10.0))
-
-
-def _poselib_camera(camera: Camera) -> dict[str, Any]:
-    return {
-        "model": camera.model,
-        "width": camera.width,
-        "height": camera.height,
-        "params": list(camera.params),
-    }
 
 
 def _from_pycolmap(rigid: Any) -> Rigid3:

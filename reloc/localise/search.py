@@ -23,7 +23,7 @@ from reloc.localise.acceptance import (
     spread,
 )
 from reloc.localise.candidates import Cluster, IndexedArea, find_clusters
-from reloc.localise.lens_prior import is_lens_of_a_map, seen_by_a_map
+from reloc.localise.lens_prior import is_lens_of_a_map, lens_for, seen_by_a_map
 from reloc.localise.matching import (
     EXPECTED_DEG,
     POSSIBLE_DEG,
@@ -211,7 +211,7 @@ def _with_lens_prior(
     if uncertainty is None:
         return pose
     own = None if request.camera_key is None else area.camera_for_key(request.camera_key)
-    own = None if own is None else _resampled(own, pose.camera.width, pose.camera.height)
+    own = None if own is None else lens_for(own, pose.camera.width, pose.camera.height)
     if own is not None and is_lens_of_a_map(pose.camera, own, uncertainty):
         return replace(pose, camera=own)
     seen = seen_by_a_map(pose.camera, uncertainty)
@@ -251,27 +251,19 @@ def camera_hypotheses(
     if request.camera_key:
         of_map = area.camera_for_key(request.camera_key)
         # Frames of films are made smaller.
-        camera = None if of_map is None else _resampled(of_map, features.width, features.height)
+        camera = None if of_map is None else lens_for(of_map, features.width, features.height)
         if camera is not None:
             return [(camera, "map")]
     if request.film:
         of_film = area.cameras_of_film(request.film)
-        lent = [_resampled(camera, features.width, features.height) for camera in of_film]
+        lent = [lens_for(camera, features.width, features.height) for camera in of_film]
         if any(camera is not None for camera in lent):
             return [(camera, "map") for camera in lent if camera is not None]
-    longer = max(features.width, features.height)
     if request.exif_focal_px:
         return [(Camera.from_focal(features.width, features.height, request.exif_focal_px), "exif")]
     # 1.2 times the longer side (a 45-degree lens) only starts the estimate.
-    return [(Camera.from_focal(features.width, features.height, 1.2 * longer), "estimated")]
-
-
-def _resampled(camera: Camera, width: int, height: int) -> Camera | None:
-    """The lens for another size of its pictures; None where that is of another shape."""
-    try:
-        return camera.scaled_to(width, height)
-    except InvalidValueError:
-        return None
+    focal_px = 1.2 * max(features.width, features.height)
+    return [(Camera.from_focal(features.width, features.height, focal_px), "estimated")]
 
 
 def _best_pose(
@@ -283,8 +275,7 @@ def _best_pose(
 ) -> PoseHypothesis | None:
     pixels, points = pairs(features, area, matches)
     found = [estimate_pose(pixels, points, camera, source, options.pose) for camera, source in cameras]
-    poses = [pose for pose in found if pose is not None]
-    return max(poses, key=lambda pose: pose.count) if poses else None
+    return max((pose for pose in found if pose is not None), key=lambda pose: pose.count, default=None)
 
 
 def _refined(

@@ -16,14 +16,6 @@ from reloc.localise.jacobians import chain_to_pose
 from reloc.localise.lens_prior import QueryLensPrior, lens_of, whole_lens, with_lens
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calibrated:
-    """Pose and camera together."""
-
-    cam_from_local: Rigid3
-    camera: Camera
-
-
 def calibrate(
     pixels: FloatArray,
     points: FloatArray,
@@ -31,8 +23,8 @@ def calibrate(
     start_camera: Camera,
     prior: QueryLensPrior,
     noise_px: float,
-) -> Calibrated:
-    """Refine pose and lens: as many parameters as the prior has.
+) -> tuple[Rigid3, Camera]:
+    """Refined cam_from_local and lens, of as many parameters as the prior has.
 
     Gauss-Newton with Cauchy weights; converges in a few steps from a RANSAC pose.
 
@@ -52,8 +44,7 @@ def calibrate(
         trust=(noise_px / measured_noise_px(pixels, points, start_pose, camera, noise_px)) ** 2,
         prior=prior,
     )
-    pose, camera = _minimise(problem, start_pose, camera)
-    return Calibrated(cam_from_local=pose, camera=camera)
+    return _minimise(problem, start_pose, camera)
 
 
 def joint_jacobians(

@@ -7,6 +7,7 @@ error moves the place along the ray.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -85,28 +86,26 @@ def locate(
 
 
 def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px: float) -> PixelPlace:
-    def refuse(reason: LocateReason, detail: str) -> PixelPlace:
-        return PixelPlace(
-            pixel=(float(pixel[0]), float(pixel[1])),
-            reason=reason,
-            detail=detail,
-            epsg=view.epsg,
-            height_datum=view.height_datum,
-            surface=surface.kind,
-        )
-
+    answered = partial(
+        PixelPlace,
+        pixel=(float(pixel[0]), float(pixel[1])),
+        epsg=view.epsg,
+        height_datum=view.height_datum,
+        surface=surface.kind,
+    )
     ray = view.rays(pixel[None])[0]
     if not (_inside(view.camera, pixel) and np.isfinite(ray).all()):
-        return refuse("OUTSIDE", f"the photo has {view.camera.width} x {view.camera.height} pixels")
+        size = f"{view.camera.width} x {view.camera.height}"
+        return answered(reason="OUTSIDE", detail=f"the photo has {size} pixels")
     # By the pose's turn alone, which is right for far things; nearer ones are asked for again.
     viewer = view.cam_from_local.center
     spread = _pixel_covariance(view, viewer + 1e4 * ray, sigma_px)
     met = surface.meet(view, pixel, _REACH_SIGMAS * _longest(spread))
     if isinstance(met, str):
-        return refuse("NO_SURFACE", met)
+        return answered(reason="NO_SURFACE", detail=met)
     toward = float(met.patch.normal @ ray)
     if toward > -1e-6:
-        return refuse("GRAZING", "the ray runs along the surface")
+        return answered(reason="GRAZING", detail="the ray runs along the surface")
     point = viewer + ray * float(met.patch.normal @ (met.patch.point - viewer)) / toward
     spread = _pixel_covariance(view, point, sigma_px)
     along = ray * met.sigma_m / toward
@@ -115,19 +114,16 @@ def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px:
     direction = ray / np.linalg.norm(ray)
     distance = float(np.linalg.norm(point - viewer))
     if float(np.sqrt(direction @ covariance @ direction)) > _LARGEST_ALONG * distance:
-        return refuse("GRAZING", f"the place is known to no better than a tenth of its {distance:.0f} m")
+        detail = f"the place is known to no better than a tenth of its {distance:.0f} m"
+        return answered(reason="GRAZING", detail=detail)
     other = _other_surfaces(view, met, pixel, point, spread)
     incidence = float(np.degrees(np.arccos(min(1.0, -float(met.patch.normal @ direction)))))
     to_true = view.frame.true_enu_from_enu(point)
     if other is not None:
         covariance = covariance + other
-    return PixelPlace(
-        pixel=(float(pixel[0]), float(pixel[1])),
+    return answered(
         reason=None,
         detail=_doubts(other is not None, incidence, surface.doubt),
-        epsg=view.epsg,
-        height_datum=view.height_datum,
-        surface=surface.kind,
         at_edge=other is not None,
         grazing=incidence > _GRAZING_DEG,
         utm=view.frame.utm_from_enu(point, view.epsg),

@@ -1,7 +1,5 @@
 """Queries between Zenoh's callback and the workers: answered once each, in a bounded queue, in time."""
 
-import heapq
-import itertools
 import logging
 import threading
 import time
@@ -28,8 +26,8 @@ def session_of(query: zenoh.Query) -> str:
 class PendingQuery:
     """A `zenoh.Query` between receipt and answer.
 
-    A worker, the deadline watch and the shutdown may all want to answer; the first one does. Answering
-    drops the Zenoh query, without which the client would wait for its timeout.
+    A worker, the deadline and the shutdown may all want to answer; the first one does. Answering drops the
+    Zenoh query, without which the client would wait for its timeout.
     """
 
     def __init__(
@@ -38,6 +36,7 @@ class PendingQuery:
         key: str,
         deadline_s: float,
         tally: Tally,
+        on_late: Callable[["PendingQuery"], None],  # told the moment that its time is over, in a thread
         *,
         identity: str | None,  # name of the client, where the server authenticates its clients
     ) -> None:
@@ -45,13 +44,25 @@ class PendingQuery:
         self.asker = identity or session_of(query)  # who shares the server with others
         self._query = query
         self._key = key
-        self._tally = tally
+        self._tally, self._on_late = tally, on_late
         self._lock = threading.Lock()
+        self._timer: threading.Timer | None = None
         self.answered = False  # or refused
         self.received = time.perf_counter()
         self.deadline = self.received + deadline_s
         self.request_id = uuid.uuid4().hex
         self.size = 0 if query.payload is None else len(query.payload)
+
+    def watch(self) -> None:
+        """Say when the deadline is over, also while a worker has the query; again when it is earlier."""
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+            if not self.answered:
+                left_s = max(0.0, self.deadline - time.perf_counter())
+                self._timer = threading.Timer(left_s, self._on_late, (self,))
+                self._timer.daemon = True
+                self._timer.start()
 
     def attachment(self) -> bytes | None:
         """The request's attachment; None where there is none or it was answered meanwhile."""
@@ -99,6 +110,8 @@ class PendingQuery:
             if self.answered:
                 return False
             self.answered = True
+            if self._timer is not None:
+                self._timer.cancel()
             self._tally.add(kind, code, latency_ms)
             try:
                 with self._query as query:
@@ -222,47 +235,6 @@ class QueryQueue:
         if not self._waiting[item.asker]:
             del self._waiting[item.asker]
         return item
-
-
-class DeadlineWatch:
-    """Says the moment a query's time is over, also while a worker still has it in hand."""
-
-    def __init__(self, on_late: Callable[[PendingQuery], None]) -> None:
-        self._on_late = on_late
-        self._heap: list[tuple[float, int, PendingQuery]] = []
-        self._order = itertools.count()
-        self._changed = threading.Condition()
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name="deadline-watch", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def add(self, item: PendingQuery) -> None:
-        """Watch the query; again when its deadline has become earlier."""
-        with self._changed:
-            heapq.heappush(self._heap, (item.deadline, next(self._order), item))
-            self._changed.notify()
-
-    def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while self._heap and self._heap[0][2].answered:
-                    heapq.heappop(self._heap)
-                if self._closed:
-                    return
-                wait_s = self._heap[0][0] - time.perf_counter() if self._heap else None
-                if wait_s is None or wait_s > 0:
-                    self._changed.wait(wait_s)
-                    continue
-                item = heapq.heappop(self._heap)[2]
-            self._on_late(item)
 
 
 def deadline_error(item: PendingQuery) -> RequestError:

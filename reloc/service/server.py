@@ -16,7 +16,7 @@ from reloc.service.live.session import Follower
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
-from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
+from reloc.service.queueing import PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import (
     ServiceStartError,
     authenticates,
@@ -75,9 +75,8 @@ class Server:
         self._reloads = 0
         self._reload_error: str | None = None
         self._queue = QueryQueue(options.max_queue, options.max_queued_bytes)
-        self._watch = DeadlineWatch(self._late)
         self._inbox = inbox
-        self._workers = WorkerPool(self._queue, self._watch, options, inbox)
+        self._workers = WorkerPool(self._queue, options, inbox)
         self._watcher = AreaWatcher(
             source,
             served_version=area.snapshot,
@@ -142,8 +141,6 @@ class Server:
         """Start all parts; those that have begun end again where another one cannot."""
         with ExitStack() as undo:
             undo.callback(self._session.close)
-            self._watch.start()
-            undo.callback(self._watch.close)
             if self._inbox is not None:
                 self._inbox.start()
                 undo.callback(self._inbox.close, 0.0)
@@ -196,7 +193,6 @@ class Server:
             queryable.undeclare()
         if self._inbox is not None:
             self._inbox.close(self._options.shutdown_grace_s)
-        self._watch.close()
         self._watcher.close(timeout_s=self._options.shutdown_grace_s)
         self._session.close()
         self._log("stopped", queries=self._queries().model_dump())
@@ -253,6 +249,7 @@ class Server:
             self._keys.localise(client, self.server_id if is_addressed(str(query.key_expr)) else ""),
             self._options.deadline_s,
             self._tally,
+            self._late,
             identity=client if self._authenticates else None,
         )
         try:
@@ -266,7 +263,7 @@ class Server:
         except RequestError as error:
             item.refuse(error)
         else:
-            self._watch.add(item)
+            item.watch()
 
     def _on_status(self, query: zenoh.Query) -> None:
         with query:
@@ -278,7 +275,7 @@ class Server:
         with query:
             query.reply(self._keys.of("maps"), encode(reply), encoding=_JSON)
 
-    # The watch over deadlines calls this.
+    # The deadline of a query calls this.
 
     def _late(self, item: PendingQuery) -> None:
         item.refuse(deadline_error(item))

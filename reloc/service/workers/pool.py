@@ -14,7 +14,7 @@ from reloc.service.contributions.inbox import Inbox, contribution_of
 from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
-from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
+from reloc.service.queueing import PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
 from reloc.service.workers.area_files import AreaFiles
@@ -39,13 +39,8 @@ class WorkerPool:
     A process that is still at a query when its time is over, or that ends before its answer, is replaced.
     """
 
-    def __init__(
-        self, queue: QueryQueue, watch: DeadlineWatch, options: ServeOptions, inbox: Inbox | None = None
-    ) -> None:
-        self._queue = queue
-        self._watch = watch
-        self._options = options
-        self._inbox = inbox
+    def __init__(self, queue: QueryQueue, options: ServeOptions, inbox: Inbox | None) -> None:
+        self._queue, self._options, self._inbox = queue, options, inbox
         self._limits = options.worker_limits
         self._answerer = partial(answer_query, limits=options.limits)
         self._files = AreaFiles()
@@ -194,7 +189,7 @@ class WorkerPool:
         if end < item.deadline:
             item.deadline = end
             _check_deadline(item)  # one that is over already must not end a process that has nothing in hand
-            self._watch.add(item)
+            item.watch()
         _check_deadline(item)
         data = item.payload()
         clock.lap("request")
