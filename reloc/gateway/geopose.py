@@ -26,7 +26,15 @@ from reloc.gateway.protocol import (
     GeoPoseReq,
     GeoPoseResp,
 )
-from reloc.wire.query import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, PriorRequest
+from reloc.wire.query import (
+    CameraRequest,
+    ErrorCode,
+    LocaliseReply,
+    LocaliseWireRequest,
+    PriorRequest,
+    explain,
+    request_id_of,
+)
 
 # The W3C's accuracy holds 95 % of the errors; so many sigmas of one axis does a circle that holds them have.
 _SIGMAS_OF_95 = math.sqrt(-2.0 * math.log(0.05))
@@ -59,7 +67,8 @@ def parse(body: bytes) -> GeoPoseReq:
     try:
         return GeoPoseReq.model_validate_json(body)
     except ValidationError as error:
-        raise bad_request(_explained(error, "body")) from error
+        # Without the values found: a missing id would print the whole request with its picture.
+        raise bad_request(explain(error, "body", inputs=False)) from error
 
 
 def check_version(accept: str) -> bool:
@@ -102,7 +111,7 @@ def question_of(request: GeoPoseReq, options: GatewayOptions) -> tuple[bytes, Lo
     asked = LocaliseWireRequest(
         prior=_prior(request, picture, options),
         camera=_camera(picture, size),
-        request_id=_wire_id(request.id),
+        request_id=request_id_of(request.id),
     )
     return image, asked
 
@@ -135,11 +144,8 @@ def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp,
 
 def _decoded(text: str, max_bytes: int) -> bytes:
     if len(text) // 4 * 3 > max_bytes + 2:
-        raise GatewayError(
-            ErrorCode.TOO_LARGE,
-            f"imageBytes: expected at most {max_bytes} bytes, found {len(text) // 4 * 3}; send a "
-            "smaller picture",
-        )
+        found = f"found {len(text) // 4 * 3}; send a smaller picture"
+        raise GatewayError(ErrorCode.TOO_LARGE, f"imageBytes: expected at most {max_bytes} bytes, {found}")
     try:
         data = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as error:
@@ -188,13 +194,7 @@ def _camera(picture: CameraReading, size: tuple[int, int] | None) -> CameraReque
     try:
         return CameraRequest(model=model, width=size[0], height=size[1], params=params.modelParams)
     except ValidationError as error:
-        raise bad_request(f"params.{_explained(error, '')}") from error
-
-
-def _explained(error: ValidationError, whole: str) -> str:
-    """Without the values found: a missing id would print the whole request with its picture."""
-    items = error.errors(include_url=False, include_input=False, include_context=False)[:3]
-    return "; ".join(f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}" for item in items)
+        raise bad_request(f"params.{explain(error, '', inputs=False)}") from error
 
 
 def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions) -> PriorRequest | None:
@@ -222,11 +222,3 @@ def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions)
 
 def _prior_request(lat: float, lon: float, sigma_m: float, options: GatewayOptions) -> PriorRequest:
     return PriorRequest(lat=lat, lon=lon, sigma_m=min(max(sigma_m, options.prior_floor_m), 1e6))
-
-
-def _wire_id(text: str) -> str | None:
-    """The id as the wire's request id, if it can be one."""
-    try:
-        return LocaliseWireRequest(request_id=text).request_id
-    except ValidationError:
-        return None

@@ -22,6 +22,7 @@ from reloc.wire.query import (
     RequestError,
     RequestOptions,
     parse_attachment,
+    request_id_of,
 )
 
 
@@ -149,16 +150,18 @@ async def read_form(request: Request, options: GatewayOptions) -> tuple[bytes, L
     if image is None:
         raise bad_request("image: expected the bytes of an image file, found no such field")
     if len(image) > options.max_image_bytes:
-        raise GatewayError(
-            ErrorCode.TOO_LARGE,
-            f"image: expected at most {options.max_image_bytes} bytes, found {len(image)}",
-        )
+        text = f"image: expected at most {options.max_image_bytes} bytes, found {len(image)}"
+        raise GatewayError(ErrorCode.TOO_LARGE, text)
     said = LocaliseWireRequest(
         camera=_json("camera", CameraRequest, parts),
         prior=_json("prior", PriorRequest, parts),
         options=_json("options", RequestOptions, parts) or RequestOptions(),
-        request_id=_request_id(parts),
+        request_id=request_id_of(parts["request_id"].decode(errors="replace"))
+        if "request_id" in parts
+        else None,
     )
+    if "request_id" in parts and said.request_id is None:
+        raise bad_request("request_id: expected 1 to 128 of A-Z a-z 0-9 . _ : -")
     return image, said
 
 
@@ -169,13 +172,3 @@ def _json(name: str, model: type[_Field], parts: dict[str, bytes]) -> _Field | N
         return parse_attachment(model, parts[name])
     except RequestError as error:
         raise bad_request(f"{name}: {error.message}") from error
-
-
-def _request_id(parts: dict[str, bytes]) -> str | None:
-    if "request_id" not in parts:
-        return None
-    try:
-        text = parts["request_id"].decode()
-        return LocaliseWireRequest(request_id=text).request_id
-    except ValueError as error:
-        raise bad_request("request_id: expected 1 to 128 of A-Z a-z 0-9 . _ : -") from error

@@ -357,7 +357,7 @@ def parse_attachment(model: type[_Attached], attachment: bytes | None) -> _Attac
     try:
         return model.model_validate_json(attachment)
     except ValidationError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, explain(error), _request_id_of(attachment)) from error
+        raise RequestError(ErrorCode.BAD_REQUEST, explain(error), _request_id_in(attachment)) from error
 
 
 def encode(message: BaseModel) -> bytes:
@@ -365,27 +365,30 @@ def encode(message: BaseModel) -> bytes:
     return message.model_dump_json().encode()
 
 
-def explain(error: ValidationError) -> str:
-    """One line for people out of pydantic's list: field, expectation, what was found."""
+def explain(error: ValidationError, whole: str = "attachment", *, inputs: bool = True) -> str:
+    """One line for people out of pydantic's list: field (or `whole`), expectation, what was found."""
     parts = []
-    for item in error.errors(include_url=False)[:3]:
-        where = ".".join(str(step) for step in item["loc"]) or "attachment"
-        found: Any = item.get("input")
-        shown = repr(found)
-        if len(shown) > _SHOWN_INPUT_CHARS:
-            shown = shown[:_SHOWN_INPUT_CHARS] + "..."
-        parts.append(f"{where}: {item['msg']}, found {shown}")
+    for item in error.errors(include_url=False, include_input=inputs, include_context=False)[:3]:
+        told = f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}"
+        if inputs:
+            shown = repr(item["input"])
+            told += f", found {shown[:_SHOWN_INPUT_CHARS]}{'...' * (len(shown) > _SHOWN_INPUT_CHARS)}"
+        parts.append(told)
     return "; ".join(parts)
 
 
-def _request_id_of(attachment: bytes) -> str | None:
+def request_id_of(found: Any) -> str | None:
+    """What a client calls its request, if a request can be called so."""
+    try:
+        return LocaliseWireRequest(request_id=found).request_id
+    except ValidationError:
+        return None
+
+
+def _request_id_in(attachment: bytes) -> str | None:
     """The request id of a refused attachment, where it can still be read."""
     try:
         found = json.loads(attachment)
     except (ValueError, RecursionError):
         return None
-    request_id = found.get("request_id") if isinstance(found, dict) else None
-    try:
-        return LocaliseWireRequest(request_id=request_id).request_id
-    except ValidationError:
-        return None
+    return request_id_of(found.get("request_id")) if isinstance(found, dict) else None
