@@ -16,7 +16,6 @@ from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.maps.feature_map import GeoPrior
 from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.lens_prior import lens_of, opencv_by_lens
-from reloc.localise.self_calibration import joint_jacobians
 from reloc.wire.query import CameraRequest, Intrinsics, LocaliseReply, PriorRequest
 from reloc.wire.track import TrackPose
 
@@ -111,12 +110,10 @@ class AnsweredView:
         Raises:
             InvalidValueError: with a lens that is neither OPENCV nor SIMPLE_RADIAL, and not exact.
         """
-        if len(self.covariance) == 6:
-            by_point, by_view = pixel_jacobians(self.camera, self.cam_from_local, point[None])
-            return by_point[0], by_view[0]
-        by_point, by_view = joint_jacobians(self.camera, self.cam_from_local, point[None])
+        lens = len(self.covariance) > 6
+        by_point, by_view = pixel_jacobians(self.camera, self.cam_from_local, point[None], lens=lens)
         by_params = np.eye(len(self.covariance))
-        if self.camera.model == "OPENCV":
+        if lens and self.camera.model == "OPENCV":
             by_params[6:, 6:] = np.linalg.inv(opencv_by_lens(lens_of(self.camera)))
         return by_point[0], by_view[0] @ by_params
 

@@ -12,11 +12,10 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
-from reloc.localise.jacobians import pixel_jacobians
+from reloc.localise.jacobians import lens_jacobians, pixel_jacobians
 from reloc.localise.lens_prior import lens_for, lens_of, opencv_by_lens
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import Inliers, LocalisedPose, place_on_earth
-from reloc.localise.self_calibration import joint_jacobians, lens_jacobians
 
 _DAMPING = 1e-9
 
@@ -186,13 +185,13 @@ def shape_covariance(
         return None
     points, shift = moved
     own = pose.lens_prior
-    jacobians = pixel_jacobians if own is None else joint_jacobians
-    by_point, by_own = jacobians(pose.camera, pose.cam_from_local, area.points[points])
+    seen = (pose.camera, pose.cam_from_local, area.points[points])
+    by_point, by_own = pixel_jacobians(*seen, lens=own is not None)
     pixels = np.einsum("kij,kjr->kir", by_point, shift)
     lender = _lender(area.maps[main], pose.camera)
     lent = np.zeros((0, shift.shape[2]))
     if lender is not None:
-        _, by_lens = joint_jacobians(pose.camera, pose.cam_from_local, area.points[points])
+        _, by_lens = pixel_jacobians(*seen, lens=True)
         zoom = pose.camera.width / area.maps[main].cameras[lender].width
         lent = _as_lens_of(pose.camera, modes.lenses[lender], zoom)
         pixels += by_lens[:, :, 6:] @ lent

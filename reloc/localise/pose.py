@@ -15,7 +15,7 @@ from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.lens_prior import LensPriors, QueryLensPrior
 from reloc.localise.options import PoseOptions
 from reloc.localise.result import CameraSource
-from reloc.localise.self_calibration import calibrate, covariance_from_information, joint_jacobians
+from reloc.localise.self_calibration import calibrate, covariance_from_information
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -233,8 +233,7 @@ def pose_uncertainty(
         point_covariance: (k, 3, 3) in the area's frame.
     """
     lens = pose.lens_prior
-    jacobians = pixel_jacobians if lens is None else joint_jacobians
-    by_point, jacobian = jacobians(pose.camera, pose.cam_from_local, points)
+    by_point, jacobian = pixel_jacobians(pose.camera, pose.cam_from_local, points, lens=lens is not None)
     residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
     noise = np.eye(2) + by_point @ point_covariance @ by_point.transpose(0, 2, 1)
     weight = np.linalg.inv(noise)

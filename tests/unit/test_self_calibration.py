@@ -17,7 +17,6 @@ from reloc.localise.pose import PoseHypothesis, pose_uncertainty, refine_pose
 from reloc.localise.self_calibration import (
     calibrate,
     covariance_from_information,
-    joint_jacobians,
 )
 from tests.support.scenes import box_points, looking_at
 
@@ -240,7 +239,7 @@ def test_degenerate_input_comes_back_finite(kind: str) -> None:
 )
 def test_closed_derivatives_against_finite_differences(camera: Camera) -> None:
     points = box_points(np.random.default_rng(6), 20)
-    by_point, joint = joint_jacobians(camera, SLANTED, points)
+    by_point, joint = pixel_jacobians(camera, SLANTED, points, lens=True)
     numeric_point, numeric_pose = pixel_jacobians(camera, SLANTED, points)
     np.testing.assert_allclose(by_point, numeric_point, rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(joint[:, :, :6], numeric_pose, rtol=1e-5, atol=1e-3)
