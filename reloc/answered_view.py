@@ -43,11 +43,7 @@ class AnsweredView:
 
     @classmethod
     def of_reply(cls, reply: LocaliseReply) -> Self:
-        """The camera of a localised reply.
-
-        Raises:
-            InvalidValueError: it has no pose on Earth.
-        """
+        """The camera of a localised reply. Raises InvalidValueError: it has no pose on Earth."""
         utm, used, covariance = reply.utm, reply.camera, reply.covariance
         if utm is None or used is None or covariance is None:
             raise InvalidValueError(f"expected a pose on Earth, found {reply.status}: {reply.detail}")
@@ -132,11 +128,7 @@ def geopose_of(message: LocaliseReply | TrackPose) -> GeoPose:
 
 
 def camera_of(lens: CameraRequest | Intrinsics) -> Camera:
-    """The camera that a message speaks of.
-
-    Raises:
-        InvalidValueError: it is none.
-    """
+    """The camera that a message speaks of. Raises InvalidValueError: it is none."""
     return Camera(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
 
 

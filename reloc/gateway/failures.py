@@ -2,7 +2,6 @@
 
 from pydantic import BaseModel, Field
 
-from featuredb.errors import ServiceError
 from reloc.client import BAD_REPLY, NO_SERVER, TIMEOUT
 from reloc.wire.query import ErrorCode
 
@@ -38,15 +37,6 @@ STATUS_OF = {
     TIMEOUT: 504,
 }
 RETRY_AFTER_S = {ErrorCode.BUSY.value: 1, ErrorCode.SHUTTING_DOWN.value: 5, NO_SERVER: 5, NOT_READY: 1}
-
-
-class GatewayError(ServiceError):
-    """Ends a request with the status of its code."""
-
-
-def bad_request(message: str) -> GatewayError:
-    """The request is not what it should be, as the message says."""
-    return GatewayError(ErrorCode.BAD_REQUEST, message)
 
 
 class ErrorBody(BaseModel):

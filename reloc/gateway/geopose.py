@@ -15,8 +15,9 @@ import numpy as np
 from PIL import Image
 from pydantic import ValidationError
 
+from featuredb.errors import ServiceError
 from featuredb.geo.datum import HEIGHT_DATUMS, ellipsoidal_height
-from reloc.gateway.failures import NOT_ACCEPTABLE, NOT_LOCALISED, GatewayError, bad_request
+from reloc.gateway.failures import NOT_ACCEPTABLE, NOT_LOCALISED
 from reloc.gateway.options import GatewayOptions
 from reloc.gateway.protocol import (
     MEDIA_TYPE,
@@ -32,6 +33,7 @@ from reloc.wire.query import (
     LocaliseReply,
     LocaliseWireRequest,
     PriorRequest,
+    bad_request,
     explain,
     request_id_of,
 )
@@ -46,7 +48,7 @@ _FILE_BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n", b"RIFF", b"II*\x00", b"MM\x
 _VERSION = re.compile(r";\s*version\s*=\s*\"?(\d{1,4})")
 
 
-class NotLocalisedError(GatewayError):
+class NotLocalisedError(ServiceError):
     """The photo's place is not known: `reply` says why."""
 
     def __init__(self, reply: LocaliseReply, geopose_id: str) -> None:
@@ -59,11 +61,7 @@ class NotLocalisedError(GatewayError):
 
 
 def parse(body: bytes) -> GeoPoseReq:
-    """Read a request.
-
-    Raises:
-        GatewayError: BAD_REQUEST with the fields.
-    """
+    """Read a request. Raises ServiceError: BAD_REQUEST with the fields."""
     try:
         return GeoPoseReq.model_validate_json(body)
     except ValidationError as error:
@@ -75,7 +73,7 @@ def check_version(accept: str) -> bool:
     """Whether the client asks for the protocol's media type; the header is that of HTTP, "" without one.
 
     Raises:
-        GatewayError: NOT_ACCEPTABLE, for another version than 2.
+        ServiceError: NOT_ACCEPTABLE, for another version than 2.
     """
     found = [part for part in accept.lower().split(",") if part.strip().startswith(MEDIA_TYPE)]
     for part in found:
@@ -83,7 +81,7 @@ def check_version(accept: str) -> bool:
         if version is None or int(version[1]) == 2:
             return True
     if found:
-        raise GatewayError(
+        raise ServiceError(
             NOT_ACCEPTABLE, f"Accept: expected {MEDIA_TYPE}; version=2.0, found {accept[:100]!r}"
         )
     return False
@@ -93,7 +91,7 @@ def question_of(request: GeoPoseReq, options: GatewayOptions) -> tuple[bytes, Lo
     """What to ask the server: an image file, and what is said of it.
 
     Raises:
-        GatewayError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE.
+        ServiceError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE.
     """
     readings = request.sensorReadings.cameraReadings
     pictures = [reading for reading in readings if reading.imageFormat.upper() != "DEPTH"]
@@ -145,13 +143,13 @@ def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp,
 def _decoded(text: str, max_bytes: int) -> bytes:
     if len(text) // 4 * 3 > max_bytes + 2:
         found = f"found {len(text) // 4 * 3}; send a smaller picture"
-        raise GatewayError(ErrorCode.TOO_LARGE, f"imageBytes: expected at most {max_bytes} bytes, {found}")
+        raise ServiceError(ErrorCode.TOO_LARGE, f"imageBytes: expected at most {max_bytes} bytes, {found}")
     try:
         data = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as error:
         raise bad_request(f"imageBytes: expected base64 without prefix or line breaks ({error})") from error
     if not data:
-        raise GatewayError(ErrorCode.BAD_IMAGE, "imageBytes: expected an image file, found none")
+        raise ServiceError(ErrorCode.BAD_IMAGE, "imageBytes: expected an image file, found none")
     return data
 
 
@@ -171,7 +169,7 @@ def _image_file(data: bytes, picture: CameraReading, size: tuple[int, int] | Non
     if channels is None or data.startswith(_FILE_BEGINNINGS) or data[4:8] == b"ftyp":
         return data
     if size is None or len(data) != size[0] * size[1] * channels:
-        raise GatewayError(
+        raise ServiceError(
             ErrorCode.BAD_IMAGE,
             f"imageBytes: expected an image file, or width x height x {channels} bytes of "
             f"{picture.imageFormat} of size {size}, found {len(data)} bytes",

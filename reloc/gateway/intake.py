@@ -11,7 +11,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message, Receive
 
-from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE, GatewayError, bad_request
+from featuredb.errors import ServiceError
+from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE
 from reloc.gateway.options import GatewayOptions
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
@@ -21,6 +22,7 @@ from reloc.wire.query import (
     PriorRequest,
     RequestError,
     RequestOptions,
+    bad_request,
     parse_attachment,
     request_id_of,
 )
@@ -36,12 +38,12 @@ class Intake:
 
     @asynccontextmanager
     async def admitted(self, request: Request, media_type: str) -> AsyncIterator[Request]:
-        """Within the block, the request with a body that ends in a GatewayError where it breaks a limit.
+        """Within the block, the request with a body that ends in a ServiceError where it breaks a limit.
 
         It is in hand from the end of its body on: who sends slowly takes nobody's place.
 
         Raises:
-            GatewayError: TOO_LARGE, UNSUPPORTED_MEDIA_TYPE; while the body is read also BUSY, SLOW_BODY.
+            ServiceError: TOO_LARGE, UNSUPPORTED_MEDIA_TYPE; while the body is read also BUSY, SLOW_BODY.
         """
         _check_headers(request, media_type)
         body = _MeteredBody(self, request.receive, self._options)
@@ -59,12 +61,12 @@ def _check_headers(request: Request, media_type: str) -> None:
     found = request.headers.get("content-type", "").split(";")[0].strip().lower()
     wanted = (media_type, "application/vnd.oscp+json") if media_type == "application/json" else (media_type,)
     if found not in wanted:
-        raise GatewayError(
+        raise ServiceError(
             UNSUPPORTED_MEDIA_TYPE, f"Content-Type: expected {media_type}, found {found[:100]!r}"
         )
     coding = request.headers.get("content-encoding", "identity").strip().lower()
     if coding != "identity":
-        raise GatewayError(
+        raise ServiceError(
             UNSUPPORTED_MEDIA_TYPE,
             f"Content-Encoding: expected none, found {coding[:100]!r}; images are compressed",
         )
@@ -87,12 +89,12 @@ class _MeteredBody:
         if self.held_bytes + size > self._options.max_body_bytes:
             raise self.too_large()
         if self._intake.buffered_bytes + size > self._options.max_buffered_bytes:
-            raise GatewayError(ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second")
+            raise ServiceError(ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second")
         self.held_bytes += size
         self._intake.buffered_bytes += size
         if not (self.complete or message.get("more_body", False)):
             if self._intake.in_flight >= self._options.max_in_flight:
-                raise GatewayError(
+                raise ServiceError(
                     ErrorCode.BUSY,
                     f"{self._intake.in_flight} photos are in hand, which is as many as are taken; try again "
                     "in a second",
@@ -101,8 +103,8 @@ class _MeteredBody:
             self._intake.in_flight += 1
         return message
 
-    def too_large(self) -> GatewayError:
-        return GatewayError(
+    def too_large(self) -> ServiceError:
+        return ServiceError(
             ErrorCode.TOO_LARGE,
             f"body: expected at most {self._options.max_body_bytes} bytes; send a smaller picture",
         )
@@ -112,7 +114,7 @@ class _MeteredBody:
             async with asyncio.timeout(max(0.0, self._end - time.monotonic())):
                 message = await self._receive()
         except TimeoutError as error:
-            raise GatewayError(
+            raise ServiceError(
                 SLOW_BODY, f"body: expected within {self._options.body_timeout_s:g} s, found a part of it"
             ) from error
         if message["type"] == "http.disconnect":
@@ -131,7 +133,7 @@ async def read_form(request: Request, options: GatewayOptions) -> tuple[bytes, L
     The file goes through a temporary file where it is larger than a megabyte.
 
     Raises:
-        GatewayError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE, and those of the body.
+        ServiceError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE, and those of the body.
     """
     parts: dict[str, bytes] = {}
     try:
@@ -151,7 +153,7 @@ async def read_form(request: Request, options: GatewayOptions) -> tuple[bytes, L
         raise bad_request("image: expected the bytes of an image file, found no such field")
     if len(image) > options.max_image_bytes:
         text = f"image: expected at most {options.max_image_bytes} bytes, found {len(image)}"
-        raise GatewayError(ErrorCode.TOO_LARGE, text)
+        raise ServiceError(ErrorCode.TOO_LARGE, text)
     said = LocaliseWireRequest(
         camera=_json("camera", CameraRequest, parts),
         prior=_json("prior", PriorRequest, parts),

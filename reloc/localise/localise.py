@@ -271,15 +271,9 @@ def runner_up(best: PoseCandidate, others: list[PoseCandidate]) -> RunnerUp | No
             apart_deg += 3.0 * float(np.degrees(np.sqrt(np.linalg.eigvalsh(placed[:3, :3])[-1])))
         inliers = _support_beside(best, other)
         if inliers and (distance_m > apart_m or angle_deg > apart_deg):
-            lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center)
+            lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center).tolist()
             found.append(
-                RunnerUp(
-                    inliers=inliers,
-                    distance_m=distance_m,
-                    angle_deg=angle_deg,
-                    latitude_deg=float(lat),
-                    longitude_deg=float(lon),
-                )
+                RunnerUp(inliers=inliers, distance_m=distance_m, angle_deg=angle_deg, lat=lat, lon=lon)
             )
     return max(found, key=lambda rival: rival.inliers, default=None)
 

@@ -204,14 +204,14 @@ class RunnerUp:
         inliers: its inlier count.
         distance_m: from the winner's camera centre.
         angle_deg: between the two orientations.
-        latitude_deg, longitude_deg: where it is.
+        lat, lon: where it is, degrees.
     """
 
     inliers: int
     distance_m: float
     angle_deg: float
-    latitude_deg: float
-    longitude_deg: float
+    lat: float
+    lon: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,7 +25,14 @@ from reloc.localise.lens_prior import QueryLensPrior, known_within
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
-from reloc.wire.query import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, RequestError
+from reloc.wire.query import (
+    CameraRequest,
+    ErrorCode,
+    LocaliseReply,
+    LocaliseWireRequest,
+    RequestError,
+    bad_request,
+)
 
 
 def answer_query(
@@ -35,11 +42,7 @@ def answer_query(
     *,
     limits: DecodeLimits = DEFAULT_LIMITS,
 ) -> LocaliseReply:
-    """Localise the image file in `data`.
-
-    Raises:
-        RequestError: why the query has no answer.
-    """
+    """Localise the image file in `data`. Raises RequestError: why the query has no answer."""
     clock = StageClock()
     try:
         gray, header = decode_photo(data, localiser, limits)
@@ -52,7 +55,7 @@ def answer_query(
     except IncompatibleExtractorError as error:
         raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
     except (MapNotFoundError, UnplacedBesideOthersError) as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, f"options.maps: {error}") from error
+        raise bad_request(f"options.maps: {error}") from error
     clock.lap("localise_rest", result.timings_ms)
     request_id = wire_request.request_id or uuid.uuid4().hex
     reply = reply_from_result(result, request_id=request_id, timings_ms={})
@@ -130,4 +133,4 @@ def _as_bad_request(field: str) -> Iterator[None]:
     try:
         yield
     except InvalidValueError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, f"{field}: {error}") from error
+        raise bad_request(f"{field}: {error}") from error

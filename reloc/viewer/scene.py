@@ -278,11 +278,7 @@ def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]
 
 
 def spot_of_trajectory(trajectory: Trajectory) -> Spot:
-    """Where the first known pose lies.
-
-    Raises:
-        InvalidValueError: all frames are lost.
-    """
+    """Where the first known pose lies. Raises InvalidValueError: all frames are lost."""
     pose = next((point.pose for point in trajectory.points if point.pose is not None), None)
     if pose is None:
         raise InvalidValueError(

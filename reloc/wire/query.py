@@ -41,6 +41,11 @@ class RequestError(ServiceError):
         super().__init__(code.value, message, request_id)
 
 
+def bad_request(message: str, request_id: str | None = None) -> RequestError:
+    """The request is not what it should be, as the message says."""
+    return RequestError(ErrorCode.BAD_REQUEST, message, request_id)
+
+
 class Request(BaseModel):
     """Base of what a client sends: unknown fields are refused."""
 
@@ -350,14 +355,12 @@ def parse_attachment(model: type[_Attached], attachment: bytes | None) -> _Attac
     """
     attachment = attachment or b"{}"
     if len(attachment) > MAX_ATTACHMENT_BYTES:
-        raise RequestError(
-            ErrorCode.BAD_REQUEST,
-            f"attachment: expected at most {MAX_ATTACHMENT_BYTES} bytes of JSON, found {len(attachment)}",
-        )
+        most = f"at most {MAX_ATTACHMENT_BYTES} bytes of JSON"
+        raise bad_request(f"attachment: expected {most}, found {len(attachment)}")
     try:
         return model.model_validate_json(attachment)
     except ValidationError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, explain(error), _request_id_in(attachment)) from error
+        raise bad_request(explain(error), _request_id_in(attachment)) from error
 
 
 def encode(message: BaseModel) -> bytes:

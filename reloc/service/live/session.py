@@ -17,7 +17,7 @@ from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
 from reloc.service.workers.area_files import LocaliserFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
-from reloc.wire.query import ErrorCode, RequestError, parse_attachment
+from reloc.wire.query import ErrorCode, RequestError, bad_request, parse_attachment
 from reloc.wire.track import EndReason, TrackEvent, TrackFrame, TrackPose
 
 logger = logging.getLogger(__name__)
@@ -143,19 +143,15 @@ class Follower:
     def _check(self, header: TrackFrame, size: int) -> None:
         """Raises RequestError: the header goes back, or the payload is too large."""
         if self._last is not None and header.sequence <= self._last.sequence:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
+            raise bad_request(
                 f"sequence: expected more than {self._last.sequence}, that of the frame before, found "
                 f"{header.sequence}; number the frames from 0, and open a new session to begin again",
             )
         self._last = header
         self._looked_at += 1
         if self._last_time_s is not None and header.time_s <= self._last_time_s:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
-                f"time_s: expected more than {self._last_time_s}, that of the frame before, found "
-                f"{header.time_s}",
-            )
+            before = f"{self._last_time_s}, that of the frame before"
+            raise bad_request(f"time_s: expected more than {before}, found {header.time_s}")
         if size > self._max_bytes:
             raise RequestError(
                 ErrorCode.TOO_LARGE,

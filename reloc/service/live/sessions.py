@@ -26,6 +26,7 @@ from reloc.wire.query import (
     ErrorCode,
     ErrorReply,
     RequestError,
+    bad_request,
     encode,
     parse_attachment,
 )
@@ -155,7 +156,7 @@ class LiveSessions:
         """Open the client's session of this name. Raises RequestError: why it is not opened."""
         for what, found in (("client", client), ("session", name)):
             if not is_name(found):
-                raise RequestError(ErrorCode.BAD_REQUEST, f"{what}: {NAME_EXPECTED}, found {found[:80]!r}")
+                raise bad_request(f"{what}: {NAME_EXPECTED}, found {found[:80]!r}")
         key = self._keys.track(client, name)
         attachment = None if query.attachment is None else query.attachment.to_bytes()
         request = parse_attachment(TrackOpenRequest, attachment)
@@ -210,8 +211,7 @@ class LiveSessions:
                 "this server takes no live sessions; start it with --live-sessions 1 or more",
             )
         if key in self._open:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
+            raise bad_request(
                 f"session: {key.rpartition('/')[2]!r} is open; choose another name, at random",
             )
         # Each has its process until it is forgotten, those that are ending as well.
