@@ -34,7 +34,7 @@ from reloc.localise.result import (
     Reason,
     RunnerUp,
 )
-from reloc.localise.search import PoseCandidate, Search, pairs, search
+from reloc.localise.search import PoseCandidate, pairs, search
 
 # Chi-square with two degrees of freedom is above this once in 10,000 answers if the prior's sigma is honest.
 _CHI_SQUARE_LIMIT = 18.42
@@ -103,8 +103,9 @@ def localise_features(
     usable = usable_areas(areas, settings.extractor.fingerprint)
 
     def ask(asked: LocaliseRequest) -> Localised:
-        found = search(features, asked, usable, settings, timed)
-        localised = _decide(found, features, asked, settings, snapshot)
+        localised = _decide(
+            search(features, asked, usable, settings, timed), features, asked, settings, snapshot
+        )
         timed.lap("answer")
         return localised
 
@@ -162,27 +163,26 @@ def _with_own_position(
 
 
 def _decide(
-    found: Search,
+    found: tuple[list[PoseCandidate], int, tuple[Reason, str] | None],  # of `search`
     features: Features,
     request: LocaliseRequest,
     options: LocaliseOptions,
     snapshot: int,
 ) -> Localised:
-    evidence = found.candidates[0].evidence if found.candidates else None
+    candidates, matches, nothing = found
+    evidence = candidates[0].evidence if candidates else None
     answered = partial(
-        LocaliseResult, features=len(features), matches=found.matches, snapshot=snapshot, evidence=evidence
+        LocaliseResult, features=len(features), matches=matches, snapshot=snapshot, evidence=evidence
     )
 
     def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None) -> Localised:
         result = answered(reason=reason, detail=detail, inliers=inliers, runner_up=rival)
         return Localised(result=result)
 
-    if found.reason is not None:
-        return refuse(found.reason, found.detail)
-    if not found.candidates:
-        return refuse("TOO_FEW_INLIERS", f"no pose agrees with the {found.matches} matches")
-    best = found.candidates[0]
-    rival = runner_up(best, found.candidates[1:])
+    if nothing is not None:
+        return refuse(*nothing)
+    best, *others = candidates
+    rival = runner_up(best, others)
     refusal = verdict(
         best.evidence,
         rival.inliers if rival else 0,
@@ -211,7 +211,7 @@ def _decide(
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
     result = answered(
         reason=None,
-        detail=f"{best.evidence.inliers} inliers of {found.matches} matches",
+        detail=f"{best.evidence.inliers} inliers of {matches} matches",
         pose=answer,
         confidence=confidence(best.evidence, rival.inliers if rival else 0),
         inliers=best.evidence.inliers,

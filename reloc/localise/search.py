@@ -62,31 +62,21 @@ class PoseCandidate:
         return self.area.maps[int(np.bincount(self.area.point_map[self.matches.point[rows]]).argmax())]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Search:
-    """What the search found: candidates, best first, and how far it came."""
-
-    candidates: list[PoseCandidate]
-    matches: int
-    reason: Reason | None
-    detail: str
-
-
 def search(
     features: Features,
     request: LocaliseRequest,
     areas: Sequence[IndexedArea],
     options: LocaliseOptions,
     clock: StageClock,
-) -> Search:
+) -> tuple[list[PoseCandidate], int, tuple[Reason, str] | None]:
+    """Candidates, best first; matches of the best cluster; where there is nothing to decide on, why."""
     if len(features) < options.acceptance.min_inliers:
-        return _nothing(
-            "TOO_FEW_FEATURES", f"{len(features)} keypoints in the photo; it shows too little texture"
-        )
+        text = f"{len(features)} keypoints in the photo; it shows too little texture"
+        return [], 0, ("TOO_FEW_FEATURES", text)
     clusters = find_clusters(areas, features, request.prior, options.candidates, request.beyond)
     clock.lap("candidates")
     if not clusters:
-        return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
+        return [], 0, ("NO_COVERAGE", "no map lies within reach of the prior")
     tries = [ClusterMatcher(features, cluster, options.matching) for cluster in clusters]
     candidates: list[PoseCandidate] = []
     most = 0
@@ -100,9 +90,11 @@ def search(
         tries = most_matched(tries, options)
         clock.lap("matching")
     candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
-    if not candidates and most < options.pose.min_matches:
-        return _nothing("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps", most)
-    return Search(candidates=candidates, matches=most, reason=None, detail="")
+    if candidates:
+        return candidates, most, None
+    if most < options.pose.min_matches:
+        return [], most, ("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps")
+    return [], most, ("TOO_FEW_INLIERS", f"no pose agrees with the {most} matches")
 
 
 def most_matched(tries: list[ClusterMatcher], options: LocaliseOptions) -> list[ClusterMatcher]:
@@ -357,7 +349,3 @@ def _independent(
 def pairs(features: Features, area: Area, matches: Matches) -> tuple[FloatArray, FloatArray]:
     """Pixels (m, 2) and points (m, 3) of the matches, float64."""
     return features.xy[matches.feature].astype(np.float64), area.points[matches.point]
-
-
-def _nothing(reason: Reason, detail: str, matches: int = 0) -> Search:
-    return Search(candidates=[], matches=matches, reason=reason, detail=detail)

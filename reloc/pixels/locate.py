@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from featuredb.geometry.error_radius import error_radius
 from reloc.answered_view import AnsweredView
 from reloc.pixels.surfaces import Met, RaySurface
@@ -93,14 +92,13 @@ def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px:
         height_datum=view.height_datum,
         surface=surface.kind,
     )
-    ray = view.rays(pixel[None])[0]
-    if not (_inside(view.camera, pixel) and np.isfinite(ray).all()):
-        size = f"{view.camera.width} x {view.camera.height}"
-        return answered(reason="OUTSIDE", detail=f"the photo has {size} pixels")
+    ray, size = view.rays(pixel[None])[0], (view.camera.width, view.camera.height)
+    if not ((pixel >= 0).all() and (pixel <= size).all() and np.isfinite(ray).all()):
+        return answered(reason="OUTSIDE", detail=f"the photo has {size[0]} x {size[1]} pixels")
     # By the pose's turn alone, which is right for far things; nearer ones are asked for again.
     viewer = view.cam_from_local.center
     spread = _pixel_covariance(view, viewer + 1e4 * ray, sigma_px)
-    met = surface.meet(view, pixel, _REACH_SIGMAS * _longest(spread))
+    met = surface.meet(view, pixel, _REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(spread)[-1])))
     if isinstance(met, str):
         return answered(reason="NO_SURFACE", detail=met)
     toward = float(met.patch.normal @ ray)
@@ -135,19 +133,11 @@ def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px:
     )
 
 
-def _inside(camera: Camera, pixel: FloatArray) -> bool:
-    return bool((pixel >= 0).all() and (pixel <= [camera.width, camera.height]).all())
-
-
 def _pixel_covariance(view: AnsweredView, point: FloatArray, sigma_px: float) -> FloatArray:
     """(2, 2): how far the pixel of a place may be off."""
     _, by_view = view.pixel_derivatives(point)
     # A floor far below what anybody sees keeps it regular.
     return np.asarray(by_view @ view.covariance @ by_view.T + (sigma_px**2 + 1e-6) * np.eye(2))
-
-
-def _longest(covariance: FloatArray) -> float:
-    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
 def _by_pixel(view: AnsweredView, point: FloatArray, normal: FloatArray) -> FloatArray:

@@ -4,8 +4,8 @@ import logging
 import threading
 import time
 import uuid
-from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable
 
 import zenoh
 
@@ -136,12 +136,10 @@ class QueryQueue:
     """
 
     def __init__(self, max_length: int, max_bytes: int) -> None:
-        self._max_length = max_length
-        self._max_bytes = max_bytes
-        self._waiting: dict[str, deque[PendingQuery]] = {}
+        self._max_length, self._max_bytes = max_length, max_bytes
+        self._waiting: dict[str, list[PendingQuery]] = {}  # by asker, the oldest first; none is empty
         self._in_hand: Counter[str] = Counter()
         self._spent_s: dict[str, float] = {}
-        self._length = self._bytes = 0
         self._closed = False
         self._changed = threading.Condition()
 
@@ -154,20 +152,16 @@ class QueryQueue:
         with self._changed:
             if self._closed:
                 raise RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping; ask again later")
-            self._remove([i for waiting in self._waiting.values() for i in waiting if i.answered])
-            busy = RequestError(
-                ErrorCode.BUSY,
-                f"{self._length} queries ({self._bytes} bytes) are waiting, the queue is full; "
-                "try again in a second",
-            )
-            refused = self._who_makes_room(item)
+            self._remove([i for i in self._all() if i.answered])
+            length, size = len(self._all()), sum(i.size for i in self._all())
+            told = f"{length} queries ({size} bytes) are waiting, the queue is full; try again in a second"
+            busy = RequestError(ErrorCode.BUSY, told)
+            refused = self._who_makes_room(item, length, size)
             if refused is None:
                 raise busy
             self._remove(refused)
             self._spent_s.setdefault(item.asker, min(self._spent_s.values(), default=0.0))
-            self._waiting.setdefault(item.asker, deque()).append(item)
-            self._length += 1
-            self._bytes += item.size
+            self._waiting.setdefault(item.asker, []).append(item)
             self._changed.notify()
         for other in refused:
             other.refuse(busy)
@@ -175,13 +169,14 @@ class QueryQueue:
     def get(self) -> PendingQuery | None:
         """The next query, blocking, to be followed by `done`; None once closed and empty."""
         with self._changed:
-            while not self._waiting:
-                if self._closed:
-                    return None
-                self._changed.wait()
+            self._changed.wait_for(lambda: self._waiting or self._closed)
+            if not self._waiting:
+                return None
             asker = min(self._waiting, key=lambda name: (self._in_hand[name], self._spent_s[name]))
             self._in_hand[asker] += 1
-            return self._taken(self._waiting[asker].popleft())
+            item = self._waiting[asker][0]
+            self._remove([item])
+            return item
 
     def done(self, item: PendingQuery, seconds: float) -> None:
         """A worker has had the query for so long."""
@@ -202,18 +197,21 @@ class QueryQueue:
     def drain(self) -> list[PendingQuery]:
         """Take out all that wait."""
         with self._changed:
-            items = [item for waiting in self._waiting.values() for item in waiting]
+            items = self._all()
             self._waiting.clear()
-            self._length = self._bytes = 0
             return items
 
     def __len__(self) -> int:
-        return self._length
+        with self._changed:
+            return len(self._all())
 
-    def _who_makes_room(self, item: PendingQuery) -> list[PendingQuery] | None:
+    def _all(self) -> list[PendingQuery]:
+        return [item for waiting in self._waiting.values() for item in waiting]
+
+    def _who_makes_room(self, item: PendingQuery, length: int, size: int) -> list[PendingQuery] | None:
         """Those of others that go for it; None where who has most waiting has no more than its asker."""
         waiting = {asker: list(items) for asker, items in self._waiting.items()}
-        own, length, size = len(waiting.get(item.asker, ())), self._length, self._bytes
+        own = len(waiting.get(item.asker, ()))
         going: list[PendingQuery] = []
         while length >= self._max_length or size + item.size > self._max_bytes:
             most = max(waiting.values(), key=len, default=[])
@@ -223,18 +221,11 @@ class QueryQueue:
             length, size = length - 1, size - going[-1].size
         return going
 
-    def _remove(self, items: Sequence[PendingQuery]) -> None:
+    def _remove(self, items: list[PendingQuery]) -> None:
         for item in items:
             self._waiting[item.asker].remove(item)
-            self._taken(item)
-
-    def _taken(self, item: PendingQuery) -> PendingQuery:
-        """Account for a query that waits no more."""
-        self._length -= 1
-        self._bytes -= item.size
-        if not self._waiting[item.asker]:
-            del self._waiting[item.asker]
-        return item
+            if not self._waiting[item.asker]:
+                del self._waiting[item.asker]
 
 
 def deadline_error(item: PendingQuery) -> RequestError:
