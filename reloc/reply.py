@@ -56,20 +56,14 @@ _NO_POSE: dict[str, Any] = {
 def place_fields(pose: OnEarth) -> dict[str, Any]:
     """Position, orientation and how surely, as members of a message."""
     x, y, z, w = pose.geopose.quaternion_xyzw
-    easting, northing, height = _floats(pose.utm)
+    place = dict(zip(("easting", "northing", "height"), _floats(pose.utm), strict=True))
     return {
         "position": Position(
             lat=pose.geopose.latitude_deg, lon=pose.geopose.longitude_deg, h=pose.geopose.height_m
         ),
         "quaternion": Quaternion(x=x, y=y, z=z, w=w),
         "height_datum": pose.height_datum,
-        "utm": UtmPose(
-            epsg=pose.epsg,
-            easting=easting,
-            northing=northing,
-            height=height,
-            cam_from_utm_xyzw=_floats(pose.cam_from_utm_xyzw),
-        ),
+        "utm": UtmPose(epsg=pose.epsg, cam_from_utm_xyzw=_floats(pose.cam_from_utm_xyzw), **place),
         "covariance": tuple(_floats(row) for row in pose.covariance),
         "accuracy": Accuracy.model_validate(pose, from_attributes=True),
     }

@@ -46,15 +46,38 @@ class Intake:
             ServiceError: TOO_LARGE, UNSUPPORTED_MEDIA_TYPE; while the body is read also BUSY, SLOW_BODY.
         """
         _check_headers(request, media_type)
-        body = _MeteredBody(self, request.receive, self._options)
+        options, held_bytes, complete = self._options, 0, False
+        end = time.monotonic() + options.body_timeout_s
+        too_large = f"body: expected at most {options.max_body_bytes} bytes; send a smaller picture"
+
+        async def receive() -> Message:
+            nonlocal held_bytes, complete
+            message = await _next(request.receive, end, options)
+            size = len(message.get("body", b""))
+            if held_bytes + size > options.max_body_bytes:
+                raise ServiceError(ErrorCode.TOO_LARGE, too_large)
+            if self.buffered_bytes + size > options.max_buffered_bytes:
+                raise ServiceError(
+                    ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second"
+                )
+            held_bytes += size
+            self.buffered_bytes += size
+            if not (complete or message.get("more_body", False)):
+                if self.in_flight >= options.max_in_flight:
+                    many = f"{self.in_flight} photos are in hand, which is as many as are taken"
+                    raise ServiceError(ErrorCode.BUSY, f"{many}; try again in a second")
+                complete = True
+                self.in_flight += 1
+            return message
+
         try:
             declared = request.headers.get("content-length", "")
-            if declared.isdecimal() and int(declared) > self._options.max_body_bytes:
-                raise body.too_large()
-            yield Request(request.scope, body.receive)
+            if declared.isdecimal() and int(declared) > options.max_body_bytes:
+                raise ServiceError(ErrorCode.TOO_LARGE, too_large)
+            yield Request(request.scope, receive)
         finally:
-            self.in_flight -= body.complete
-            self.buffered_bytes -= body.held_bytes
+            self.in_flight -= complete
+            self.buffered_bytes -= held_bytes
 
 
 def _check_headers(request: Request, media_type: str) -> None:
@@ -72,54 +95,17 @@ def _check_headers(request: Request, media_type: str) -> None:
         )
 
 
-class _MeteredBody:
-    """One request's body."""
-
-    def __init__(self, intake: Intake, receive: Receive, options: GatewayOptions) -> None:
-        self._intake = intake
-        self._receive = receive
-        self._options = options
-        self._end = time.monotonic() + options.body_timeout_s
-        self.held_bytes = 0
-        self.complete = False
-
-    async def receive(self) -> Message:
-        message = await self._next()
-        size = len(message.get("body", b""))
-        if self.held_bytes + size > self._options.max_body_bytes:
-            raise self.too_large()
-        if self._intake.buffered_bytes + size > self._options.max_buffered_bytes:
-            raise ServiceError(ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second")
-        self.held_bytes += size
-        self._intake.buffered_bytes += size
-        if not (self.complete or message.get("more_body", False)):
-            if self._intake.in_flight >= self._options.max_in_flight:
-                raise ServiceError(
-                    ErrorCode.BUSY,
-                    f"{self._intake.in_flight} photos are in hand, which is as many as are taken; try again "
-                    "in a second",
-                )
-            self.complete = True
-            self._intake.in_flight += 1
-        return message
-
-    def too_large(self) -> ServiceError:
-        return ServiceError(
-            ErrorCode.TOO_LARGE,
-            f"body: expected at most {self._options.max_body_bytes} bytes; send a smaller picture",
-        )
-
-    async def _next(self) -> Message:
-        try:
-            async with asyncio.timeout(max(0.0, self._end - time.monotonic())):
-                message = await self._receive()
-        except TimeoutError as error:
-            raise ServiceError(
-                SLOW_BODY, f"body: expected within {self._options.body_timeout_s:g} s, found a part of it"
-            ) from error
-        if message["type"] == "http.disconnect":
-            raise ClientDisconnect
-        return message
+async def _next(receive: Receive, end: float, options: GatewayOptions) -> Message:
+    """What comes of a body, until `end` of the monotonic clock."""
+    try:
+        async with asyncio.timeout(max(0.0, end - time.monotonic())):
+            message = await receive()
+    except TimeoutError as error:
+        text = f"body: expected within {options.body_timeout_s:g} s, found a part of it"
+        raise ServiceError(SLOW_BODY, text) from error
+    if message["type"] == "http.disconnect":
+        raise ClientDisconnect
+    return message
 
 
 _Field = TypeVar("_Field", CameraRequest, PriorRequest, RequestOptions)

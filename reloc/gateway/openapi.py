@@ -100,9 +100,10 @@ LOCALISE: dict[str, Any] = {
                     },
                     "encoding": {
                         "image": {"contentType": "image/jpeg"},
-                        "camera": {"contentType": "application/json"},
-                        "prior": {"contentType": "application/json"},
-                        "options": {"contentType": "application/json"},
+                        **{
+                            name: {"contentType": "application/json"}
+                            for name in ("camera", "prior", "options")
+                        },
                     },
                 }
             },

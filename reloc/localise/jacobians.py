@@ -5,6 +5,7 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import skew
 from reloc.localise.lens_prior import lens_of, whole_lens
 
 
@@ -23,10 +24,8 @@ def pixel_jacobians(
         lens_jacobians(camera, in_camera) if lens else (camera.projection_jacobian(in_camera), None)
     )
     by_point = by_camera @ cam_from_local.rotation
-    x, y, z = (points - cam_from_local.center).T
-    zero = np.zeros_like(x)
-    crosses = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    by_own = [by_point @ crosses, -by_point, *([] if by_lens is None else [by_lens])]
+    by_turn = by_point @ skew(points - cam_from_local.center)
+    by_own = [by_turn, -by_point, *([] if by_lens is None else [by_lens])]
     return by_point, np.concatenate(by_own, axis=2)
 
 

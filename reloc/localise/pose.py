@@ -26,16 +26,14 @@ class PoseHypothesis:
         cam_from_local: area frame to camera.
         camera: intrinsics, the focal length estimated where `camera_source` is exif or estimated.
         inliers: (m,) bool over the matches that it was estimated from.
-        prior_focal_px: focal length from EXIF, or the guess that stands for an unknown one.
         lens_prior: what was known of the lens beforehand, where it is estimated with the pose; None: it is
-            exact, or nothing has been refined yet.
+            exact.
     """
 
     cam_from_local: Rigid3
     camera: Camera
     camera_source: CameraSource
     inliers: NDArray[np.bool_]
-    prior_focal_px: float
     lens_prior: QueryLensPrior | None = None
 
     @property
@@ -70,7 +68,7 @@ def estimate_pose(
             camera=lens,
             camera_source=source,
             inliers=reprojection_errors(pixels, points, lens, cam_from_local) < tolerance_px,
-            prior_focal_px=camera.focal_px,
+            lens_prior=options.lens.of_source(camera, source),
         )
         for cam_from_local, lens in (found for found in tries if found is not None)
     ]
@@ -150,8 +148,10 @@ def refine_pose(
         near = residual < 2.0 * tolerance_px
         if near.sum() < 4:
             break
-        if pose.focal_is_free or pose.lens_prior is not None:
-            pose = _refine_with_lens(pixels[near], points[near], pose, tolerance_px, options)
+        if pose.lens_prior is not None:
+            problem = (pose.cam_from_local, pose.camera, pose.lens_prior)
+            moved, camera = calibrate(pixels[near], points[near], *problem, 0.25 * tolerance_px)
+            pose = replace(pose, cam_from_local=moved, camera=camera)
         else:
             pose = _refine_known_lens(pixels, points, near, pose, tolerance_px)
     residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
@@ -176,18 +176,6 @@ def _refine_known_lens(
         settings,
     )
     return start if found is None else replace(start, cam_from_local=_from_pycolmap(found["cam_from_world"]))
-
-
-def _refine_with_lens(
-    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, tolerance_px: float, options: PoseOptions
-) -> PoseHypothesis:
-    prior = start.lens_prior
-    if prior is None:
-        priors = options.lens
-        rel = priors.exif_focal_rel if start.camera_source == "exif" else priors.unknown_focal_rel
-        prior = priors.around(start.camera, start.prior_focal_px, rel)
-    pose, camera = calibrate(pixels, points, start.cam_from_local, start.camera, prior, 0.25 * tolerance_px)
-    return replace(start, cam_from_local=pose, camera=camera, lens_prior=prior)
 
 
 def reprojection_errors(

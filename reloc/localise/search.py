@@ -182,11 +182,7 @@ def _poses(
         return [best]
     second = _refined(features, cluster, left, rival, options)
     clock.lap("guided")
-    source, focal_px = best.pose.camera_source, best.pose.prior_focal_px
-    return [
-        best,
-        replace(second, pose=replace(second.pose, camera_source=source, prior_focal_px=focal_px)),
-    ]
+    return [best, replace(second, pose=replace(second.pose, camera_source=best.pose.camera_source))]
 
 
 def _with_lens_prior(
@@ -197,7 +193,7 @@ def _with_lens_prior(
     The map's own estimate of the same camera fits its points, which are bent by what that is off.
     """
     if not request.camera_is_exact:
-        return replace(pose, lens_prior=request.camera_prior)
+        return replace(pose, lens_prior=request.camera_prior or pose.lens_prior)
     counts = np.bincount(area.point_map[matches.point[pose.inliers]], minlength=len(area.maps))
     uncertainty = LensUncertainty.of_provenance(area.maps[int(np.argmax(counts))].provenance)
     if uncertainty is None:

@@ -6,6 +6,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable
+from typing import Literal
 
 import zenoh
 
@@ -64,19 +65,11 @@ class PendingQuery:
                 self._timer.daemon = True
                 self._timer.start()
 
-    def attachment(self) -> bytes | None:
-        """The request's attachment; None where there is none or it was answered meanwhile."""
+    def bytes_of(self, part: Literal["attachment", "payload"]) -> bytes:
+        """A part of the request; empty where there is none or it was answered meanwhile."""
         with self._lock:
-            if self.answered or self._query.attachment is None:
-                return None
-            return self._query.attachment.to_bytes()
-
-    def payload(self) -> bytes:
-        """The request's payload; empty where there is none or it was answered meanwhile."""
-        with self._lock:
-            if self.answered or self._query.payload is None:
-                return b""
-            return self._query.payload.to_bytes()
+            found: zenoh.ZBytes | None = None if self.answered else getattr(self._query, part)
+            return b"" if found is None else found.to_bytes()
 
     def answer(self, reply: LocaliseReply) -> bool:
         """Send the reply; False if somebody was faster."""

@@ -52,14 +52,14 @@ class Server:
 
     def __init__(
         self,
-        *,
         source: DatabaseSource,
+        options: ServeOptions,
+        database: str,
+        inbox: Inbox | None,
         area: ServedArea,
         session: zenoh.Session,
         endpoints: tuple[str, ...],
-        database: str,
-        options: ServeOptions,
-        inbox: Inbox | None,
+        *,
         authenticates: bool,
     ) -> None:
         self.database = database  # its name on the wire
@@ -122,14 +122,7 @@ class Server:
             config.insert_json5("listen/endpoints", json.dumps(endpoints))
         session = open_server_session(config, ", ".join(endpoints) or str(options.config_path))
         server = cls(
-            source=source,
-            area=area,
-            session=session,
-            endpoints=endpoints,
-            database=database,
-            options=options,
-            inbox=inbox,
-            authenticates=authenticates(config),
+            source, options, database, inbox, area, session, endpoints, authenticates=authenticates(config)
         )
         try:
             server._declare()

@@ -6,7 +6,7 @@ place: such a frame is level at its origin only, so maps that are far from each 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -206,11 +206,7 @@ class _Builder:
         of_scan = slice(len(shown), None)
         place = {
             "name": f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}",
-            "frame": {
-                "latitude_deg": frame.latitude_deg,
-                "longitude_deg": frame.longitude_deg,
-                "height_m": frame.height_m,
-            },
+            "frame": asdict(frame),
             "height_datums": sorted({m.height_datum for m in maps} | {s.height_datum for s in scans}),
             "maps": [{**told, "buffer": b} for (told, _), b in zip(shown, buffers, strict=False)],
             "scans": [

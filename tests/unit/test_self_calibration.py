@@ -108,7 +108,7 @@ def test_a_lens_with_more_than_one_coefficient_is_told_whole() -> None:
                 camera=Camera.from_focal(WIDTH, HEIGHT, 754.0),
                 camera_source="exif",
                 inliers=np.ones(count, dtype=bool),
-                prior_focal_px=754.0,
+                lens_prior=options.lens.around(lens, 754.0, PRIORS.exif_focal_rel),
             )
             found = refine_pose(pixels, points, start, options)
             rows = found.inliers
@@ -176,7 +176,7 @@ def test_the_covariance_holds_over_lenses_from_the_priors(scene: object) -> None
             camera=Camera.from_focal(WIDTH, HEIGHT, lens.focal_px),
             camera_source="exif",
             inliers=np.ones(len(points), dtype=bool),
-            prior_focal_px=nominal,
+            lens_prior=PRIORS.around(lens, nominal, PRIORS.exif_focal_rel),
         )
         wide = replace(options, tolerance_rel=0.006)
         # Start inside the tolerance whatever the distortion; how far one may start is tested above.

@@ -176,7 +176,7 @@ class WorkerPool:
     def _localise(self, item: PendingQuery, process: WorkerProcess) -> None:
         clock = StageClock(start=item.received)
         clock.lap("queue")
-        request = parse_attachment(LocaliseWireRequest, item.attachment())
+        request = parse_attachment(LocaliseWireRequest, item.bytes_of("attachment"))
         item.request_id = request.request_id or item.request_id
         if request.contribute and self._inbox is None:
             instead = "leave it out, or start the server with --contributions on"
@@ -189,7 +189,7 @@ class WorkerPool:
             _check_deadline(item)  # one that is over already must not end a process that has nothing in hand
             item.watch()
         _check_deadline(item)
-        data = item.payload()
+        data = item.bytes_of("payload")
         clock.lap("request")
         if item.answered:
             return

@@ -72,11 +72,7 @@ def point_of(frame: TrackedFrame) -> TrajectoryPoint:
     ):
         pose = frame.ground.posed(frame.rows, frame.cam_from_local, frame.covariance)
     return TrajectoryPoint(
-        index=frame.index,
-        time_s=frame.time_s,
-        state=frame.state,
+        **{name: getattr(frame, name) for name in ("index", "time_s", "state", "inliers", "detail")},
         pose=pose if isinstance(pose, EarthPose) else None,
         in_map=pose if isinstance(pose, OwnPose) else None,
-        inliers=frame.inliers,
-        detail=frame.detail,
     )
