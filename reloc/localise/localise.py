@@ -30,11 +30,10 @@ from reloc.localise.result import (
     LocaliseRequest,
     LocaliseResult,
     OwnPosition,
-    PositionRole,
-    Reason,
     RunnerUp,
 )
 from reloc.localise.search import PoseCandidate, pairs, search
+from reloc.wire.query import PositionRole, Reason
 
 # Chi-square with two degrees of freedom is above this once in 10,000 answers if the prior's sigma is honest.
 _CHI_SQUARE_LIMIT = 18.42

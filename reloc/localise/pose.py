@@ -14,8 +14,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.lens_prior import LensPriors, QueryLensPrior
 from reloc.localise.options import PoseOptions
-from reloc.localise.result import CameraSource
 from reloc.localise.self_calibration import calibrate, covariance_from_information
+from reloc.wire.query import CameraSource
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

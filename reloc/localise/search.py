@@ -39,7 +39,8 @@ from reloc.localise.pose import (
     refine_pose,
     reprojection_errors,
 )
-from reloc.localise.result import CameraSource, Evidence, LocaliseRequest, Reason
+from reloc.localise.result import Evidence, LocaliseRequest
+from reloc.wire.query import CameraSource, Reason
 
 _MORE_BY_REFINING = 2  # times RANSAC's inliers
 _FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement

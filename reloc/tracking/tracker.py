@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from featuredb.geometry.camera import Camera
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.flow_track import FlowTrack, RecentFrame, RecentFrames, carried
-from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, TrackState, Unmatched
+from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, Unmatched
 from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose
+from reloc.wire.track import TrackState
 
 Answer = Keyframe | FlowTrack | Unmatched
 _FAR = sys.maxsize

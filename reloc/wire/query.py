@@ -20,6 +20,19 @@ MESSAGE_HEADROOM = 4
 _SHOWN_INPUT_CHARS = 80  # of a refused value, in the message that refuses it
 
 
+# Words of an answer: why there is no pose, where the lens came from, what the photo's own position did.
+Reason = Literal[
+    "NO_COVERAGE",
+    "TOO_FEW_FEATURES",
+    "TOO_FEW_MATCHES",
+    "TOO_FEW_INLIERS",
+    "AMBIGUOUS",
+    "CONTRADICTS_PRIOR",
+]
+CameraSource = Literal["request", "map", "exif", "estimated"]
+PositionRole = Literal["agrees", "decided", "contradicted", "no_help"]
+
+
 class ErrorCode(StrEnum):
     """Why a query got `reply_err` instead of an answer."""
 
@@ -188,7 +201,7 @@ class Intrinsics(Answer):
 class CameraUsed(Intrinsics):
     """Intrinsics that the pose was computed with, and where they came from."""
 
-    source: Literal["request", "map", "exif", "estimated"]
+    source: CameraSource
 
 
 class Lineage(Answer):
@@ -225,7 +238,7 @@ class OwnPositionUse(Answer):
     either. `distance_m`: of the answer from it, horizontally.
     """
 
-    role: Literal["agrees", "decided", "contradicted", "no_help"]
+    role: PositionRole
     distance_m: NotNegative | None
 
 
@@ -269,16 +282,6 @@ class ContributionReply(Answer):
     detail: str
 
 
-ReasonText = Literal[
-    "NO_COVERAGE",
-    "TOO_FEW_FEATURES",
-    "TOO_FEW_MATCHES",
-    "TOO_FEW_INLIERS",
-    "AMBIGUOUS",
-    "CONTRADICTS_PRIOR",
-]
-
-
 class LocaliseReply(Answer):
     """The answer to a localise query; the pose's fields are null when it is not localised on Earth.
 
@@ -290,7 +293,7 @@ class LocaliseReply(Answer):
     """
 
     status: Literal["localised", "localised_in_map", "not_localised"]
-    reason: ReasonText | None
+    reason: Reason | None
     detail: str
     position: Position | None
     quaternion: Quaternion | None

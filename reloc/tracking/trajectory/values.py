@@ -11,7 +11,8 @@ from itertools import groupby
 
 from featuredb.errors import InvalidValueError
 from reloc.localise.result import OwnPose
-from reloc.tracking.ground import EarthPose, TrackedFrame, TrackState
+from reloc.tracking.ground import EarthPose, TrackedFrame
+from reloc.wire.track import TrackState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
