@@ -1,7 +1,7 @@
 """The camera of an answer: its lens and pose in a frame of its own, with how well both are known."""
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,30 +58,16 @@ class AnsweredView:
         )
 
     @classmethod
-    def at(
-        cls,
-        utm: ArrayLike,
-        epsg: int,
-        cam_from_utm_xyzw: ArrayLike,
-        *,
-        camera: Camera,
-        covariance: FloatArray,
-        height_datum: str,
-        map_ids: tuple[str, ...] = (),
-    ) -> Self:
-        """A camera at a UTM place (3,), with the rotation (4,) of grid axes into camera axes."""
-        easting, northing, height = np.asarray(utm, dtype=np.float64)
-        frame = LocalFrame.from_utm(float(easting), float(northing), float(height), epsg)
+    def at(cls, utm: ArrayLike, epsg: int, cam_from_utm_xyzw: ArrayLike, **known: Any) -> Self:
+        """A camera at a UTM place (3,), with the rotation (4,) of grid axes into camera axes.
+
+        `known`: what is not said by these.
+        """
+        easting, northing, height = np.asarray(utm, dtype=np.float64).tolist()
+        frame = LocalFrame.from_utm(easting, northing, height, epsg)
         rotation = matrix_from_quaternion(cam_from_utm_xyzw) @ frame.grid_from_enu(np.zeros(3), epsg)
-        return cls(
-            frame=frame,
-            camera=camera,
-            cam_from_local=Rigid3(rotation=rotation, translation=np.zeros(3)),
-            covariance=covariance,
-            epsg=epsg,
-            height_datum=height_datum,
-            map_ids=map_ids,
-        )
+        cam_from_local = Rigid3(rotation=rotation, translation=np.zeros(3))
+        return cls(frame=frame, cam_from_local=cam_from_local, epsg=epsg, **known)
 
     def seen_in(self, frame: LocalFrame) -> "AnsweredView":
         """The same camera with its pose in another frame nearby; the covariance keeps its axes."""

@@ -93,7 +93,7 @@ class Server:
             self.server_id,
             authenticates=authenticates,
         )
-        self._queryables: list[zenoh.Queryable[None]] = []
+        self._declared = ExitStack()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._token_lock = threading.Lock()
         self._closed = False
@@ -153,7 +153,7 @@ class Server:
             (self._keys.of("status"), self._on_status),
             (self._keys.of("maps"), self._on_maps),
         ):
-            self._queryables.append(self._session.declare_queryable(key, callback, complete=True))
+            self._declared.enter_context(self._session.declare_queryable(key, callback, complete=True))
         if whole:
             self._live.start()
         self._advertise(self._area)  # after the queryables: who sees the token can ask at once
@@ -182,8 +182,7 @@ class Server:
         for item in (*self._queue.drain(), *left):
             item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server stopped before it could answer"))
             self._workers.abandon(item)
-        for queryable in self._queryables:
-            queryable.undeclare()
+        self._declared.close()
         if self._inbox is not None:
             self._inbox.close(self._options.shutdown_grace_s)
         self._watcher.close(timeout_s=self._options.shutdown_grace_s)
