@@ -28,10 +28,9 @@ from reloc.viewer.map_layer import (
     describe_map,
     describe_own_place,
     describe_photos,
-    own_points,
     picks_command,
 )
-from reloc.viewer.points import DrawnPoints, map_points, scan_points_in, shares
+from reloc.viewer.points import DrawnPoints, drawn_points, map_points, sampled, scan_points_in, shares
 from reloc.viewer.poses import describe_trajectory
 
 DEFAULT_POINTS = 1_000_000
@@ -151,7 +150,9 @@ class _Builder:
         self._tell()
         if unplaced is None:
             return
-        drawn = own_points(unplaced, self._options.points)
+        points_of, count = unplaced.points, len(unplaced.points)
+        rows = sampled(count, self._options.points)
+        drawn = drawn_points(points_of.xyz[rows], points_of.rgb[rows], count)
         (buffer,), data = _packed([drawn])
         command = picks_command(self._database.url, summary.map_id, self._options.photos)
         places.append(describe_own_place(summary, unplaced, drawn, buffer, command))

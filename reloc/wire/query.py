@@ -77,6 +77,7 @@ class Answer(BaseModel):
 RequestId = Annotated[str, Field(pattern=r"^[A-Za-z0-9._:-]{1,128}$")]
 # Names of people and terms: no control characters, since terminals and logs show them.
 Name = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f-\x9f][^\x00-\x1f\x7f-\x9f]{0,199}$")]
+MapId = Annotated[str, Field(min_length=1, max_length=200)]
 # Wide enough for any camera; a value outside is a unit mistake or nonsense.
 CameraParam = Annotated[float, Field(ge=-1e6, le=1e6)]
 CameraSigma = Annotated[float, Field(ge=0, le=1e6)]
@@ -124,10 +125,7 @@ class RequestOptions(Request):
 
     inliers: bool = False
     exif_prior: bool = False
-    maps: (
-        Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=1000)]
-        | None
-    ) = None
+    maps: Annotated[tuple[MapId, ...], Field(max_length=1000)] | None = None
     deadline_ms: Annotated[float, Field(ge=1, le=600_000)] | None = None
 
 
