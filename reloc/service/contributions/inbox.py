@@ -203,22 +203,19 @@ class Inbox:
             return [self._queue.popleft() for _ in range(min(len(self._queue), self._options.batch))]
 
     def _write(self, batch: "list[tuple[Ticket, Callable[[], Contribution]]]") -> None:
-        tickets = [ticket for ticket, _ in batch]
-        contributions = [made for _, make in batch if (made := _made(make)) is not None]
-        written = self._write_with_retries(contributions) if contributions else False
+        made = [(ticket, one) for ticket, make in batch if (one := _made(make)) is not None]
+        if not (made and self._write_with_retries([one for _, one in made])):
+            made = []
         with self._changed:
-            if written:
-                self._written += len(contributions)
-                self._lost += len(batch) - len(contributions)
-                waiting = Counter(self._counts.waiting_by_owner) + Counter(t.owner for t in tickets)
-                states = Counter(self._counts.by_state) + Counter(waiting=len(batch))
-                stored = self._counts.stored_bytes + sum(t.size for t in tickets)
-                self._counts = InboxCounts(
-                    by_state=dict(states), waiting_by_owner=dict(waiting), stored_bytes=stored
-                )
-            else:
-                self._lost += len(batch)
-        for ticket in tickets:
+            self._written += len(made)
+            self._lost += len(batch) - len(made)
+            waiting = Counter(self._counts.waiting_by_owner) + Counter(ticket.owner for ticket, _ in made)
+            states = Counter(self._counts.by_state) + Counter(waiting=len(made))
+            stored = self._counts.stored_bytes + sum(ticket.size for ticket, _ in made)
+            self._counts = InboxCounts(
+                by_state=dict(states), waiting_by_owner=dict(waiting), stored_bytes=stored
+            )
+        for ticket, _ in batch:
             self.cancel(ticket)
 
     def _write_with_retries(self, contributions: list[Contribution]) -> bool:
