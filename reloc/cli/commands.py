@@ -224,7 +224,9 @@ def _answer_all(args: argparse.Namespace, ask: "Ask", database: str) -> int:
             elif args.overlay is not None:
                 from reloc.overlay import write_overlay
 
-                target = _overlay_path(args.overlay, path, len(args.image) > 1)
+                target = args.overlay
+                if len(args.image) > 1:
+                    target = target.with_name(f"{target.stem}-{path.stem}{target.suffix or '.png'}")
                 write_overlay(target, data, reply, other_points)
                 sys.stderr.write(f"wrote {target}\n")
         except (OSError, FeatureDbError) as error:
@@ -270,8 +272,3 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
             said = as_arguments(lens.as_request())
             sys.stderr.write(f"{key}: lens of {lens.agree.sum()} of {len(lens.agree)} photos: {said}\n")
     return {p: lens for p, lens in zip(paths, asked_with, strict=True) if lens is not None}
-
-
-def _overlay_path(overlay: Path, image: Path, several: bool) -> Path:
-    name = f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}"
-    return overlay.with_name(name) if several else overlay

@@ -1,8 +1,6 @@
 """One query from bytes to reply: parse, decode, localise, word the answer. No network here."""
 
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,8 +111,10 @@ def query_camera(camera: CameraRequest, width: int, height: int) -> Camera:
     Raises:
         RequestError: BAD_REQUEST, it is none, or of another shape.
     """
-    with _as_bad_request("camera"):
+    try:
         return camera_of(camera).scaled_to(width, height)
+    except InvalidValueError as error:
+        raise bad_request(f"camera: {error}") from error
 
 
 def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | None:
@@ -124,13 +124,7 @@ def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | No
     lengths = {"OPENCV": 4, "SIMPLE_RADIAL": 3}.get(camera.model, 0)  # in pixels, which grow with the image
     sigmas = np.array(request.sigmas)
     sigmas[:lengths] *= camera.width / request.width
-    with _as_bad_request("camera.sigmas"):
-        return known_within(camera, sigmas)
-
-
-@contextmanager
-def _as_bad_request(field: str) -> Iterator[None]:
     try:
-        yield
+        return known_within(camera, sigmas)
     except InvalidValueError as error:
-        raise bad_request(f"{field}: {error}") from error
+        raise bad_request(f"camera.sigmas: {error}") from error
