@@ -76,15 +76,11 @@ def check_version(accept: str) -> bool:
         ServiceError: NOT_ACCEPTABLE, for another version than 2.
     """
     found = [part for part in accept.lower().split(",") if part.strip().startswith(MEDIA_TYPE)]
-    for part in found:
-        version = _VERSION.search(part)
-        if version is None or int(version[1]) == 2:
-            return True
-    if found:
-        raise ServiceError(
-            NOT_ACCEPTABLE, f"Accept: expected {MEDIA_TYPE}; version=2.0, found {accept[:100]!r}"
-        )
-    return False
+    versions = [_VERSION.search(part) for part in found]
+    if found and not any(version is None or int(version[1]) == 2 for version in versions):
+        text = f"Accept: expected {MEDIA_TYPE}; version=2.0, found {accept[:100]!r}"
+        raise ServiceError(NOT_ACCEPTABLE, text)
+    return bool(found)
 
 
 def question_of(request: GeoPoseReq, options: GatewayOptions) -> tuple[bytes, LocaliseWireRequest]:
