@@ -73,7 +73,7 @@ class McapLog:
             ) from error
         self._writer: Any = Writer(self._file)
         self._writer.start(profile="ros2", library="featuredb")
-        self._channels = {}
+        self._channels: dict[str, int] = {}
         for topic, (name, definition) in TOPICS.items():
             schema = self._writer.register_schema(name, "ros2msg", definition.encode())
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)

@@ -285,10 +285,10 @@ def _support_beside(best: PoseCandidate, other: PoseCandidate) -> int:
     """
     if best.area is not other.area:
         return other.evidence.inliers
-    numbers = [  # one for each inlier's pair of feature and point
+    theirs, ours = (  # one number for each inlier's pair of feature and point
         of.matches.feature[of.rows] * len(of.area.points) + of.matches.point[of.rows] for of in (other, best)
-    ]
-    return int(np.count_nonzero(~np.isin(*numbers)))
+    )
+    return int(np.count_nonzero(~np.isin(theirs, ours)))
 
 
 def _in_frame_of(area: Area, candidate: PoseCandidate) -> Rigid3:
