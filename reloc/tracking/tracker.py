@@ -146,8 +146,8 @@ class Tracker:
 
     def finish(self) -> Sequence[TrackedFrame]:
         """After the last frame: poses of those before it that a frame still being looked for has found."""
-        sent, self._sent = self._sent, None
-        if self._options.live or self._track is not None:
+        sent, self._sent, followed = self._sent, None, self._track
+        if self._options.live or followed is not None:
             return ()
         self.late = []
         last, fitted = self._frames.last, None
