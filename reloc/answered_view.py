@@ -1,7 +1,7 @@
 """The camera of an answer: its lens and pose in a frame of its own, with how well both are known."""
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,6 @@ from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.maps.feature_map import GeoPrior
 from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.lens_prior import lens_of, opencv_by_lens
-from reloc.localise.self_calibration import joint_jacobians
 from reloc.wire.query import CameraRequest, Intrinsics, LocaliseReply, PriorRequest
 from reloc.wire.track import TrackPose
 
@@ -44,11 +43,7 @@ class AnsweredView:
 
     @classmethod
     def of_reply(cls, reply: LocaliseReply) -> Self:
-        """The camera of a localised reply.
-
-        Raises:
-            InvalidValueError: it has no pose on Earth.
-        """
+        """The camera of a localised reply. Raises InvalidValueError: it has no pose on Earth."""
         utm, used, covariance = reply.utm, reply.camera, reply.covariance
         if utm is None or used is None or covariance is None:
             raise InvalidValueError(f"expected a pose on Earth, found {reply.status}: {reply.detail}")
@@ -63,30 +58,16 @@ class AnsweredView:
         )
 
     @classmethod
-    def at(
-        cls,
-        utm: ArrayLike,
-        epsg: int,
-        cam_from_utm_xyzw: ArrayLike,
-        *,
-        camera: Camera,
-        covariance: FloatArray,
-        height_datum: str,
-        map_ids: tuple[str, ...] = (),
-    ) -> Self:
-        """A camera at a UTM place (3,), with the rotation (4,) of grid axes into camera axes."""
-        easting, northing, height = np.asarray(utm, dtype=np.float64)
-        frame = LocalFrame.from_utm(float(easting), float(northing), float(height), epsg)
+    def at(cls, utm: ArrayLike, epsg: int, cam_from_utm_xyzw: ArrayLike, **known: Any) -> Self:
+        """A camera at a UTM place (3,), with the rotation (4,) of grid axes into camera axes.
+
+        `known`: what is not said by these.
+        """
+        easting, northing, height = np.asarray(utm, dtype=np.float64).tolist()
+        frame = LocalFrame.from_utm(easting, northing, height, epsg)
         rotation = matrix_from_quaternion(cam_from_utm_xyzw) @ frame.grid_from_enu(np.zeros(3), epsg)
-        return cls(
-            frame=frame,
-            camera=camera,
-            cam_from_local=Rigid3(rotation=rotation, translation=np.zeros(3)),
-            covariance=covariance,
-            epsg=epsg,
-            height_datum=height_datum,
-            map_ids=map_ids,
-        )
+        cam_from_local = Rigid3(rotation=rotation, translation=np.zeros(3))
+        return cls(frame=frame, cam_from_local=cam_from_local, epsg=epsg, **known)
 
     def seen_in(self, frame: LocalFrame) -> "AnsweredView":
         """The same camera with its pose in another frame nearby; the covariance keeps its axes."""
@@ -111,12 +92,10 @@ class AnsweredView:
         Raises:
             InvalidValueError: with a lens that is neither OPENCV nor SIMPLE_RADIAL, and not exact.
         """
-        if len(self.covariance) == 6:
-            by_point, by_view = pixel_jacobians(self.camera, self.cam_from_local, point[None])
-            return by_point[0], by_view[0]
-        by_point, by_view = joint_jacobians(self.camera, self.cam_from_local, point[None])
+        lens = len(self.covariance) > 6
+        by_point, by_view = pixel_jacobians(self.camera, self.cam_from_local, point[None], lens=lens)
         by_params = np.eye(len(self.covariance))
-        if self.camera.model == "OPENCV":
+        if lens and self.camera.model == "OPENCV":
             by_params[6:, 6:] = np.linalg.inv(opencv_by_lens(lens_of(self.camera)))
         return by_point[0], by_view[0] @ by_params
 
@@ -135,11 +114,7 @@ def geopose_of(message: LocaliseReply | TrackPose) -> GeoPose:
 
 
 def camera_of(lens: CameraRequest | Intrinsics) -> Camera:
-    """The camera that a message speaks of.
-
-    Raises:
-        InvalidValueError: it is none.
-    """
+    """The camera that a message speaks of. Raises InvalidValueError: it is none."""
     return Camera(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
 
 

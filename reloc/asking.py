@@ -130,19 +130,26 @@ class PhotoAsker:
             RequestError: an image, a camera or maps that do not fit. StoreError: the database is gone.
         """
         photo, called = _image_bytes(image)
-        request = _request(prior, camera, exif_prior, maps, inliers)
+        try:
+            if isinstance(prior, tuple):
+                lat, lon, sigma_m = map(float, prior)
+                prior = PriorRequest(lat=lat, lon=lon, sigma_m=sigma_m)
+            if isinstance(camera, Camera):
+                camera = CameraRequest(**asdict(camera))
+            options = RequestOptions(inliers=inliers, exif_prior=exif_prior, maps=maps)
+            request = LocaliseWireRequest(prior=prior, camera=camera, options=options)
+        except ValidationError as error:
+            raise InvalidValueError(f"localise: {explain(error)}") from error
+        except (TypeError, ValueError) as error:
+            raise InvalidValueError(
+                f"localise: expected a prior of latitude, longitude and metres, found {prior!r}"
+            ) from error
         localiser = self.localiser()
         reply = answer_query(request, photo, localiser)
-        on_earth = reply.status == "localised"
-        return PhotoAnswer(
-            name=called,
-            database=self.name,
-            reply=reply,
-            photo=photo,
-            other_points_utm=map_points_in_view(localiser.areas, AnsweredView.of_reply(reply))
-            if on_earth and inliers
-            else None,
-        )
+        others = None
+        if reply.status == "localised" and inliers:
+            others = map_points_in_view(localiser.areas, AnsweredView.of_reply(reply))
+        return PhotoAnswer(name=called, database=self.name, reply=reply, photo=photo, other_points_utm=others)
 
 
 def _image_bytes(image: Image) -> tuple[bytes, str]:
@@ -159,26 +166,3 @@ def _image_bytes(image: Image) -> tuple[bytes, str]:
         )
     stored = pixels if pixels.ndim == 2 else pixels[:, :, ::-1]
     return cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes(), "photo"
-
-
-def _request(
-    prior: PriorRequest | tuple[float, float, float] | None,
-    camera: CameraRequest | Camera | None,
-    exif_prior: bool,
-    maps: tuple[str, ...] | None,
-    inliers: bool,
-) -> LocaliseWireRequest:
-    try:
-        if isinstance(prior, tuple):
-            lat, lon, sigma_m = map(float, prior)
-            prior = PriorRequest(lat=lat, lon=lon, sigma_m=sigma_m)
-        if isinstance(camera, Camera):
-            camera = CameraRequest(**asdict(camera))
-        options = RequestOptions(inliers=inliers, exif_prior=exif_prior, maps=maps)
-        return LocaliseWireRequest(prior=prior, camera=camera, options=options)
-    except ValidationError as error:
-        raise InvalidValueError(f"localise: {explain(error)}") from error
-    except (TypeError, ValueError) as error:
-        raise InvalidValueError(
-            f"localise: expected a prior of latitude, longitude and metres, found {prior!r}"
-        ) from error

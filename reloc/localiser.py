@@ -53,15 +53,8 @@ def in_own_frame(result: LocaliseResult, unplaced: UnplacedMap) -> LocaliseResul
     pose = result.pose
     if pose is None:
         return replace(result, runner_up=None)
-    in_map = PoseInMap(
-        map_id=unplaced.map_id,
-        frame=unplaced.frame,
-        cam_from_map=pose.cam_from_local,
-        covariance=pose.covariance,
-        camera=pose.camera,
-        camera_source=pose.camera_source,
-        residual_rms_px=pose.residual_rms_px,
-    )
+    same = {n: getattr(pose, n) for n in ("covariance", "camera", "camera_source", "residual_rms_px")}
+    in_map = PoseInMap(map_id=unplaced.map_id, frame=unplaced.frame, cam_from_map=pose.cam_from_local, **same)
     return replace(result, pose=None, in_map=in_map, runner_up=None)
 
 

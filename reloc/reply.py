@@ -28,21 +28,13 @@ def reply_from_result(
     result: LocaliseResult, *, request_id: str, timings_ms: dict[str, float]
 ) -> LocaliseReply:
     """Word a result as the wire does; `timings_ms` replaces the result's own."""
-    runner_up, own = result.runner_up, result.own_position
+    rival, own = result.runner_up, result.own_position
     fields: dict[str, Any] = _NO_POSE if result.pose is None else _pose_fields(result.pose)
     if result.in_map is not None:
         fields = _NO_POSE | {"in_map": _in_map(result.in_map), "maps": (result.in_map.map_id,)}
     return LocaliseReply(
         **{name: getattr(result, name) for name in _SAME},
-        runner_up=None
-        if runner_up is None
-        else RunnerUpPose(
-            inliers=runner_up.inliers,
-            distance_m=runner_up.distance_m,
-            angle_deg=runner_up.angle_deg,
-            lat=runner_up.latitude_deg,
-            lon=runner_up.longitude_deg,
-        ),
+        runner_up=None if rival is None else RunnerUpPose.model_validate(rival, from_attributes=True),
         exif_prior=None if own is None else OwnPositionUse(**asdict(own)),
         timings_ms=timings_ms,
         request_id=request_id,
@@ -64,26 +56,16 @@ _NO_POSE: dict[str, Any] = {
 def place_fields(pose: OnEarth) -> dict[str, Any]:
     """Position, orientation and how surely, as members of a message."""
     x, y, z, w = pose.geopose.quaternion_xyzw
-    easting, northing, height = _floats(pose.utm)
+    place = dict(zip(("easting", "northing", "height"), _floats(pose.utm), strict=True))
     return {
         "position": Position(
             lat=pose.geopose.latitude_deg, lon=pose.geopose.longitude_deg, h=pose.geopose.height_m
         ),
         "quaternion": Quaternion(x=x, y=y, z=z, w=w),
         "height_datum": pose.height_datum,
-        "utm": UtmPose(
-            epsg=pose.epsg,
-            easting=easting,
-            northing=northing,
-            height=height,
-            cam_from_utm_xyzw=_floats(pose.cam_from_utm_xyzw),
-        ),
+        "utm": UtmPose(epsg=pose.epsg, cam_from_utm_xyzw=_floats(pose.cam_from_utm_xyzw), **place),
         "covariance": tuple(_floats(row) for row in pose.covariance),
-        "accuracy": Accuracy(
-            horizontal_68_m=pose.horizontal_68_m,
-            vertical_68_m=pose.vertical_68_m,
-            orientation_68_deg=pose.orientation_68_deg,
-        ),
+        "accuracy": Accuracy.model_validate(pose, from_attributes=True),
     }
 
 

@@ -124,9 +124,9 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
     for view, own_px in zip(views, noise, strict=True):
         pixels, points, trust = view.pixels, view.points, (noise_px / own_px) ** 2
         problem = LensProblem(pixels=pixels, points=points, noise_px=noise_px, trust=trust, prior=prior)
-        own = calibrate(pixels, points, view.cam_from_local, view.camera, prior, noise_px)
         problems.append(problem)
-        alone.append(problem.cost_of_pixels(own.cam_from_local, own.camera))
+        own = calibrate(pixels, points, view.cam_from_local, view.camera, prior, noise_px)
+        alone.append(problem.cost_of_pixels(*own))
     while agree.sum() >= _LEAST_PHOTOS:
         rows = [int(r) for r in np.flatnonzero(agree)]
         start = views[max(rows, key=lambda r: len(views[r].pixels))].camera

@@ -65,7 +65,6 @@ class MavlinkSender:
     def _odometry(self, pose: RobotPose, origin: LocalFrame) -> Any:
         place, turn, covariance = _local(pose, origin)
         x, y, z, w = (float(q) for q in quaternion_from_matrix(turn))
-        unknown = [float("nan")] * 21
         return self._dialect.MAVLink_odometry_message(
             time_usec=round(pose.time_s * 1e6),
             frame_id=self._dialect.MAV_FRAME_LOCAL_NED,
@@ -74,7 +73,7 @@ class MavlinkSender:
             q=[w, x, y, z],
             **dict.fromkeys(("vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed"), float("nan")),
             pose_covariance=_upper(covariance),
-            velocity_covariance=unknown,
+            velocity_covariance=[float("nan")] * 21,
             reset_counter=0,
             estimator_type=self._dialect.MAV_ESTIMATOR_TYPE_VISION,
             quality=0,
@@ -94,23 +93,15 @@ class MavlinkSender:
         )
 
     def _gps(self, pose: RobotPose, origin: LocalFrame) -> Any:
-        flags = self._dialect
-        ignored = (
-            flags.GPS_INPUT_IGNORE_FLAG_HDOP
-            | flags.GPS_INPUT_IGNORE_FLAG_VDOP
-            | flags.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
-            | flags.GPS_INPUT_IGNORE_FLAG_VEL_VERT
-            | flags.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
-        )
         altitude = altitude_m(pose, self._geoid_m)
-        if altitude is None:
-            ignored |= flags.GPS_INPUT_IGNORE_FLAG_ALT | flags.GPS_INPUT_IGNORE_FLAG_VERTICAL_ACCURACY
+        ignored = ["HDOP", "VDOP", "VEL_HORIZ", "VEL_VERT", "SPEED_ACCURACY"]
+        ignored += ["ALT", "VERTICAL_ACCURACY"] if altitude is None else []
         gps_s = pose.time_s - _GPS_EPOCH_S + _LEAP_S
         yaw, _, _ = yaw_pitch_roll(NED_FROM_ENU @ pose.true_enu_from_body @ FLU_FROM_FRD)
-        return flags.MAVLink_gps_input_message(
+        return self._dialect.MAVLink_gps_input_message(
             time_usec=round(pose.time_s * 1e6),
             gps_id=0,
-            ignore_flags=ignored,
+            ignore_flags=sum(getattr(self._dialect, f"GPS_INPUT_IGNORE_FLAG_{name}") for name in ignored),
             time_week_ms=round(gps_s % _WEEK_S * 1000.0),
             time_week=int(gps_s // _WEEK_S),
             fix_type=3,

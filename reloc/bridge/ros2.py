@@ -73,16 +73,10 @@ class McapLog:
             ) from error
         self._writer: Any = Writer(self._file)
         self._writer.start(profile="ros2", library="featuredb")
-        self._channels = {
-            topic: self._writer.register_channel(
-                topic=topic,
-                message_encoding="cdr",
-                schema_id=self._writer.register_schema(
-                    name=name, encoding="ros2msg", data=definition.encode()
-                ),
-            )
-            for topic, (name, definition) in TOPICS.items()
-        }
+        self._channels: dict[str, int] = {}
+        for topic, (name, definition) in TOPICS.items():
+            schema = self._writer.register_schema(name, "ros2msg", definition.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
         return self
 
     def __exit__(self, *failed: object) -> None:

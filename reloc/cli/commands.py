@@ -129,10 +129,9 @@ def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _query(args: argparse.Namespace) -> int:
-    from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.client import Client
 
-    prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
+    camera, told = _told(args)
     if args.contribute and not (args.credit and args.licence):
         raise InvalidValueError(
             "--contribute: expected --credit and --licence, too: whom to name with them, and the terms"
@@ -143,15 +142,13 @@ def _query(args: argparse.Namespace) -> int:
         def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "tuple[LocaliseReply, None]":
             reply = client.localise(
                 data,
-                prior,
-                lens or camera,
+                camera=lens or camera,
                 timeout_s=args.timeout,
                 inliers=first or args.overlay is not None,
-                exif_prior=not args.no_exif_prior,
-                maps=tuple(args.map) if args.map else None,
                 contribute=args.contribute and not first,
                 credit=args.credit,
                 licence=args.licence,
+                **told,
             )
             return reply, None
 
@@ -173,25 +170,26 @@ def asking_here(
         InvalidValueError: the prior or the camera is none.
     """
     from reloc.asking import PhotoAsker
-    from reloc.cli.query_arguments import parse_camera, parse_prior
 
-    prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
+    camera, told = _told(args)
     asker = PhotoAsker(database())
 
     def ask(
         data: bytes, lens: "CameraRequest | None", first: bool
     ) -> "tuple[LocaliseReply, FloatArray | None]":
-        answer = asker.ask(
-            data,
-            prior=prior,
-            camera=lens or camera,
-            exif_prior=not args.no_exif_prior,
-            maps=tuple(args.map) if args.map else None,
-            inliers=first or inliers,
-        )
+        answer = asker.ask(data, camera=lens or camera, inliers=first or inliers, **told)
         return answer.reply, answer.other_points_utm
 
     return asker, ask
+
+
+def _told(args: argparse.Namespace) -> "tuple[CameraRequest | None, dict[str, Any]]":
+    """What `add_request_arguments` was told: the camera, and what else `ask` and `localise` take alike."""
+    from reloc.cli.query_arguments import parse_camera, parse_prior
+
+    maps, exif_prior = tuple(args.map) if args.map else None, not args.no_exif_prior
+    told = {"prior": parse_prior(args.prior), "exif_prior": exif_prior, "maps": maps}
+    return parse_camera(args.camera, args.camera_sigmas), told
 
 
 def require_an_image(paths: list[str]) -> None:
@@ -220,15 +218,15 @@ def _answer_all(args: argparse.Namespace, ask: "Ask", database: str) -> int:
             sys.stdout.flush()
             if reply.status == "not_localised":
                 codes.add(_NOT_LOCALISED)
-                if args.overlay is not None:
-                    sys.stderr.write(f"featuredb: {path}: no overlay, as it was not localised\n")
-            elif reply.in_map is not None:
-                if args.overlay is not None:
-                    sys.stderr.write(f"featuredb: {path}: no overlay of a map without a place\n")
+            if args.overlay is not None and reply.status != "localised":
+                why = " of a map without a place" if reply.in_map else ", as it was not localised"
+                sys.stderr.write(f"featuredb: {path}: no overlay{why}\n")
             elif args.overlay is not None:
                 from reloc.overlay import write_overlay
 
-                target = _overlay_path(args.overlay, path, len(args.image) > 1)
+                target = args.overlay
+                if len(args.image) > 1:
+                    target = target.with_name(f"{target.stem}-{path.stem}{target.suffix or '.png'}")
                 write_overlay(target, data, reply, other_points)
                 sys.stderr.write(f"wrote {target}\n")
         except (OSError, FeatureDbError) as error:
@@ -274,8 +272,3 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
             said = as_arguments(lens.as_request())
             sys.stderr.write(f"{key}: lens of {lens.agree.sum()} of {len(lens.agree)} photos: {said}\n")
     return {p: lens for p, lens in zip(paths, asked_with, strict=True) if lens is not None}
-
-
-def _overlay_path(overlay: Path, image: Path, several: bool) -> Path:
-    name = f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}"
-    return overlay.with_name(name) if several else overlay

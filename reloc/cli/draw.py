@@ -115,17 +115,10 @@ def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
         return _NO_POSE
     with open_video(args.image) as video:
         camera = lens.scaled_to(video.info.width, video.info.height)
-        views = {
-            index: AnsweredView.at(
-                pose.utm,
-                pose.epsg,
-                pose.cam_from_utm_xyzw,
-                camera=camera,
-                covariance=pose.covariance,
-                height_datum=pose.height_datum,
-            )
-            for index, pose in poses.items()
-        }
+        views = {}
+        for index, pose in poses.items():
+            known = {"camera": camera, "covariance": pose.covariance, "height_datum": pose.height_datum}
+            views[index] = AnsweredView.at(pose.utm, pose.epsg, pose.cam_from_utm_xyzw, **known)
         first = next(iter(views.values()))
         # The scan along the track, in the frame of its first view.
         places = np.array([view.seen_in(first.frame).cam_from_local.center[:2] for view in views.values()])

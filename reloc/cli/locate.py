@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from featuredb.cli.common import open_database
+from featuredb.cli.common import numbers, open_database
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ def register(subparsers: Any) -> None:
     locate.add_argument(
         "--pixel",
         action="append",
+        type=lambda text: numbers(text, "U,V such as 812.5,640", 2),
         default=[],
         metavar="U,V",
         help="pixel of the stored picture, the centre of the top-left one being 0.5,0.5; may be repeated",
@@ -93,7 +94,7 @@ def _locate(args: argparse.Namespace) -> int:
         require_an_image([args.image])
     if args.geojson is not None:
         check_output("--geojson", args.geojson, args.image)
-    marks = [MarkedPixel(pixel=_pixel(text)) for text in args.pixel]
+    marks = [MarkedPixel(pixel=pixel) for pixel in args.pixel]
     if args.boxes is not None:
         marks += _boxes(args)
     if not marks:
@@ -152,14 +153,6 @@ def check_output(option: str, path: Path, image: str) -> None:
         raise InvalidValueError(f"{option}: expected a file in a folder that is there, found {path}")
     if path.exists() and Path(image).exists() and path.samefile(image):
         raise InvalidValueError(f"{option}: expected another file than the image, found {path}")
-
-
-def _pixel(text: str) -> tuple[float, float]:
-    try:
-        u, v = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise InvalidValueError(f"--pixel: expected U,V such as 812.5,640, found {text!r}") from error
-    return u, v
 
 
 def answered_view(

@@ -37,20 +37,17 @@ def parse_camera(text: str | None, sigmas: str | None = None) -> CameraRequest |
         ) from error
     if sigmas is None:
         return camera
-    return camera.model_copy(update={"sigmas": _sigmas(sigmas, len(camera.params))})
-
-
-def _sigmas(text: str, count: int) -> tuple[float, ...]:
     try:
-        sigmas = tuple(float(s) for s in text.split(","))
+        parsed = tuple(float(s) for s in sigmas.split(","))
     except ValueError:
-        sigmas = ()
-    if len(sigmas) != count or not all(0 <= s < float("inf") for s in sigmas):
+        parsed = ()
+    count = len(camera.params)
+    if len(parsed) != count or not all(0 <= s < float("inf") for s in parsed):
         raise InvalidValueError(
             f"--camera-sigmas: expected {count} numbers, 0 or more, one for each of --camera's parameters, "
-            f"found {text!r}"
+            f"found {sigmas!r}"
         )
-    return sigmas
+    return camera.model_copy(update={"sigmas": parsed})
 
 
 def as_arguments(camera: CameraRequest) -> str:

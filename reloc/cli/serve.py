@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from featuredb.cli.common import add_command, open_database
+from featuredb.cli.common import add_command, numbers, open_database
 from reloc.wire.keys import DEFAULT_ENDPOINT
 
 logger = logging.getLogger(__name__)
@@ -83,13 +83,10 @@ def register(subparsers: Any) -> None:
 
 
 def _bbox(text: str) -> tuple[float, float, float, float]:
-    expected = f"expected west,south,east,north in degrees, found {text!r}"
-    try:
-        west, south, east, north = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(expected) from None
+    what = "west,south,east,north in degrees"
+    west, south, east, north = numbers(text, what, 4)
     if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
-        raise argparse.ArgumentTypeError(expected)
+        raise argparse.ArgumentTypeError(f"expected {what}, found {text!r}")
     return west, south, east, north
 
 

@@ -94,7 +94,16 @@ class Client:
         Raises:
             ServiceError: NO_SERVER, nobody at the endpoint, or no (or not exactly one) database.
         """
-        session = self._connected_session()
+        try:
+            if self._config_path is not None:
+                config = zenoh.Config.from_file(str(self._config_path))
+                self.name = name_in(config)
+            else:
+                config = client_config(self._connect, self._connect_timeout_s)
+            session = zenoh.open(config)
+        except zenoh.ZError as error:
+            asked = "is `featuredb serve` running, and is this its --listen endpoint?"
+            raise ServiceError(NO_SERVER, f"nobody answers at {self._where}; {asked}") from error
         try:
             self._database = wait_for_database(session, self._database, self._where, self._connect_timeout_s)
         except ServiceError:
@@ -263,16 +272,14 @@ class Client:
             source_info=zenoh.SourceInfo(self._session().id, 0),
         )
         found = []
-        for reply in replies:
+        for payload in (reply.ok.payload for reply in replies if reply.ok is not None):
             with suppress(ServiceError):  # what is no such message is nobody's
-                if reply.ok is not None:
-                    found.append(read_message(reply.ok.payload.to_bytes(), model))
+                found.append(read_message(payload.to_bytes(), model))
         return found
 
     def track(
         self,
-        camera: CameraRequest
-        | None = None,  # of the frames, of any size of the same picture; None: estimated
+        camera: CameraRequest | None = None,  # of the frames, in any size; None: estimated
         prior: PriorRequest | None = None,  # where the first frame may have been taken
         *,
         timeout_s: float = _TIMEOUT_S,  # the longest wait for the session to open
@@ -308,37 +315,14 @@ class Client:
     def _keys(self) -> Keys:
         return Keys(database=str(self._database))
 
-    def _connected_session(self) -> zenoh.Session:
-        try:
-            if self._config_path is not None:
-                config = zenoh.Config.from_file(str(self._config_path))
-                self.name = name_in(config)
-            else:
-                config = client_config(self._connect, self._connect_timeout_s)
-            return zenoh.open(config)
-        except zenoh.ZError as error:
-            raise ServiceError(
-                NO_SERVER,
-                f"nobody answers at {self._where}; is `featuredb serve` running, and is this its --listen "
-                "endpoint?",
-            ) from error
-
-    def _ask(
-        self,
-        key: str,
-        model: type[_Message],
-        timeout_s: float,
-        payload: bytes | None = None,
-        attachment: bytes | None = None,
-    ) -> _Message:
+    def _ask(self, key: str, model: type[_Message], timeout_s: float, **sent: bytes) -> _Message:
         start = time.perf_counter()
         found = first_reply(
             self._session(),
             key,
             model,
             timeout_s,
-            payload=payload,
-            attachment=attachment,
+            **sent,
             # A photo is many fragments; dropping one of them under load would lose the query silently.
             congestion_control=zenoh.CongestionControl.BLOCK,
             express=True,

@@ -82,11 +82,7 @@ def first_reply(
 
 
 def read_message(payload: bytes, model: type[_Message]) -> _Message:
-    """A message of the server.
-
-    Raises:
-        ServiceError: BAD_REPLY, it is none.
-    """
+    """A message of the server. Raises ServiceError: BAD_REPLY, it is none."""
     try:
         return model.model_validate_json(payload)
     except ValidationError as error:

@@ -15,10 +15,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.video.film import VideoOptions
 from featuredb.video.frames import open_video
 from featuredb.video.opening import Source
+from reloc.answered_view import geopose_of
 from reloc.client.client import Client
 from reloc.client.live import LiveTrack
 from reloc.tracking.film_end import until_it_ends
-from reloc.tracking.pose_message import point_of_message
+from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from reloc.wire.query import CameraRequest, PriorRequest
 from reloc.wire.track import TrackPose
@@ -83,6 +84,23 @@ class _Answers:
     def _tell(self, *_: object) -> None:
         with self._changed:
             self._changed.notify_all()
+
+
+def point_of_message(message: TrackPose) -> TrajectoryPoint:
+    """A message's frame as a point of a trajectory."""
+    utm, pose = message.utm, None
+    if utm is not None:
+        pose = EarthPose(
+            epsg=utm.epsg,
+            utm=np.array([utm.easting, utm.northing, utm.height]),
+            height_datum=message.height_datum or "unknown",
+            cam_from_utm_xyzw=np.array(utm.cam_from_utm_xyzw),
+            geopose=geopose_of(message),
+            covariance=np.array(message.covariance),
+            map_id=message.map_id or "",
+        )
+    same = {name: getattr(message, name) for name in ("time_s", "state", "inliers", "detail")}
+    return TrajectoryPoint(index=message.sequence, pose=pose, **same)
 
 
 @contextmanager

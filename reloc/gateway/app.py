@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from importlib import resources
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -223,7 +223,7 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
 
     @app.get(f"{prefix}/geopose", **openapi.RUNNING)
     async def running() -> Response:
-        return _json({"status": "running"})  # as the protocol's reference servers answer
+        return JSONResponse({"status": "running"})  # as the protocol's reference servers answer
 
     @app.post(f"{prefix}/localise", **openapi.LOCALISE)
     async def localise(request: Request) -> Response:
@@ -250,7 +250,7 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
 
     @app.get(f"{prefix}/metrics", **openapi.METRICS)
     async def metrics() -> Response:
-        status: StatusReply | None = None
+        status = None
         try:
             status = await gateway.status()
         except ServiceError as error:
@@ -295,10 +295,8 @@ def _add_failures(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def defect(request: Request, error: Exception) -> Response:
         # Starlette raises it again after this answer, so that uvicorn's log has the trace.
-        body = ErrorBody(
-            code=ErrorCode.INTERNAL, message="the gateway failed on this request; its log says why"
-        )
-        return Response(body.model_dump_json(), 500, media_type="application/json")
+        text = "the gateway failed on this request; its log says why"
+        return _json(ErrorBody(code=ErrorCode.INTERNAL, message=text), 500)
 
 
 def _failed(body: ErrorBody, headers: dict[str, str] | None = None) -> Response:
@@ -309,12 +307,8 @@ def _failed(body: ErrorBody, headers: dict[str, str] | None = None) -> Response:
     return _json(body, STATUS_OF.get(body.code, 502), headers)
 
 
-def _json(
-    content: BaseModel | dict[str, Any], status: int = 200, headers: dict[str, str] | None = None
-) -> Response:
-    if isinstance(content, BaseModel):
-        return Response(content.model_dump_json(), status, headers, "application/json")
-    return JSONResponse(content, status, headers)
+def _json(content: BaseModel, status: int = 200, headers: dict[str, str] | None = None) -> Response:
+    return Response(content.model_dump_json(), status, headers, "application/json")
 
 
 class _Observed:

@@ -2,7 +2,6 @@
 
 from pydantic import BaseModel, Field
 
-from featuredb.errors import ServiceError
 from reloc.client import BAD_REPLY, NO_SERVER, TIMEOUT
 from reloc.wire.query import ErrorCode
 
@@ -15,38 +14,23 @@ SLOW_BODY = "SLOW_BODY"
 UNSUPPORTED_MEDIA_TYPE = "UNSUPPORTED_MEDIA_TYPE"
 
 # 500 is left for defects of the gateway itself: what is wrong behind it is a bad gateway's 502.
-STATUS_OF = {
-    ErrorCode.BAD_REQUEST.value: 400,
-    NOT_FOUND: 404,
-    METHOD_NOT_ALLOWED: 405,
-    NOT_ACCEPTABLE: 406,
-    SLOW_BODY: 408,
-    ErrorCode.TOO_LARGE.value: 413,
-    UNSUPPORTED_MEDIA_TYPE: 415,
+_CODES_OF = {
+    400: (ErrorCode.BAD_REQUEST,),
+    404: (NOT_FOUND,),
+    405: (METHOD_NOT_ALLOWED,),
+    406: (NOT_ACCEPTABLE,),
+    408: (SLOW_BODY,),
+    413: (ErrorCode.TOO_LARGE,),
     # RFC 9110: also "as a result of inspecting the data directly".
-    ErrorCode.BAD_IMAGE.value: 415,
-    NOT_LOCALISED: 422,
-    ErrorCode.INTERNAL.value: 502,
-    ErrorCode.INCOMPATIBLE_EXTRACTOR.value: 502,
-    BAD_REPLY: 502,
-    ErrorCode.UNSUPPORTED.value: 501,
-    ErrorCode.BUSY.value: 503,
-    ErrorCode.SHUTTING_DOWN.value: 503,
-    NO_SERVER: 503,
-    NOT_READY: 503,
-    ErrorCode.DEADLINE.value: 504,
-    TIMEOUT: 504,
+    415: (UNSUPPORTED_MEDIA_TYPE, ErrorCode.BAD_IMAGE),
+    422: (NOT_LOCALISED,),
+    501: (ErrorCode.UNSUPPORTED,),
+    502: (ErrorCode.INTERNAL, ErrorCode.INCOMPATIBLE_EXTRACTOR, BAD_REPLY),
+    503: (ErrorCode.BUSY, ErrorCode.SHUTTING_DOWN, NO_SERVER, NOT_READY),
+    504: (ErrorCode.DEADLINE, TIMEOUT),
 }
+STATUS_OF = {str(code): status for status, codes in _CODES_OF.items() for code in codes}
 RETRY_AFTER_S = {ErrorCode.BUSY.value: 1, ErrorCode.SHUTTING_DOWN.value: 5, NO_SERVER: 5, NOT_READY: 1}
-
-
-class GatewayError(ServiceError):
-    """Ends a request with the status of its code."""
-
-
-def bad_request(message: str) -> GatewayError:
-    """The request is not what it should be, as the message says."""
-    return GatewayError(ErrorCode.BAD_REQUEST, message)
 
 
 class ErrorBody(BaseModel):

@@ -15,8 +15,9 @@ import numpy as np
 from PIL import Image
 from pydantic import ValidationError
 
+from featuredb.errors import ServiceError
 from featuredb.geo.datum import HEIGHT_DATUMS, ellipsoidal_height
-from reloc.gateway.failures import NOT_ACCEPTABLE, NOT_LOCALISED, GatewayError, bad_request
+from reloc.gateway.failures import NOT_ACCEPTABLE, NOT_LOCALISED
 from reloc.gateway.options import GatewayOptions
 from reloc.gateway.protocol import (
     MEDIA_TYPE,
@@ -26,7 +27,16 @@ from reloc.gateway.protocol import (
     GeoPoseReq,
     GeoPoseResp,
 )
-from reloc.wire.query import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, PriorRequest
+from reloc.wire.query import (
+    CameraRequest,
+    ErrorCode,
+    LocaliseReply,
+    LocaliseWireRequest,
+    PriorRequest,
+    bad_request,
+    explain,
+    request_id_of,
+)
 
 # The W3C's accuracy holds 95 % of the errors; so many sigmas of one axis does a circle that holds them have.
 _SIGMAS_OF_95 = math.sqrt(-2.0 * math.log(0.05))
@@ -38,7 +48,7 @@ _FILE_BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n", b"RIFF", b"II*\x00", b"MM\x
 _VERSION = re.compile(r";\s*version\s*=\s*\"?(\d{1,4})")
 
 
-class NotLocalisedError(GatewayError):
+class NotLocalisedError(ServiceError):
     """The photo's place is not known: `reply` says why."""
 
     def __init__(self, reply: LocaliseReply, geopose_id: str) -> None:
@@ -51,40 +61,33 @@ class NotLocalisedError(GatewayError):
 
 
 def parse(body: bytes) -> GeoPoseReq:
-    """Read a request.
-
-    Raises:
-        GatewayError: BAD_REQUEST with the fields.
-    """
+    """Read a request. Raises ServiceError: BAD_REQUEST with the fields."""
     try:
         return GeoPoseReq.model_validate_json(body)
     except ValidationError as error:
-        raise bad_request(_explained(error, "body")) from error
+        # Without the values found: a missing id would print the whole request with its picture.
+        raise bad_request(explain(error, "body", inputs=False)) from error
 
 
 def check_version(accept: str) -> bool:
     """Whether the client asks for the protocol's media type; the header is that of HTTP, "" without one.
 
     Raises:
-        GatewayError: NOT_ACCEPTABLE, for another version than 2.
+        ServiceError: NOT_ACCEPTABLE, for another version than 2.
     """
     found = [part for part in accept.lower().split(",") if part.strip().startswith(MEDIA_TYPE)]
-    for part in found:
-        version = _VERSION.search(part)
-        if version is None or int(version[1]) == 2:
-            return True
-    if found:
-        raise GatewayError(
-            NOT_ACCEPTABLE, f"Accept: expected {MEDIA_TYPE}; version=2.0, found {accept[:100]!r}"
-        )
-    return False
+    versions = [_VERSION.search(part) for part in found]
+    if found and not any(version is None or int(version[1]) == 2 for version in versions):
+        text = f"Accept: expected {MEDIA_TYPE}; version=2.0, found {accept[:100]!r}"
+        raise ServiceError(NOT_ACCEPTABLE, text)
+    return bool(found)
 
 
 def question_of(request: GeoPoseReq, options: GatewayOptions) -> tuple[bytes, LocaliseWireRequest]:
     """What to ask the server: an image file, and what is said of it.
 
     Raises:
-        GatewayError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE.
+        ServiceError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE.
     """
     readings = request.sensorReadings.cameraReadings
     pictures = [reading for reading in readings if reading.imageFormat.upper() != "DEPTH"]
@@ -102,7 +105,7 @@ def question_of(request: GeoPoseReq, options: GatewayOptions) -> tuple[bytes, Lo
     asked = LocaliseWireRequest(
         prior=_prior(request, picture, options),
         camera=_camera(picture, size),
-        request_id=_wire_id(request.id),
+        request_id=request_id_of(request.id),
     )
     return image, asked
 
@@ -135,17 +138,14 @@ def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp,
 
 def _decoded(text: str, max_bytes: int) -> bytes:
     if len(text) // 4 * 3 > max_bytes + 2:
-        raise GatewayError(
-            ErrorCode.TOO_LARGE,
-            f"imageBytes: expected at most {max_bytes} bytes, found {len(text) // 4 * 3}; send a "
-            "smaller picture",
-        )
+        found = f"found {len(text) // 4 * 3}; send a smaller picture"
+        raise ServiceError(ErrorCode.TOO_LARGE, f"imageBytes: expected at most {max_bytes} bytes, {found}")
     try:
         data = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as error:
         raise bad_request(f"imageBytes: expected base64 without prefix or line breaks ({error})") from error
     if not data:
-        raise GatewayError(ErrorCode.BAD_IMAGE, "imageBytes: expected an image file, found none")
+        raise ServiceError(ErrorCode.BAD_IMAGE, "imageBytes: expected an image file, found none")
     return data
 
 
@@ -165,7 +165,7 @@ def _image_file(data: bytes, picture: CameraReading, size: tuple[int, int] | Non
     if channels is None or data.startswith(_FILE_BEGINNINGS) or data[4:8] == b"ftyp":
         return data
     if size is None or len(data) != size[0] * size[1] * channels:
-        raise GatewayError(
+        raise ServiceError(
             ErrorCode.BAD_IMAGE,
             f"imageBytes: expected an image file, or width x height x {channels} bytes of "
             f"{picture.imageFormat} of size {size}, found {len(data)} bytes",
@@ -188,13 +188,7 @@ def _camera(picture: CameraReading, size: tuple[int, int] | None) -> CameraReque
     try:
         return CameraRequest(model=model, width=size[0], height=size[1], params=params.modelParams)
     except ValidationError as error:
-        raise bad_request(f"params.{_explained(error, '')}") from error
-
-
-def _explained(error: ValidationError, whole: str) -> str:
-    """Without the values found: a missing id would print the whole request with its picture."""
-    items = error.errors(include_url=False, include_input=False, include_context=False)[:3]
-    return "; ".join(f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}" for item in items)
+        raise bad_request(f"params.{explain(error, '', inputs=False)}") from error
 
 
 def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions) -> PriorRequest | None:
@@ -222,11 +216,3 @@ def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions)
 
 def _prior_request(lat: float, lon: float, sigma_m: float, options: GatewayOptions) -> PriorRequest:
     return PriorRequest(lat=lat, lon=lon, sigma_m=min(max(sigma_m, options.prior_floor_m), 1e6))
-
-
-def _wire_id(text: str) -> str | None:
-    """The id as the wire's request id, if it can be one."""
-    try:
-        return LocaliseWireRequest(request_id=text).request_id
-    except ValidationError:
-        return None

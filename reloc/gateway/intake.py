@@ -11,7 +11,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message, Receive
 
-from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE, GatewayError, bad_request
+from featuredb.errors import ServiceError
+from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE
 from reloc.gateway.options import GatewayOptions
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
@@ -21,7 +22,9 @@ from reloc.wire.query import (
     PriorRequest,
     RequestError,
     RequestOptions,
+    bad_request,
     parse_attachment,
+    request_id_of,
 )
 
 
@@ -35,88 +38,74 @@ class Intake:
 
     @asynccontextmanager
     async def admitted(self, request: Request, media_type: str) -> AsyncIterator[Request]:
-        """Within the block, the request with a body that ends in a GatewayError where it breaks a limit.
+        """Within the block, the request with a body that ends in a ServiceError where it breaks a limit.
 
         It is in hand from the end of its body on: who sends slowly takes nobody's place.
 
         Raises:
-            GatewayError: TOO_LARGE, UNSUPPORTED_MEDIA_TYPE; while the body is read also BUSY, SLOW_BODY.
+            ServiceError: TOO_LARGE, UNSUPPORTED_MEDIA_TYPE; while the body is read also BUSY, SLOW_BODY.
         """
         _check_headers(request, media_type)
-        body = _MeteredBody(self, request.receive, self._options)
+        options, held_bytes, complete = self._options, 0, False
+        end = time.monotonic() + options.body_timeout_s
+        too_large = f"body: expected at most {options.max_body_bytes} bytes; send a smaller picture"
+
+        async def receive() -> Message:
+            nonlocal held_bytes, complete
+            message = await _next(request.receive, end, options)
+            size = len(message.get("body", b""))
+            if held_bytes + size > options.max_body_bytes:
+                raise ServiceError(ErrorCode.TOO_LARGE, too_large)
+            if self.buffered_bytes + size > options.max_buffered_bytes:
+                raise ServiceError(
+                    ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second"
+                )
+            held_bytes += size
+            self.buffered_bytes += size
+            if not (complete or message.get("more_body", False)):
+                if self.in_flight >= options.max_in_flight:
+                    many = f"{self.in_flight} photos are in hand, which is as many as are taken"
+                    raise ServiceError(ErrorCode.BUSY, f"{many}; try again in a second")
+                complete = True
+                self.in_flight += 1
+            return message
+
         try:
             declared = request.headers.get("content-length", "")
-            if declared.isdecimal() and int(declared) > self._options.max_body_bytes:
-                raise body.too_large()
-            yield Request(request.scope, body.receive)
+            if declared.isdecimal() and int(declared) > options.max_body_bytes:
+                raise ServiceError(ErrorCode.TOO_LARGE, too_large)
+            yield Request(request.scope, receive)
         finally:
-            self.in_flight -= body.complete
-            self.buffered_bytes -= body.held_bytes
+            self.in_flight -= complete
+            self.buffered_bytes -= held_bytes
 
 
 def _check_headers(request: Request, media_type: str) -> None:
     found = request.headers.get("content-type", "").split(";")[0].strip().lower()
     wanted = (media_type, "application/vnd.oscp+json") if media_type == "application/json" else (media_type,)
     if found not in wanted:
-        raise GatewayError(
+        raise ServiceError(
             UNSUPPORTED_MEDIA_TYPE, f"Content-Type: expected {media_type}, found {found[:100]!r}"
         )
     coding = request.headers.get("content-encoding", "identity").strip().lower()
     if coding != "identity":
-        raise GatewayError(
+        raise ServiceError(
             UNSUPPORTED_MEDIA_TYPE,
             f"Content-Encoding: expected none, found {coding[:100]!r}; images are compressed",
         )
 
 
-class _MeteredBody:
-    """One request's body."""
-
-    def __init__(self, intake: Intake, receive: Receive, options: GatewayOptions) -> None:
-        self._intake = intake
-        self._receive = receive
-        self._options = options
-        self._end = time.monotonic() + options.body_timeout_s
-        self.held_bytes = 0
-        self.complete = False
-
-    async def receive(self) -> Message:
-        message = await self._next()
-        size = len(message.get("body", b""))
-        if self.held_bytes + size > self._options.max_body_bytes:
-            raise self.too_large()
-        if self._intake.buffered_bytes + size > self._options.max_buffered_bytes:
-            raise GatewayError(ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second")
-        self.held_bytes += size
-        self._intake.buffered_bytes += size
-        if not (self.complete or message.get("more_body", False)):
-            if self._intake.in_flight >= self._options.max_in_flight:
-                raise GatewayError(
-                    ErrorCode.BUSY,
-                    f"{self._intake.in_flight} photos are in hand, which is as many as are taken; try again "
-                    "in a second",
-                )
-            self.complete = True
-            self._intake.in_flight += 1
-        return message
-
-    def too_large(self) -> GatewayError:
-        return GatewayError(
-            ErrorCode.TOO_LARGE,
-            f"body: expected at most {self._options.max_body_bytes} bytes; send a smaller picture",
-        )
-
-    async def _next(self) -> Message:
-        try:
-            async with asyncio.timeout(max(0.0, self._end - time.monotonic())):
-                message = await self._receive()
-        except TimeoutError as error:
-            raise GatewayError(
-                SLOW_BODY, f"body: expected within {self._options.body_timeout_s:g} s, found a part of it"
-            ) from error
-        if message["type"] == "http.disconnect":
-            raise ClientDisconnect
-        return message
+async def _next(receive: Receive, end: float, options: GatewayOptions) -> Message:
+    """What comes of a body, until `end` of the monotonic clock."""
+    try:
+        async with asyncio.timeout(max(0.0, end - time.monotonic())):
+            message = await receive()
+    except TimeoutError as error:
+        text = f"body: expected within {options.body_timeout_s:g} s, found a part of it"
+        raise ServiceError(SLOW_BODY, text) from error
+    if message["type"] == "http.disconnect":
+        raise ClientDisconnect
+    return message
 
 
 _Field = TypeVar("_Field", CameraRequest, PriorRequest, RequestOptions)
@@ -130,7 +119,7 @@ async def read_form(request: Request, options: GatewayOptions) -> tuple[bytes, L
     The file goes through a temporary file where it is larger than a megabyte.
 
     Raises:
-        GatewayError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE, and those of the body.
+        ServiceError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE, and those of the body.
     """
     parts: dict[str, bytes] = {}
     try:
@@ -149,16 +138,18 @@ async def read_form(request: Request, options: GatewayOptions) -> tuple[bytes, L
     if image is None:
         raise bad_request("image: expected the bytes of an image file, found no such field")
     if len(image) > options.max_image_bytes:
-        raise GatewayError(
-            ErrorCode.TOO_LARGE,
-            f"image: expected at most {options.max_image_bytes} bytes, found {len(image)}",
-        )
+        text = f"image: expected at most {options.max_image_bytes} bytes, found {len(image)}"
+        raise ServiceError(ErrorCode.TOO_LARGE, text)
     said = LocaliseWireRequest(
         camera=_json("camera", CameraRequest, parts),
         prior=_json("prior", PriorRequest, parts),
         options=_json("options", RequestOptions, parts) or RequestOptions(),
-        request_id=_request_id(parts),
+        request_id=request_id_of(parts["request_id"].decode(errors="replace"))
+        if "request_id" in parts
+        else None,
     )
+    if "request_id" in parts and said.request_id is None:
+        raise bad_request("request_id: expected 1 to 128 of A-Z a-z 0-9 . _ : -")
     return image, said
 
 
@@ -169,13 +160,3 @@ def _json(name: str, model: type[_Field], parts: dict[str, bytes]) -> _Field | N
         return parse_attachment(model, parts[name])
     except RequestError as error:
         raise bad_request(f"{name}: {error.message}") from error
-
-
-def _request_id(parts: dict[str, bytes]) -> str | None:
-    if "request_id" not in parts:
-        return None
-    try:
-        text = parts["request_id"].decode()
-        return LocaliseWireRequest(request_id=text).request_id
-    except ValueError as error:
-        raise bad_request("request_id: expected 1 to 128 of A-Z a-z 0-9 . _ : -") from error

@@ -47,6 +47,14 @@ def _responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: {"model": ErrorBody, "description": _TOLD[status]} for status in statuses}
 
 
+def _body(media_type: str, **content: dict[str, Any]) -> dict[str, Any]:
+    return {"requestBody": {"required": True, "content": {media_type: content}}}
+
+
+def _schema(model: str) -> dict[str, Any]:
+    return {"$ref": _REF.format(model=model)}
+
+
 GEOPOSE: dict[str, Any] = {
     "summary": "OSCP GeoPoseProtocol v2: the pose of the first camera reading",
     "responses": {
@@ -54,21 +62,18 @@ GEOPOSE: dict[str, Any] = {
             "model": GeoPoseResp,
             "description": "The pose. Header Featuredb-Height-Datum names the datum of h where it is not the "
             "ellipsoid's.",
-            "content": {MEDIA_TYPE: {"schema": {"$ref": _REF.format(model="GeoPoseResp")}}},
+            "content": {MEDIA_TYPE: {"schema": _schema("GeoPoseResp")}},
         },
         **_responses(400, 406, 408, 413, 415, 422, 501, 502, 503, 504),
     },
-    "openapi_extra": {
-        "requestBody": {
-            "required": True,
-            "content": {"application/json": {"schema": {"$ref": _REF.format(model="GeoPoseReq")}}},
-        }
-    },
+    "openapi_extra": _body("application/json", schema=_schema("GeoPoseReq")),
 }
 RUNNING: dict[str, Any] = {
     "summary": "The gateway runs, as the protocol's reference servers say it",
     "responses": {200: {"content": {"application/json": {"example": {"status": "running"}}}}},
 }
+_IMAGE = {"type": "string", "format": "binary", "description": "JPEG, HEIC, AVIF, PNG, WebP, TIFF, BMP"}
+_SAID = {"camera": "CameraRequest", "prior": "PriorRequest", "options": "RequestOptions"}
 LOCALISE: dict[str, Any] = {
     "summary": "One photo as a form; the answer is the wire's localise_reply.json",
     "responses": {
@@ -78,36 +83,22 @@ LOCALISE: dict[str, Any] = {
         },
         **_responses(400, 408, 413, 415, 501, 502, 503, 504),
     },
-    "openapi_extra": {
-        "requestBody": {
-            "required": True,
-            "content": {
-                "multipart/form-data": {
-                    "schema": {
-                        "type": "object",
-                        "required": ["image"],
-                        "properties": {
-                            "image": {
-                                "type": "string",
-                                "format": "binary",
-                                "description": "JPEG, HEIC, AVIF, PNG, WebP, TIFF, BMP",
-                            },
-                            "camera": {"$ref": _REF.format(model="CameraRequest")},
-                            "prior": {"$ref": _REF.format(model="PriorRequest")},
-                            "options": {"$ref": _REF.format(model="RequestOptions")},
-                            "request_id": {"type": "string", "pattern": "^[A-Za-z0-9._:-]{1,128}$"},
-                        },
-                    },
-                    "encoding": {
-                        "image": {"contentType": "image/jpeg"},
-                        "camera": {"contentType": "application/json"},
-                        "prior": {"contentType": "application/json"},
-                        "options": {"contentType": "application/json"},
-                    },
-                }
+    "openapi_extra": _body(
+        "multipart/form-data",
+        schema={
+            "type": "object",
+            "required": ["image"],
+            "properties": {
+                "image": _IMAGE,
+                **{name: _schema(model) for name, model in _SAID.items()},
+                "request_id": {"type": "string", "pattern": "^[A-Za-z0-9._:-]{1,128}$"},
             },
-        }
-    },
+        },
+        encoding={
+            "image": {"contentType": "image/jpeg"},
+            **{name: {"contentType": "application/json"} for name in _SAID},
+        },
+    ),
 }
 MAPS: dict[str, Any] = {
     "summary": "The maps that the server answers from",

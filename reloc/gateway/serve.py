@@ -74,11 +74,7 @@ def uvicorn_server(options: GatewayOptions) -> uvicorn.Server:
 
 
 def serve(options: GatewayOptions, on_ready: Callable[[str], None] = lambda url: None) -> None:
-    """Serve until SIGINT or SIGTERM; call from the main thread.
-
-    Raises:
-        ListenError: cannot listen.
-    """
+    """Serve until SIGINT or SIGTERM; call from the main thread. Raises ListenError: cannot listen."""
     listening.run(
         uvicorn_server(options), partial(listen, options), lambda url: on_ready(url + options.prefix)
     )

@@ -8,7 +8,8 @@ from scipy.special import gammaln
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import GeoPrior
-from reloc.localise.result import Evidence, Reason
+from reloc.localise.result import Evidence
+from reloc.wire.query import Reason
 
 # Fitted on right and wrong poses of a simulated town and of real photos.
 _CONFIDENCE_BASE, _CONFIDENCE_PER_LOG, _CONFIDENCE_PER_RIVAL = -4.46, 1.36, -2.08

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import skew
@@ -13,11 +12,10 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
-from reloc.localise.jacobians import pixel_jacobians
-from reloc.localise.lens_prior import lens_of, opencv_by_lens
+from reloc.localise.jacobians import lens_jacobians, pixel_jacobians
+from reloc.localise.lens_prior import lens_for, lens_of, opencv_by_lens
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import Inliers, LocalisedPose, place_on_earth
-from reloc.localise.self_calibration import joint_jacobians, lens_jacobians
 
 _DAMPING = 1e-9
 
@@ -187,13 +185,13 @@ def shape_covariance(
         return None
     points, shift = moved
     own = pose.lens_prior
-    jacobians = pixel_jacobians if own is None else joint_jacobians
-    by_point, by_own = jacobians(pose.camera, pose.cam_from_local, area.points[points])
+    seen = (pose.camera, pose.cam_from_local, area.points[points])
+    by_point, by_own = pixel_jacobians(*seen, lens=own is not None)
     pixels = np.einsum("kij,kjr->kir", by_point, shift)
     lender = _lender(area.maps[main], pose.camera)
     lent = np.zeros((0, shift.shape[2]))
     if lender is not None:
-        _, by_lens = joint_jacobians(pose.camera, pose.cam_from_local, area.points[points])
+        _, by_lens = pixel_jacobians(*seen, lens=True)
         zoom = pose.camera.width / area.maps[main].cameras[lender].width
         lent = _as_lens_of(pose.camera, modes.lenses[lender], zoom)
         pixels += by_lens[:, :, 6:] @ lent
@@ -252,14 +250,11 @@ def _moved_points(
 
 def _lender(feature_map: FeatureMap, camera: Camera) -> int | None:
     """The map's camera that this is, of pictures of any size; None if it is none."""
-    for c, own in enumerate(feature_map.cameras):
-        try:
-            same = own.model == "OPENCV" and own.scaled_to(camera.width, camera.height) == camera
-        except InvalidValueError:  # of another shape
-            continue
-        if same:
-            return c
-    return None
+    found = [
+        own.model == "OPENCV" and lens_for(own, camera.width, camera.height) == camera
+        for own in feature_map.cameras
+    ]
+    return found.index(True) if any(found) else None
 
 
 def _as_lens_of(camera: Camera, modes: FloatArray, zoom: float = 1.0) -> FloatArray:

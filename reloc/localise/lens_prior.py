@@ -74,20 +74,17 @@ class LensPriors:
     tangential: float = 0.001
     aspect: float = 0.001
 
+    def of_source(self, camera: Camera, source: str) -> QueryLensPrior | None:
+        """What is known of a lens whose focal length is EXIF's, or a guess; None: it is told otherwise."""
+        rel = {"exif": self.exif_focal_rel, "estimated": self.unknown_focal_rel}.get(source)
+        return None if rel is None else self.around(camera, camera.focal_px, rel)
+
     def around(self, camera: Camera, focal_px: float, focal_rel: float) -> QueryLensPrior:
         """What is known of a lens of pictures of this camera's size, whose focal length is about this."""
         longer, count = max(camera.width, camera.height), 8 if self.whole_lens else 4
         mean = [focal_px, camera.width / 2, camera.height / 2, 0.0, 0.0, 0.0, 0.0, 0.0]
-        sigma = [
-            focal_rel * focal_px,
-            self.center_rel * longer,
-            self.center_rel * longer,
-            self.radial,
-            self.aspect,
-            self.second_radial,
-            self.tangential,
-            self.tangential,
-        ]
+        center, tangential = [self.center_rel * longer] * 2, [self.tangential] * 2
+        sigma = [focal_rel * focal_px, *center, self.radial, self.aspect, self.second_radial, *tangential]
         return QueryLensPrior(mean=np.array(mean[:count]), sigma=np.array(sigma[:count]))
 
 
@@ -143,6 +140,14 @@ def is_lens_of_a_map(camera: Camera, of_map: Camera, lenses: LensUncertainty) ->
         return False
     off = (lens_of(own) - seen[1].mean) / seen[1].sigma
     return bool(np.abs(off).max() <= -ndtri(0.5 * _SAME_LENS_RATE / len(off)))
+
+
+def lens_for(camera: Camera, width: int, height: int) -> Camera | None:
+    """The lens for another size of its pictures; None where that is of another shape."""
+    try:
+        return camera.scaled_to(width, height)
+    except InvalidValueError:
+        return None
 
 
 def lens_of(camera: Camera) -> FloatArray:

@@ -30,11 +30,10 @@ from reloc.localise.result import (
     LocaliseRequest,
     LocaliseResult,
     OwnPosition,
-    PositionRole,
-    Reason,
     RunnerUp,
 )
-from reloc.localise.search import PoseCandidate, Search, pairs, search
+from reloc.localise.search import PoseCandidate, pairs, search
+from reloc.wire.query import PositionRole, Reason
 
 # Chi-square with two degrees of freedom is above this once in 10,000 answers if the prior's sigma is honest.
 _CHI_SQUARE_LIMIT = 18.42
@@ -78,12 +77,11 @@ def localise(
         ImageError: the image is not (h, w) uint8 or tiny.
         InvalidValueError: the request's camera is of another image size.
     """
-    options = options or LocaliseOptions()
+    options, clock = options or LocaliseOptions(), StageClock()
     areas = usable_areas(areas, options.extractor.fingerprint)
-    clock = StageClock()
     features = extract(gray, options.extractor, size)
     clock.lap("features")
-    return _localised(features, request, areas, options, snapshot, clock).result
+    return localise_features(features, request, areas, options, snapshot, clock).result
 
 
 def localise_features(
@@ -91,6 +89,8 @@ def localise_features(
     request: LocaliseRequest,
     areas: Sequence[IndexedArea],
     options: LocaliseOptions | None = None,
+    snapshot: int = 0,
+    clock: StageClock | None = None,
 ) -> Localised:
     """`localise` of a photo whose features are there already, strongest and best spread first.
 
@@ -98,29 +98,20 @@ def localise_features(
         IncompatibleExtractorError: there are areas, and all of them are of another extractor.
         InvalidValueError: the request's camera is of another image size.
     """
-    options = options or LocaliseOptions()
-    areas = usable_areas(areas, options.extractor.fingerprint)
-    return _localised(features, request, areas, options, 0, StageClock())
+    settings, timed = options or LocaliseOptions(), clock or StageClock()
+    usable = usable_areas(areas, settings.extractor.fingerprint)
 
-
-def _localised(
-    features: Features,
-    request: LocaliseRequest,
-    areas: Sequence[IndexedArea],
-    options: LocaliseOptions,
-    snapshot: int,
-    clock: StageClock,
-) -> Localised:
     def ask(asked: LocaliseRequest) -> Localised:
-        found = search(features, asked, areas, options, clock)
-        localised = _decide(found, features, asked, options, snapshot)
-        clock.lap("answer")
+        localised = _decide(
+            search(features, asked, usable, settings, timed), features, asked, settings, snapshot
+        )
+        timed.lap("answer")
         return localised
 
     localised = ask(request)
     if request.own_position is not None and request.prior is None:
-        localised = _with_own_position(localised, request, ask, options)
-    return replace(localised, result=replace(localised.result, timings_ms=clock.milliseconds()))
+        localised = _with_own_position(localised, request, ask, settings)
+    return replace(localised, result=replace(localised.result, timings_ms=timed.milliseconds()))
 
 
 def _with_own_position(
@@ -136,11 +127,14 @@ def _with_own_position(
     photo fits near its position about as well.
     """
     assert request.own_position is not None
-    position, first = weakened(request.own_position), everywhere.result
+    # Not believed more closely than phones deserve.
+    sigma_m = max(request.own_position.sigma_horizontal_m, _OWN_POSITION_SIGMA_M)
+    position, first = replace(request.own_position, sigma_horizontal_m=sigma_m), everywhere.result
 
     def said(chosen: Localised, role: PositionRole) -> Localised:
         pose = chosen.result.pose
-        own = OwnPosition(role=role, distance_m=None if pose is None else distance_from(pose, position))
+        away_m = None if pose is None else float(np.linalg.norm(_offset(pose, position)))
+        own = OwnPosition(role=role, distance_m=away_m)
         return replace(chosen, result=replace(chosen.result, own_position=own))
 
     if first.pose is not None and contradicts_prior(first.pose, position) is None:
@@ -168,27 +162,26 @@ def _with_own_position(
 
 
 def _decide(
-    found: Search,
+    found: tuple[list[PoseCandidate], int, tuple[Reason, str] | None],  # of `search`
     features: Features,
     request: LocaliseRequest,
     options: LocaliseOptions,
     snapshot: int,
 ) -> Localised:
-    evidence = found.candidates[0].evidence if found.candidates else None
+    candidates, matches, nothing = found
+    evidence = candidates[0].evidence if candidates else None
     answered = partial(
-        LocaliseResult, features=len(features), matches=found.matches, snapshot=snapshot, evidence=evidence
+        LocaliseResult, features=len(features), matches=matches, snapshot=snapshot, evidence=evidence
     )
 
     def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None) -> Localised:
         result = answered(reason=reason, detail=detail, inliers=inliers, runner_up=rival)
         return Localised(result=result)
 
-    if found.reason is not None:
-        return refuse(found.reason, found.detail)
-    if not found.candidates:
-        return refuse("TOO_FEW_INLIERS", f"no pose agrees with the {found.matches} matches")
-    best = found.candidates[0]
-    rival = runner_up(best, found.candidates[1:])
+    if nothing is not None:
+        return refuse(*nothing)
+    best, *others = candidates
+    rival = runner_up(best, others)
     refusal = verdict(
         best.evidence,
         rival.inliers if rival else 0,
@@ -217,24 +210,13 @@ def _decide(
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
     result = answered(
         reason=None,
-        detail=f"{best.evidence.inliers} inliers of {found.matches} matches",
+        detail=f"{best.evidence.inliers} inliers of {matches} matches",
         pose=answer,
         confidence=confidence(best.evidence, rival.inliers if rival else 0),
         inliers=best.evidence.inliers,
         runner_up=rival,
     )
     return Localised(result=result, best=best, uncertainty=uncertainty)
-
-
-def weakened(position: GeoPrior) -> GeoPrior:
-    """A photo's own position as a prior, not believed more closely than phones deserve."""
-    sigma_m = max(position.sigma_horizontal_m, _OWN_POSITION_SIGMA_M)
-    return replace(position, sigma_horizontal_m=sigma_m)
-
-
-def distance_from(answer: LocalisedPose, prior: GeoPrior) -> float:
-    """Horizontal distance of the camera from the prior, metres."""
-    return float(np.linalg.norm(_offset(answer, prior)))
 
 
 def _offset(answer: LocalisedPose, prior: GeoPrior) -> FloatArray:
@@ -288,15 +270,9 @@ def runner_up(best: PoseCandidate, others: list[PoseCandidate]) -> RunnerUp | No
             apart_deg += 3.0 * float(np.degrees(np.sqrt(np.linalg.eigvalsh(placed[:3, :3])[-1])))
         inliers = _support_beside(best, other)
         if inliers and (distance_m > apart_m or angle_deg > apart_deg):
-            lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center)
+            lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center).tolist()
             found.append(
-                RunnerUp(
-                    inliers=inliers,
-                    distance_m=distance_m,
-                    angle_deg=angle_deg,
-                    latitude_deg=float(lat),
-                    longitude_deg=float(lon),
-                )
+                RunnerUp(inliers=inliers, distance_m=distance_m, angle_deg=angle_deg, lat=lat, lon=lon)
             )
     return max(found, key=lambda rival: rival.inliers, default=None)
 
@@ -309,14 +285,10 @@ def _support_beside(best: PoseCandidate, other: PoseCandidate) -> int:
     """
     if best.area is not other.area:
         return other.evidence.inliers
-    shared = np.isin(_pair_numbers(other), _pair_numbers(best))
-    return int(np.count_nonzero(~shared))
-
-
-def _pair_numbers(candidate: PoseCandidate) -> NDArray[np.int64]:
-    """One number for each inlier's pair of feature and point."""
-    matches, rows = candidate.matches, candidate.rows
-    return matches.feature[rows] * len(candidate.area.points) + matches.point[rows]
+    theirs, ours = (  # one number for each inlier's pair of feature and point
+        of.matches.feature[of.rows] * len(of.area.points) + of.matches.point[of.rows] for of in (other, best)
+    )
+    return int(np.count_nonzero(~np.isin(theirs, ours)))
 
 
 def _in_frame_of(area: Area, candidate: PoseCandidate) -> Rigid3:

@@ -1,6 +1,6 @@
 """Absolute pose from 2D-3D matches: LO-RANSAC, focal length where unknown, refinement, covariance."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.lens_prior import LensPriors, QueryLensPrior
 from reloc.localise.options import PoseOptions
-from reloc.localise.result import CameraSource
-from reloc.localise.self_calibration import calibrate, covariance_from_information, joint_jacobians
+from reloc.localise.self_calibration import calibrate, covariance_from_information
+from reloc.wire.query import CameraSource
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,16 +26,14 @@ class PoseHypothesis:
         cam_from_local: area frame to camera.
         camera: intrinsics, the focal length estimated where `camera_source` is exif or estimated.
         inliers: (m,) bool over the matches that it was estimated from.
-        prior_focal_px: focal length from EXIF, or the guess that stands for an unknown one.
         lens_prior: what was known of the lens beforehand, where it is estimated with the pose; None: it is
-            exact, or nothing has been refined yet.
+            exact.
     """
 
     cam_from_local: Rigid3
     camera: Camera
     camera_source: CameraSource
     inliers: NDArray[np.bool_]
-    prior_focal_px: float
     lens_prior: QueryLensPrior | None = None
 
     @property
@@ -60,19 +58,17 @@ def estimate_pose(
     if len(pixels) < options.min_matches:
         return None
     tolerance_px = options.tolerance_px(camera)
-    tries = [
-        _ransac(pixels, points, guess, tolerance_px, options)
-        for guess in _guesses(camera, source, options.lens)
-    ]
+    asked = (pixels, points, tolerance_px, options)
+    tries = [_ransac(guess, *asked) for guess in _guesses(camera, source, options.lens)]
     if source in ("exif", "estimated"):
-        tries.append(_ransac_focal(pixels, points, camera, tolerance_px, options))
+        tries.append(_ransac_focal(camera, *asked))
     found = [
         PoseHypothesis(
             cam_from_local=cam_from_local,
             camera=lens,
             camera_source=source,
             inliers=reprojection_errors(pixels, points, lens, cam_from_local) < tolerance_px,
-            prior_focal_px=camera.focal_px,
+            lens_prior=options.lens.of_source(camera, source),
         )
         for cam_from_local, lens in (found for found in tries if found is not None)
     ]
@@ -93,12 +89,12 @@ def _guesses(camera: Camera, source: CameraSource, lens: LensPriors) -> list[Cam
 
 
 def _ransac(
-    pixels: FloatArray, points: FloatArray, camera: Camera, tolerance_px: float, options: PoseOptions
+    camera: Camera, pixels: FloatArray, points: FloatArray, tolerance_px: float, options: PoseOptions
 ) -> tuple[Rigid3, Camera] | None:
     pose, info = poselib.estimate_absolute_pose(
         pixels,
         points,
-        _poselib_camera(camera),
+        asdict(camera),
         {
             "max_reproj_error": tolerance_px,
             "seed": options.seed,
@@ -115,7 +111,7 @@ def _ransac(
 
 
 def _ransac_focal(
-    pixels: FloatArray, points: FloatArray, camera: Camera, tolerance_px: float, options: PoseOptions
+    camera: Camera, pixels: FloatArray, points: FloatArray, tolerance_px: float, options: PoseOptions
 ) -> tuple[Rigid3, Camera] | None:
     settings = pycolmap.AbsolutePoseEstimationOptions()
     settings.estimate_focal_length = True
@@ -152,8 +148,10 @@ def refine_pose(
         near = residual < 2.0 * tolerance_px
         if near.sum() < 4:
             break
-        if pose.focal_is_free or pose.lens_prior is not None:
-            pose = _refine_with_lens(pixels[near], points[near], pose, tolerance_px, options)
+        if pose.lens_prior is not None:
+            problem = (pose.cam_from_local, pose.camera, pose.lens_prior)
+            moved, camera = calibrate(pixels[near], points[near], *problem, 0.25 * tolerance_px)
+            pose = replace(pose, cam_from_local=moved, camera=camera)
         else:
             pose = _refine_known_lens(pixels, points, near, pose, tolerance_px)
     residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
@@ -178,18 +176,6 @@ def _refine_known_lens(
         settings,
     )
     return start if found is None else replace(start, cam_from_local=_from_pycolmap(found["cam_from_world"]))
-
-
-def _refine_with_lens(
-    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, tolerance_px: float, options: PoseOptions
-) -> PoseHypothesis:
-    prior = start.lens_prior
-    if prior is None:
-        priors = options.lens
-        rel = priors.exif_focal_rel if start.camera_source == "exif" else priors.unknown_focal_rel
-        prior = priors.around(start.camera, start.prior_focal_px, rel)
-    found = calibrate(pixels, points, start.cam_from_local, start.camera, prior, 0.25 * tolerance_px)
-    return replace(start, cam_from_local=found.cam_from_local, camera=found.camera, lens_prior=prior)
 
 
 def reprojection_errors(
@@ -235,8 +221,7 @@ def pose_uncertainty(
         point_covariance: (k, 3, 3) in the area's frame.
     """
     lens = pose.lens_prior
-    jacobians = pixel_jacobians if lens is None else joint_jacobians
-    by_point, jacobian = jacobians(pose.camera, pose.cam_from_local, points)
+    by_point, jacobian = pixel_jacobians(pose.camera, pose.cam_from_local, points, lens=lens is not None)
     residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
     noise = np.eye(2) + by_point @ point_covariance @ by_point.transpose(0, 2, 1)
     weight = np.linalg.inv(noise)
@@ -279,15 +264,6 @@ def _price_of_robustness(residual: FloatArray, scale_px: float, parameters: int)
     few = 1.0 + parameters / residual.size * variation
     # A dozen residuals may be small by luck; the lower bound keeps that from being taken for precision.
     return float(np.clip(few**2 * np.mean(weight**2 * squared) / spread / slope**2, 0.1, 10.0))
-
-
-def _poselib_camera(camera: Camera) -> dict[str, Any]:
-    return {
-        "model": camera.model,
-        "width": camera.width,
-        "height": camera.height,
-        "params": list(camera.params),
-    }
 
 
 def _from_pycolmap(rigid: Any) -> Rigid3:

@@ -17,17 +17,7 @@ from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.unplaced_map import OwnFrame
 from reloc.localise.lens_prior import QueryLensPrior
-
-Reason = Literal[
-    "NO_COVERAGE",
-    "TOO_FEW_FEATURES",
-    "TOO_FEW_MATCHES",
-    "TOO_FEW_INLIERS",
-    "AMBIGUOUS",
-    "CONTRADICTS_PRIOR",
-]
-CameraSource = Literal["request", "map", "exif", "estimated"]
-PositionRole = Literal["agrees", "decided", "contradicted", "no_help"]
+from reloc.wire.query import CameraSource, PositionRole, Reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,14 +194,14 @@ class RunnerUp:
         inliers: its inlier count.
         distance_m: from the winner's camera centre.
         angle_deg: between the two orientations.
-        latitude_deg, longitude_deg: where it is.
+        lat, lon: where it is, degrees.
     """
 
     inliers: int
     distance_m: float
     angle_deg: float
-    latitude_deg: float
-    longitude_deg: float
+    lat: float
+    lon: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

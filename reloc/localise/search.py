@@ -23,7 +23,7 @@ from reloc.localise.acceptance import (
     spread,
 )
 from reloc.localise.candidates import Cluster, IndexedArea, find_clusters
-from reloc.localise.lens_prior import is_lens_of_a_map, seen_by_a_map
+from reloc.localise.lens_prior import is_lens_of_a_map, lens_for, seen_by_a_map
 from reloc.localise.matching import (
     EXPECTED_DEG,
     POSSIBLE_DEG,
@@ -39,7 +39,8 @@ from reloc.localise.pose import (
     refine_pose,
     reprojection_errors,
 )
-from reloc.localise.result import CameraSource, Evidence, LocaliseRequest, Reason
+from reloc.localise.result import Evidence, LocaliseRequest
+from reloc.wire.query import CameraSource, Reason
 
 _MORE_BY_REFINING = 2  # times RANSAC's inliers
 _FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement
@@ -62,37 +63,29 @@ class PoseCandidate:
         return self.area.maps[int(np.bincount(self.area.point_map[self.matches.point[rows]]).argmax())]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Search:
-    """What the search found: candidates, best first, and how far it came."""
-
-    candidates: list[PoseCandidate]
-    matches: int
-    reason: Reason | None
-    detail: str
-
-
 def search(
     features: Features,
     request: LocaliseRequest,
     areas: Sequence[IndexedArea],
     options: LocaliseOptions,
     clock: StageClock,
-) -> Search:
+) -> tuple[list[PoseCandidate], int, tuple[Reason, str] | None]:
+    """Candidates, best first; matches of the best cluster; where there is nothing to decide on, why."""
     if len(features) < options.acceptance.min_inliers:
-        return _nothing(
-            "TOO_FEW_FEATURES", f"{len(features)} keypoints in the photo; it shows too little texture"
-        )
+        text = f"{len(features)} keypoints in the photo; it shows too little texture"
+        return [], 0, ("TOO_FEW_FEATURES", text)
     clusters = find_clusters(areas, features, request.prior, options.candidates, request.beyond)
     clock.lap("candidates")
     if not clusters:
-        return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
+        return [], 0, ("NO_COVERAGE", "no map lies within reach of the prior")
     tries = [ClusterMatcher(features, cluster, options.matching) for cluster in clusters]
     candidates: list[PoseCandidate] = []
     most = 0
     while tries:
         matcher, *tries = tries
-        found, count = _try_cluster(features, matcher, request, options, clock)
+        found, count = _ClusterSearch(
+            features=features, matcher=matcher, request=request, options=options, clock=clock
+        ).poses()
         most = max(most, count)
         candidates.extend(found)
         if candidates and _settled(candidates, matcher.cluster, [t.cluster for t in tries], options):
@@ -100,9 +93,11 @@ def search(
         tries = most_matched(tries, options)
         clock.lap("matching")
     candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
-    if not candidates and most < options.pose.min_matches:
-        return _nothing("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps", most)
-    return Search(candidates=candidates, matches=most, reason=None, detail="")
+    if candidates:
+        return candidates, most, None
+    if most < options.pose.min_matches:
+        return [], most, ("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps")
+    return [], most, ("TOO_FEW_INLIERS", f"no pose agrees with the {most} matches")
 
 
 def most_matched(tries: list[ClusterMatcher], options: LocaliseOptions) -> list[ClusterMatcher]:
@@ -115,26 +110,111 @@ def most_matched(tries: list[ClusterMatcher], options: LocaliseOptions) -> list[
     return [tries[i] for i in order[:take]]
 
 
-def _try_cluster(
-    features: Features,
-    matcher: ClusterMatcher,
-    request: LocaliseRequest,
-    options: LocaliseOptions,
-    clock: StageClock,
-) -> tuple[list[PoseCandidate], int]:
-    """Poses of one cluster and the number of matches behind them.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _ClusterSearch:
+    """What the steps within one cluster share."""
 
-    The first features, which are the best spread, are matched alone; all of them only where that does not
-    settle it. Guided matching uses all of them in any case.
-    """
-    first = options.matching.first_features
-    for count in (first, len(features)) if first < len(features) else (len(features),):
-        matches = matcher.matches(count)
-        clock.lap("matching")
-        found = _poses(features, matcher.cluster, matches, request, options, clock)
-        if any(c.evidence.log_nfa > options.acceptance.settled_log_nfa for c in found):
-            break
-    return found, len(matches)
+    features: Features
+    matcher: ClusterMatcher
+    request: LocaliseRequest
+    options: LocaliseOptions
+    clock: StageClock
+
+    @property
+    def area(self) -> Area:
+        return self.matcher.cluster.area
+
+    def poses(self) -> tuple[list[PoseCandidate], int]:
+        """Poses of the cluster and the number of matches behind them.
+
+        The first features, which are the best spread, are matched alone; all of them only where that does not
+        settle it. Guided matching uses all of them in any case.
+        """
+        first, count = self.options.matching.first_features, len(self.features)
+        for most in (first, count) if first < count else (count,):
+            matches = self.matcher.matches(most)
+            self.clock.lap("matching")
+            found = self._poses(matches)
+            if any(c.evidence.log_nfa > self.options.acceptance.settled_log_nfa for c in found):
+                break
+        return found, len(matches)
+
+    def _poses(self, matches: Matches) -> list[PoseCandidate]:
+        """The cluster's best pose, and the best one among the matches that it leaves over."""
+        pose = self._best_pose(matches, camera_hypotheses(self.features, self.area, self.request))
+        if pose is not None:
+            pose = _with_lens_prior(pose, self.area, matches, self.request)
+        self.clock.lap("pose")
+        if pose is None or pose.count < 4:
+            return []
+        if _is_hopeless(len(matches), pose, self.options):
+            return [self._with_evidence(pose, matches, matches)]
+        best = self._refined(matches, pose)
+        taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
+        left = Matches(feature=matches.feature[~taken], point=matches.point[~taken])
+        # A photo has one lens, which the first pose has estimated.
+        rival = self._best_pose(left, [(best.pose.camera, "request")])
+        self.clock.lap("pose")
+        if rival is None or rival.count < 4:
+            return [best]
+        second = self._refined(left, rival)
+        return [best, replace(second, pose=replace(second.pose, camera_source=best.pose.camera_source))]
+
+    def _best_pose(
+        self, matches: Matches, cameras: list[tuple[Camera, CameraSource]]
+    ) -> PoseHypothesis | None:
+        points = pairs(self.features, self.area, matches)
+        found = [estimate_pose(*points, camera, source, self.options.pose) for camera, source in cameras]
+        return max((pose for pose in found if pose is not None), key=lambda pose: pose.count, default=None)
+
+    def _refined(self, matches: Matches, pose: PoseHypothesis) -> PoseCandidate:
+        """Refine on matches looked for where the pose has them; keep that only if it agrees with more."""
+        features, area, options = self.features, self.area, self.options
+        best = refine_pose(*pairs(features, area, matches), pose, options.pose, rounds=1)
+        kept, points = matches, self.matcher.cluster.points
+        guided = guided_matches(features, area, points, best.camera, best.cam_from_local, options.matching)
+        if len(guided) >= 4:
+            again = refine_pose(*pairs(features, area, guided), best, options.pose)
+            if again.count >= best.count:
+                best, kept = again, guided
+        candidate = self._with_evidence(best, kept, matches)
+        self.clock.lap("guided")
+        return candidate
+
+    def _with_evidence(self, pose: PoseHypothesis, matches: Matches, unguided: Matches) -> PoseCandidate:
+        """The number of false alarms is that of the unguided matches: guided ones look where they are wanted.
+
+        Of those, only independent ones count, or a few places that match many times over would be believed.
+        """
+        features, area, size = self.features, self.area, (pose.camera.width, pose.camera.height)
+        own = self._independent(pose, matches, pose.inliers)
+        error = reprojection_errors(*pairs(features, area, unguided), pose.camera, pose.cam_from_local)
+        tolerance_px = self.options.pose.tolerance_px(pose.camera)
+        blind = self._independent(pose, unguided, error < tolerance_px)
+        inlier_pixels = features.xy[matches.feature[own]]
+        expected_pixels = _expected(area, self.matcher.cluster.points.astype(np.int64), pose)
+        evidence = Evidence(
+            inliers=len(own),
+            log_nfa=_log_nfa(len(unguided), len(blind), pose, self.options),
+            coverage=coverage(inlier_pixels, *size),
+            agreement=agreement(inlier_pixels, expected_pixels, *size),
+            spread=spread(inlier_pixels, expected_pixels, *size),
+        )
+        return PoseCandidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
+
+    def _independent(
+        self, pose: PoseHypothesis, matches: Matches, inlier: NDArray[np.bool_]
+    ) -> NDArray[np.intp]:
+        """Rows of the inliers that the pose can see, each a measurement of its own.
+
+        A flat place fits a mirrored photo if one looks at it from under the ground: these do not count.
+        """
+        rows, area = np.flatnonzero(inlier), self.area
+        seen = visible_points(area, matches.point[rows], pose.camera, pose.cam_from_local, POSSIBLE_DEG)
+        rows = rows[np.isin(matches.point[rows], seen)]
+        pixels, points = pairs(self.features, area, matches)
+        gap_px = 0.002 * max(pose.camera.width, pose.camera.height)
+        return rows[independent_inliers(pixels[rows], points[rows], gap_px)]
 
 
 def _settled(
@@ -160,43 +240,6 @@ def _around(candidate: PoseCandidate, cluster: Cluster) -> bool:
     return bool(np.median(np.linalg.norm(offset, axis=1)) <= 2.0 * reach)
 
 
-def _poses(
-    features: Features,
-    cluster: Cluster,
-    matches: Matches,
-    request: LocaliseRequest,
-    options: LocaliseOptions,
-    clock: StageClock,
-) -> list[PoseCandidate]:
-    """The cluster's best pose, and the best one among the matches that it leaves over."""
-    pose = _best_pose(
-        features, cluster.area, matches, camera_hypotheses(features, cluster.area, request), options
-    )
-    if pose is not None:
-        pose = _with_lens_prior(pose, cluster.area, matches, request)
-    clock.lap("pose")
-    if pose is None or pose.count < 4:
-        return []
-    if _is_hopeless(len(matches), pose, options):
-        return [_with_evidence(features, cluster, pose, matches, matches, options)]
-    best = _refined(features, cluster, matches, pose, options)
-    clock.lap("guided")
-    taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
-    left = Matches(feature=matches.feature[~taken], point=matches.point[~taken])
-    # A photo has one lens, which the first pose has estimated.
-    rival = _best_pose(features, cluster.area, left, [(best.pose.camera, "request")], options)
-    clock.lap("pose")
-    if rival is None or rival.count < 4:
-        return [best]
-    second = _refined(features, cluster, left, rival, options)
-    clock.lap("guided")
-    source, focal_px = best.pose.camera_source, best.pose.prior_focal_px
-    return [
-        best,
-        replace(second, pose=replace(second.pose, camera_source=source, prior_focal_px=focal_px)),
-    ]
-
-
 def _with_lens_prior(
     pose: PoseHypothesis, area: Area, matches: Matches, request: LocaliseRequest
 ) -> PoseHypothesis:
@@ -205,13 +248,13 @@ def _with_lens_prior(
     The map's own estimate of the same camera fits its points, which are bent by what that is off.
     """
     if not request.camera_is_exact:
-        return replace(pose, lens_prior=request.camera_prior)
+        return replace(pose, lens_prior=request.camera_prior or pose.lens_prior)
     counts = np.bincount(area.point_map[matches.point[pose.inliers]], minlength=len(area.maps))
     uncertainty = LensUncertainty.of_provenance(area.maps[int(np.argmax(counts))].provenance)
     if uncertainty is None:
         return pose
     own = None if request.camera_key is None else area.camera_for_key(request.camera_key)
-    own = None if own is None else _resampled(own, pose.camera.width, pose.camera.height)
+    own = None if own is None else lens_for(own, pose.camera.width, pose.camera.height)
     if own is not None and is_lens_of_a_map(pose.camera, own, uncertainty):
         return replace(pose, camera=own)
     seen = seen_by_a_map(pose.camera, uncertainty)
@@ -251,86 +294,19 @@ def camera_hypotheses(
     if request.camera_key:
         of_map = area.camera_for_key(request.camera_key)
         # Frames of films are made smaller.
-        camera = None if of_map is None else _resampled(of_map, features.width, features.height)
+        camera = None if of_map is None else lens_for(of_map, features.width, features.height)
         if camera is not None:
             return [(camera, "map")]
     if request.film:
         of_film = area.cameras_of_film(request.film)
-        lent = [_resampled(camera, features.width, features.height) for camera in of_film]
+        lent = [lens_for(camera, features.width, features.height) for camera in of_film]
         if any(camera is not None for camera in lent):
             return [(camera, "map") for camera in lent if camera is not None]
-    longer = max(features.width, features.height)
     if request.exif_focal_px:
         return [(Camera.from_focal(features.width, features.height, request.exif_focal_px), "exif")]
     # 1.2 times the longer side (a 45-degree lens) only starts the estimate.
-    return [(Camera.from_focal(features.width, features.height, 1.2 * longer), "estimated")]
-
-
-def _resampled(camera: Camera, width: int, height: int) -> Camera | None:
-    """The lens for another size of its pictures; None where that is of another shape."""
-    try:
-        return camera.scaled_to(width, height)
-    except InvalidValueError:
-        return None
-
-
-def _best_pose(
-    features: Features,
-    area: Area,
-    matches: Matches,
-    cameras: list[tuple[Camera, CameraSource]],
-    options: LocaliseOptions,
-) -> PoseHypothesis | None:
-    pixels, points = pairs(features, area, matches)
-    found = [estimate_pose(pixels, points, camera, source, options.pose) for camera, source in cameras]
-    poses = [pose for pose in found if pose is not None]
-    return max(poses, key=lambda pose: pose.count) if poses else None
-
-
-def _refined(
-    features: Features, cluster: Cluster, matches: Matches, pose: PoseHypothesis, options: LocaliseOptions
-) -> PoseCandidate:
-    """Refine on matches looked for where the pose says they are; keep that only if it agrees with more."""
-    area = cluster.area
-    pixels, points = pairs(features, area, matches)
-    best, kept = refine_pose(pixels, points, pose, options.pose, rounds=1), matches
-    guided = guided_matches(
-        features, area, cluster.points, best.camera, best.cam_from_local, options.matching
-    )
-    if len(guided) >= 4:
-        pixels, points = pairs(features, area, guided)
-        again = refine_pose(pixels, points, best, options.pose)
-        if again.count >= best.count:
-            best, kept = again, guided
-    return _with_evidence(features, cluster, best, kept, matches, options)
-
-
-def _with_evidence(
-    features: Features,
-    cluster: Cluster,
-    pose: PoseHypothesis,
-    matches: Matches,
-    unguided: Matches,
-    options: LocaliseOptions,
-) -> PoseCandidate:
-    """The number of false alarms is that of the unguided matches: guided ones look where they are wanted.
-
-    Of those, only independent ones count, or a few places that match several times over would be believed.
-    """
-    area, width, height = cluster.area, pose.camera.width, pose.camera.height
-    own = _independent(features, area, pose, matches, pose.inliers)
-    error = reprojection_errors(*pairs(features, area, unguided), pose.camera, pose.cam_from_local)
-    blind = _independent(features, area, pose, unguided, error < options.pose.tolerance_px(pose.camera))
-    inlier_pixels = features.xy[matches.feature[own]]
-    expected_pixels = _expected(area, cluster.points.astype(np.int64), pose)
-    evidence = Evidence(
-        inliers=len(own),
-        log_nfa=_log_nfa(len(unguided), len(blind), pose, options),
-        coverage=coverage(inlier_pixels, width, height),
-        agreement=agreement(inlier_pixels, expected_pixels, width, height),
-        spread=spread(inlier_pixels, expected_pixels, width, height),
-    )
-    return PoseCandidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
+    focal_px = 1.2 * max(features.width, features.height)
+    return [(Camera.from_focal(features.width, features.height, focal_px), "estimated")]
 
 
 def _expected(area: Area, points: NDArray[np.int64], pose: PoseHypothesis) -> FloatArray:
@@ -348,25 +324,6 @@ def _expected(area: Area, points: NDArray[np.int64], pose: PoseHypothesis) -> Fl
     return pixels
 
 
-def _independent(
-    features: Features, area: Area, pose: PoseHypothesis, matches: Matches, inlier: NDArray[np.bool_]
-) -> NDArray[np.intp]:
-    """Rows of the inliers that the pose can see, each a measurement of its own.
-
-    A flat place fits a mirrored photo if one looks at it from under the ground: such inliers do not count.
-    """
-    rows = np.flatnonzero(inlier)
-    seen = visible_points(area, matches.point[rows], pose.camera, pose.cam_from_local, POSSIBLE_DEG)
-    rows = rows[np.isin(matches.point[rows], seen)]
-    pixels, points = pairs(features, area, matches)
-    gap_px = 0.002 * max(pose.camera.width, pose.camera.height)
-    return rows[independent_inliers(pixels[rows], points[rows], gap_px)]
-
-
 def pairs(features: Features, area: Area, matches: Matches) -> tuple[FloatArray, FloatArray]:
     """Pixels (m, 2) and points (m, 3) of the matches, float64."""
     return features.xy[matches.feature].astype(np.float64), area.points[matches.point]
-
-
-def _nothing(reason: Reason, detail: str, matches: int = 0) -> Search:
-    return Search(candidates=[], matches=matches, reason=reason, detail=detail)

@@ -12,16 +12,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from reloc.localise.jacobians import chain_to_pose
+from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.lens_prior import QueryLensPrior, lens_of, whole_lens, with_lens
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calibrated:
-    """Pose and camera together."""
-
-    cam_from_local: Rigid3
-    camera: Camera
 
 
 def calibrate(
@@ -31,8 +23,8 @@ def calibrate(
     start_camera: Camera,
     prior: QueryLensPrior,
     noise_px: float,
-) -> Calibrated:
-    """Refine pose and lens: as many parameters as the prior has.
+) -> tuple[Rigid3, Camera]:
+    """Refined cam_from_local and lens, of as many parameters as the prior has.
 
     Gauss-Newton with Cauchy weights; converges in a few steps from a RANSAC pose.
 
@@ -52,51 +44,7 @@ def calibrate(
         trust=(noise_px / measured_noise_px(pixels, points, start_pose, camera, noise_px)) ** 2,
         prior=prior,
     )
-    pose, camera = _minimise(problem, start_pose, camera)
-    return Calibrated(cam_from_local=pose, camera=camera)
-
-
-def joint_jacobians(
-    camera: Camera, cam_from_local: Rigid3, points: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of pixels by points (k, 2, 3), and by pose and lens (k, 2, 6 + n), n as in `lens_of`."""
-    by_camera, by_lens = lens_jacobians(camera, cam_from_local.act(points))
-    by_point, by_pose = chain_to_pose(by_camera, cam_from_local, points)
-    return by_point, np.concatenate([by_pose, by_lens], axis=2)
-
-
-def lens_jacobians(camera: Camera, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of pixels by points (k, 2, 3) in camera axes, and by the lens (k, 2, n), n as in `lens_of`.
-
-    In closed form: pixel = (f, f (1 + aspect)) d(u, v) + c with (u, v) = (x, y) / z and Brown's distortion d.
-    """
-    lens = lens_of(camera)
-    focal, _, _, k1, aspect, k2, p1, p2 = whole_lens(lens)
-    depth = in_camera[:, 2]
-    uv = in_camera[:, :2] / depth[:, None]
-    u, v = uv.T
-    squared = u * u + v * v
-    stretch, slope = 1.0 + (k1 + k2 * squared) * squared, 2.0 * (k1 + 2.0 * k2 * squared)
-    scale = focal * np.array([1.0, 1.0 + aspect])
-    first = np.stack([2.0 * u * v, squared + 2.0 * v * v], axis=1)  # by p1
-    second = np.stack([squared + 2.0 * u * u, 2.0 * u * v], axis=1)  # by p2
-    bent = stretch[:, None] * uv + p1 * first + p2 * second
-    across = slope * u * v + 2.0 * (p1 * u + p2 * v)
-    along_u = stretch + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u
-    along_v = stretch + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v
-    by_uv = scale[:, None] * np.stack([along_u, across, across, along_v], axis=1).reshape(-1, 2, 2)
-    by_camera = np.concatenate([by_uv, -by_uv @ uv[:, :, None]], axis=2) / depth[:, None, None]
-    by_lens = [
-        bent * [1.0, 1.0 + aspect],
-        np.tile([1.0, 0.0], (len(in_camera), 1)),
-        np.tile([0.0, 1.0], (len(in_camera), 1)),
-        scale * squared[:, None] * uv,
-        focal * bent * [0.0, 1.0],
-        scale * (squared**2)[:, None] * uv,
-        scale * first,
-        scale * second,
-    ]
-    return by_camera, np.stack(by_lens[: len(lens)], axis=2)
+    return _minimise(problem, start_pose, camera)
 
 
 def covariance_from_information(information: FloatArray) -> FloatArray:
@@ -179,7 +127,7 @@ class LensProblem:
         in_camera = pose.act(self.points)
         # The derivatives reach a little beyond the point: on the fold of the distortion there are none.
         front = (in_camera[:, 2] > 0.1) & np.isfinite(camera.project(in_camera * [1.001, 1.001, 1.0])).all(1)
-        _, jacobian = joint_jacobians(camera, pose, self.points[front])
+        _, jacobian = pixel_jacobians(camera, pose, self.points[front], lens=True)
         residual = self.pixels[front] - camera.project(in_camera[front])
         weight = self.trust / (self.noise_px**2 + np.sum(residual**2, axis=1))
         information = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)

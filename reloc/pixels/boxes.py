@@ -72,7 +72,17 @@ def geojson(places: Sequence[PixelPlace], marks: Sequence[MarkedPixel], photo: s
 
     A pixel without a place has no geometry, and its reason among its properties.
     """
-    features = [_feature(place, mark) for place, mark in zip(places, marks, strict=True)]
+    features = []
+    for place, mark in zip(places, marks, strict=True):
+        geometry = None
+        if place.lat_lon_h is not None:
+            latitude, longitude, height = place.lat_lon_h.tolist()
+            geometry = {
+                "type": "Point",
+                "coordinates": [round(longitude, 9), round(latitude, 9), round(height, 4)],
+            }
+        properties = {**mark.properties, **as_json(place)}
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
     return {"type": "FeatureCollection", "photo": photo, "features": features}
 
 
@@ -81,17 +91,6 @@ def as_json(place: PixelPlace) -> dict[str, Any]:
     told = {name: getattr(place, name) for name in _TOLD}
     utm = None if place.utm is None else np.round(place.utm, 4)
     return {name: plain(value) for name, value in (told | {"utm": utm}).items()}
-
-
-def _feature(place: PixelPlace, mark: MarkedPixel) -> dict[str, Any]:
-    geometry = None
-    if place.lat_lon_h is not None:
-        latitude, longitude, height = (float(v) for v in place.lat_lon_h)
-        geometry = {
-            "type": "Point",
-            "coordinates": [round(longitude, 9), round(latitude, 9), round(height, 4)],
-        }
-    return {"type": "Feature", "geometry": geometry, "properties": {**mark.properties, **as_json(place)}}
 
 
 def _boxes_of(document: Any, image: Path, images: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -37,29 +37,18 @@ def draw_layer(
     colours = {name: _COLOURS_RGB[i % 5] for i, name in enumerate(dict.fromkeys(s.name for s in shapes))}
     seen = _Visibility(view, cloud)
     for shape in shapes:
-        colour = colours[shape.name]
+        pen = (colours[shape.name], thick, cv2.LINE_AA)
         if shape.is_point:
             pixels, shown = seen(shape.points)
             for x, y in pixels[shown] * scale:
-                cv2.circle(
-                    picture, _sixteenths(x, y), 16 * 4 * thick, colour, thick, cv2.LINE_AA, _SIXTEENTHS
-                )
+                cv2.circle(picture, _sixteenths(x, y), 16 * 4 * thick, *pen, _SIXTEENTHS)
                 where = (int(x) + 6 * thick, int(y))
-                cv2.putText(
-                    picture,
-                    shape.name,
-                    where,
-                    cv2.FONT_HERSHEY_SIMPLEX,
-                    0.4 * thick,
-                    colour,
-                    thick,
-                    cv2.LINE_AA,
-                )
+                cv2.putText(picture, shape.name, where, cv2.FONT_HERSHEY_SIMPLEX, 0.4 * thick, *pen)
             continue
         pixels, shown = seen(_cut(view, shape.points))
         both = shown[1:] & shown[:-1]
         for a, b in zip((pixels[:-1] * scale)[both], (pixels[1:] * scale)[both], strict=True):
-            cv2.line(picture, _sixteenths(*a), _sixteenths(*b), colour, thick, cv2.LINE_AA, _SIXTEENTHS)
+            cv2.line(picture, _sixteenths(*a), _sixteenths(*b), *pen, _SIXTEENTHS)
     return picture
 
 

@@ -105,9 +105,8 @@ def laid_on(layer: Layer, frame: LocalFrame, cloud: PointCloud | None) -> list[S
 def _heights(points: FloatArray, cloud: PointCloud, tree: cKDTree) -> FloatArray:
     distance, rows = tree.query(points[:, :2], k=min(4, len(cloud)), distance_upper_bound=_REACH_M)
     distance, rows = (np.asarray(found).reshape(len(points), -1) for found in (distance, rows))
-    z = np.append(cloud.xyz[:, 2].astype(np.float64), -np.inf)[
-        rows
-    ]  # what is too far has the row behind the last
+    # What is too far has the row behind the last.
+    z = np.append(cloud.xyz[:, 2].astype(np.float64), -np.inf)[rows]
     return np.where(np.isfinite(distance[:, 0]), z.max(axis=1), np.nan)
 
 

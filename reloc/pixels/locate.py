@@ -7,12 +7,12 @@ error moves the place along the ray.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from featuredb.geometry.error_radius import error_radius
 from reloc.answered_view import AnsweredView
 from reloc.pixels.surfaces import Met, RaySurface
@@ -85,28 +85,25 @@ def locate(
 
 
 def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px: float) -> PixelPlace:
-    def refuse(reason: LocateReason, detail: str) -> PixelPlace:
-        return PixelPlace(
-            pixel=(float(pixel[0]), float(pixel[1])),
-            reason=reason,
-            detail=detail,
-            epsg=view.epsg,
-            height_datum=view.height_datum,
-            surface=surface.kind,
-        )
-
-    ray = view.rays(pixel[None])[0]
-    if not (_inside(view.camera, pixel) and np.isfinite(ray).all()):
-        return refuse("OUTSIDE", f"the photo has {view.camera.width} x {view.camera.height} pixels")
+    answered = partial(
+        PixelPlace,
+        pixel=(float(pixel[0]), float(pixel[1])),
+        epsg=view.epsg,
+        height_datum=view.height_datum,
+        surface=surface.kind,
+    )
+    ray, size = view.rays(pixel[None])[0], (view.camera.width, view.camera.height)
+    if not ((pixel >= 0).all() and (pixel <= size).all() and np.isfinite(ray).all()):
+        return answered(reason="OUTSIDE", detail=f"the photo has {size[0]} x {size[1]} pixels")
     # By the pose's turn alone, which is right for far things; nearer ones are asked for again.
     viewer = view.cam_from_local.center
     spread = _pixel_covariance(view, viewer + 1e4 * ray, sigma_px)
-    met = surface.meet(view, pixel, _REACH_SIGMAS * _longest(spread))
+    met = surface.meet(view, pixel, _REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(spread)[-1])))
     if isinstance(met, str):
-        return refuse("NO_SURFACE", met)
+        return answered(reason="NO_SURFACE", detail=met)
     toward = float(met.patch.normal @ ray)
     if toward > -1e-6:
-        return refuse("GRAZING", "the ray runs along the surface")
+        return answered(reason="GRAZING", detail="the ray runs along the surface")
     point = viewer + ray * float(met.patch.normal @ (met.patch.point - viewer)) / toward
     spread = _pixel_covariance(view, point, sigma_px)
     along = ray * met.sigma_m / toward
@@ -115,19 +112,16 @@ def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px:
     direction = ray / np.linalg.norm(ray)
     distance = float(np.linalg.norm(point - viewer))
     if float(np.sqrt(direction @ covariance @ direction)) > _LARGEST_ALONG * distance:
-        return refuse("GRAZING", f"the place is known to no better than a tenth of its {distance:.0f} m")
+        detail = f"the place is known to no better than a tenth of its {distance:.0f} m"
+        return answered(reason="GRAZING", detail=detail)
     other = _other_surfaces(view, met, pixel, point, spread)
     incidence = float(np.degrees(np.arccos(min(1.0, -float(met.patch.normal @ direction)))))
     to_true = view.frame.true_enu_from_enu(point)
     if other is not None:
         covariance = covariance + other
-    return PixelPlace(
-        pixel=(float(pixel[0]), float(pixel[1])),
+    return answered(
         reason=None,
         detail=_doubts(other is not None, incidence, surface.doubt),
-        epsg=view.epsg,
-        height_datum=view.height_datum,
-        surface=surface.kind,
         at_edge=other is not None,
         grazing=incidence > _GRAZING_DEG,
         utm=view.frame.utm_from_enu(point, view.epsg),
@@ -139,19 +133,11 @@ def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px:
     )
 
 
-def _inside(camera: Camera, pixel: FloatArray) -> bool:
-    return bool((pixel >= 0).all() and (pixel <= [camera.width, camera.height]).all())
-
-
 def _pixel_covariance(view: AnsweredView, point: FloatArray, sigma_px: float) -> FloatArray:
     """(2, 2): how far the pixel of a place may be off."""
     _, by_view = view.pixel_derivatives(point)
     # A floor far below what anybody sees keeps it regular.
     return np.asarray(by_view @ view.covariance @ by_view.T + (sigma_px**2 + 1e-6) * np.eye(2))
-
-
-def _longest(covariance: FloatArray) -> float:
-    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
 def _by_pixel(view: AnsweredView, point: FloatArray, normal: FloatArray) -> FloatArray:

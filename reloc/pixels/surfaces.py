@@ -308,10 +308,8 @@ def scan_surface(
     if not scans:
         return None
     cloud = load_cloud(database, view.frame, box, scan_ids=scans)
-    doubt = (
-        _UNKNOWN_HEIGHTS if view.height_datum == "unknown" and not _placed_by_scans(database, view) else ""
-    )
-    return ScanSurface(cloud=cloud, doubt=doubt) if len(cloud) else None
+    unsure = view.height_datum == "unknown" and not _placed_by_scans(database, view)
+    return ScanSurface(cloud=cloud, doubt=_UNKNOWN_HEIGHTS if unsure else "") if len(cloud) else None
 
 
 def _placed_by_scans(database: Database, view: AnsweredView) -> bool:

@@ -1,8 +1,6 @@
 """One query from bytes to reply: parse, decode, localise, word the answer. No network here."""
 
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +23,14 @@ from reloc.localise.lens_prior import QueryLensPrior, known_within
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
-from reloc.wire.query import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, RequestError
+from reloc.wire.query import (
+    CameraRequest,
+    ErrorCode,
+    LocaliseReply,
+    LocaliseWireRequest,
+    RequestError,
+    bad_request,
+)
 
 
 def answer_query(
@@ -35,11 +40,7 @@ def answer_query(
     *,
     limits: DecodeLimits = DEFAULT_LIMITS,
 ) -> LocaliseReply:
-    """Localise the image file in `data`.
-
-    Raises:
-        RequestError: why the query has no answer.
-    """
+    """Localise the image file in `data`. Raises RequestError: why the query has no answer."""
     clock = StageClock()
     try:
         gray, header = decode_photo(data, localiser, limits)
@@ -52,7 +53,7 @@ def answer_query(
     except IncompatibleExtractorError as error:
         raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
     except (MapNotFoundError, UnplacedBesideOthersError) as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, f"options.maps: {error}") from error
+        raise bad_request(f"options.maps: {error}") from error
     clock.lap("localise_rest", result.timings_ms)
     request_id = wire_request.request_id or uuid.uuid4().hex
     reply = reply_from_result(result, request_id=request_id, timings_ms={})
@@ -110,8 +111,10 @@ def query_camera(camera: CameraRequest, width: int, height: int) -> Camera:
     Raises:
         RequestError: BAD_REQUEST, it is none, or of another shape.
     """
-    with _as_bad_request("camera"):
+    try:
         return camera_of(camera).scaled_to(width, height)
+    except InvalidValueError as error:
+        raise bad_request(f"camera: {error}") from error
 
 
 def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | None:
@@ -121,13 +124,7 @@ def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | No
     lengths = {"OPENCV": 4, "SIMPLE_RADIAL": 3}.get(camera.model, 0)  # in pixels, which grow with the image
     sigmas = np.array(request.sigmas)
     sigmas[:lengths] *= camera.width / request.width
-    with _as_bad_request("camera.sigmas"):
-        return known_within(camera, sigmas)
-
-
-@contextmanager
-def _as_bad_request(field: str) -> Iterator[None]:
     try:
-        yield
+        return known_within(camera, sigmas)
     except InvalidValueError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, f"{field}: {error}") from error
+        raise bad_request(f"camera.sigmas: {error}") from error

@@ -100,11 +100,7 @@ class ServeOptions:
 
 
 def check_wire_name(name: str) -> str:
-    """`name`, if it can be one chunk of a Zenoh key.
-
-    Raises:
-        InvalidValueError: it cannot.
-    """
+    """`name`, if it can be one chunk of a Zenoh key. Raises InvalidValueError: it cannot."""
     if not is_name(name):
         raise InvalidValueError(
             f"database name on the wire: {NAME_EXPECTED}, found {name!r}; choose one with --name"

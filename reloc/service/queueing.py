@@ -1,13 +1,12 @@
 """Queries between Zenoh's callback and the workers: answered once each, in a bounded queue, in time."""
 
-import heapq
-import itertools
 import logging
 import threading
 import time
 import uuid
-from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable
+from typing import Literal
 
 import zenoh
 
@@ -28,8 +27,8 @@ def session_of(query: zenoh.Query) -> str:
 class PendingQuery:
     """A `zenoh.Query` between receipt and answer.
 
-    A worker, the deadline watch and the shutdown may all want to answer; the first one does. Answering
-    drops the Zenoh query, without which the client would wait for its timeout.
+    A worker, the deadline and the shutdown may all want to answer; the first one does. Answering drops the
+    Zenoh query, without which the client would wait for its timeout.
     """
 
     def __init__(
@@ -38,6 +37,7 @@ class PendingQuery:
         key: str,
         deadline_s: float,
         tally: Tally,
+        on_late: Callable[["PendingQuery"], None],  # told the moment that its time is over, in a thread
         *,
         identity: str | None,  # name of the client, where the server authenticates its clients
     ) -> None:
@@ -45,27 +45,31 @@ class PendingQuery:
         self.asker = identity or session_of(query)  # who shares the server with others
         self._query = query
         self._key = key
-        self._tally = tally
+        self._tally, self._on_late = tally, on_late
         self._lock = threading.Lock()
+        self._timer: threading.Timer | None = None
         self.answered = False  # or refused
         self.received = time.perf_counter()
         self.deadline = self.received + deadline_s
         self.request_id = uuid.uuid4().hex
         self.size = 0 if query.payload is None else len(query.payload)
 
-    def attachment(self) -> bytes | None:
-        """The request's attachment; None where there is none or it was answered meanwhile."""
+    def watch(self) -> None:
+        """Say when the deadline is over, also while a worker has the query; again when it is earlier."""
         with self._lock:
-            if self.answered or self._query.attachment is None:
-                return None
-            return self._query.attachment.to_bytes()
+            if self._timer is not None:
+                self._timer.cancel()
+            if not self.answered:
+                left_s = max(0.0, self.deadline - time.perf_counter())
+                self._timer = threading.Timer(left_s, self._on_late, (self,))
+                self._timer.daemon = True
+                self._timer.start()
 
-    def payload(self) -> bytes:
-        """The request's payload; empty where there is none or it was answered meanwhile."""
+    def bytes_of(self, part: Literal["attachment", "payload"]) -> bytes:
+        """A part of the request; empty where there is none or it was answered meanwhile."""
         with self._lock:
-            if self.answered or self._query.payload is None:
-                return b""
-            return self._query.payload.to_bytes()
+            found: zenoh.ZBytes | None = None if self.answered else getattr(self._query, part)
+            return b"" if found is None else found.to_bytes()
 
     def answer(self, reply: LocaliseReply) -> bool:
         """Send the reply; False if somebody was faster."""
@@ -99,6 +103,8 @@ class PendingQuery:
             if self.answered:
                 return False
             self.answered = True
+            if self._timer is not None:
+                self._timer.cancel()
             self._tally.add(kind, code, latency_ms)
             try:
                 with self._query as query:
@@ -123,12 +129,10 @@ class QueryQueue:
     """
 
     def __init__(self, max_length: int, max_bytes: int) -> None:
-        self._max_length = max_length
-        self._max_bytes = max_bytes
-        self._waiting: dict[str, deque[PendingQuery]] = {}
+        self._max_length, self._max_bytes = max_length, max_bytes
+        self._waiting: dict[str, list[PendingQuery]] = {}  # by asker, the oldest first; none is empty
         self._in_hand: Counter[str] = Counter()
         self._spent_s: dict[str, float] = {}
-        self._length = self._bytes = 0
         self._closed = False
         self._changed = threading.Condition()
 
@@ -141,20 +145,16 @@ class QueryQueue:
         with self._changed:
             if self._closed:
                 raise RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping; ask again later")
-            self._remove([i for waiting in self._waiting.values() for i in waiting if i.answered])
-            busy = RequestError(
-                ErrorCode.BUSY,
-                f"{self._length} queries ({self._bytes} bytes) are waiting, the queue is full; "
-                "try again in a second",
-            )
-            refused = self._who_makes_room(item)
+            self._remove([i for i in self._all() if i.answered])
+            length, size = len(self._all()), sum(i.size for i in self._all())
+            told = f"{length} queries ({size} bytes) are waiting, the queue is full; try again in a second"
+            busy = RequestError(ErrorCode.BUSY, told)
+            refused = self._who_makes_room(item, length, size)
             if refused is None:
                 raise busy
             self._remove(refused)
             self._spent_s.setdefault(item.asker, min(self._spent_s.values(), default=0.0))
-            self._waiting.setdefault(item.asker, deque()).append(item)
-            self._length += 1
-            self._bytes += item.size
+            self._waiting.setdefault(item.asker, []).append(item)
             self._changed.notify()
         for other in refused:
             other.refuse(busy)
@@ -162,13 +162,14 @@ class QueryQueue:
     def get(self) -> PendingQuery | None:
         """The next query, blocking, to be followed by `done`; None once closed and empty."""
         with self._changed:
-            while not self._waiting:
-                if self._closed:
-                    return None
-                self._changed.wait()
+            self._changed.wait_for(lambda: self._waiting or self._closed)
+            if not self._waiting:
+                return None
             asker = min(self._waiting, key=lambda name: (self._in_hand[name], self._spent_s[name]))
             self._in_hand[asker] += 1
-            return self._taken(self._waiting[asker].popleft())
+            item = self._waiting[asker][0]
+            self._remove([item])
+            return item
 
     def done(self, item: PendingQuery, seconds: float) -> None:
         """A worker has had the query for so long."""
@@ -189,18 +190,21 @@ class QueryQueue:
     def drain(self) -> list[PendingQuery]:
         """Take out all that wait."""
         with self._changed:
-            items = [item for waiting in self._waiting.values() for item in waiting]
+            items = self._all()
             self._waiting.clear()
-            self._length = self._bytes = 0
             return items
 
     def __len__(self) -> int:
-        return self._length
+        with self._changed:
+            return len(self._all())
 
-    def _who_makes_room(self, item: PendingQuery) -> list[PendingQuery] | None:
+    def _all(self) -> list[PendingQuery]:
+        return [item for waiting in self._waiting.values() for item in waiting]
+
+    def _who_makes_room(self, item: PendingQuery, length: int, size: int) -> list[PendingQuery] | None:
         """Those of others that go for it; None where who has most waiting has no more than its asker."""
         waiting = {asker: list(items) for asker, items in self._waiting.items()}
-        own, length, size = len(waiting.get(item.asker, ())), self._length, self._bytes
+        own = len(waiting.get(item.asker, ()))
         going: list[PendingQuery] = []
         while length >= self._max_length or size + item.size > self._max_bytes:
             most = max(waiting.values(), key=len, default=[])
@@ -210,59 +214,11 @@ class QueryQueue:
             length, size = length - 1, size - going[-1].size
         return going
 
-    def _remove(self, items: Sequence[PendingQuery]) -> None:
+    def _remove(self, items: list[PendingQuery]) -> None:
         for item in items:
             self._waiting[item.asker].remove(item)
-            self._taken(item)
-
-    def _taken(self, item: PendingQuery) -> PendingQuery:
-        """Account for a query that waits no more."""
-        self._length -= 1
-        self._bytes -= item.size
-        if not self._waiting[item.asker]:
-            del self._waiting[item.asker]
-        return item
-
-
-class DeadlineWatch:
-    """Says the moment a query's time is over, also while a worker still has it in hand."""
-
-    def __init__(self, on_late: Callable[[PendingQuery], None]) -> None:
-        self._on_late = on_late
-        self._heap: list[tuple[float, int, PendingQuery]] = []
-        self._order = itertools.count()
-        self._changed = threading.Condition()
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name="deadline-watch", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def add(self, item: PendingQuery) -> None:
-        """Watch the query; again when its deadline has become earlier."""
-        with self._changed:
-            heapq.heappush(self._heap, (item.deadline, next(self._order), item))
-            self._changed.notify()
-
-    def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while self._heap and self._heap[0][2].answered:
-                    heapq.heappop(self._heap)
-                if self._closed:
-                    return
-                wait_s = self._heap[0][0] - time.perf_counter() if self._heap else None
-                if wait_s is None or wait_s > 0:
-                    self._changed.wait(wait_s)
-                    continue
-                item = heapq.heappop(self._heap)[2]
-            self._on_late(item)
+            if not self._waiting[item.asker]:
+                del self._waiting[item.asker]
 
 
 def deadline_error(item: PendingQuery) -> RequestError:

@@ -16,7 +16,7 @@ from reloc.service.live.session import Follower
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
-from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
+from reloc.service.queueing import PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import (
     ServiceStartError,
     authenticates,
@@ -52,14 +52,14 @@ class Server:
 
     def __init__(
         self,
-        *,
         source: DatabaseSource,
+        options: ServeOptions,
+        database: str,
+        inbox: Inbox | None,
         area: ServedArea,
         session: zenoh.Session,
         endpoints: tuple[str, ...],
-        database: str,
-        options: ServeOptions,
-        inbox: Inbox | None,
+        *,
         authenticates: bool,
     ) -> None:
         self.database = database  # its name on the wire
@@ -75,9 +75,8 @@ class Server:
         self._reloads = 0
         self._reload_error: str | None = None
         self._queue = QueryQueue(options.max_queue, options.max_queued_bytes)
-        self._watch = DeadlineWatch(self._late)
         self._inbox = inbox
-        self._workers = WorkerPool(self._queue, self._watch, options, inbox)
+        self._workers = WorkerPool(self._queue, options, inbox)
         self._watcher = AreaWatcher(
             source,
             served_version=area.snapshot,
@@ -94,7 +93,7 @@ class Server:
             self.server_id,
             authenticates=authenticates,
         )
-        self._queryables: list[zenoh.Queryable[None]] = []
+        self._declared = ExitStack()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._token_lock = threading.Lock()
         self._closed = False
@@ -123,14 +122,7 @@ class Server:
             config.insert_json5("listen/endpoints", json.dumps(endpoints))
         session = open_server_session(config, ", ".join(endpoints) or str(options.config_path))
         server = cls(
-            source=source,
-            area=area,
-            session=session,
-            endpoints=endpoints,
-            database=database,
-            options=options,
-            inbox=inbox,
-            authenticates=authenticates(config),
+            source, options, database, inbox, area, session, endpoints, authenticates=authenticates(config)
         )
         try:
             server._declare()
@@ -142,8 +134,6 @@ class Server:
         """Start all parts; those that have begun end again where another one cannot."""
         with ExitStack() as undo:
             undo.callback(self._session.close)
-            self._watch.start()
-            undo.callback(self._watch.close)
             if self._inbox is not None:
                 self._inbox.start()
                 undo.callback(self._inbox.close, 0.0)
@@ -163,7 +153,7 @@ class Server:
             (self._keys.of("status"), self._on_status),
             (self._keys.of("maps"), self._on_maps),
         ):
-            self._queryables.append(self._session.declare_queryable(key, callback, complete=True))
+            self._declared.enter_context(self._session.declare_queryable(key, callback, complete=True))
         if whole:
             self._live.start()
         self._advertise(self._area)  # after the queryables: who sees the token can ask at once
@@ -192,11 +182,9 @@ class Server:
         for item in (*self._queue.drain(), *left):
             item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server stopped before it could answer"))
             self._workers.abandon(item)
-        for queryable in self._queryables:
-            queryable.undeclare()
+        self._declared.close()
         if self._inbox is not None:
             self._inbox.close(self._options.shutdown_grace_s)
-        self._watch.close()
         self._watcher.close(timeout_s=self._options.shutdown_grace_s)
         self._session.close()
         self._log("stopped", queries=self._queries().model_dump())
@@ -253,6 +241,7 @@ class Server:
             self._keys.localise(client, self.server_id if is_addressed(str(query.key_expr)) else ""),
             self._options.deadline_s,
             self._tally,
+            self._late,
             identity=client if self._authenticates else None,
         )
         try:
@@ -266,7 +255,7 @@ class Server:
         except RequestError as error:
             item.refuse(error)
         else:
-            self._watch.add(item)
+            item.watch()
 
     def _on_status(self, query: zenoh.Query) -> None:
         with query:
@@ -278,7 +267,7 @@ class Server:
         with query:
             query.reply(self._keys.of("maps"), encode(reply), encoding=_JSON)
 
-    # The watch over deadlines calls this.
+    # The deadline of a query calls this.
 
     def _late(self, item: PendingQuery) -> None:
         item.refuse(deadline_error(item))

@@ -1,7 +1,7 @@
 """What a track stands on, points of maps or of a scan in one local frame, and what it says of a frame."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,10 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from reloc.localise.result import CameraSource, LocaliseRequest, OnEarth, OwnPose
+from reloc.localise.result import LocaliseRequest, OnEarth, OwnPose
 from reloc.tracking.options import TrackOptions
+from reloc.wire.query import CameraSource
+from reloc.wire.track import TrackState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,9 +87,6 @@ class Unmatched:
 
     reason: str
     detail: str
-
-
-TrackState = Literal["tracking", "relocalised", "lost"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

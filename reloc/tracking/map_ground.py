@@ -59,7 +59,6 @@ class MapGround:
             camera=camera,
             camera_source="request",
             inliers=np.ones(len(pixels), dtype=np.bool_),
-            prior_focal_px=camera.focal_px,
         )
         refined = refine_pose(pixels, points, start, settings.pose)
         if refined.count < options.min_matches:

@@ -73,19 +73,8 @@ def fit_pose(
     def linearise() -> None:
         longer = focal * float(np.exp(zoom))
         rotation = np.ascontiguousarray(pose.rotation)  # the loop is compiled for this order alone
-        linearised(
-            rotation,
-            pose.translation,
-            points,
-            seen,
-            focal,
-            longer,
-            loss,
-            residual,
-            jacobian,
-            normal,
-            gradient,
-        )
+        made = (residual, jacobian, normal, gradient)
+        linearised(rotation, pose.translation, points, seen, focal, longer, loss, *made)
 
     for _ in range(_ITERATIONS):
         linearise()

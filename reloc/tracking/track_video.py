@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError, VideoError
+from featuredb.errors import VideoError
 from featuredb.features.exif.read import unnamed_model
 from featuredb.file_digest import file_sha256
 from featuredb.geometry.camera import Camera
@@ -90,8 +90,6 @@ class ReadAhead:
 
     def __init__(self, video: Video, most: int = 24) -> None:
         """`most`: frames that are decoded before they are used; fewer of large films, for their memory."""
-        if most < 1:
-            raise InvalidValueError(f"most: expected 1 frame or more to be read ahead, found {most}")
         info = video.info
         bytes_each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
         self._frames: Iterator[VideoFrame] | None = None
@@ -134,8 +132,8 @@ class ReadAhead:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackVideoOptions:
-    """How a video is tracked.
+class TrackVideoOptions(VideoOptions):
+    """How a video is read, as in VideoOptions, and tracked.
 
     Attributes:
         max_side_px: frames are made smaller for tracking; flow costs as their area, and 1280 pixels tell a
@@ -145,10 +143,7 @@ class TrackVideoOptions:
         track: the tracker's settings.
     """
 
-    max_side_px: int = 1280
-    start_s: float | None = None
-    end_s: float | None = None
-    fps: float | None = None
+    max_side_px: int | None = 1280
     track: TrackOptions = field(default_factory=TrackOptions)
 
 
@@ -188,15 +183,12 @@ def track_video(
     trouble: list[str] = []
     clock = StageClock()
     last = gap = 0.0
-    settings = VideoOptions(
-        max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s, fps=options.fps
-    )
     threads = cv2.getNumThreads()
     # Flow of a few hundred points gains nothing by a second thread; the keyframes have that core.
     cv2.setNumThreads(1)
     try:
         with ExitStack() as stack:
-            video = stack.enter_context(open_video(source, settings))
+            video = stack.enter_context(open_video(source, options))
             info = video.info
             lens = None if camera is None else camera.scaled_to(info.frame_width, info.frame_height)
             request = _with_film(request or LocaliseRequest(), info, source)

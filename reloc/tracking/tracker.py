@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from featuredb.geometry.camera import Camera
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.flow_track import FlowTrack, RecentFrame, RecentFrames, carried
-from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, TrackState, Unmatched
+from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, Unmatched
 from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose
+from reloc.wire.track import TrackState
 
 Answer = Keyframe | FlowTrack | Unmatched
 _FAR = sys.maxsize
@@ -68,7 +69,9 @@ class Tracker:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
         self._track: FlowTrack | None = None
         self._frames = RecentFrames(_frames_kept(self._options))
-        self._late: list[TrackedFrame] = []
+        # Earlier frames, said to be lost then, whose poses the last call of `track` has found: from a
+        # localised frame on, which is answered some frames later, and before it, back to a cut.
+        self.late: list[TrackedFrame] = []
         self._sent: _Sent | None = None
         self._catching: _Catching | None = None
         self._behind = _FAR  # frames through which the thread carries a track that was found, live
@@ -97,7 +100,7 @@ class Tracker:
         before = self._frames.last
         now = RecentFrame(index=self._index, time_s=time_s, gray=gray, camera_key=camera_key)
         self._frames.add(now, self._needed_from())
-        self._late = []
+        self.late = []
         fitted = None
         state: TrackState = "tracking"
         if before is not None and self._track is not None:
@@ -126,11 +129,6 @@ class Tracker:
         return self._known(now, state, fitted, self._track)
 
     @property
-    def tracking(self) -> bool:
-        """Whether the last frame has a pose."""
-        return self._track is not None
-
-    @property
     def busy(self) -> bool:
         """Whether the thread of the keyframes has one in hand."""
         return self._sent is not None and not self._sent.answer.done()
@@ -149,21 +147,12 @@ class Tracker:
             self._lost("LOST: the maps have changed")
         self._sent = None
 
-    @property
-    def late(self) -> Sequence[TrackedFrame]:
-        """Earlier frames, said to be lost then, whose poses the last call of `track` has found.
-
-        A localised frame is answered some frames later; from it on, the frames between are tracked, too, and
-        those before it, back to a cut.
-        """
-        return tuple(self._late)
-
     def finish(self) -> Sequence[TrackedFrame]:
         """After the last frame: poses of those before it that a frame still being looked for has found."""
-        sent, self._sent = self._sent, None
-        if self._options.live or self.tracking:
+        sent, self._sent, followed = self._sent, None, self._track
+        if self._options.live or followed is not None:
             return ()
-        self._late = []
+        self.late = []
         last, fitted = self._frames.last, None
         if sent is not None and last is not None:
             answered = sent.answer.result()
@@ -172,9 +161,9 @@ class Tracker:
         if self._catching is not None:
             fitted = self._caught_up_by(_FAR)
         if fitted is not None and self._track is not None and last is not None:
-            state: TrackState = "tracking" if self._late else "relocalised"
-            self._late.append(self._known(last, state, fitted, self._track))
-        return tuple(self._late)
+            state: TrackState = "tracking" if self.late else "relocalised"
+            self.late.append(self._known(last, state, fitted, self._track))
+        return self.late
 
     def _known(
         self, frame: RecentFrame, state: TrackState, fitted: FittedPose, track: FlowTrack
@@ -245,7 +234,7 @@ class Tracker:
         if self._options.live:
             return self._caught_up(begun, since)
         earlier = self._earlier(found, since[0])
-        self._late.extend(earlier)
+        self.late.extend(earlier)
         state: TrackState = "tracking" if earlier else "relocalised"
         self._catching = _Catching(track=begun, at=since[0], fitted=fitted, state=state)
         return self._caught_up_by(self._options.catch_up)
@@ -282,7 +271,7 @@ class Tracker:
         catching = self._catching
         assert catching is not None
         for before, after in pairwise(self._frames.since(catching.at.index)[: most + 1]):
-            self._late.append(self._known(before, catching.state, catching.fitted, catching.track))
+            self.late.append(self._known(before, catching.state, catching.fitted, catching.track))
             followed = catching.track.follow(before, after)
             if followed is None:
                 self._lost(f"LOST: {catching.track.why}")

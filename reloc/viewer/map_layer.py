@@ -16,7 +16,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.lineage import MapLineage, describe_lineage
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store import MapSummary, UnplacedSummary
-from reloc.viewer.points import DrawnPoints, drawn_points, sampled
+from reloc.viewer.points import DrawnPoints
 from reloc.viewer.poses import drawn_pose, worded_place, worded_sigmas
 
 _CELLS = 60  # along the longer side of the drawn points; smaller cells would fall into specks
@@ -116,12 +116,6 @@ def _round_length(length: float) -> float:
     """1, 2 or 5 times a power of ten, at least `length`."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(next(f * power for f in (1.0, 2.0, 5.0, 10.0) if f * power >= length - 1e-12))
-
-
-def own_points(unplaced: UnplacedMap, wanted: int) -> DrawnPoints:
-    """At most `wanted` points of the map, own units."""
-    rows = sampled(len(unplaced.points), wanted)
-    return drawn_points(unplaced.points.xyz[rows], unplaced.points.rgb[rows], len(unplaced.points))
 
 
 def describe_own_place(

@@ -6,7 +6,7 @@ place: such a frame is level at its origin only, so maps that are far from each 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,9 @@ from reloc.viewer.map_layer import (
     describe_map,
     describe_own_place,
     describe_photos,
-    own_points,
     picks_command,
 )
-from reloc.viewer.points import DrawnPoints, map_points, scan_points_in, shares
+from reloc.viewer.points import DrawnPoints, drawn_points, map_points, sampled, scan_points_in, shares
 from reloc.viewer.poses import describe_trajectory
 
 DEFAULT_POINTS = 1_000_000
@@ -151,7 +150,9 @@ class _Builder:
         self._tell()
         if unplaced is None:
             return
-        drawn = own_points(unplaced, self._options.points)
+        points_of, count = unplaced.points, len(unplaced.points)
+        rows = sampled(count, self._options.points)
+        drawn = drawn_points(points_of.xyz[rows], points_of.rgb[rows], count)
         (buffer,), data = _packed([drawn])
         command = picks_command(self._database.url, summary.map_id, self._options.photos)
         places.append(describe_own_place(summary, unplaced, drawn, buffer, command))
@@ -206,11 +207,7 @@ class _Builder:
         of_scan = slice(len(shown), None)
         place = {
             "name": f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}",
-            "frame": {
-                "latitude_deg": frame.latitude_deg,
-                "longitude_deg": frame.longitude_deg,
-                "height_m": frame.height_m,
-            },
+            "frame": asdict(frame),
             "height_datums": sorted({m.height_datum for m in maps} | {s.height_datum for s in scans}),
             "maps": [{**told, "buffer": b} for (told, _), b in zip(shown, buffers, strict=False)],
             "scans": [
@@ -278,11 +275,7 @@ def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]
 
 
 def spot_of_trajectory(trajectory: Trajectory) -> Spot:
-    """Where the first known pose lies.
-
-    Raises:
-        InvalidValueError: all frames are lost.
-    """
+    """Where the first known pose lies. Raises InvalidValueError: all frames are lost."""
     pose = next((point.pose for point in trajectory.points if point.pose is not None), None)
     if pose is None:
         raise InvalidValueError(

@@ -20,6 +20,19 @@ MESSAGE_HEADROOM = 4
 _SHOWN_INPUT_CHARS = 80  # of a refused value, in the message that refuses it
 
 
+# Words of an answer: why there is no pose, where the lens came from, what the photo's own position did.
+Reason = Literal[
+    "NO_COVERAGE",
+    "TOO_FEW_FEATURES",
+    "TOO_FEW_MATCHES",
+    "TOO_FEW_INLIERS",
+    "AMBIGUOUS",
+    "CONTRADICTS_PRIOR",
+]
+CameraSource = Literal["request", "map", "exif", "estimated"]
+PositionRole = Literal["agrees", "decided", "contradicted", "no_help"]
+
+
 class ErrorCode(StrEnum):
     """Why a query got `reply_err` instead of an answer."""
 
@@ -41,6 +54,11 @@ class RequestError(ServiceError):
         super().__init__(code.value, message, request_id)
 
 
+def bad_request(message: str, request_id: str | None = None) -> RequestError:
+    """The request is not what it should be, as the message says."""
+    return RequestError(ErrorCode.BAD_REQUEST, message, request_id)
+
+
 class Request(BaseModel):
     """Base of what a client sends: unknown fields are refused."""
 
@@ -59,6 +77,7 @@ class Answer(BaseModel):
 RequestId = Annotated[str, Field(pattern=r"^[A-Za-z0-9._:-]{1,128}$")]
 # Names of people and terms: no control characters, since terminals and logs show them.
 Name = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f-\x9f][^\x00-\x1f\x7f-\x9f]{0,199}$")]
+MapId = Annotated[str, Field(min_length=1, max_length=200)]
 # Wide enough for any camera; a value outside is a unit mistake or nonsense.
 CameraParam = Annotated[float, Field(ge=-1e6, le=1e6)]
 CameraSigma = Annotated[float, Field(ge=0, le=1e6)]
@@ -106,10 +125,7 @@ class RequestOptions(Request):
 
     inliers: bool = False
     exif_prior: bool = False
-    maps: (
-        Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=1000)]
-        | None
-    ) = None
+    maps: Annotated[tuple[MapId, ...], Field(max_length=1000)] | None = None
     deadline_ms: Annotated[float, Field(ge=1, le=600_000)] | None = None
 
 
@@ -183,7 +199,7 @@ class Intrinsics(Answer):
 class CameraUsed(Intrinsics):
     """Intrinsics that the pose was computed with, and where they came from."""
 
-    source: Literal["request", "map", "exif", "estimated"]
+    source: CameraSource
 
 
 class Lineage(Answer):
@@ -220,7 +236,7 @@ class OwnPositionUse(Answer):
     either. `distance_m`: of the answer from it, horizontally.
     """
 
-    role: Literal["agrees", "decided", "contradicted", "no_help"]
+    role: PositionRole
     distance_m: NotNegative | None
 
 
@@ -264,16 +280,6 @@ class ContributionReply(Answer):
     detail: str
 
 
-ReasonText = Literal[
-    "NO_COVERAGE",
-    "TOO_FEW_FEATURES",
-    "TOO_FEW_MATCHES",
-    "TOO_FEW_INLIERS",
-    "AMBIGUOUS",
-    "CONTRADICTS_PRIOR",
-]
-
-
 class LocaliseReply(Answer):
     """The answer to a localise query; the pose's fields are null when it is not localised on Earth.
 
@@ -285,7 +291,7 @@ class LocaliseReply(Answer):
     """
 
     status: Literal["localised", "localised_in_map", "not_localised"]
-    reason: ReasonText | None
+    reason: Reason | None
     detail: str
     position: Position | None
     quaternion: Quaternion | None
@@ -350,14 +356,12 @@ def parse_attachment(model: type[_Attached], attachment: bytes | None) -> _Attac
     """
     attachment = attachment or b"{}"
     if len(attachment) > MAX_ATTACHMENT_BYTES:
-        raise RequestError(
-            ErrorCode.BAD_REQUEST,
-            f"attachment: expected at most {MAX_ATTACHMENT_BYTES} bytes of JSON, found {len(attachment)}",
-        )
+        most = f"at most {MAX_ATTACHMENT_BYTES} bytes of JSON"
+        raise bad_request(f"attachment: expected {most}, found {len(attachment)}")
     try:
         return model.model_validate_json(attachment)
     except ValidationError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, explain(error), _request_id_of(attachment)) from error
+        raise bad_request(explain(error), _request_id_in(attachment)) from error
 
 
 def encode(message: BaseModel) -> bytes:
@@ -365,27 +369,30 @@ def encode(message: BaseModel) -> bytes:
     return message.model_dump_json().encode()
 
 
-def explain(error: ValidationError) -> str:
-    """One line for people out of pydantic's list: field, expectation, what was found."""
+def explain(error: ValidationError, whole: str = "attachment", *, inputs: bool = True) -> str:
+    """One line for people out of pydantic's list: field (or `whole`), expectation, what was found."""
     parts = []
-    for item in error.errors(include_url=False)[:3]:
-        where = ".".join(str(step) for step in item["loc"]) or "attachment"
-        found: Any = item.get("input")
-        shown = repr(found)
-        if len(shown) > _SHOWN_INPUT_CHARS:
-            shown = shown[:_SHOWN_INPUT_CHARS] + "..."
-        parts.append(f"{where}: {item['msg']}, found {shown}")
+    for item in error.errors(include_url=False, include_input=inputs, include_context=False)[:3]:
+        told = f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}"
+        if inputs:
+            shown = repr(item["input"])
+            told += f", found {shown[:_SHOWN_INPUT_CHARS]}{'...' * (len(shown) > _SHOWN_INPUT_CHARS)}"
+        parts.append(told)
     return "; ".join(parts)
 
 
-def _request_id_of(attachment: bytes) -> str | None:
+def request_id_of(found: Any) -> str | None:
+    """What a client calls its request, if a request can be called so."""
+    try:
+        return LocaliseWireRequest(request_id=found).request_id
+    except ValidationError:
+        return None
+
+
+def _request_id_in(attachment: bytes) -> str | None:
     """The request id of a refused attachment, where it can still be read."""
     try:
         found = json.loads(attachment)
     except (ValueError, RecursionError):
         return None
-    request_id = found.get("request_id") if isinstance(found, dict) else None
-    try:
-        return LocaliseWireRequest(request_id=request_id).request_id
-    except ValidationError:
-        return None
+    return request_id_of(found.get("request_id")) if isinstance(found, dict) else None

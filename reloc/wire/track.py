@@ -74,7 +74,7 @@ class TrackFrame(Request):
     time_s: Annotated[float, Field(ge=-1e12, le=1e12)]  # on the client's own clock
 
 
-TrackStateText = Literal["tracking", "relocalised", "lost"]
+TrackState = Literal["tracking", "relocalised", "lost"]
 
 
 class TrackPose(Answer):
@@ -88,7 +88,7 @@ class TrackPose(Answer):
     session: str
     sequence: Sequence
     time_s: float
-    state: TrackStateText
+    state: TrackState
     detail: str
     position: Position | None
     quaternion: Quaternion | None

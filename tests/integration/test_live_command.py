@@ -16,9 +16,9 @@ from featuredb.errors import ServiceError, VideoError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.video.writer import VideoWriter
 from reloc.client import Client
-from reloc.client.film import stream_film
+from reloc.client.film import point_of_message, stream_film
+from reloc.service.live.frames import pose_message
 from reloc.service.server import Server
-from reloc.tracking.pose_message import point_of_message, pose_message
 from reloc.wire.track import TrackPose
 from tests.support.live import LENS, SOON_S, error_m, frame, localiser
 from tests.support.planar_map import CAMERA

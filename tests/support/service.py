@@ -59,7 +59,7 @@ def localised(snapshot: int, camera: Camera, *, want_inliers: bool = False) -> L
         residual_rms_px=0.8,
         inliers=inliers if want_inliers else None,
     )
-    runner_up = RunnerUp(inliers=9, distance_m=40.0, angle_deg=170.0, latitude_deg=49.0, longitude_deg=8.4)
+    runner_up = RunnerUp(inliers=9, distance_m=40.0, angle_deg=170.0, lat=49.0, lon=8.4)
     return LocaliseResult(
         reason=None,
         detail="1 map",

@@ -42,7 +42,6 @@ def answer_of(
         camera=Camera.from_focal(1000, 800, 900.0),
         camera_source="request",
         inliers=np.ones(len(rows), dtype=bool),
-        prior_focal_px=900.0,
     )
     uncertainty = PoseUncertainty(
         joint=np.zeros((6, 6)) if measured is None else measured,
@@ -183,7 +182,6 @@ def test_what_pixels_show_has_the_covariance_of_pose_and_lens_together() -> None
         camera=camera,
         camera_source="estimated",
         inliers=np.ones(20, dtype=bool),
-        prior_focal_px=900.0,
     )
     scale = np.array([1e-3] * 3 + [0.05] * 3 + [3.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4])
     root = rng.normal(size=(14, 14)) * scale[:, None]

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[2]
 MOST_WORDS = 15_000
 _NOT_COUNTED = ("decisions", "measurements", "measurements.md")
 # Types and enumerations in which the program lists codes, and the arguments that hand one on.
-_LISTS = re.compile(r"\w*(Reason|ReasonText|ErrorCode|ERROR_CODES)")
+_LISTS = re.compile(r"\w*(Reason|ErrorCode|ERROR_CODES)")
 _ARGUMENTS = {"reason", "reason_code"}
 _CODE, _LIKE_A_CODE = re.compile(r"[A-Z_]{3,}|[a-z]+(_[a-z]+)*"), re.compile(r"[A-Z]+(_[A-Z]+)+")
 _NO_REASONS = re.compile(

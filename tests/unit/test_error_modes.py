@@ -91,7 +91,6 @@ def test_a_pose_is_off_as_the_map_is(lens_of_photo: str) -> None:
         camera=right,
         camera_source="map",
         inliers=np.ones(len(rows), np.bool_),
-        prior_focal_px=None,
     )
     covariance = shape_covariance(area, 0, pose, rows, modes)
     assert covariance is not None

@@ -49,7 +49,6 @@ def start(pose: Rigid3, camera: Camera, count: int) -> PoseHypothesis:
         camera=camera,
         camera_source="request",
         inliers=np.ones(count, dtype=bool),
-        prior_focal_px=camera.focal_px,
     )
 
 

@@ -191,6 +191,18 @@ def test_a_photo_that_cannot_be_described_does_not_take_others_with_it(store, op
     assert (status.accepted, status.written, status.lost) == (4, 3, 1)
 
 
+def test_a_photo_that_cannot_be_described_counts_against_nobody(store, opened):
+    store.gate = Gate()
+    inbox = opened(InboxOptions(max_owner_photos=2))
+    give(inbox, contribution(0, "Bob"))
+    assert store.gate.entered.acquire(timeout=WAIT_S)
+    for make in (lambda: 1 / 0, lambda: contribution(1, "Ada")):  # in one batch
+        inbox.submit(inbox.reserve("Ada", 10), make)
+    store.gate.open()
+    until(lambda: inbox.status().waiting == 0, "all are done")
+    assert reason(give(inbox, contribution(2, "Ada"))) == "taken"
+
+
 def test_a_store_that_cannot_be_counted_at_the_start(opened, store, monkeypatch):
     def fail() -> InboxCounts:
         raise StoreError("no such bucket")

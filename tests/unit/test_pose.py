@@ -72,7 +72,8 @@ def test_a_free_focal_length_with_outliers(seed: int, guess: float) -> None:
     assert angle_deg < 0.5
     assert found.camera.focal_px == pytest.approx(900, rel=0.01)
     assert (found.inliers & true).sum() > 0.95 * true.sum()
-    assert found.prior_focal_px == guess
+    assert found.lens_prior is not None
+    assert found.lens_prior.mean[0] == guess
 
 
 def test_the_same_input_gives_the_same_pose() -> None:
@@ -137,7 +138,6 @@ def test_a_pose_that_points_on_a_line_leave_open_is_not_called_certain() -> None
         camera=CAMERA,
         camera_source="request",
         inliers=np.ones(40, dtype=bool),
-        prior_focal_px=900.0,
     )
     measured = pose_uncertainty(pixels, points, np.zeros((40, 3, 3)), pose, OPTIONS)
     assert np.sqrt(np.linalg.eigvalsh(measured.covariance[3:, 3:])[-1]) > 50.0
@@ -219,7 +219,6 @@ def test_the_covariance_is_that_of_the_errors(noise_px: float, tolerance_rel: fl
             camera=CAMERA,
             camera_source="request",
             inliers=np.ones(len(points), dtype=bool),
-            prior_focal_px=900.0,
         )
         found = refine_pose(pixels, mapped, start, options)
         rows = found.inliers

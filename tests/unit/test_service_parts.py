@@ -12,7 +12,6 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
-from reloc.localise.result import Reason
 from reloc.reply import reply_from_result
 from reloc.service.logs import Tally
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
@@ -20,7 +19,14 @@ from reloc.service.queueing import QueryQueue
 from reloc.service.session import bind_free_port
 from reloc.service.workers.answering import capped_process
 from reloc.wire.keys import Keys
-from reloc.wire.query import ContributionReply, LocaliseWireRequest, RequestError, encode, parse_attachment
+from reloc.wire.query import (
+    ContributionReply,
+    LocaliseWireRequest,
+    Reason,
+    RequestError,
+    encode,
+    parse_attachment,
+)
 from reloc.wording import ADVICE, describe
 from tests.support.service import localised, not_localised
 

@@ -38,7 +38,7 @@ def photos(rng: np.random.Generator, count: int, camera: Camera, noise_px: float
             camera=Camera.from_focal(WIDTH, HEIGHT, 0.95 * camera.focal_px),
             camera_source="exif",
             inliers=np.ones(len(points), dtype=bool),
-            prior_focal_px=0.95 * camera.focal_px,
+            lens_prior=LensPriors().around(camera, 0.95 * camera.focal_px, LensPriors().exif_focal_rel),
         )
         alone = refine_pose(pixels, points, start, PoseOptions())
         rows = alone.inliers
@@ -137,12 +137,10 @@ def test_a_known_lens_is_kept_within_its_sigmas_and_no_closer() -> None:
         camera=TRUE,
         camera_source="request",
         inliers=np.ones(len(view.pixels), dtype=bool),
-        prior_focal_px=900.0,
     )
     for sigmas, within in ((np.zeros(8), 1e-3), (np.full(8, 1e-9), 1e-3)):
         tight = PoseHypothesis(
             **{f: getattr(start, f) for f in ("cam_from_local", "camera", "camera_source", "inliers")},
-            prior_focal_px=900.0,
             lens_prior=known_within(TRUE, sigmas),
         )
         found = refine_pose(view.pixels, view.points, tight, PoseOptions())
@@ -153,7 +151,6 @@ def test_a_known_lens_is_kept_within_its_sigmas_and_no_closer() -> None:
         camera=wrong,
         camera_source="request",
         inliers=start.inliers,
-        prior_focal_px=900.0,
         lens_prior=known_within(wrong, np.array([20.0, 20.0, 1, 1, 1e-3, 1e-3, 1e-5, 1e-5])),
     )
     found = refine_pose(view.pixels, view.points, loose, PoseOptions())

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from featuredb.errors import InvalidValueError, VideoError
+from featuredb.errors import VideoError
 from featuredb.video.film import Video, VideoFrame, VideoReport
 from featuredb.video.frames import open_video
 from reloc.tracking.track_video import ReadAhead
@@ -119,8 +119,3 @@ def test_a_film_that_is_left_early_has_no_thread_left(tmp_path: Path) -> None:
             if frame.index == 3:
                 break
     assert not [t.name for t in threading.enumerate() if t.name.startswith("decoding")]
-
-
-def test_nothing_to_read_ahead_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidValueError, match="1 frame or more"):
-        ReadAhead(_Film(film(tmp_path, "mp4")), most=0)

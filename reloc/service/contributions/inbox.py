@@ -44,9 +44,7 @@ def contribution_of(
         width=header.width,
         height=header.height,
         owner=owner,
-        credit=request.credit or "",
-        licence=request.licence or "",
-        client_id=request.client_id or "",
+        **{name: getattr(request, name) or "" for name in ("credit", "licence", "client_id")},
         received_at=received_at,
         request={**asked, "exif": exif},
         answer=reply.model_dump(mode="json", include=_ANSWER),
@@ -70,7 +68,7 @@ class InboxOptions:
     retry_s: tuple[float, ...] = (0.5, 2.0, 8.0, 30.0)  # pauses before a failed write is tried again
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ticket:
     """A place in the queue for a photo of `size` bytes; `submit` or `cancel` must be called with it, once."""
 
@@ -91,8 +89,7 @@ class Inbox:
         self._options = options or InboxOptions()
         self._changed = threading.Condition()
         self._queue: deque[tuple[Ticket, Callable[[], Contribution]]] = deque()
-        self._reserved = self._reserved_bytes = 0  # places given out and not yet written
-        self._owners: Counter[str] = Counter()  # of these places
+        self._places: set[Ticket] = set()  # that are given out and not yet written
         self._counts = InboxCounts(by_state={}, waiting_by_owner={}, stored_bytes=0)
         self._counted_at = -1e9
         self._limited = False  # someone was refused by the counts since they were taken
@@ -117,7 +114,7 @@ class Inbox:
         self._thread.join(timeout_s)
         with self._changed:
             if self._thread.is_alive():  # with a batch in hand that the store may still take
-                _lost(self._reserved, "the server stopped before the store took them")
+                _lost(len(self._places), "the server stopped before the store took them")
 
     def reserve(self, owner: str, size: int) -> Ticket | ContributionReply:
         """A place for a photo of `size` bytes, or why there is none. Returns at once."""
@@ -127,10 +124,9 @@ class Inbox:
                 reason, detail = refusal
                 self._refused[reason] += 1
                 return ContributionReply(accepted=False, candidate_id=None, reason=reason, detail=detail)
-            self._reserved += 1
-            self._reserved_bytes += size
-            self._owners[owner] += 1
-            return Ticket(owner=owner, size=size)
+            place = Ticket(owner=owner, size=size)
+            self._places.add(place)
+            return place
 
     def submit(self, ticket: Ticket, make: Callable[[], Contribution]) -> None:
         """Give the photo; `make` is called by the writing thread."""
@@ -142,11 +138,7 @@ class Inbox:
     def cancel(self, ticket: Ticket) -> None:
         """Give the place back."""
         with self._changed:
-            self._reserved -= 1
-            self._reserved_bytes -= ticket.size
-            self._owners[ticket.owner] -= 1
-            if not self._owners[ticket.owner]:
-                del self._owners[ticket.owner]
+            self._places.remove(ticket)
 
     def status(self) -> ContributionStatus:
         """For `.../status`."""
@@ -154,7 +146,7 @@ class Inbox:
             return ContributionStatus(
                 accepted=self._accepted,
                 refused=dict(sorted(self._refused.items())),
-                waiting=self._reserved,
+                waiting=len(self._places),
                 written=self._written,
                 lost=self._lost,
                 error=self._error,
@@ -165,14 +157,13 @@ class Inbox:
         if self._error is not None or self._closed:
             why = self._error or "the server is stopping"
             return "STORE_FAILED", f"the inbox cannot be written: {why}"
-        if self._reserved >= options.max_queue or self._reserved_bytes + size > options.max_queued_bytes:
-            return "QUEUE_FULL", (
-                f"{self._reserved} contributed photos ({self._reserved_bytes} bytes) wait to be stored; send "
-                "it again in a few seconds"
-            )
-        mine = counts.waiting_by_owner.get(owner, 0) + self._owners[owner]
-        stored = counts.stored_bytes + self._reserved_bytes
-        waiting = counts.waiting + self._reserved
+        queued, queued_bytes = len(self._places), sum(place.size for place in self._places)
+        if queued >= options.max_queue or queued_bytes + size > options.max_queued_bytes:
+            told = f"{queued} contributed photos ({queued_bytes} bytes) wait to be stored"
+            return "QUEUE_FULL", f"{told}; send it again in a few seconds"
+        mine = counts.waiting_by_owner.get(owner, 0) + sum(place.owner == owner for place in self._places)
+        stored = counts.stored_bytes + queued_bytes
+        waiting = counts.waiting + queued
         refusal: tuple[ContributionReason, str]
         if mine >= options.max_owner_photos:
             told = f"{mine} photos of this owner wait for growth, which is as many as one owner may have"
@@ -212,22 +203,19 @@ class Inbox:
             return [self._queue.popleft() for _ in range(min(len(self._queue), self._options.batch))]
 
     def _write(self, batch: "list[tuple[Ticket, Callable[[], Contribution]]]") -> None:
-        tickets = [ticket for ticket, _ in batch]
-        contributions = [made for _, make in batch if (made := _made(make)) is not None]
-        written = self._write_with_retries(contributions) if contributions else False
+        made = [(ticket, one) for ticket, make in batch if (one := _made(make)) is not None]
+        if not (made and self._write_with_retries([one for _, one in made])):
+            made = []
         with self._changed:
-            if written:
-                self._written += len(contributions)
-                self._lost += len(batch) - len(contributions)
-                waiting = Counter(self._counts.waiting_by_owner) + Counter(t.owner for t in tickets)
-                states = Counter(self._counts.by_state) + Counter(waiting=len(batch))
-                stored = self._counts.stored_bytes + sum(t.size for t in tickets)
-                self._counts = InboxCounts(
-                    by_state=dict(states), waiting_by_owner=dict(waiting), stored_bytes=stored
-                )
-            else:
-                self._lost += len(batch)
-        for ticket in tickets:
+            self._written += len(made)
+            self._lost += len(batch) - len(made)
+            waiting = Counter(self._counts.waiting_by_owner) + Counter(ticket.owner for ticket, _ in made)
+            states = Counter(self._counts.by_state) + Counter(waiting=len(made))
+            stored = self._counts.stored_bytes + sum(ticket.size for ticket, _ in made)
+            self._counts = InboxCounts(
+                by_state=dict(states), waiting_by_owner=dict(waiting), stored_bytes=stored
+            )
+        for ticket, _ in batch:
             self.cancel(ticket)
 
     def _write_with_retries(self, contributions: list[Contribution]) -> bool:

@@ -2,9 +2,10 @@
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +13,24 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError
 from featuredb.features.decode import decode_gray, probe
 from featuredb.features.shrink import fitted_size, shrunk
+from featuredb.geo.geopose import BODY_AXES
+from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from reloc.answered_view import geo_prior
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
+from reloc.reply import place_fields
 from reloc.service.handler import image_refused, query_camera
 from reloc.service.options import LiveOptions
 from reloc.tracking.map_ground import MapFinder
-from reloc.tracking.pose_message import pose_message
 from reloc.tracking.tracker import Tracker
-from reloc.tracking.trajectory.values import point_of
-from reloc.wire.query import ErrorCode, RequestError
+from reloc.tracking.trajectory.values import TrajectoryPoint, point_of
+from reloc.wire.query import ErrorCode, Intrinsics, RequestError
 from reloc.wire.track import TrackOpenRequest, TrackPose
 
 # Pixels to decode that 4K video has at most. Frames of more are served behind queries.
 _VIDEO_PIXELS = 4096 * 2160
+_PLACE = ("position", "quaternion", "height_datum", "utm", "covariance", "accuracy", "camera", "map_id")
 _YIELDING = 10  # niceness: a ninth of the processor that a query gets beside it
 
 
@@ -80,12 +84,10 @@ class FrameAnswerer:
             point,
             camera,
             session=self._session,
-            sequence=ask.sequence,
             snapshot=localiser.snapshot,
-            dropped=ask.dropped,
-            received_at=ask.received_at,
             answered_at=datetime.now(UTC).isoformat(),
             timings_ms=clock.milliseconds(),
+            **asdict(ask),
         )
 
     def _decoded(self, data: bytes) -> NDArray[np.uint8]:
@@ -130,6 +132,20 @@ class FrameAnswerer:
             self._tracker.use(finder)
         self._localiser = localiser
         return self._tracker
+
+
+def pose_message(point: TrajectoryPoint, camera: Camera | None, **about: Any) -> TrackPose:
+    """A frame on Earth as the wire says it, with its camera as the client sent it where there is a pose.
+
+    `about`: the other fields of TrackPose.
+    """
+    pose: dict[str, Any] = dict.fromkeys(_PLACE)
+    if point.pose is not None:
+        assert camera is not None
+        lens = Intrinsics(**asdict(camera))
+        pose = {**place_fields(point.pose), "camera": lens, "map_id": point.pose.map_id}
+    same = {name: getattr(point, name) for name in ("time_s", "state", "detail", "inliers")}
+    return TrackPose(body_axes=BODY_AXES, **same | about | pose)
 
 
 def _yield_to_queries() -> None:

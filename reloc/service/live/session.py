@@ -17,7 +17,7 @@ from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
 from reloc.service.workers.area_files import LocaliserFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
-from reloc.wire.query import ErrorCode, RequestError, parse_attachment
+from reloc.wire.query import ErrorCode, RequestError, bad_request, parse_attachment
 from reloc.wire.track import EndReason, TrackEvent, TrackFrame, TrackPose
 
 logger = logging.getLogger(__name__)
@@ -32,14 +32,6 @@ class Arrival:
     size: int  # bytes that were sent
     received: float  # `time.perf_counter` at receipt
     received_at: datetime  # the same by the clock
-
-
-class FrameError(RequestError):
-    """A frame cannot be used; `sequence`: its number, where it could be read."""
-
-    def __init__(self, code: ErrorCode, message: str, sequence: int | None) -> None:
-        super().__init__(code, message)
-        self.sequence = sequence
 
 
 class Follower:
@@ -83,19 +75,16 @@ class Follower:
         if process is not None:
             process.kill()
 
-    def answer(self, arrival: Arrival) -> TrackPose:
+    def answer(self, header: TrackFrame, arrival: Arrival) -> TrackPose:
         """The pose of a frame, or that the track is lost.
 
         Raises:
-            FrameError: a header that is none or goes back, what `FrameAnswerer.answer` refuses, or a frame
-                that is beyond the limits or ends the process. WorkerEndedError: it was told to stop.
+            RequestError: a header that goes back, what `FrameAnswerer.answer` refuses, or a frame that is
+                beyond the limits or ends the process. WorkerEndedError: it was told to stop.
         """
         clock = StageClock(start=arrival.received)
-        sequence: int | None = None
+        self._check(header, arrival.size)
         try:
-            header = parse_attachment(TrackFrame, arrival.header)
-            sequence = header.sequence
-            self._check(header, arrival.size)
             process = self._ready()
             clock.lap("queue")
             frame = FrameAsk(
@@ -105,19 +94,14 @@ class Follower:
                 received_at=arrival.received_at.isoformat(),
             )
             pose = self._asked(process, frame, arrival.payload)
-        except RequestError as error:
-            raise FrameError(ErrorCode(error.code), error.message, sequence) from error
         except (WorkerEndedError, WorkerDefectError) as error:
             self._close()
             if self._stopped:
                 raise
             logger.exception("a frame failed", extra=fields("frame_failed"))
             how = error if isinstance(error, WorkerEndedError) else "a defect"
-            raise FrameError(
-                ErrorCode.INTERNAL,
-                f"{how} on this frame; the server's log has it. The track begins anew",
-                sequence,
-            ) from error
+            text = f"{how} on this frame; the server's log has it. The track begins anew"
+            raise RequestError(ErrorCode.INTERNAL, text) from error
         self._last_time_s = header.time_s
         clock.lap("worker", pose.timings_ms)
         return pose.model_copy(update={"timings_ms": clock.milliseconds()})
@@ -134,12 +118,10 @@ class Follower:
         try:
             return process.ask(frame, data, TrackPose)
         except WorkerEndedError as error:
-            if late.is_set():
-                raise RequestError(
-                    ErrorCode.DEADLINE,
-                    f"the frame was not done within {self._frame_s:g} s; send smaller ones",
-                ) from error
-            raise
+            if not late.is_set():
+                raise
+            text = f"the frame was not done within {self._frame_s:g} s; send smaller ones"
+            raise RequestError(ErrorCode.DEADLINE, text) from error
         finally:
             watch.cancel()
 
@@ -161,19 +143,15 @@ class Follower:
     def _check(self, header: TrackFrame, size: int) -> None:
         """Raises RequestError: the header goes back, or the payload is too large."""
         if self._last is not None and header.sequence <= self._last.sequence:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
+            raise bad_request(
                 f"sequence: expected more than {self._last.sequence}, that of the frame before, found "
                 f"{header.sequence}; number the frames from 0, and open a new session to begin again",
             )
         self._last = header
         self._looked_at += 1
         if self._last_time_s is not None and header.time_s <= self._last_time_s:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
-                f"time_s: expected more than {self._last_time_s}, that of the frame before, found "
-                f"{header.time_s}",
-            )
+            before = f"{self._last_time_s}, that of the frame before"
+            raise bad_request(f"time_s: expected more than {before}, found {header.time_s}")
         if size > self._max_bytes:
             raise RequestError(
                 ErrorCode.TOO_LARGE,
@@ -286,12 +264,15 @@ class LiveSession:
 
     def _answered(self, arrival: Arrival) -> bool:
         """Whether the frame could be used: it has been answered then."""
+        sequence: int | None = None
         try:
-            pose = self._follower.answer(arrival)
-        except FrameError as error:
+            header = parse_attachment(TrackFrame, arrival.header)
+            sequence = header.sequence
+            pose = self._follower.answer(header, arrival)
+        except RequestError as error:
             self._tally.add("frame refused", error.code)
             self._states["refused"] += 1
-            self._event("refused", error.code, error.message, error.sequence)
+            self._event("refused", error.code, error.message, sequence)
             return False
         self._states[pose.state] += 1
         latency_ms = (time.perf_counter() - arrival.received) * 1e3

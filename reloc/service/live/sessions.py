@@ -26,6 +26,7 @@ from reloc.wire.query import (
     ErrorCode,
     ErrorReply,
     RequestError,
+    bad_request,
     encode,
     parse_attachment,
 )
@@ -69,18 +70,15 @@ class LiveSessions:
         self._open: dict[str, LiveSession] = {}  # by key
         self._frames: dict[str, zenoh.Subscriber[None]] = {}
         self._closed = False
-        self._queryable: zenoh.Queryable[None] | None = None
-        self._tokens: zenoh.Subscriber[None] | None = None
+        self._declared = ExitStack()
 
     def start(self) -> None:
         """Take sessions from now on."""
-        self._tokens = self._session.liveliness().declare_subscriber(
-            self._keys.track("*", "*", "client"), self._on_token
-        )
+        declared, keys = self._declared.enter_context, self._keys
+        alive = self._session.liveliness()
+        declared(alive.declare_subscriber(keys.track("*", "*", "client"), self._on_token))
         # `complete`: of several servers of one database the nearest takes the session.
-        self._queryable = self._session.declare_queryable(
-            self._keys.track("*", "*"), self._on_open, complete=True
-        )
+        declared(self._session.declare_queryable(keys.track("*", "*"), self._on_open, complete=True))
 
     def close(self, timeout_s: float) -> None:
         """End all sessions, and wait for that at most so long; take no more."""
@@ -92,10 +90,7 @@ class LiveSessions:
         end = time.perf_counter() + timeout_s
         for session in sessions:
             session.join(max(0.0, end - time.perf_counter()))
-        if self._queryable is not None:
-            self._queryable.undeclare()
-        if self._tokens is not None:
-            self._tokens.undeclare()
+        self._declared.close()
 
     def status(self) -> LiveStatus:
         """Counts since the start."""
@@ -155,7 +150,7 @@ class LiveSessions:
         """Open the client's session of this name. Raises RequestError: why it is not opened."""
         for what, found in (("client", client), ("session", name)):
             if not is_name(found):
-                raise RequestError(ErrorCode.BAD_REQUEST, f"{what}: {NAME_EXPECTED}, found {found[:80]!r}")
+                raise bad_request(f"{what}: {NAME_EXPECTED}, found {found[:80]!r}")
         key = self._keys.track(client, name)
         attachment = None if query.attachment is None else query.attachment.to_bytes()
         request = parse_attachment(TrackOpenRequest, attachment)
@@ -210,8 +205,7 @@ class LiveSessions:
                 "this server takes no live sessions; start it with --live-sessions 1 or more",
             )
         if key in self._open:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
+            raise bad_request(
                 f"session: {key.rpartition('/')[2]!r} is open; choose another name, at random",
             )
         # Each has its process until it is forgotten, those that are ending as well.

@@ -45,11 +45,7 @@ class AreaFiles:
         self._written: weakref.WeakKeyDictionary[object, LocaliserFiles] = weakref.WeakKeyDictionary()
 
     def of(self, localiser: Localiser) -> LocaliserFiles:
-        """The files of a localiser.
-
-        Raises:
-            StoreError: the folder of temporary files has no room for them.
-        """
+        """The files of a localiser. Raises StoreError: the folder of temporary files has no room for them."""
         try:
             return self._files(localiser)
         except OSError as error:

@@ -14,7 +14,7 @@ from reloc.service.contributions.inbox import Inbox, contribution_of
 from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
-from reloc.service.queueing import DeadlineWatch, PendingQuery, QueryQueue, deadline_error
+from reloc.service.queueing import PendingQuery, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
 from reloc.service.workers.area_files import AreaFiles
@@ -39,13 +39,8 @@ class WorkerPool:
     A process that is still at a query when its time is over, or that ends before its answer, is replaced.
     """
 
-    def __init__(
-        self, queue: QueryQueue, watch: DeadlineWatch, options: ServeOptions, inbox: Inbox | None = None
-    ) -> None:
-        self._queue = queue
-        self._watch = watch
-        self._options = options
-        self._inbox = inbox
+    def __init__(self, queue: QueryQueue, options: ServeOptions, inbox: Inbox | None) -> None:
+        self._queue, self._options, self._inbox = queue, options, inbox
         self._limits = options.worker_limits
         self._answerer = partial(answer_query, limits=options.limits)
         self._files = AreaFiles()
@@ -181,22 +176,20 @@ class WorkerPool:
     def _localise(self, item: PendingQuery, process: WorkerProcess) -> None:
         clock = StageClock(start=item.received)
         clock.lap("queue")
-        request = parse_attachment(LocaliseWireRequest, item.attachment())
+        request = parse_attachment(LocaliseWireRequest, item.bytes_of("attachment"))
         item.request_id = request.request_id or item.request_id
         if request.contribute and self._inbox is None:
-            raise RequestError(
-                ErrorCode.UNSUPPORTED,
-                "contribute: this server takes no contributions; leave it out, or start the server with "
-                "--contributions on",
-            )
+            instead = "leave it out, or start the server with --contributions on"
+            text = f"contribute: this server takes no contributions; {instead}"
+            raise RequestError(ErrorCode.UNSUPPORTED, text)
         wished_s = (request.options.deadline_ms or math.inf) / 1e3
         end = min(item.received + wished_s, time.perf_counter() + self._options.work_s)
         if end < item.deadline:
             item.deadline = end
             _check_deadline(item)  # one that is over already must not end a process that has nothing in hand
-            self._watch.add(item)
+            item.watch()
         _check_deadline(item)
-        data = item.payload()
+        data = item.bytes_of("payload")
         clock.lap("request")
         if item.answered:
             return
@@ -207,44 +200,44 @@ class WorkerPool:
         clock.lap("worker", reply.timings_ms)
         reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
         _check_deadline(item)
-        if name is not None and self._inbox is not None:
-            _answer_and_keep(item, data, request, reply, clock, self._inbox, name)
-        else:
+        if name is None:
             item.answer(reply)
+        else:
+            self._answer_and_keep(item, data, request, reply, clock, name)
 
+    def _answer_and_keep(
+        self,
+        item: PendingQuery,
+        data: bytes,
+        request: LocaliseWireRequest,
+        reply: LocaliseReply,
+        clock: StageClock,
+        name: Future[str],
+    ) -> None:
+        """Answer, and hand the photo to the inbox if it has a place; what the answer says is then done."""
+        assert self._inbox is not None
 
-def _answer_and_keep(
-    item: PendingQuery,
-    data: bytes,
-    request: LocaliseWireRequest,
-    reply: LocaliseReply,
-    clock: StageClock,
-    inbox: Inbox,
-    name: "Future[str]",
-) -> None:
-    """Answer, and hand the photo to the inbox if it has a place; what is said in the answer is then done."""
-    received_at = datetime.now(UTC)
-    owner = item.identity or ANONYMOUS  # never what the request claims
-    place = inbox.reserve(owner, len(data))
-    if isinstance(place, ContributionReply):
-        item.answer(_with_contribution(reply, place, clock))
-        return
-    answered = False
-    try:
-        said = ContributionReply(
-            accepted=True, candidate_id=name.result(), reason=None, detail="queued for the inbox"
-        )
-        answered = item.answer(_with_contribution(reply, said, clock))
-    finally:
-        if not answered:
-            inbox.cancel(place)
-    if answered:
-        inbox.submit(place, lambda: contribution_of(data, request, reply, received_at, owner))
+        def answer(said: ContributionReply) -> bool:
+            clock.lap("contribution")
+            told = {"contribution": said, "timings_ms": clock.milliseconds()}
+            return item.answer(reply.model_copy(update=told))
 
-
-def _with_contribution(reply: LocaliseReply, said: ContributionReply, clock: StageClock) -> LocaliseReply:
-    clock.lap("contribution")
-    return reply.model_copy(update={"contribution": said, "timings_ms": clock.milliseconds()})
+        received_at = datetime.now(UTC)
+        owner = item.identity or ANONYMOUS  # never what the request claims
+        place = self._inbox.reserve(owner, len(data))
+        if isinstance(place, ContributionReply):
+            answer(place)
+            return
+        answered = False
+        try:
+            queued = "queued for the inbox"
+            said = ContributionReply(accepted=True, candidate_id=name.result(), reason=None, detail=queued)
+            answered = answer(said)
+        finally:
+            if not answered:
+                self._inbox.cancel(place)
+        if answered:
+            self._inbox.submit(place, lambda: contribution_of(data, request, reply, received_at, owner))
 
 
 def _check_deadline(item: PendingQuery) -> None:

@@ -12,9 +12,10 @@ from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
-from reloc.tracking.ground import EarthPose, TrackState
+from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.files import CSV_COLUMNS, OWN_CSV_COLUMNS
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
+from reloc.wire.track import TrackState
 
 _UPPER = np.triu_indices(6)
 _COVARIANCE = tuple(name for name in CSV_COLUMNS if name.startswith("cov_"))

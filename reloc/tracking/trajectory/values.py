@@ -11,7 +11,8 @@ from itertools import groupby
 
 from featuredb.errors import InvalidValueError
 from reloc.localise.result import OwnPose
-from reloc.tracking.ground import EarthPose, TrackedFrame, TrackState
+from reloc.tracking.ground import EarthPose, TrackedFrame
+from reloc.wire.track import TrackState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,11 +73,7 @@ def point_of(frame: TrackedFrame) -> TrajectoryPoint:
     ):
         pose = frame.ground.posed(frame.rows, frame.cam_from_local, frame.covariance)
     return TrajectoryPoint(
-        index=frame.index,
-        time_s=frame.time_s,
-        state=frame.state,
+        **{name: getattr(frame, name) for name in ("index", "time_s", "state", "inliers", "detail")},
         pose=pose if isinstance(pose, EarthPose) else None,
         in_map=pose if isinstance(pose, OwnPose) else None,
-        inliers=frame.inliers,
-        detail=frame.detail,
     )

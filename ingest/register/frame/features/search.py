@@ -171,7 +171,6 @@ def unmatched(cam_from_local: Rigid3, camera: Camera, source: RenderSource) -> F
         camera=camera,
         camera_source="request",
         inliers=np.zeros(0, dtype=bool),
-        prior_focal_px=camera.focal_px,
     )
     return FrameHypothesis(pose=pose, source=source)
 
