@@ -32,6 +32,7 @@ from ingest.photos.photo import Photo, answered_positions
 from ingest.positions.center_priors import center_priors
 from ingest.sfm.extract import PhotoFeatures
 
+_AS_IN_PHOTO = ("name", "sha256", "capture_time", "gps", "owner", "licence")
 _LEAST_POSITIONS = 3  # tell a similarity
 _MOST_PHOTOS = 1000  # whose normal equations are inverted densely
 
@@ -107,10 +108,7 @@ def build_unplaced_map(
     if parts is None:
         return None
     return UnplacedMap(
-        frame=frame,
-        points=OwnPoints(xyz=parts.xyz, **parts.point_columns),
-        no_place=no_place,
-        **parts.shared,
+        frame=frame, points=OwnPoints(xyz=parts.xyz, **parts.point_columns), no_place=no_place, **parts.shared
     )
 
 
@@ -209,26 +207,17 @@ def _images(
     return [
         MapImage(
             image_id=k,
-            name=photo.name,
-            sha256=photo.sha256,
             camera_id=int(model.camera_of[k]),
             cam_from_local=poses[k],
             covariance=spread[k],
-            capture_time=photo.capture_time,
-            gps=photo.gps,
-            owner=photo.owner,
-            licence=photo.licence,
+            **{name: getattr(photo, name) for name in _AS_IN_PHOTO},
         )
         for k, photo in enumerate(photos)
     ]
 
 
 def _point_columns(
-    model: Model,
-    rgb: NDArray[np.uint8],
-    linear: Linearised,
-    covariances: FloatArray,
-    kept: NDArray[np.bool_],
+    model: Model, rgb: NDArray[np.uint8], linear: Linearised, covariances: FloatArray, kept: NDArray[np.bool_]
 ) -> dict[str, Any]:
     """Columns of PointColumns by name."""
     lengths = model.track_lengths()
@@ -243,10 +232,7 @@ def _point_columns(
 
 
 def _observations(
-    model: Model,
-    used: "_Used",
-    kept: NDArray[np.bool_],
-    options: MapOptions,
+    model: Model, used: "_Used", kept: NDArray[np.bool_], options: MapOptions
 ) -> MapObservations:
     rows = np.flatnonzero(kept[model.point_of])
     row_of_point = np.cumsum(kept) - 1
@@ -265,11 +251,7 @@ def _observations(
 
 
 def _well_placed(
-    enu: FloatArray,
-    poses: Sequence[Rigid3],
-    covariances: FloatArray,
-    model: Model,
-    options: MapOptions,
+    enu: FloatArray, poses: Sequence[Rigid3], covariances: FloatArray, model: Model, options: MapOptions
 ) -> NDArray[np.bool_]:
     """Points (n,) whose standard deviation is small against their distance."""
     centers = np.array([pose.center for pose in poses])

@@ -18,7 +18,7 @@ from featuredb.errors import VideoError
 from featuredb.features.shrink import fitted_size
 from featuredb.video.decoding import Decoder, FilmClock
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
-from featuredb.video.opening import Opening, Source, coded_pixels, open_input, opening_of
+from featuredb.video.opening import MAX_CODED_PIXELS, Opening, Source, check_size, open_input, opening_of
 from featuredb.video.pixels import PixelReader
 from featuredb.video.rotation import clockwise_from_display_matrix
 
@@ -48,8 +48,8 @@ def open_container(source: Source, options: VideoOptions) -> "ContainerVideo":
         VideoError: it cannot be opened, holds no video that can be decoded, or is of a size or rotation that
             is not taken.
     """
-    opening = opening_of(source, options)
-    container = open_input(opening, options)
+    opening = opening_of(source)
+    container = open_input(opening)
     try:
         return _opened(container, opening, options)
     except BaseException:
@@ -59,12 +59,12 @@ def open_container(source: Source, options: VideoOptions) -> "ContainerVideo":
 
 def _opened(container: InputContainer, opening: Opening, options: VideoOptions) -> "ContainerVideo":
     stream = _largest_stream(container, opening.name)
-    _check_size(opening.name, stream.width, stream.height, options)
+    check_size(opening.name, stream.width, stream.height)
     context = stream.codec_context
     # One thread leaves the other cores to the caller, who has more to do, and loses the least of a damaged
     # film: each further one may lose another frame, and delays a live source by a frame.
     context.thread_count = 1
-    context.options = {"max_pixels": str(coded_pixels(options))}
+    context.options = {"max_pixels": str(MAX_CODED_PIXELS)}
     tally = VideoReport()
     decoder = Decoder(container, stream, _clock(container, stream), tally, opening.name)
     pictures = decoder.pictures()
@@ -74,7 +74,7 @@ def _opened(container: InputContainer, opening: Opening, options: VideoOptions) 
         raise VideoError(
             f"{opening.name}: no frame of its {stream.codec_context.name} video can be decoded{broken}"
         )
-    _check_size(opening.name, first[1].width, first[1].height, options)
+    check_size(opening.name, first[1].width, first[1].height)
     return ContainerVideo(
         info=_info(container, stream, first[1], opening, options),
         container=container,
@@ -131,9 +131,9 @@ class ContainerVideo(Video):
     def _frames(self) -> Iterator[VideoFrame]:
         for index, time_s, picture in chosen(self._from_start(), self._options):
             yield self._frame(index, time_s, picture)
-        report = self.report
-        if not report.whole:
-            logger.warning("%s: %s", self.info.name, "; ".join(report.complaints()))
+        complaints = self.report.complaints()
+        if complaints:
+            logger.warning("%s: %s", self.info.name, "; ".join(complaints))
 
     def _from_start(self) -> Iterator[tuple[float, av.VideoFrame]]:
         """Decoded frames with their times, from at or before the asked start."""
@@ -195,23 +195,11 @@ def _largest_stream(container: InputContainer, name: str) -> VideoStream:
         kinds = sorted({stream.type for stream in container.streams})
         found = f"only {', '.join(kinds)}" if kinds else "no stream in it; its index is broken, copy it again"
         raise VideoError(f"{name}: expected a film, found {found}")
-    decodable = [stream for stream in streams if _context(stream) is not None]
+    # None without a decoder, whatever its type says.
+    decodable = [stream for stream in streams if cast("Any", stream).codec_context is not None]
     if not decodable:
         raise VideoError(f"{name}: there is no decoder for its video; encode it as H.264 or H.265")
     return max(decodable, key=lambda stream: (stream.width * stream.height, -stream.index))
-
-
-def _context(stream: VideoStream) -> Any | None:
-    return stream.codec_context  # None without a decoder, whatever its type says
-
-
-def _check_size(name: str, width: int, height: int, options: VideoOptions) -> None:
-    """Refuse what is too large to be meant; a size of 0 is one that only the first frame tells."""
-    if max(width, height) > options.max_full_side_px or width * height > options.max_full_pixels:
-        raise VideoError(
-            f"{name}: its pictures have {width}x{height} pixels, the limit is {options.max_full_side_px} a "
-            f"side and {options.max_full_pixels / 1e6:.0f} million; make it smaller, unless it is broken"
-        )
 
 
 def _indexed(container: InputContainer) -> bool:

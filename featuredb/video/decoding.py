@@ -149,7 +149,6 @@ class Decoder:
             failed = 0 if pictures else failed
             for picture in pictures:
                 self.check_open()
-                self._tally.decoded += 1
                 yield picture
 
     def _packets(self) -> "Iterator[av.Packet[VideoStream]]":  # generic in the stubs only
@@ -190,5 +189,5 @@ class Decoder:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, av.error.ExitError):
-        return "nothing came within the timeout; check the camera and the network, or allow more"
+        return "nothing came within the timeout; check the camera and the network"
     return getattr(error, "strerror", None) or str(error)

@@ -42,12 +42,7 @@ class DaskExecutor:
             one of them does not see the folders or has another version of featuredb.
     """
 
-    def __init__(
-        self,
-        address: str,
-        *,
-        shared: Sequence[Path] = (),
-    ) -> None:
+    def __init__(self, address: str, *, shared: Sequence[Path] = ()) -> None:
         self._address = address
         self._client = _connected(address)
         try:

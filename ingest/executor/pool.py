@@ -10,12 +10,14 @@ import multiprocessing.connection
 import pickle
 import signal
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from ingest.executor.interface import Lost, Progress, no_progress
+from ingest.executor.interface import Executor, InProcessExecutor, Lost, Progress, no_progress
 from ingest.executor.worker import READY, capped_environment, serve
 
 _LOG = logging.getLogger(__name__)
@@ -161,6 +163,27 @@ class PoolExecutor:
             self._workers.remove(worker)
 
 
+@contextmanager
+def open_executor(workers: int, dask: str | None = None, shared: Sequence[Path] = ()) -> Iterator[Executor]:
+    """The executor that somebody asks for.
+
+    Args:
+        workers: processes; 1 runs everything in this one.
+        dask: address of a scheduler, whose workers run the tasks instead.
+        shared: folders that all of these must see, the work folder first.
+    """
+    if dask is not None:
+        from ingest.executor.dask_cluster import DaskExecutor
+
+        with DaskExecutor(dask, shared=shared) as cluster:
+            yield cluster
+    elif workers == 1:
+        yield InProcessExecutor()
+    else:
+        with PoolExecutor(workers) as pool:
+            yield pool
+
+
 class _Worker:
     """One process and the pipe to it."""
 
@@ -176,17 +199,13 @@ class _Worker:
         self.ready = False
         self.task: int | None = None
 
-    @property
-    def pid(self) -> int:
-        return self._process.pid or 0
-
     def send(self, index: int, function: Callable[[Any], Any], items: Sequence[Any]) -> None:
         message = pickle.dumps((function, items[index]))
         self.task = index
         try:
             self.connection.send_bytes(message)
         except OSError:
-            _LOG.debug("worker %d died between two tasks", self.pid)  # seen again when its answer is read
+            _LOG.debug("%s died between two tasks", self._process)  # seen again when its answer is read
 
     def receive(self) -> tuple[bool, Any] | None:
         """Its answer; None for the word that it is ready.

@@ -2,9 +2,9 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ingest.html_parts import pill, table
 
@@ -74,11 +74,6 @@ class FilmOutcome:
     def keyframes(self) -> int:
         """Photos that were made of it."""
         return sum(len(shot.keyframes) for shot in self.shots)
-
-
-def films_json(films: Sequence[FilmOutcome]) -> list[dict[str, Any]]:
-    """For the report's JSON; what became of the keyframes is with the photos of their names."""
-    return [asdict(film) | {"frames": film.frames} for film in films]
 
 
 def films_text(films: Sequence[FilmOutcome], photos: Sequence["PhotoOutcome"]) -> list[str]:

@@ -8,13 +8,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.plain_json import plain
 from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
 from ingest.plot_parts import PlanView
 from ingest.register.control.placement import GcpPlacement
-from ingest.report.films import FilmOutcome, films_json
+from ingest.report.films import FilmOutcome
 
 FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
 MapOutcomeStatus = Literal["committed", "already_there", "unplaced", "refused"]
@@ -204,13 +203,6 @@ class IngestReport:
     films: tuple[FilmOutcome, ...] = ()
     warnings: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.started.tzinfo is None:
-            raise InvalidValueError("IngestReport.started: expected a time with its zone, found none")
-        names = [photo.name for photo in self.photos]
-        if len(set(names)) != len(names):
-            raise InvalidValueError("IngestReport.photos: a file occurs twice")
-
     def count(self, status: FileStatus) -> int:
         """Number of files with that status."""
         return sum(photo.status == status for photo in self.photos)
@@ -229,7 +221,7 @@ def report_json(report: IngestReport) -> dict[str, Any]:
             "job_id": report.job_id,
             "database": report.database,
             "folder": report.folder,
-            "started": report.started.isoformat(),
+            "started": report.started,
             "seconds": report.seconds,
             "options": report.options,
             "versions": report.versions,
@@ -244,11 +236,8 @@ def report_json(report: IngestReport) -> dict[str, Any]:
             },
             "stages": [asdict(stage) for stage in report.stages],
             "maps": [_map_json(outcome) for outcome in report.maps],
-            "films": films_json(report.films),
-            "photos": [
-                asdict(photo) | {"capture_time": photo.capture_time and photo.capture_time.isoformat()}
-                for photo in report.photos
-            ],
+            "films": [asdict(film) | {"frames": film.frames} for film in report.films],
+            "photos": [asdict(photo) for photo in report.photos],
         }
     )
     return document

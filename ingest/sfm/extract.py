@@ -1,10 +1,8 @@
 """Stage: the features of each photo, on a pool of processes, one file each."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
 import cv2
 import numpy as np
@@ -106,32 +104,13 @@ def read_keypoints(path: Path) -> NDArray[np.float32]:
     return np.asarray(read_array(path, "xy"), dtype=np.float32)
 
 
-class LazyFeatures(Sequence[PhotoFeatures], ABC):
-    """Features of many photos, each read when it is asked for, and not kept; a slice reads all of its own."""
-
-    @abstractmethod
-    def read(self, index: int) -> PhotoFeatures:
-        """Those of one photo."""
-
-    @overload
-    def __getitem__(self, index: int) -> PhotoFeatures: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[PhotoFeatures]: ...
-
-    def __getitem__(self, index: int | slice) -> PhotoFeatures | Sequence[PhotoFeatures]:
-        if isinstance(index, slice):
-            return [self.read(k) for k in range(len(self))[index]]
-        return self.read(index)
-
-
-class FeatureFiles(LazyFeatures):
-    """Features of many photos, a file each."""
+class FeatureFiles(Sequence[PhotoFeatures]):
+    """Features of many photos, a file each, read when it is asked for and not kept; there are no slices."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self.paths = tuple(paths)
 
-    def read(self, index: int) -> PhotoFeatures:
+    def __getitem__(self, index: int) -> PhotoFeatures:  # type: ignore[override]
         return read_features(self.paths[index])
 
     def __len__(self) -> int:
