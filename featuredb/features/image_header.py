@@ -7,6 +7,7 @@ allocate nothing, warn nobody and cost well under a millisecond.
 import re
 import struct
 import zlib
+from typing import Any
 
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
@@ -109,7 +110,7 @@ def _jpeg(data: bytes) -> ImageHeader:
     """Walk the segments to the frame header, then the scans to the end marker. ITU T.81, annex B."""
     at, scans, jfif = 2, 0, False
     frame: tuple[int, int] | None = None
-    metadata: dict[str, tuple[int, int]] = {}
+    metadata: dict[str, Any] = {}  # exif and xmp of ImageHeader
     while True:
         if scans:  # entropy-coded data: the next marker that is neither stuffing nor a restart
             found = _JPEG_IN_SCAN.search(data, at)
@@ -171,7 +172,7 @@ def _jpeg_frame(marker: int, body: bytes) -> tuple[int, int]:
 def _png(data: bytes) -> ImageHeader:
     """Walk all chunks and check their sums, so that a flipped bit is found. PNG 3rd edition, section 5."""
     at, size = 8, (0, 0)
-    metadata: dict[str, tuple[int, int]] = {}
+    metadata: dict[str, Any] = {}  # exif and xmp of ImageHeader
     view = memoryview(data)
     has_pixels = False
     while True:
@@ -209,7 +210,7 @@ def _webp(data: bytes) -> ImageHeader:
     if end > len(data):
         raise _truncated("WebP", data, f"of {end}")
     at, size = 12, None
-    metadata: dict[str, tuple[int, int]] = {}
+    metadata: dict[str, Any] = {}  # exif and xmp of ImageHeader
     while at + 8 <= end:
         kind, length = struct.unpack_from("<4sI", data, at)
         body, stop = at + 8, at + 8 + length

@@ -57,14 +57,12 @@ def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
     return len(found) == len(shape) and all(s in (None, a) for s, a in zip(shape, found, strict=True))
 
 
-def freeze(
-    value: object, dtype: DTypeLike = np.float64, *, nan: bool = False, **shapes: tuple[int | None, ...]
-) -> None:
+def freeze(value: object, dtype: DTypeLike = np.float64, **shapes: tuple[int | None, ...]) -> None:
     """Put `frozen_array` of each named field, of this shape, in its place in a frozen dataclass.
 
     Raises:
         InvalidValueError: as `frozen_array`.
     """
     for name, shape in shapes.items():
-        array = frozen_array(f"{type(value).__name__}.{name}", getattr(value, name), shape, dtype, nan=nan)
+        array = frozen_array(f"{type(value).__name__}.{name}", getattr(value, name), shape, dtype)
         object.__setattr__(value, name, array)

@@ -178,11 +178,10 @@ def _from_table(path: Path, names: list[str]) -> list[tuple[float, str]]:
         name = (row["file"] or "").strip()
         if name in times:
             raise VideoError(f"{path}: line {rows.line_num}: {name} is there twice")
-        times[name] = number(row["time_s"] or "")
+        told = (row["time_s"] or "").strip()
+        times[name] = number(told)
         if math.isnan(times[name]):
-            raise VideoError(
-                f"{path}: line {rows.line_num}: expected a time in seconds, found {row['time_s']!r}"
-            )
+            raise VideoError(f"{path}: line {rows.line_num}: expected a time in seconds, found {told!r}")
     without = [name for name in names if name not in times]
     unknown = sorted(set(times) - set(names), key=natural_key)
     if without or unknown:

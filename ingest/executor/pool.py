@@ -17,7 +17,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from ingest.executor.interface import Executor, InProcessExecutor, Lost, Progress, no_progress
+from ingest.executor.interface import Executor, InProcessExecutor, Lost, Progress, given_up, no_progress
 from ingest.executor.worker import READY, capped_environment, serve
 
 _LOG = logging.getLogger(__name__)
@@ -72,7 +72,8 @@ class PoolExecutor:
                     if not list(self._run(stage, function, items, [index], 1, done)):
                         break
                 else:
-                    done(index, self._lost(stage, items[index]))
+                    ended = f"ended {_RUNS_ALONE + 1} worker processes, at last alone"
+                    done(index, given_up(stage, items[index], ended))
         except BaseException:
             self._drop_busy()
             raise
@@ -147,14 +148,6 @@ class PoolExecutor:
                 f"{stage}: expected worker processes, found that {self._failed_starts} in a row ended while "
                 f"starting ({end}); what was finished is kept: see their output above, or use --workers 1"
             )
-
-    def _lost(self, stage: str, item: object) -> Lost:
-        _LOG.warning("%s: %s ends every worker that runs it", stage, item)
-        return Lost(
-            task=str(item),
-            reason=f"ended {_RUNS_ALONE + 1} worker processes, at last alone (killed, or out of memory); the "
-            "same command tries it again",
-        )
 
     def _drop_busy(self) -> None:
         """End the workers whose answers nobody waits for any more."""

@@ -130,18 +130,14 @@ def _kept(shot: ShotOutcome, known: Mapping[str, "PhotoOutcome"]) -> str:
     said = ", ".join(f"{count} {text}" for text, count in where.most_common())
     text = f"{len(shot.keyframes)} keyframes" + (f" ({said})" if said else "")
     if any(shot.bars):
-        text += f", bars over {1.0 - _inside(shot):.0%} of the picture"
+        left, top, right, bottom = shot.bars
+        text += f", bars over {1.0 - (1.0 - left - right) * (1.0 - top - bottom):.0%} of the picture"
     if shot.overlay_share:
         text += f", {shot.overlay_share:.1%} under logos or captions"
     lenses = {known[name].camera_key for name in shot.keyframes if name in known}
     if len(lenses) > 1:
         text += f", the lens zooms ({len(lenses)} focal lengths)"
     return text
-
-
-def _inside(shot: ShotOutcome) -> float:
-    left, top, right, bottom = shot.bars
-    return (1.0 - left - right) * (1.0 - top - bottom)
 
 
 def _dropped(shot: ShotOutcome) -> str:

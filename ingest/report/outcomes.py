@@ -68,20 +68,16 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
     if isinstance(made, UnplacedMap):
         why = made.no_place
         return replace(outcome, status="unplaced", reason_code=why.reason_code, reason=why.reason)
+    centers = [image.cam_from_local.center for image in made.images]
     return replace(
         outcome,
         epsg=made.epsg,
         height_datum=made.height_datum,
         scale=made.placement.local_from_sfm.scale,
         residual_rms_m=made.placement.residual_rms_m,
-        place=PlaceBounds.of(made.placement.covariance, _middle(made)),
+        place=PlaceBounds.of(made.placement.covariance, np.median(centers, axis=0)),
         plan=_plan(component, made),
     )
-
-
-def _middle(feature_map: FeatureMap) -> FloatArray:
-    """(3,) median of the cameras' centres, in its frame."""
-    return np.median([image.cam_from_local.center for image in feature_map.images], axis=0)
 
 
 def photo_outcomes(

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ _BETTER = (
     "over a larger area, or photos that tell their gimbal's angles"
 )
 _PERCENTILES = (50, 90, 99)
+_AS_IT_IS = ("job_id", "database", "folder", "started", "seconds", "options", "versions", "warnings")
 _DRAWN = ("errors_px", "track_lengths", "plan", "control")  # what the page shows of a map
 
 
@@ -218,21 +219,11 @@ def report_json(report: IngestReport) -> dict[str, Any]:
     document: dict[str, Any] = plain(
         {
             "schema": SCHEMA_ID,
-            "job_id": report.job_id,
-            "database": report.database,
-            "folder": report.folder,
-            "started": report.started,
-            "seconds": report.seconds,
-            "options": report.options,
-            "versions": report.versions,
-            "warnings": report.warnings,
+            **{name: getattr(report, name) for name in _AS_IT_IS},
             "pairs": {"tried": report.pairs, "verified": report.verified_pairs},
             "files": {
                 "all": len(report.photos),
-                "registered": report.count("registered"),
-                "unplaced": report.count("unplaced"),
-                "not_registered": report.count("not_registered"),
-                "skipped": report.count("skipped"),
+                **{status: report.count(status) for status in get_args(FileStatus)},
             },
             "stages": [asdict(stage) for stage in report.stages],
             "maps": [_map_json(outcome) for outcome in report.maps],

@@ -83,12 +83,9 @@ def finder_for(database: Database, asked: FilmGround, camera: Camera | None, opt
         )
     area, scans = maps.grounds[0].area, chosen_scans(database, asked.scans)
     centers = area.image_center[area.searched_images()]
-    low, high = (
-        (np.min(centers, axis=0) - _MAP_MARGIN_M).tolist(),
-        (np.max(centers, axis=0) + _MAP_MARGIN_M).tolist(),
-    )
-    scan = _finder(database, scans, area.frame, (low[0], low[1], high[0], high[1]), rough)
-    return MapOverScanFinder(maps, scan)
+    low, high = np.min(centers, axis=0) - _MAP_MARGIN_M, np.max(centers, axis=0) + _MAP_MARGIN_M
+    box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return MapOverScanFinder(maps, _finder(database, scans, area.frame, box, rough))
 
 
 def _maps(database: Database, asked: FilmGround, options: TrackOptions) -> MapFinder:

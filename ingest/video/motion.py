@@ -113,7 +113,8 @@ def measure_motion(frames: Iterable[VideoFrame]) -> Motion:
         broken.append(step is None)
         cut.append(False)
         kinds.append(int(kind))
-        sharpness.append(_sharpness(frame.gray))
+        edges = float(cv2.Laplacian(frame.gray, cv2.CV_32F).std())
+        sharpness.append(edges / max(float(frame.gray.std()), 1.0))
         before = frame.gray
         shown = shown if step is None else before
     return Motion(
@@ -161,11 +162,6 @@ def _step(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> FloatArray | Non
     if found is None or inliers is None or inliers.sum() < max(8, _MIN_SHARE * len(pixels)):
         return None
     return np.asarray(found, dtype=np.float64)
-
-
-def _sharpness(gray: NDArray[np.uint8]) -> float:
-    spread = float(gray.std())
-    return float(cv2.Laplacian(gray, cv2.CV_32F).std()) / max(spread, 1.0)
 
 
 SCENE_FEATURES = ExtractorOptions(first_octave_px=1280, max_features=600)  # of each frame

@@ -19,6 +19,7 @@ _MAX_GAP_S = 3.0
 
 # All but the first two may be left out.
 _COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "relative_height_m", "gimbal_ypr_deg", "clock_s")
+_STRAIGHT = ("latitude_deg", "height_m", "relative_height_m", "clock_s")  # others go around the circle
 
 
 def _not_known() -> FloatArray:
@@ -48,12 +49,12 @@ class TelemetrySamples:
 
     def __post_init__(self) -> None:
         freeze(self, times_s=(None,))
-        each = (len(self),)
-        shapes = dict.fromkeys(_COLUMNS, each) | {"gimbal_ypr_deg": (*each, 3)}
-        for name in _COLUMNS[2:]:
-            if not np.size(getattr(self, name)):
-                object.__setattr__(self, name, np.full(shapes[name], np.nan))
-        freeze(self, np.float64, nan=True, **shapes)
+        for name in _COLUMNS:
+            given, shape = getattr(self, name), (len(self), 3) if name == "gimbal_ypr_deg" else (len(self),)
+            if name in _COLUMNS[2:] and not np.size(given):
+                given = np.full(shape, np.nan)
+            column = frozen_array(f"TelemetrySamples.{name}", given, shape, nan=True)
+            object.__setattr__(self, name, column)
         _check_positions(self.latitude_deg, self.longitude_deg)
 
     def __len__(self) -> int:
@@ -125,15 +126,10 @@ class Telemetry(TelemetrySamples):
         def line(values: FloatArray, circle: bool = False) -> FloatArray:
             return _interpolated(self.times_s, values, wanted, reach, circle)
 
-        return TelemetrySamples(
-            times_s=wanted,
-            latitude_deg=line(self.latitude_deg),
-            longitude_deg=line(self.longitude_deg, circle=True),
-            height_m=line(self.height_m),
-            relative_height_m=line(self.relative_height_m),
-            gimbal_ypr_deg=np.stack([line(angle, circle=True) for angle in self.gimbal_ypr_deg.T], axis=1),
-            clock_s=line(self.clock_s),
-        )
+        columns = {name: line(getattr(self, name)) for name in _STRAIGHT}
+        ypr = np.stack([line(angle, circle=True) for angle in self.gimbal_ypr_deg.T], axis=1)
+        longitude = line(self.longitude_deg, circle=True)
+        return TelemetrySamples(times_s=wanted, longitude_deg=longitude, gimbal_ypr_deg=ypr, **columns)
 
 
 def _check_positions(latitude_deg: FloatArray, longitude_deg: FloatArray) -> None:
