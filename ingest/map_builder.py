@@ -83,14 +83,15 @@ def build_map(
     parts = _parts(model, placement.local_from_sfm, photos, features, identity, options, positions)
     if parts is None:
         return None
+    xyz, columns, shared = parts
     epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
     return FeatureMap(
         epsg=epsg,
         height_datum=options.height_datum,
         frame=frame,
-        points=MapPoints(utm=frame.utm_from_enu(parts.xyz, epsg), **parts.point_columns),
+        points=MapPoints(utm=frame.utm_from_enu(xyz, epsg), **columns),
         placement=placement,
-        **parts.shared,
+        **shared,
     )
 
 
@@ -107,19 +108,8 @@ def build_unplaced_map(
     parts = _parts(model, own_from_sfm, photos, features, identity, options)
     if parts is None:
         return None
-    return UnplacedMap(
-        frame=frame, points=OwnPoints(xyz=parts.xyz, **parts.point_columns), no_place=no_place, **parts.shared
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Parts:
-    """What a map has whatever is known of its place: points xyz (n, 3) in its frame with their other columns,
-    and the fields that FeatureMap and UnplacedMap share."""
-
-    xyz: FloatArray
-    point_columns: dict[str, Any]
-    shared: dict[str, Any]
+    xyz, columns, shared = parts
+    return UnplacedMap(frame=frame, points=OwnPoints(xyz=xyz, **columns), no_place=no_place, **shared)
 
 
 def _parts(
@@ -130,8 +120,12 @@ def _parts(
     identity: MapIdentity,
     options: MapOptions,
     positions: CenterPriors | None = None,
-) -> _Parts | None:
-    """The model in its frame; None if no point is placed well enough."""
+) -> tuple[FloatArray, dict[str, Any], dict[str, Any]] | None:
+    """What a map has whatever is known of its place; None if no point is placed well enough.
+
+    Returns:
+        Points xyz (n, 3) in its frame, their other columns, and the fields that both kinds of map share.
+    """
     used = _used_features(features, model)
     poses = [frame_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm]
     xyz = frame_from_sfm.act(model.xyz)
@@ -150,22 +144,19 @@ def _parts(
     kept = _well_placed(xyz, poses, covariances, model, options)
     if not kept.any():
         return None
-    return _Parts(
-        xyz=xyz[kept],
-        point_columns=_point_columns(model, used.rgb, linear, covariances, kept),
-        shared={
-            "map_id": identity.map_id,
-            "name": identity.name,
-            "cameras": model.cameras,
-            "camera_keys": _camera_keys(model, photos),
-            "images": tuple(_images(photos, model, poses, pose_spread)),
-            "observations": _observations(model, used, kept, options),
-            "extractor_fingerprint": used.fingerprint,
-            "source": identity.source,
-            "licence": identity.licence,
-            "provenance": provenance,
-        },
-    )
+    shared = {
+        "map_id": identity.map_id,
+        "name": identity.name,
+        "cameras": model.cameras,
+        "camera_keys": _camera_keys(model, photos),
+        "images": tuple(_images(photos, model, poses, pose_spread)),
+        "observations": _observations(model, used, kept, options),
+        "extractor_fingerprint": used.fingerprint,
+        "source": identity.source,
+        "licence": identity.licence,
+        "provenance": provenance,
+    }
+    return xyz[kept], _point_columns(model, used.rgb, linear, covariances, kept), shared
 
 
 def _positions(

@@ -107,12 +107,12 @@ def reconstruct_photos(
     """
     clock = clock or StageClock()
     with clock.stage("extract") as counts:
-        extracted = extract_photos(list(photos), workspace, options.extractor, executor, progress)
-        counts |= {"reused": extracted.reused, "total": len(photos)}
-    usable = tuple(p for p in photos if p.name not in extracted.unreadable)
+        unreadable, reused = extract_photos(list(photos), workspace, options.extractor, executor, progress)
+        counts |= {"reused": reused, "total": len(photos)}
+    usable = tuple(p for p in photos if p.name not in unreadable)
     fingerprint = features_key(options.extractor)
     features = FeatureFiles([workspace.features(fingerprint, p.sha256) for p in usable])
-    done = Reconstructed(usable=usable, features=features, unreadable=extracted.unreadable)
+    done = Reconstructed(usable=usable, features=features, unreadable=unreadable)
     if stop_after == "extract":
         return done
 

@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
-from fractions import Fraction
 from typing import Any, cast
 
 import av
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import VideoError
 from featuredb.features.shrink import fitted_size
-from featuredb.video.decoding import Decoder, FilmClock
+from featuredb.video.decoding import Decoder, is_indexed, nominal_rate
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
 from featuredb.video.opening import MAX_CODED_PIXELS, Opening, Source, check_size, open_input, opening_of
 from featuredb.video.pixels import PixelReader
@@ -24,13 +23,8 @@ from featuredb.video.rotation import clockwise_from_display_matrix
 
 logger = logging.getLogger(__name__)
 
-# Their time line starts at 0 and their index finds key frames. Others start at any time (a transport stream's
-# own clock, a camera's uptime), and libav's search in a transport stream ends behind the frame it looks for.
-_INDEXED = frozenset({"mov", "matroska", "avi"})
 # An index goes by decoding time, which runs ahead of display by some frames: aim a little before the start.
 _SEEK_MARGINS_S = (1.0, 10.0)
-# High-speed cameras write up to 1000 frames a second; what says more gives its tick, not its rate.
-_MAX_RATE_HZ = 1000.0
 # Phones, QuickTime's own atoms, and what libav makes of them; the most specific first.
 _MAKE = ("com.apple.quicktime.make", "com.android.manufacturer", "make", "manufacturer")
 _MODEL = ("com.apple.quicktime.model", "com.android.model", "model")
@@ -66,7 +60,7 @@ def _opened(container: InputContainer, opening: Opening, options: VideoOptions) 
     context.thread_count = 1
     context.options = {"max_pixels": str(MAX_CODED_PIXELS)}
     tally = VideoReport()
-    decoder = Decoder(container, stream, _clock(container, stream), tally, opening.name)
+    decoder = Decoder(container, stream, tally, opening.name)
     pictures = decoder.pictures()
     first = next(pictures, None)
     if first is None:
@@ -141,7 +135,7 @@ class ContainerVideo(Video):
         (first_s, first), following = self._begun
         start_s = self._options.start_s
         moved = False
-        if start_s is not None and start_s > first_s and not self.info.live and _indexed(self._container):
+        if start_s is not None and start_s > first_s and not self.info.live and is_indexed(self._container):
             for aim_s in (*(start_s - margin for margin in _SEEK_MARGINS_S), first_s):
                 if not self._decoder.seek(max(aim_s, first_s)):
                     continue
@@ -202,31 +196,6 @@ def _largest_stream(container: InputContainer, name: str) -> VideoStream:
     return max(decodable, key=lambda stream: (stream.width * stream.height, -stream.index))
 
 
-def _indexed(container: InputContainer) -> bool:
-    return not _INDEXED.isdisjoint(container.format.name.split(","))
-
-
-def _rate(stream: VideoStream) -> Fraction | None:
-    """Nominal frames per second."""
-    for rate in (stream.average_rate, stream.guessed_rate):
-        if rate and 0 < rate <= _MAX_RATE_HZ:
-            return rate
-    return None
-
-
-def _clock(container: InputContainer, stream: VideoStream) -> FilmClock:
-    starts_anywhere = not _indexed(container) and container.start_time is not None
-    rate = _rate(stream)
-    if not stream.time_base:
-        raise VideoError(f"{container.name}: its video has no time base; copy it into an mp4 or mkv")
-    return FilmClock(
-        time_base=stream.time_base,
-        origin_s=Fraction(container.start_time, av.time_base) if starts_anywhere else Fraction(0),
-        interval_s=float(1 / rate) if rate else None,
-        decoding_order=container.format.name == "avi",
-    )
-
-
 def _duration_s(container: InputContainer, stream: VideoStream) -> float | None:
     """Stated length of the video stream, else of the whole container."""
     if stream.duration and stream.duration > 0 and stream.time_base:
@@ -241,7 +210,7 @@ def _expected(
 ) -> tuple[int | None, float | None]:
     # Only the index of an mp4 lists every frame, and only those that its edit list leaves to be shown.
     packets = len(stream.index_entries) if "mov" in container.format.name.split(",") else None
-    duration_s, rate = _duration_s(container, stream), _rate(stream)
+    duration_s, rate = _duration_s(container, stream), nominal_rate(stream)
     last_s = first_s + duration_s - float(1 / rate) if duration_s and rate else None
     return packets, last_s
 

@@ -46,27 +46,18 @@ class PhotoFeatures:
     rgb: NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Extracted:
-    """What the stage did.
-
-    Attributes:
-        unreadable: photos by name whose pixels could not be read after all, with the reason.
-        reused: photos whose features were there already.
-    """
-
-    unreadable: dict[str, str]
-    reused: int
-
-
 def extract_photos(
     photos: list[Photo],
     workspace: Workspace,
     options: ExtractorOptions,
     executor: Executor,
     progress: Progress = no_progress,
-) -> Extracted:
-    """Write the features of every photo that has none yet."""
+) -> tuple[dict[str, str], int]:
+    """Write the features of every photo that has none yet.
+
+    Returns:
+        Photos by name whose pixels could not be read after all, with the reason; and how many had features.
+    """
     fingerprint = features_key(options)
     tasks: dict[str, ExtractTask] = {}
     for photo in photos:
@@ -75,10 +66,8 @@ def extract_photos(
             tasks[photo.name] = ExtractTask(photo=photo.path, target=target, options=options)
     outcomes = executor.map("extract", _extract_one, list(tasks.values()), progress)
     reasons = (o.reason if isinstance(o, Lost) else o for o in outcomes)
-    return Extracted(
-        unreadable={name: reason for name, reason in zip(tasks, reasons, strict=True) if reason},
-        reused=len(photos) - len(tasks),
-    )
+    unreadable = {name: reason for name, reason in zip(tasks, reasons, strict=True) if reason}
+    return unreadable, len(photos) - len(tasks)
 
 
 def features_key(options: ExtractorOptions) -> str:

@@ -9,6 +9,7 @@ import tempfile
 import zlib
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -18,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from featuredb.errors import VideoError
-from featuredb.video.decoding import Decoder, FilmClock
+from featuredb.video.decoding import Decoder
 from featuredb.video.film import VideoOptions, VideoReport
 from featuredb.video.frames import open_video
 from tests.support.films import (
@@ -234,12 +235,10 @@ class _Container:
 
 
 def _times(stamps: list[Any], interval_s: float | None = 0.04) -> tuple[list[float], VideoReport]:
-    clock = FilmClock(
-        time_base=Fraction(1, 100), origin_s=Fraction(0), interval_s=interval_s, decoding_order=False
-    )
-    stream = type("Stream", (), {"codec_context": type("Context", (), {"reorder_depth": 0})})
+    rate = None if interval_s is None else 1 / Fraction(str(interval_s))
+    stream = SimpleNamespace(time_base=Fraction(1, 100), average_rate=rate, guessed_rate=None)
     tally = VideoReport()
-    decoder = Decoder(_Container(stamps), stream, clock, tally, "film.mp4")  # type: ignore[arg-type]
+    decoder = Decoder(_Container(stamps), stream, tally, "film.mp4")  # type: ignore[arg-type]
     return [time_s for time_s, _ in decoder.pictures()], tally
 
 
