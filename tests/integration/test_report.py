@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.place_bounds import PlaceBounds
 from ingest.api.ingesting import summary
@@ -270,14 +269,6 @@ def test_changed_focal_lengths_are_warned_about() -> None:
     assert "330 px, EXIF says 300" in changed.warnings[0]
     unknown = replace(outcome, cameras=(replace(outcome.cameras[0], focal_before_px=None),))
     assert unknown.warnings == ()
-
-
-def test_values_validate_themselves() -> None:
-    with pytest.raises(InvalidValueError, match="zone"):
-        report(started=datetime(2024, 1, 2))
-    twice = PhotoOutcome(name="a", status="skipped")
-    with pytest.raises(InvalidValueError, match="twice"):
-        report(photos=(twice, twice))
 
 
 def test_exaggeration() -> None:
