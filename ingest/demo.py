@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from reloc.wire.query import LocaliseReply
 
 Say = Callable[[str], None]
-# What the simulated drone's tags are good for: exact ones are rounded by EXIF to about a millimetre, and a
-# reconstruction places its cameras to a few of them; the others are a consumer drone's, as EXIF suggests.
+# What the simulated drone's exact tags are good for: they are rounded by EXIF to about a millimetre, and a
+# reconstruction places its cameras to a few of them.
 _EXACT_SIGMA_M = 0.003
 
 
@@ -80,21 +80,18 @@ def run_demo(out: Path, *, size: str, seed: int, say: Say) -> list[DemoAnswer]:
     start = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     _tell(say, start, "drawing the town and its photos, a minute or two ...")
-    world = make_world(out / "world", size=size, seed=seed, exact_gps=True)
+    world = make_world(out / "world", size=size, seed=seed)
     _tell(say, start, f"simulated town: {len(world.images('drone'))} drone photos in {world.folder}")
     _tell(say, start, "making a map of them; each stage is told when it is done ...")
     database = Database.create(out / "db")
-    report = ingest_world(world, database, out / "report", exact_gps=True)
+    report = ingest_world(world, database, out / "report")
     made = next((m for m in report.maps if m.status != "refused"), None)
     if made is None:
         raise FeatureDbError(
             "demo: no map came of the drone photos: " + "; ".join(m.reason for m in report.maps)
         )
-    _tell(
-        say,
-        start,
-        f"map: {made.photos} photos, {made.points} points; {out / 'report' / 'report.html'}",
-    )
+    page = out / "report" / "report.html"
+    _tell(say, start, f"map: {made.photos} photos, {made.points} points; {page}")
     _tell(say, start, "serving the map, and asking it where other photos were taken ...")
     with (
         start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
@@ -108,19 +105,17 @@ def run_demo(out: Path, *, size: str, seed: int, say: Say) -> list[DemoAnswer]:
     return answers
 
 
-def make_world(folder: Path, *, size: str, seed: int, exact_gps: bool) -> "World":
-    """The world in `folder`, made unless it is there already."""
+def make_world(folder: Path, *, size: str, seed: int) -> "World":
+    """The world in `folder`, made unless it is there already; its drone's tags are exact."""
     from featuredb.simworld.world import WorldOptions, open_world, write_world
 
     if (folder / "truth.json").exists():
         return open_world(folder)
     options = WorldOptions.short(seed) if size == "short" else WorldOptions(seed=seed)
-    if exact_gps:
-        options = replace(options, flight=replace(options.flight, gps_error="none"))
-    return write_world(folder, options)
+    return write_world(folder, replace(options, flight=replace(options.flight, gps_error="none")))
 
 
-def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gps: bool) -> "IngestReport":
+def ingest_world(world: "World", database: Any, report_folder: Path) -> "IngestReport":
     """Ingest the drone photos and write the report."""
     from featuredb.features.extractor import ExtractorOptions
     from ingest.api.ingesting import ingest
@@ -129,7 +124,7 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
     from ingest.reconstruction import MapMakingOptions
 
     options = IngestOptions(
-        gps_sigma_m=(_EXACT_SIGMA_M, _EXACT_SIGMA_M) if exact_gps else None,
+        gps_sigma_m=(_EXACT_SIGMA_M, _EXACT_SIGMA_M),
         # The town is rich in texture; a quarter of the usual features make a first impression short.
         making=MapMakingOptions(
             extractor=ExtractorOptions(max_features=3000), maps=MapOptions(height_datum="ellipsoidal")

@@ -13,7 +13,7 @@ from featuredb.errors import CandidateNotFoundError, FeatureDbError
 from featuredb.store import Database
 from featuredb.store.candidates.photos import list_candidates, load_images, refuse
 from featuredb.store.candidates.states import Candidate
-from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
+from ingest.executor import Executor, Progress, no_progress, open_executor
 from ingest.growth.growth_report import GrowthReport, PhotoFate
 from ingest.growth.run import grow
 from ingest.growth.values import GrowthOptions, GrowthPhotos
@@ -140,11 +140,8 @@ def grow_candidates(
     remove_leftovers(work)
     waiting, unusable = waiting_photos(database, work, progress)
     photos = waiting[:_MOST_PHOTOS]
-    if options.workers == 1:
-        new, unreadable = _prepared(photos, work, options, InProcessExecutor(), progress)
-    else:
-        with PoolExecutor(options.workers) as pool:
-            new, unreadable = _prepared(photos, work, options, pool, progress)
+    with open_executor(options.workers) as executor:
+        new, unreadable = _prepared(photos, work, options, executor, progress)
     report = grow(database, new, work, replace(options.growth, threads=options.workers))
     refused = _refuse(database, {**unusable, **unreadable}, report, now, options)
     left = len(waiting) - len(photos)

@@ -32,6 +32,7 @@ from ingest.photos.photo import Photo, answered_positions
 from ingest.positions.center_priors import center_priors
 from ingest.sfm.extract import PhotoFeatures
 
+_AS_IN_PHOTO = ("name", "sha256", "capture_time", "gps", "owner", "licence")
 _LEAST_POSITIONS = 3  # tell a similarity
 _MOST_PHOTOS = 1000  # whose normal equations are inverted densely
 
@@ -82,14 +83,15 @@ def build_map(
     parts = _parts(model, placement.local_from_sfm, photos, features, identity, options, positions)
     if parts is None:
         return None
+    xyz, columns, shared = parts
     epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
     return FeatureMap(
         epsg=epsg,
         height_datum=options.height_datum,
         frame=frame,
-        points=MapPoints(utm=frame.utm_from_enu(parts.xyz, epsg), **parts.point_columns),
+        points=MapPoints(utm=frame.utm_from_enu(xyz, epsg), **columns),
         placement=placement,
-        **parts.shared,
+        **shared,
     )
 
 
@@ -106,22 +108,8 @@ def build_unplaced_map(
     parts = _parts(model, own_from_sfm, photos, features, identity, options)
     if parts is None:
         return None
-    return UnplacedMap(
-        frame=frame,
-        points=OwnPoints(xyz=parts.xyz, **parts.point_columns),
-        no_place=no_place,
-        **parts.shared,
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Parts:
-    """What a map has whatever is known of its place: points xyz (n, 3) in its frame with their other columns,
-    and the fields that FeatureMap and UnplacedMap share."""
-
-    xyz: FloatArray
-    point_columns: dict[str, Any]
-    shared: dict[str, Any]
+    xyz, columns, shared = parts
+    return UnplacedMap(frame=frame, points=OwnPoints(xyz=xyz, **columns), no_place=no_place, **shared)
 
 
 def _parts(
@@ -132,8 +120,12 @@ def _parts(
     identity: MapIdentity,
     options: MapOptions,
     positions: CenterPriors | None = None,
-) -> _Parts | None:
-    """The model in its frame; None if no point is placed well enough."""
+) -> tuple[FloatArray, dict[str, Any], dict[str, Any]] | None:
+    """What a map has whatever is known of its place; None if no point is placed well enough.
+
+    Returns:
+        Points xyz (n, 3) in its frame, their other columns, and the fields that both kinds of map share.
+    """
     used = _used_features(features, model)
     poses = [frame_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm]
     xyz = frame_from_sfm.act(model.xyz)
@@ -152,22 +144,19 @@ def _parts(
     kept = _well_placed(xyz, poses, covariances, model, options)
     if not kept.any():
         return None
-    return _Parts(
-        xyz=xyz[kept],
-        point_columns=_point_columns(model, used.rgb, linear, covariances, kept),
-        shared={
-            "map_id": identity.map_id,
-            "name": identity.name,
-            "cameras": model.cameras,
-            "camera_keys": _camera_keys(model, photos),
-            "images": tuple(_images(photos, model, poses, pose_spread)),
-            "observations": _observations(model, used, kept, options),
-            "extractor_fingerprint": used.fingerprint,
-            "source": identity.source,
-            "licence": identity.licence,
-            "provenance": provenance,
-        },
-    )
+    shared = {
+        "map_id": identity.map_id,
+        "name": identity.name,
+        "cameras": model.cameras,
+        "camera_keys": _camera_keys(model, photos),
+        "images": tuple(_images(photos, model, poses, pose_spread)),
+        "observations": _observations(model, used, kept, options),
+        "extractor_fingerprint": used.fingerprint,
+        "source": identity.source,
+        "licence": identity.licence,
+        "provenance": provenance,
+    }
+    return xyz[kept], _point_columns(model, used.rgb, linear, covariances, kept), shared
 
 
 def _positions(
@@ -209,26 +198,17 @@ def _images(
     return [
         MapImage(
             image_id=k,
-            name=photo.name,
-            sha256=photo.sha256,
             camera_id=int(model.camera_of[k]),
             cam_from_local=poses[k],
             covariance=spread[k],
-            capture_time=photo.capture_time,
-            gps=photo.gps,
-            owner=photo.owner,
-            licence=photo.licence,
+            **{name: getattr(photo, name) for name in _AS_IN_PHOTO},
         )
         for k, photo in enumerate(photos)
     ]
 
 
 def _point_columns(
-    model: Model,
-    rgb: NDArray[np.uint8],
-    linear: Linearised,
-    covariances: FloatArray,
-    kept: NDArray[np.bool_],
+    model: Model, rgb: NDArray[np.uint8], linear: Linearised, covariances: FloatArray, kept: NDArray[np.bool_]
 ) -> dict[str, Any]:
     """Columns of PointColumns by name."""
     lengths = model.track_lengths()
@@ -243,10 +223,7 @@ def _point_columns(
 
 
 def _observations(
-    model: Model,
-    used: "_Used",
-    kept: NDArray[np.bool_],
-    options: MapOptions,
+    model: Model, used: "_Used", kept: NDArray[np.bool_], options: MapOptions
 ) -> MapObservations:
     rows = np.flatnonzero(kept[model.point_of])
     row_of_point = np.cumsum(kept) - 1
@@ -265,11 +242,7 @@ def _observations(
 
 
 def _well_placed(
-    enu: FloatArray,
-    poses: Sequence[Rigid3],
-    covariances: FloatArray,
-    model: Model,
-    options: MapOptions,
+    enu: FloatArray, poses: Sequence[Rigid3], covariances: FloatArray, model: Model, options: MapOptions
 ) -> NDArray[np.bool_]:
     """Points (n,) whose standard deviation is small against their distance."""
     centers = np.array([pose.center for pose in poses])

@@ -3,20 +3,19 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from featuredb.errors import InvalidValueError
-from featuredb.geo.datum import HEIGHT_DATUMS
+from featuredb.geo.datum import check_datum
 from featuredb.index.vocabulary import shipped_vocabulary
 from featuredb.plain_json import plain
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database, Snapshot
-from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
+from ingest.executor import Progress, no_progress, open_executor
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.map_builder import MapIdentity
 from ingest.own_frame import WAYS_TO_A_PLACE
@@ -76,11 +75,7 @@ class IngestOptions:
             raise InvalidValueError(
                 f"IngestOptions.gps_sigma_m: expected metres in (0, 1e6), found {self.gps_sigma_m}"
             )
-        if self.making.maps.height_datum not in HEIGHT_DATUMS:
-            raise InvalidValueError(
-                f"MapOptions.height_datum: expected one of {', '.join(HEIGHT_DATUMS)}, "
-                f"found {self.making.maps.height_datum!r}"
-            )
+        check_datum(self.making.maps.height_datum)
 
     @property
     def fingerprint(self) -> str:
@@ -118,7 +113,8 @@ def ingest_photos(
     if options.stop_after == "scan":
         result = Reconstructed()
     else:
-        with executor_of(options, shared=(root, folder.parent if is_table(folder) else folder)) as executor:
+        shared = (root, folder.parent if is_table(folder) else folder)
+        with open_executor(options.workers, options.dask, shared) as executor:
             result = reconstruct_photos(
                 photos,
                 workspace,
@@ -153,10 +149,7 @@ def ingest_photos(
             *scanned.notes,
             *_warnings(result, outcomes, options),
             *_quarantine_note(quarantined),
-            *(
-                f"Matching of {lost.task} is lost: {lost.reason}"
-                for lost in result.matched.lost[:_MOST_NOTES]
-            ),
+            *(f"Matching of {o.task} is lost: {o.reason}" for o in result.matched.lost[:_MOST_NOTES]),
         ),
     )
 
@@ -196,25 +189,6 @@ def _with_sigmas(photos: Sequence[Photo], options: IngestOptions) -> list[Photo]
         else replace(photo, gps=replace(photo.gps, sigma_horizontal_m=horizontal, sigma_vertical_m=vertical))
         for photo in photos
     ]
-
-
-@contextmanager
-def executor_of(options: IngestOptions, shared: Sequence[Path]) -> Iterator[Executor]:
-    """The executor that the options ask for.
-
-    Args:
-        shared: folders that all workers must see, the work folder first.
-    """
-    if options.dask is not None:
-        from ingest.executor.dask_cluster import DaskExecutor
-
-        with DaskExecutor(options.dask, shared=shared) as dask:
-            yield dask
-    elif options.workers == 1:
-        yield InProcessExecutor()
-    else:
-        with PoolExecutor(options.workers) as pool:
-            yield pool
 
 
 def _identity(folder: Path, options: IngestOptions, job_id: str, number: int) -> MapIdentity:

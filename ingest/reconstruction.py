@@ -107,19 +107,21 @@ def reconstruct_photos(
     """
     clock = clock or StageClock()
     with clock.stage("extract") as counts:
-        extracted = extract_photos(list(photos), workspace, options.extractor, executor, progress)
-        counts |= {"reused": extracted.reused, "total": len(photos)}
-    usable = tuple(p for p in photos if p.name not in extracted.unreadable)
+        unreadable, reused = extract_photos(list(photos), workspace, options.extractor, executor, progress)
+        counts |= {"reused": reused, "total": len(photos)}
+    usable = tuple(p for p in photos if p.name not in unreadable)
     fingerprint = features_key(options.extractor)
     features = FeatureFiles([workspace.features(fingerprint, p.sha256) for p in usable])
-    done = Reconstructed(usable=usable, features=features, unreadable=extracted.unreadable)
+    done = Reconstructed(usable=usable, features=features, unreadable=unreadable)
     if stop_after == "extract":
         return done
 
     cameras, camera_rows = photo_cameras(usable, options.cameras, options.sfm.camera_model)
     views = [
-        PhotoView(sha256=photo.sha256, features=path, camera=cameras[row][0], focal_known=cameras[row][1])
-        for photo, path, row in zip(usable, features.paths, camera_rows, strict=True)
+        PhotoView(
+            name=p.name, sha256=p.sha256, features=f, camera=cameras[row][0], focal_known=cameras[row][1]
+        )
+        for p, f, row in zip(usable, features.paths, camera_rows, strict=True)
     ]
     words = shipped_vocabulary()
     with clock.stage("pairs"):
@@ -129,16 +131,13 @@ def reconstruct_photos(
             vectors = aggregate_photos(features.paths, words, most, workspace, executor, progress)
         pairs = choose_pairs(usable, vectors, options.pairs)
     with clock.stage("match") as counts:
-        names = [photo.name for photo in usable]
-        matched = match_pairs(views, pairs, workspace, options.matching, executor, progress, names)
+        matched = match_pairs(views, pairs, workspace, options.matching, executor, progress)
         more = more_pairs(len(usable), matched.inliers, pairs, options.pairs)
         if more:
-            matched = matched | match_pairs(
-                views, more, workspace, options.matching, executor, progress, names
-            )
+            matched |= match_pairs(views, more, workspace, options.matching, executor, progress)
         counts |= {"reused": matched.reused, "total": len(matched.files)}
     copies = copies_of(usable, matched)
-    matched = matched.without({row for row, _ in copies.items()})
+    matched = matched.without(copies.keys())
     done = replace(
         done,
         copies={usable[row].name: usable[kept].name for row, kept in copies.items()},

@@ -109,13 +109,10 @@ def _archive(path: Path) -> Iterator[Any]:
         raise IngestError(f"{path}: expected a stage's npz file, {error}; delete it and run again") from error
 
 
-def remove_leftovers(root: Path) -> int:
-    """Delete temporary files of killed jobs under `root` that are older than a day; how many there were."""
-    count = 0
+def remove_leftovers(root: Path) -> None:
+    """Delete temporary files of killed jobs under `root` that are older than a day."""
     now = time.time()
     for path in root.rglob(f"{TEMPORARY}*"):
         # A day: no stage of one photo or pair takes that long.
         if path.exists() and now - path.stat().st_mtime > 86_400.0:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-            count += 1
-    return count

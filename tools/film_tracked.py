@@ -23,7 +23,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
-from featuredb.video.telemetry import telemetry_of_video
+from featuredb.video.telemetry.read import telemetry_of_video
 from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 

@@ -247,7 +247,6 @@ def _photo(number: int, frame: LocalFrame, position: FloatArray, sigma_m: float)
             sigma_horizontal_m=sigma_m,
             sigma_vertical_m=sigma_m,
         ),
-        altitude_reference="ellipsoid",
     )
 
 
@@ -264,8 +263,8 @@ def _model_of(
             name=f"{k:02d}.jpg",
             camera_row=0,
             keypoints=features.xy,
-            prior_position=position,
-            prior_covariance=np.diag(sigmas_m**2),
+            prior_position=tuple(position.tolist()),
+            prior_sigma_m=tuple(sigmas_m.tolist()),
         )
         for k, ((_, features), position) in enumerate(zip(shown, measured, strict=True))
     )
@@ -281,7 +280,7 @@ def _model_of(
     database, output = work / "colmap.db", work / "models"
     output.mkdir()
     write_database(database, [(start, True)], photos, pairs)
-    run_incremental(database, work, output, mapping_settings(SfmOptions(), _WIDTH), lambda: None)
+    run_incremental(database, work, output, mapping_settings(SfmOptions(), _WIDTH))
     known = Known(photos=photos, focal_px={1: _FOCAL_PX})
     adjust_models(output, database, known, 0.5, AdjustOptions())
     return max(read_models(output), key=lambda model: len(model.rows), default=None)

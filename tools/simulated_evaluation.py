@@ -54,10 +54,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("simulated-evaluation"))
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    world = make_world(args.out / "world", size="full", seed=args.seed, exact_gps=True)
+    world = make_world(args.out / "world", size="full", seed=args.seed)
     database = Database.create(args.out / "db")
     if not database.snapshot().maps():
-        ingest_world(world, database, args.out / "report", exact_gps=True)
+        ingest_world(world, database, args.out / "report")
     localiser = Localiser.open(database)
     photos = {"drone": world.images("queries"), "street": world.images("street")}
     photos |= {kind: world.negatives(kind) for kind in NEGATIVE_KINDS}

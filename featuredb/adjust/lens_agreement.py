@@ -17,9 +17,8 @@ from featuredb.adjust.marginals import inverse_blocks
 from featuredb.geometry.arrays import FloatArray
 
 _LEAST_PHOTOS = 3  # that can disagree
-_USUAL = (
-    5.0  # about that of `brighton`, the one real set looked at; `python -m tools.lens_widths` prints others
-)
+# About that of `brighton`, the one real set looked at; `python -m tools.lens_widths` prints others.
+_USUAL = 5.0
 _SIZE = 8  # parameters of a whole lens
 _USUAL_PHOTOS = 4.0  # so many photos weigh as much as what is usual: chosen, not measured
 

@@ -63,16 +63,6 @@ class Marginals:
         factor = lenses * scale[:, None] * scale + _DAMPING * np.eye(len(scale))
         return np.asarray((across * scale) @ np.linalg.solve(factor, (across * scale).T))
 
-    def by_lens_prior(self, camera: int, gradient: FloatArray) -> FloatArray:
-        """(q, q) the part of `by_lenses` that comes from how far a free lens is off its prior.
-
-        Args:
-            gradient: (p, p) covariance of the prior's part of the gradient.
-        """
-        start = int(self.lens_start[camera])
-        across = self.shared[:, start : start + self.lens_size[camera]]
-        return np.asarray(across @ gradient @ across.T)
-
     def lens(self, camera: int) -> FloatArray:
         """(p, p) of a camera's parameters; zero where they are held."""
         return self._part(int(self.lens_start[camera]), self.lens_size[camera])

@@ -22,15 +22,7 @@ from featuredb.adjust.marginals import (
     marginals,
     target_marginals,
 )
-from featuredb.adjust.terms import (
-    CenterPriors,
-    LensPrior,
-    Marks,
-    Orientations,
-    PointPriors,
-    Targets,
-    Terms,
-)
+from featuredb.adjust.terms import CenterPriors, LensPrior, Marks, Orientations, PointPriors, Targets, Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 
@@ -190,7 +182,9 @@ class Problem:
                 information = np.linalg.inv(prior.covariance)
                 squares = float(off @ information @ off)
                 weight = 1.0 / (1.0 + squares / _LETS_GO**2) if prior.robust else 1.0  # of the Cauchy loss
-                part += found.by_lens_prior(c, np.asarray(weight**2 * information))
+                start = int(found.lens_start[c])
+                across = found.shared[:, start : start + found.lens_size[c]]
+                part += across @ (weight**2 * information) @ across.T
         return part
 
     def target_marginals(self) -> TargetMarginals:

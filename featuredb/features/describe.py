@@ -15,10 +15,7 @@ _FINEST_PX = 0.999 * 2.0 * SIGMA * 2.0 ** (0.5 / LAYERS)
 
 
 def describe_at(
-    gray: NDArray[np.uint8],
-    xy: NDArray[np.float32],
-    scale: NDArray[np.float32],
-    angle: NDArray[np.float32],
+    gray: NDArray[np.uint8], xy: NDArray[np.float32], scale: NDArray[np.float32], angle: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
     """RootSIFT (n, 128) at given keypoints.
 
@@ -37,9 +34,7 @@ def describe_at(
 
 
 def orientations_at(
-    gray: NDArray[np.uint8],
-    xy: NDArray[np.float32],
-    scale: NDArray[np.float32],
+    gray: NDArray[np.uint8], xy: NDArray[np.float32], scale: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Orientation (n,) of given keypoints, degrees in [0, 360), clockwise from the x axis: the strongest; 0
     where there is none.

@@ -100,15 +100,8 @@ def read_heif(data: bytes) -> ImageHeader:
         exif = (exif[0] + skipped, exif[1]) if exif[0] + skipped < exif[1] else None
         if exif is not None and data[exif[0] : exif[0] + 6] == b"Exif\0\0":
             exif = (exif[0] + 6, exif[1])
-    return ImageHeader(
-        format="AVIF" if meta.is_avif else "HEIC",
-        width=width,
-        height=height,
-        orientation=orientation,
-        exif=exif,
-        xmp=xmp,
-        end=end,
-    )
+    kind = "AVIF" if meta.is_avif else "HEIC"
+    return ImageHeader(kind, width, height, orientation=orientation, exif=exif, xmp=xmp, end=end)
 
 
 def heic_pixels(data: bytes, header_size: tuple[int, int], orientation: int) -> NDArray[np.uint8]:

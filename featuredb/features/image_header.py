@@ -7,6 +7,7 @@ allocate nothing, warn nobody and cost well under a millisecond.
 import re
 import struct
 import zlib
+from typing import Any
 
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
@@ -107,11 +108,9 @@ def _truncated(name: str, data: bytes, what: str) -> ImageError:
 
 def _jpeg(data: bytes) -> ImageHeader:
     """Walk the segments to the frame header, then the scans to the end marker. ITU T.81, annex B."""
-    at, scans = 2, 0
+    at, scans, jfif = 2, 0, False
     frame: tuple[int, int] | None = None
-    exif: tuple[int, int] | None = None
-    xmp: tuple[int, int] | None = None
-    jfif = False
+    metadata: dict[str, Any] = {}  # exif and xmp of ImageHeader
     while True:
         if scans:  # entropy-coded data: the next marker that is neither stuffing nor a restart
             found = _JPEG_IN_SCAN.search(data, at)
@@ -131,16 +130,7 @@ def _jpeg(data: bytes) -> ImageHeader:
             if frame is None or not scans:
                 raise ImageError("the JPEG ends before any picture", "broken")
             width, height = frame
-            return ImageHeader(
-                format="JPEG",
-                width=width,
-                height=height,
-                exif=exif,
-                xmp=xmp,
-                jfif=jfif,
-                scans=scans,
-                end=at + 2,
-            )
+            return ImageHeader("JPEG", width, height, jfif=jfif, scans=scans, end=at + 2, **metadata)
         body, stop = at + 4, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if max(body, stop) > len(data):
             raise _truncated("JPEG", data, f"within the segment at byte {at}")
@@ -152,10 +142,10 @@ def _jpeg(data: bytes) -> ImageHeader:
             frame = _jpeg_frame(marker, data[body:stop])
         elif marker == 0xE0 and data[body : body + 5] == b"JFIF\0":
             jfif = True
-        elif marker == 0xE1 and exif is None and data[body : body + 6] == b"Exif\0\0":
-            exif = (body + 6, stop)
-        elif marker == 0xE1 and xmp is None and data[body : body + 29] == b"http://ns.adobe.com/xap/1.0/\0":
-            xmp = (body + 29, stop)
+        elif marker == 0xE1 and data[body : body + 6] == b"Exif\0\0":
+            metadata.setdefault("exif", (body + 6, stop))
+        elif marker == 0xE1 and data[body : body + 29] == b"http://ns.adobe.com/xap/1.0/\0":
+            metadata.setdefault("xmp", (body + 29, stop))
         elif marker == 0xDA:
             scans += 1
             if frame is None:
@@ -182,8 +172,7 @@ def _jpeg_frame(marker: int, body: bytes) -> tuple[int, int]:
 def _png(data: bytes) -> ImageHeader:
     """Walk all chunks and check their sums, so that a flipped bit is found. PNG 3rd edition, section 5."""
     at, size = 8, (0, 0)
-    exif: tuple[int, int] | None = None
-    xmp: tuple[int, int] | None = None
+    metadata: dict[str, Any] = {}  # exif and xmp of ImageHeader
     view = memoryview(data)
     has_pixels = False
     while True:
@@ -203,15 +192,15 @@ def _png(data: bytes) -> ImageHeader:
         elif kind == b"acTL":
             raise ImageError("an animated PNG is not supported; export one frame", "unsupported")
         elif kind == b"eXIf":
-            exif = (body, stop)
+            metadata["exif"] = (body, stop)
         elif kind == b"iTXt" and data[body : body + 22] == b"XML:com.adobe.xmp\0\0\0\0\0":
-            xmp = (body + 22, stop)
+            metadata["xmp"] = (body + 22, stop)
         elif kind == b"IDAT":
             has_pixels = True
         elif kind == b"IEND":
             if not has_pixels:
                 raise ImageError("the PNG has no pixels", "broken")
-            return ImageHeader(format="PNG", width=size[0], height=size[1], exif=exif, xmp=xmp, end=stop + 4)
+            return ImageHeader("PNG", *size, end=stop + 4, **metadata)
         at = stop + 4
 
 
@@ -221,8 +210,7 @@ def _webp(data: bytes) -> ImageHeader:
     if end > len(data):
         raise _truncated("WebP", data, f"of {end}")
     at, size = 12, None
-    exif: tuple[int, int] | None = None
-    xmp: tuple[int, int] | None = None
+    metadata: dict[str, Any] = {}  # exif and xmp of ImageHeader
     while at + 8 <= end:
         kind, length = struct.unpack_from("<4sI", data, at)
         body, stop = at + 8, at + 8 + length
@@ -239,13 +227,13 @@ def _webp(data: bytes) -> ImageHeader:
             size = ((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
         elif kind == b"EXIF":
             prefix = 6 if data[body : body + 6] == b"Exif\0\0" else 0
-            exif = (body + prefix, stop)
+            metadata["exif"] = (body + prefix, stop)
         elif kind == b"XMP ":
-            xmp = (body, stop)
+            metadata["xmp"] = (body, stop)
         at = stop + (length & 1)
     if size is None:
         raise ImageError("the WebP has no picture", "broken")
-    return ImageHeader(format="WEBP", width=size[0], height=size[1], exif=exif, xmp=xmp, end=end)
+    return ImageHeader("WEBP", *size, end=end, **metadata)
 
 
 def _tiff(data: bytes) -> ImageHeader:
@@ -271,9 +259,7 @@ def _tiff(data: bytes) -> ImageHeader:
             break
     else:
         raise ImageError("the TIFF does not say where its pixels lie", "broken")
-    return ImageHeader(
-        format="TIFF", width=int(width), height=int(height), exif=(0, len(data)), end=len(data)
-    )
+    return ImageHeader("TIFF", int(width), int(height), exif=(0, len(data)), end=len(data))
 
 
 def _finite(ifd: Ifd, tag: int, default: float) -> float:
@@ -290,4 +276,4 @@ def _bmp(data: bytes) -> ImageHeader:
         raise ImageError(f"the BMP has the impossible size {width}x{height} at {bits} bits", "broken")
     if compression in (0, 3) and pixels + (width * bits + 31) // 32 * 4 * height > len(data):
         raise _truncated("BMP", data, "within its pixels")
-    return ImageHeader(format="BMP", width=width, height=height, end=len(data))
+    return ImageHeader("BMP", width, height, end=len(data))

@@ -28,13 +28,7 @@ SAMPLES = 4 * (_CELLS + 1)  # a side: four a cell, and half a cell beyond them o
 
 @compiled
 def extrema(
-    octave: NDArray[np.float32],
-    number: int,
-    sigma: float,
-    first: int,
-    end: int,
-    contrast: float,
-    edge: float,
+    octave: NDArray[np.float32], number: int, sigma: float, first: int, end: int, contrast: float, edge: float
 ) -> NDArray[np.float32]:
     """Keypoints (n, 6) of an octave's rows from first to end: extrema of its differences in place and scale.
 

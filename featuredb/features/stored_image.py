@@ -1,9 +1,9 @@
 """An image file by its header."""
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ImageHeader:
     """Format and size of an image as stored.
 
@@ -22,10 +22,11 @@ class ImageHeader:
     format: str
     width: int
     height: int
+    _: KW_ONLY
     exif: tuple[int, int] | None = None
     xmp: tuple[int, int] | None = None
     scans: int = 1
-    end: int = 0
+    end: int
     orientation: int | None = None
     jfif: bool = False
 

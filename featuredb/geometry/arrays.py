@@ -11,12 +11,18 @@ FloatArray = NDArray[np.float64]
 
 
 def frozen_array(
-    name: str, value: ArrayLike, shape: tuple[int | None, ...], dtype: DTypeLike = np.float64
+    name: str,
+    value: ArrayLike,
+    shape: tuple[int | None, ...],
+    dtype: DTypeLike = np.float64,
+    *,
+    nan: bool = False,
 ) -> NDArray[Any]:
     """Return a read-only copy of `value` with the given dtype, after checking its shape.
 
-    `None` in `shape` accepts any length on that axis. Floating arrays must be finite; a conversion to
-    integers or booleans must keep every value, so that 0.7 does not become row 0 and 300 not the byte 44.
+    `None` in `shape` accepts any length on that axis. Floating arrays must be finite, with `nan` except for
+    NaN; a conversion to integers or booleans must keep every value, so that 0.7 does not become row 0 and 300
+    not the byte 44.
 
     Raises:
         InvalidValueError: wrong shape, not convertible without changing values, or not finite.
@@ -40,8 +46,9 @@ def frozen_array(
     if array.shape != shape and not _fits(array.shape, shape):
         wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
         raise InvalidValueError(f"{name}: expected shape {wanted}, found {array.shape}")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise InvalidValueError(f"{name}: expected finite numbers, found NaN or infinity")
+    if array.dtype.kind == "f" and not (np.isfinite(array).all() or (nan and not np.isinf(array).any())):
+        found = "infinity" if nan else "NaN or infinity"
+        raise InvalidValueError(f"{name}: expected finite numbers, found {found}")
     array.setflags(write=False)
     return array
 

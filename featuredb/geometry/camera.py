@@ -1,7 +1,7 @@
 """Camera intrinsics by COLMAP's models; projection is pycolmap's own code."""
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -47,17 +47,11 @@ class Camera:
     params: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if self.model not in SUPPORTED_MODELS:
-            raise InvalidValueError(
-                f"Camera.model: expected one of {', '.join(SUPPORTED_MODELS)}, found {self.model!r}"
-            )
+        template = _template(self.model)
         for name in ("width", "height"):
             object.__setattr__(self, name, _pixel_count(f"Camera.{name}", getattr(self, name)))
-        template = _template(self.model)
-        wanted = len(template.params)
-        params = frozen_array(
-            f"Camera.params of {self.model} ({template.params_info})", self.params, (wanted,)
-        )
+        what, wanted = f"Camera.params of {self.model} ({template.params_info})", len(template.params)
+        params = frozen_array(what, self.params, (wanted,))
         object.__setattr__(self, "params", tuple(float(p) for p in params))
         focals = [self.params[i] for i in template.focal_length_idxs()]
         if not all(0 < focal < _MAX_FOCAL_PX for focal in focals):
@@ -68,10 +62,7 @@ class Camera:
     @classmethod
     def from_focal(cls, width: int, height: int, focal_px: float, model: str = "SIMPLE_RADIAL") -> Self:
         """A camera of the given model with this focal length, centred, without distortion."""
-        if model not in SUPPORTED_MODELS:
-            raise InvalidValueError(
-                f"Camera.model: expected one of {', '.join(SUPPORTED_MODELS)}, found {model!r}"
-            )
+        _template(model)  # raises where there is no such model
         width, height = _pixel_count("Camera.width", width), _pixel_count("Camera.height", height)
         camera = _pycolmap().Camera.create_from_model_name(1, model, float(focal_px), width, height)
         return cls(model=model, width=width, height=height, params=tuple(camera.params))
@@ -108,7 +99,7 @@ class Camera:
         params = list(self.params)
         for i in _template(self.model).focal_length_idxs():
             params[i] *= focal_px / self.focal_px
-        return Camera(model=self.model, width=self.width, height=self.height, params=tuple(params))
+        return replace(self, params=tuple(params))
 
     def scaled_to(self, width: int, height: int) -> "Camera":
         """The same lens for an image resampled to another size.
@@ -217,11 +208,15 @@ def _radial_polynomials(model: str, k: tuple[float, ...]) -> "tuple[Polynomial, 
     return Polynomial(numerator), Polynomial(denominator)
 
 
-_TEMPLATES: dict[str, Any] = {}
-
-
+@cache
 def _template(model: str) -> Any:
-    """A pycolmap camera of the model, for its constants (parameter names and places)."""
-    if model not in _TEMPLATES:
-        _TEMPLATES[model] = _pycolmap().Camera.create_from_model_name(1, model, 1.0, 2, 2)
-    return _TEMPLATES[model]
+    """A pycolmap camera of the model, for its constants (parameter names and places).
+
+    Raises:
+        InvalidValueError: there is no such model here.
+    """
+    if model not in SUPPORTED_MODELS:
+        raise InvalidValueError(
+            f"Camera.model: expected one of {', '.join(SUPPORTED_MODELS)}, found {model!r}"
+        )
+    return _pycolmap().Camera.create_from_model_name(1, model, 1.0, 2, 2)

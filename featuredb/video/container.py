@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
-from fractions import Fraction
 from typing import Any, cast
 
 import av
@@ -16,21 +15,16 @@ from numpy.typing import NDArray
 
 from featuredb.errors import VideoError
 from featuredb.features.shrink import fitted_size
-from featuredb.video.decoding import Decoder, FilmClock
+from featuredb.video.decoding import Decoder, is_indexed, nominal_rate
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
-from featuredb.video.opening import Opening, Source, coded_pixels, open_input, opening_of
+from featuredb.video.opening import MAX_CODED_PIXELS, Opening, Source, check_size, open_input, opening_of
 from featuredb.video.pixels import PixelReader
 from featuredb.video.rotation import clockwise_from_display_matrix
 
 logger = logging.getLogger(__name__)
 
-# Their time line starts at 0 and their index finds key frames. Others start at any time (a transport stream's
-# own clock, a camera's uptime), and libav's search in a transport stream ends behind the frame it looks for.
-_INDEXED = frozenset({"mov", "matroska", "avi"})
 # An index goes by decoding time, which runs ahead of display by some frames: aim a little before the start.
 _SEEK_MARGINS_S = (1.0, 10.0)
-# High-speed cameras write up to 1000 frames a second; what says more gives its tick, not its rate.
-_MAX_RATE_HZ = 1000.0
 # Phones, QuickTime's own atoms, and what libav makes of them; the most specific first.
 _MAKE = ("com.apple.quicktime.make", "com.android.manufacturer", "make", "manufacturer")
 _MODEL = ("com.apple.quicktime.model", "com.android.model", "model")
@@ -48,8 +42,8 @@ def open_container(source: Source, options: VideoOptions) -> "ContainerVideo":
         VideoError: it cannot be opened, holds no video that can be decoded, or is of a size or rotation that
             is not taken.
     """
-    opening = opening_of(source, options)
-    container = open_input(opening, options)
+    opening = opening_of(source)
+    container = open_input(opening)
     try:
         return _opened(container, opening, options)
     except BaseException:
@@ -59,14 +53,14 @@ def open_container(source: Source, options: VideoOptions) -> "ContainerVideo":
 
 def _opened(container: InputContainer, opening: Opening, options: VideoOptions) -> "ContainerVideo":
     stream = _largest_stream(container, opening.name)
-    _check_size(opening.name, stream.width, stream.height, options)
+    check_size(opening.name, stream.width, stream.height)
     context = stream.codec_context
     # One thread leaves the other cores to the caller, who has more to do, and loses the least of a damaged
     # film: each further one may lose another frame, and delays a live source by a frame.
     context.thread_count = 1
-    context.options = {"max_pixels": str(coded_pixels(options))}
+    context.options = {"max_pixels": str(MAX_CODED_PIXELS)}
     tally = VideoReport()
-    decoder = Decoder(container, stream, _clock(container, stream), tally, opening.name)
+    decoder = Decoder(container, stream, tally, opening.name)
     pictures = decoder.pictures()
     first = next(pictures, None)
     if first is None:
@@ -74,7 +68,7 @@ def _opened(container: InputContainer, opening: Opening, options: VideoOptions) 
         raise VideoError(
             f"{opening.name}: no frame of its {stream.codec_context.name} video can be decoded{broken}"
         )
-    _check_size(opening.name, first[1].width, first[1].height, options)
+    check_size(opening.name, first[1].width, first[1].height)
     return ContainerVideo(
         info=_info(container, stream, first[1], opening, options),
         container=container,
@@ -131,9 +125,9 @@ class ContainerVideo(Video):
     def _frames(self) -> Iterator[VideoFrame]:
         for index, time_s, picture in chosen(self._from_start(), self._options):
             yield self._frame(index, time_s, picture)
-        report = self.report
-        if not report.whole:
-            logger.warning("%s: %s", self.info.name, "; ".join(report.complaints()))
+        complaints = self.report.complaints()
+        if complaints:
+            logger.warning("%s: %s", self.info.name, "; ".join(complaints))
 
     def _from_start(self) -> Iterator[tuple[float, av.VideoFrame]]:
         """Decoded frames with their times, from at or before the asked start."""
@@ -141,7 +135,7 @@ class ContainerVideo(Video):
         (first_s, first), following = self._begun
         start_s = self._options.start_s
         moved = False
-        if start_s is not None and start_s > first_s and not self.info.live and _indexed(self._container):
+        if start_s is not None and start_s > first_s and not self.info.live and is_indexed(self._container):
             for aim_s in (*(start_s - margin for margin in _SEEK_MARGINS_S), first_s):
                 if not self._decoder.seek(max(aim_s, first_s)):
                     continue
@@ -195,48 +189,11 @@ def _largest_stream(container: InputContainer, name: str) -> VideoStream:
         kinds = sorted({stream.type for stream in container.streams})
         found = f"only {', '.join(kinds)}" if kinds else "no stream in it; its index is broken, copy it again"
         raise VideoError(f"{name}: expected a film, found {found}")
-    decodable = [stream for stream in streams if _context(stream) is not None]
+    # None without a decoder, whatever its type says.
+    decodable = [stream for stream in streams if cast("Any", stream).codec_context is not None]
     if not decodable:
         raise VideoError(f"{name}: there is no decoder for its video; encode it as H.264 or H.265")
     return max(decodable, key=lambda stream: (stream.width * stream.height, -stream.index))
-
-
-def _context(stream: VideoStream) -> Any | None:
-    return stream.codec_context  # None without a decoder, whatever its type says
-
-
-def _check_size(name: str, width: int, height: int, options: VideoOptions) -> None:
-    """Refuse what is too large to be meant; a size of 0 is one that only the first frame tells."""
-    if max(width, height) > options.max_full_side_px or width * height > options.max_full_pixels:
-        raise VideoError(
-            f"{name}: its pictures have {width}x{height} pixels, the limit is {options.max_full_side_px} a "
-            f"side and {options.max_full_pixels / 1e6:.0f} million; make it smaller, unless it is broken"
-        )
-
-
-def _indexed(container: InputContainer) -> bool:
-    return not _INDEXED.isdisjoint(container.format.name.split(","))
-
-
-def _rate(stream: VideoStream) -> Fraction | None:
-    """Nominal frames per second."""
-    for rate in (stream.average_rate, stream.guessed_rate):
-        if rate and 0 < rate <= _MAX_RATE_HZ:
-            return rate
-    return None
-
-
-def _clock(container: InputContainer, stream: VideoStream) -> FilmClock:
-    starts_anywhere = not _indexed(container) and container.start_time is not None
-    rate = _rate(stream)
-    if not stream.time_base:
-        raise VideoError(f"{container.name}: its video has no time base; copy it into an mp4 or mkv")
-    return FilmClock(
-        time_base=stream.time_base,
-        origin_s=Fraction(container.start_time, av.time_base) if starts_anywhere else Fraction(0),
-        interval_s=float(1 / rate) if rate else None,
-        decoding_order=container.format.name == "avi",
-    )
 
 
 def _duration_s(container: InputContainer, stream: VideoStream) -> float | None:
@@ -253,7 +210,7 @@ def _expected(
 ) -> tuple[int | None, float | None]:
     # Only the index of an mp4 lists every frame, and only those that its edit list leaves to be shown.
     packets = len(stream.index_entries) if "mov" in container.format.name.split(",") else None
-    duration_s, rate = _duration_s(container, stream), _rate(stream)
+    duration_s, rate = _duration_s(container, stream), nominal_rate(stream)
     last_s = first_s + duration_s - float(1 / rate) if duration_s and rate else None
     return packets, last_s
 

@@ -10,7 +10,6 @@ not do by itself, and is done here:
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from fractions import Fraction
 
 import av
@@ -20,6 +19,11 @@ from av.video.stream import VideoStream
 from featuredb.errors import VideoError
 from featuredb.video.film import VideoReport
 
+# Their time line starts at 0 and their index finds key frames. Others start at any time (a transport stream's
+# own clock, a camera's uptime), and libav's search in a transport stream ends behind the frame it looks for.
+_INDEXED = frozenset({"mov", "matroska", "avi"})
+# High-speed cameras write up to 1000 frames a second; what says more gives its tick, not its rate.
+_MAX_RATE_HZ = 1000.0
 # A stream in which nothing can be decoded for that long (minutes) will not come right.
 _MAX_UNDECODABLE_IN_A_ROW = 5_000
 # A broken place of the container costs one or two of these; a file full of them is not worth reading.
@@ -28,47 +32,38 @@ _MAX_READ_ERRORS_IN_A_ROW = 20
 _MAX_BACKWARD_IN_A_ROW = 250
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FilmClock:
-    """How the time stamps of a stream become seconds on the film's clock.
+def is_indexed(container: InputContainer) -> bool:
+    """Whether its time line starts at 0 and its index finds key frames."""
+    return not _INDEXED.isdisjoint(container.format.name.split(","))
 
-    Attributes:
-        time_base: seconds per tick of the stream's time stamps.
-        origin_s: what the stamps say at the film's start; 0 for containers whose time line starts there.
-        interval_s: nominal time between frames, or None.
-        decoding_order: whether the container stores no presentation times (AVI). Its decoding times only
-            count its packets: frames that a broken place swallows shift those behind them.
-    """
 
-    time_base: Fraction
-    origin_s: Fraction
-    interval_s: float | None
-    decoding_order: bool
-
-    def time_s(self, picture: av.VideoFrame, delay_frames: int) -> float | None:
-        """The picture's own time, or None where it has none.
-
-        Args:
-            delay_frames: by how many frames the decoder reorders; AVI counts in frames.
-        """
-        stamp = picture.pts
-        if self.decoding_order:
-            stamp = None if picture.dts is None else picture.dts - delay_frames
-        return None if stamp is None else float(stamp * self.time_base - self.origin_s)
-
-    def stamp(self, time_s: float) -> int:
-        """Stream time stamp of a time on the film's clock."""
-        return round((Fraction(time_s) + self.origin_s) / self.time_base)
+def nominal_rate(stream: VideoStream) -> Fraction | None:
+    """Frames per second, or None."""
+    for rate in (stream.average_rate, stream.guessed_rate):
+        if rate and 0 < rate <= _MAX_RATE_HZ:
+            return rate
+    return None
 
 
 class Decoder:
-    """Decodes one stream of an open container; to be used from one thread."""
+    """Decodes one stream of an open container; to be used from one thread.
 
-    def __init__(
-        self, container: InputContainer, stream: VideoStream, clock: FilmClock, tally: VideoReport, name: str
-    ) -> None:
-        self._container, self._stream = container, stream
-        self._clock, self._tally, self._name = clock, tally, name
+    Raises:
+        VideoError: the stream does not say what its time stamps count.
+    """
+
+    def __init__(self, container: InputContainer, stream: VideoStream, tally: VideoReport, name: str) -> None:
+        if not stream.time_base:
+            raise VideoError(f"{name}: its video has no time base; copy it into an mp4 or mkv")
+        self._container, self._stream, self._tally, self._name = container, stream, tally, name
+        self._time_base, rate = stream.time_base, nominal_rate(stream)
+        self._interval_s = float(1 / rate) if rate else None
+        starts_anywhere = not is_indexed(container) and container.start_time is not None
+        # What the stamps say at the film's start.
+        self._origin_s = Fraction(container.start_time, av.time_base) if starts_anywhere else Fraction(0)
+        # AVI stores no presentation times. Its decoding times only count its packets: frames that a broken
+        # place swallows shift those behind them.
+        self._decoding_order = container.format.name == "avi"
         # Gaps in a transport stream's counters mark packets that mostly decode; elsewhere the mark means that
         # the file ends within the packet, and with several threads such a packet takes its neighbours along.
         self._skip_marked = "mpegts" not in container.format.name.split(",")
@@ -94,7 +89,8 @@ class Decoder:
         """
         self.check_open()
         try:
-            self._container.seek(self._clock.stamp(time_s), stream=self._stream)
+            stamp = round((Fraction(time_s) + self._origin_s) / self._time_base)
+            self._container.seek(stamp, stream=self._stream)
         except (av.FFmpegError, OverflowError):
             return False
         return True
@@ -108,11 +104,11 @@ class Decoder:
         last_s: float | None = None
         backward = 0
         for picture in self._decoded():
-            time_s = self._clock.time_s(picture, self._stream.codec_context.reorder_depth)
-            if time_s is None and last_s is not None and self._clock.interval_s is not None:
-                time_s = last_s + self._clock.interval_s
+            time_s = self._time_s(picture)
+            if time_s is None and last_s is not None and self._interval_s is not None:
+                time_s = last_s + self._interval_s
                 # The last frames of an AVI come when no packet is left to name their time: the next one.
-                self._tally.times_guessed += not self._clock.decoding_order
+                self._tally.times_guessed += not self._decoding_order
             if time_s is None and last_s is None:
                 time_s = 0.0
                 self._tally.times_guessed += 1
@@ -128,6 +124,14 @@ class Decoder:
             backward = 0
             last_s = self._tally.last_s = time_s
             yield time_s, picture
+
+    def _time_s(self, picture: av.VideoFrame) -> float | None:
+        """The picture's own time on the film's clock, or None where it has none."""
+        stamp = picture.pts
+        if self._decoding_order:  # the decoder reorders by some frames, in which AVI counts
+            delay_frames = self._stream.codec_context.reorder_depth
+            stamp = None if picture.dts is None else picture.dts - delay_frames
+        return None if stamp is None else float(stamp * self._time_base - self._origin_s)
 
     def _decoded(self) -> Iterator[av.VideoFrame]:
         failed = 0
@@ -149,7 +153,6 @@ class Decoder:
             failed = 0 if pictures else failed
             for picture in pictures:
                 self.check_open()
-                self._tally.decoded += 1
                 yield picture
 
     def _packets(self) -> "Iterator[av.Packet[VideoStream]]":  # generic in the stubs only
@@ -190,5 +193,5 @@ class Decoder:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, av.error.ExitError):
-        return "nothing came within the timeout; check the camera and the network, or allow more"
+        return "nothing came within the timeout; check the camera and the network"
     return getattr(error, "strerror", None) or str(error)

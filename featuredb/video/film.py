@@ -26,31 +26,20 @@ class VideoOptions:
     Attributes:
         start_s, end_s: only frames with start_s <= time_s < end_s; None for the film's own start and end.
         max_side_px: frames are made smaller so that no side is longer; None for full size.
-        timeout_s: how long a URL or a device may be silent, when it is opened and between its packets.
         fps: frames per second of a folder that has no file of times.
-        input_options: libav's options of the format, e.g. {"video_size": "1280x720"}.
-        max_full_side_px, max_full_pixels: larger films are refused before anything is allocated for them.
     """
 
     start_s: float | None = None
     end_s: float | None = None
     max_side_px: int | None = None
-    timeout_s: float = 10.0
     fps: float | None = None
-    input_options: Mapping[str, str] = field(default_factory=lambda: NO_TAGS)
-    # Panoramic cameras reach 11520x5760; a frame of the most pixels takes 200 MB as 4:2:0.
-    max_full_side_px: int = 16_384
-    max_full_pixels: int = 16_384 * 8_192
 
     def __post_init__(self) -> None:
-        for name in ("max_side_px", "max_full_side_px", "max_full_pixels"):
-            value = getattr(self, name)
-            if value is not None and (not isinstance(value, int) or value < 1):
-                raise InvalidValueError(f"{name}: expected a whole number of at least 1, found {value!r}")
-        for name in ("timeout_s", "fps"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < math.inf:
-                raise InvalidValueError(f"{name}: expected a positive number, found {value!r}")
+        side = self.max_side_px
+        if side is not None and (not isinstance(side, int) or side < 1):
+            raise InvalidValueError(f"max_side_px: expected a whole number of at least 1, found {side!r}")
+        if self.fps is not None and not 0.0 < self.fps < math.inf:
+            raise InvalidValueError(f"fps: expected a positive number, found {self.fps!r}")
         bounds = [value for value in (self.start_s, self.end_s) if value is not None]
         if not all(math.isfinite(value) for value in bounds) or (len(bounds) == 2 and bounds[0] >= bounds[1]):
             raise InvalidValueError(
@@ -130,7 +119,6 @@ class VideoReport:
     """What reading a film has come to so far; counted up by its reader, who gives copies away.
 
     Attributes:
-        decoded: frames that were decoded, also those outside the asked stretch.
         undecodable: packets (each a frame) that could not be decoded, or are only there in part.
         damaged: frames that were handed out although parts of them are made up.
         out_of_order: frames that were dropped because their time is not after that of the frame before.
@@ -141,7 +129,6 @@ class VideoReport:
             it is more than rounding; sound that runs on counts as length, too.
     """
 
-    decoded: int = 0
     undecodable: int = 0
     damaged: int = 0
     out_of_order: int = 0
@@ -152,13 +139,8 @@ class VideoReport:
     missing: int = 0
     short_by_s: float = 0.0
 
-    @property
-    def whole(self) -> bool:
-        """Whether nothing was found wrong with what was read."""
-        return not self.complaints()
-
     def complaints(self) -> tuple[str, ...]:
-        """What is wrong with the film, in words."""
+        """What is wrong with the film, in words; nothing where it is whole."""
         said = (
             (self.undecodable, f"{self.undecodable} packets cannot be decoded"),
             (self.damaged, f"{self.damaged} frames are damaged"),

@@ -23,11 +23,16 @@ from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb, pro
 from featuredb.features.exif.read import ExifInfo, read_exif
 from featuredb.features.shrink import fitted_size, shrunk
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
+from featuredb.video.opening import MAX_FULL_PIXELS, MAX_FULL_SIDE_PX
+from featuredb.video.telemetry.formats.text import number
 
 _T = TypeVar("_T")
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".heic", ".heif", ".avif", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 _CSV_NAME = "timestamps.csv"
-_MAX_BYTES = 1 << 30  # of one picture: an uncompressed TIFF of the most pixels has 400 MB
+# An uncompressed TIFF of the most pixels has 400 MB.
+_LIMITS = DecodeLimits(
+    max_bytes=1 << 30, max_pixels=MAX_FULL_PIXELS, max_side_px=MAX_FULL_SIDE_PX, min_side_px=1
+)
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
@@ -51,14 +56,7 @@ def open_folder(folder: Path, options: VideoOptions) -> "FolderVideo":
     names = sorted((name for name in names if not name.startswith(".")), key=natural_key)
     if not names:
         raise VideoError(f"{folder}: expected pictures ({', '.join(sorted(_SUFFIXES))}), found none")
-    timed = _timed(folder, names, options.fps)
-    limits = DecodeLimits(
-        max_bytes=_MAX_BYTES,
-        max_pixels=options.max_full_pixels,
-        max_side_px=options.max_full_side_px,
-        min_side_px=1,
-    )
-    return FolderVideo(folder, timed, limits, options)
+    return FolderVideo(folder, _timed(folder, names, options.fps), options)
 
 
 class FolderVideo(Video):
@@ -68,10 +66,8 @@ class FolderVideo(Video):
         timed: (time in seconds, name), in order of time.
     """
 
-    def __init__(
-        self, folder: Path, timed: list[tuple[float, str]], limits: DecodeLimits, options: VideoOptions
-    ) -> None:
-        self._folder, self._timed, self._limits, self._options = folder, timed, limits, options
+    def __init__(self, folder: Path, timed: list[tuple[float, str]], options: VideoOptions) -> None:
+        self._folder, self._timed, self._options = folder, timed, options
         self._size = self._stored_size(timed[0][1])
         frame_width, frame_height = fitted_size(*self._size, options.max_side_px)
         self._report = VideoReport()
@@ -119,7 +115,6 @@ class FolderVideo(Video):
 
     def _frame(self, index: int, time_s: float, name: str) -> VideoFrame:
         gray = self._pixels(decode_gray, name)
-        self._report.decoded += 1
         self._report.last_s = time_s
         return VideoFrame(
             index=index,
@@ -141,7 +136,7 @@ class FolderVideo(Video):
     def _read(self, read: Callable[[Path, DecodeLimits], _T], name: str) -> _T:
         """What `read` makes of a picture's file."""
         try:
-            return read(self._folder / name, self._limits)
+            return read(self._folder / name, _LIMITS)
         except ImageError as error:
             raise VideoError(f"{self._folder.name}: the picture {name} cannot be read: {error}") from error
 
@@ -175,7 +170,11 @@ def _timed(folder: Path, names: list[str], fps: float | None) -> list[tuple[floa
 
 
 def _from_table(path: Path, names: list[str]) -> list[tuple[float, str]]:
-    rows = csv.DictReader(_text(path).splitlines())
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise VideoError(f"{path}: the times cannot be read: {error}") from error
+    rows = csv.DictReader(text.splitlines())
     columns = [column.strip() for column in rows.fieldnames or ()]
     rows.fieldnames = columns
     if not {"file", "time_s"} <= set(columns):
@@ -185,7 +184,10 @@ def _from_table(path: Path, names: list[str]) -> list[tuple[float, str]]:
         name = (row["file"] or "").strip()
         if name in times:
             raise VideoError(f"{path}: line {rows.line_num}: {name} is there twice")
-        times[name] = _seconds(path, rows.line_num, row["time_s"] or "")
+        told = (row["time_s"] or "").strip()
+        times[name] = number(told)
+        if math.isnan(times[name]):
+            raise VideoError(f"{path}: line {rows.line_num}: expected a time in seconds, found {told!r}")
     without = [name for name in names if name not in times]
     unknown = sorted(set(times) - set(names), key=natural_key)
     if without or unknown:
@@ -194,23 +196,6 @@ def _from_table(path: Path, names: list[str]) -> list[tuple[float, str]]:
             f"{_some(without)}; not in the folder: {_some(unknown)}"
         )
     return [(times[name], name) for name in names]
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise VideoError(f"{path}: the times cannot be read: {error}") from error
-
-
-def _seconds(path: Path, number: int, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise VideoError(f"{path}: line {number}: expected a time in seconds, found {text.strip()!r}")
-    return value
 
 
 def _some(names: list[str]) -> str:

@@ -13,7 +13,6 @@ import av
 from av.container import InputContainer
 
 from featuredb.errors import VideoError
-from featuredb.video.film import VideoOptions
 
 # A file is taken for a film by its contents. Without this list, a playlist or a script that somebody named
 # .mp4 would make libav open other files and addresses on its behalf.
@@ -21,10 +20,15 @@ _FILE_FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"
 _FILE_FORMATS_SAID = "mp4, mov, mkv, webm, avi or ts"
 _SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "rtp", "srt", "tcp", "udp")
 # What an address may lead on to (a playlist's segments, RTSP's streams): the network, no local files.
-_NETWORK_PROTOCOLS = ",".join((*_SCHEMES, "tls", "crypto", "httpproxy"))
-
+_OF_NETWORK = {"protocol_whitelist": ",".join((*_SCHEMES, "tls", "crypto", "httpproxy"))}
+_OF_FILES = {"format_whitelist": _FILE_FORMATS, "protocol_whitelist": "file"}
+_TIMEOUT_S = 10.0  # that a URL or a device may be silent, when it is opened and between its packets
+# Larger films are refused before anything is allocated for them. Panoramic cameras reach 11520x5760; a frame
+# of the most pixels takes 200 MB as 4:2:0.
+MAX_FULL_SIDE_PX, MAX_FULL_PIXELS = 16_384, 16_384 * 8_192
 _BLOCK_PX = 128  # of AV1 and its like; half of it in H.265
-
+# Of a coded picture, which ends in whole blocks; libav allocates nothing for larger ones.
+MAX_CODED_PIXELS = MAX_FULL_PIXELS + 2 * _BLOCK_PX * MAX_FULL_SIDE_PX
 
 Source = str | Path
 
@@ -48,32 +52,30 @@ class Opening:
     input_format: str | None = None
 
 
-def opening_of(source: Source, options: VideoOptions) -> Opening:
+def opening_of(source: Source) -> Opening:
     """Where a source is and how it is opened; nothing is opened yet.
 
     Raises:
         VideoError: no such file, not a regular file, or an address of an unknown kind.
     """
     if isinstance(source, str) and re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", source):
-        return _address(source, options)
-    return _file_or_device(Path(source), options)
+        return _address(source)
+    return _file_or_device(Path(source))
 
 
-def _address(url: str, options: VideoOptions) -> Opening:
+def _address(url: str) -> Opening:
     parts = urlsplit(url)
     name = url if "@" not in parts.netloc else url.replace(parts.netloc, parts.netloc.rpartition("@")[2], 1)
     if parts.scheme not in _SCHEMES:
         raise VideoError(
             f"{name}: expected a path, or an address of one of {', '.join(_SCHEMES)}, found {parts.scheme}://"
         )
-    given = {"protocol_whitelist": _NETWORK_PROTOCOLS}
-    if parts.scheme in ("rtsp", "rtsps"):
-        # Over UDP a lost datagram smears the picture until the next key frame.
-        given["rtsp_transport"] = "tcp"
-    return Opening(name=name, target=url, input_options={**given, **options.input_options}, live=True)
+    # Over UDP a lost datagram smears the picture until the next key frame.
+    over = {"rtsp_transport": "tcp"} if parts.scheme in ("rtsp", "rtsps") else {}
+    return Opening(name=name, target=url, input_options=_OF_NETWORK | over, live=True)
 
 
-def _file_or_device(path: Path, options: VideoOptions) -> Opening:
+def _file_or_device(path: Path) -> Opening:
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError) as error:
@@ -82,24 +84,31 @@ def _file_or_device(path: Path, options: VideoOptions) -> Opening:
     if not (stat.S_ISREG(mode) or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)):
         raise VideoError(f"{path}: expected a film, a folder of pictures, a pipe or a camera's device")
     regular, device = stat.S_ISREG(mode), stat.S_ISCHR(mode)
-    given = {} if device else {"format_whitelist": _FILE_FORMATS, "protocol_whitelist": "file"}
     return Opening(
         name=path.name if regular else str(path),
         # Without the scheme a name like "tcp:2.mp4" would be taken for an address.
         target=str(path) if device else f"file:{path.absolute()}",
         path=path if regular else None,
         input_format="v4l2" if device else None,
-        input_options={**given, **options.input_options},
+        input_options={} if device else _OF_FILES,
         live=not regular,
     )
 
 
-def coded_pixels(options: VideoOptions) -> int:
-    """Most pixels of a coded picture, which ends in whole blocks; libav allocates nothing for larger ones."""
-    return options.max_full_pixels + 2 * _BLOCK_PX * options.max_full_side_px
+def check_size(name: str, width: int, height: int) -> None:
+    """Refuse what is too large to be meant; a size of 0 is one that only the first frame tells.
+
+    Raises:
+        VideoError: it is.
+    """
+    if max(width, height) > MAX_FULL_SIDE_PX or width * height > MAX_FULL_PIXELS:
+        raise VideoError(
+            f"{name}: its pictures have {width}x{height} pixels, the limit is {MAX_FULL_SIDE_PX} a side and "
+            f"{MAX_FULL_PIXELS / 1e6:.0f} million; make it smaller, unless it is broken"
+        )
 
 
-def open_input(opening: Opening, options: VideoOptions) -> InputContainer:
+def open_input(opening: Opening) -> InputContainer:
     """The open container.
 
     Raises:
@@ -111,17 +120,17 @@ def open_input(opening: Opening, options: VideoOptions) -> InputContainer:
             "r",
             format=opening.input_format,
             # For libav's own look at the first frames; the decoder is given the same.
-            options={"max_pixels": str(coded_pixels(options))},
+            options={"max_pixels": str(MAX_CODED_PIXELS)},
             container_options=opening.input_options,
             metadata_errors="replace",  # a camera's odd bytes in a tag are no reason to refuse its film
             # A timeout makes libav ask Python again and again, which a file is not worth.
-            timeout=options.timeout_s if opening.live else None,
+            timeout=_TIMEOUT_S if opening.live else None,
         )
     except (av.FFmpegError, OSError, ValueError) as error:
-        raise _refusal(opening, options, error) from error
+        raise _refusal(opening, error) from error
 
 
-def _refusal(opening: Opening, options: VideoOptions, error: Exception) -> VideoError:
+def _refusal(opening: Opening, error: Exception) -> VideoError:
     name = opening.name
     # A format that is not in the list is invalid data, or an invalid argument where its suffix names it.
     if opening.path is not None and (
@@ -130,8 +139,7 @@ def _refusal(opening: Opening, options: VideoOptions, error: Exception) -> Video
         return VideoError(f"{name}: {_what_it_is(opening.path)}")
     if isinstance(error, av.error.ExitError):
         return VideoError(
-            f"{name}: nothing came within {options.timeout_s:g} s; check that the source is sending and can "
-            "be reached, or allow a longer timeout_s"
+            f"{name}: nothing came within {_TIMEOUT_S:g} s; check that the source sends and can be reached"
         )
     if isinstance(error, av.InvalidDataError):
         return VideoError(

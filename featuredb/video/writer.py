@@ -1,14 +1,12 @@
 """Writes films: H.264 in mp4, which browsers, phones and our own reader play."""
 
 import math
-import os
-import secrets
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import av
 import numpy as np
@@ -17,6 +15,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from featuredb.atomic import atomic_file
 from featuredb.errors import InvalidValueError, VideoError
 from featuredb.video.film import NO_TAGS
 
@@ -84,37 +83,39 @@ class VideoWriter:
             )
         self.path, self.width, self.height, self.options = path, width, height, options
         self._rate = None if fps is None else _exact_rate(fps)
-        self._temporary = path.with_name(f".{path.stem}.{os.getpid()}.{secrets.token_hex(4)}.part")
         self._to_yuv = VideoReformatter()
+        self._opened = ExitStack()
         self._container: OutputContainer | None = None
         self._stream: VideoStream | None = None
         self._last_stamp: int | None = None
 
     def __enter__(self) -> Self:
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._container = av.open(
-                str(self._temporary.absolute()),
-                "w",
-                format="mp4",
-                # The index in front, so that browsers begin before all has come; tags under their own names.
-                options={"movflags": "+faststart+use_metadata_tags"},
-            )
-            self._stream = self._added_stream(self._container)
+            with ExitStack() as opened:
+                temporary = opened.enter_context(atomic_file(self.path))
+                self._container = av.open(
+                    str(temporary.absolute()),
+                    "w",
+                    format="mp4",
+                    # The index in front, so that browsers begin before all has come; tags by their own names.
+                    options={"movflags": "+faststart+use_metadata_tags"},
+                )
+                opened.callback(self._close)
+                self._stream = self._added_stream(self._container)
+                self._opened = opened.pop_all()
         except (av.FFmpegError, OSError, ValueError) as error:
-            self._discard()
             raise self._failed(error) from error
         return self
 
-    def __exit__(self, failed: object, *more: object) -> None:
-        if failed is not None:
-            self._discard()
+    def __exit__(self, *failed: Any) -> None:
+        if failed[0] is not None:
+            self._opened.__exit__(*failed)
             return
         try:
-            self._finish()
-        except BaseException:
-            self._discard()
-            raise
+            with self._opened:
+                self._finish()
+        except (av.FFmpegError, OSError) as error:
+            raise self._failed(error) from error
 
     def write(self, picture: NDArray[np.uint8], time_s: float | None = None) -> None:
         """Add a frame.
@@ -196,22 +197,16 @@ class VideoWriter:
         container, stream = self._container, self._stream
         if container is None or stream is None or self._last_stamp is None:
             raise VideoError(f"{self.path}: expected at least one frame, found none; no film was written")
-        try:
-            container.mux(stream.encode(None))
-            container.close()
-            self._container = None
-            self._temporary.replace(self.path)
-        except (av.FFmpegError, OSError) as error:
-            raise self._failed(error) from error
+        container.mux(stream.encode(None))
+        container.close()
+        self._container = None
 
-    def _discard(self) -> None:
-        """Leave nothing behind; what goes wrong here follows from what went wrong before."""
+    def _close(self) -> None:
+        """What is open still; what goes wrong here follows from what went wrong before."""
         if self._container is not None:
             with suppress(av.FFmpegError, OSError):
                 self._container.close()
         self._container = None
-        with suppress(OSError):  # also where its folder is none
-            self._temporary.unlink()
 
     def _failed(self, error: Exception) -> VideoError:
         reason = getattr(error, "strerror", None) or str(error)

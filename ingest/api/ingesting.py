@@ -20,7 +20,7 @@ from ingest.register.control.placement import GcpOptions
 from ingest.register.control.report import residual_table
 from ingest.report.films import FilmOutcome, films_text
 from ingest.report.page import write_report
-from ingest.report.values import IngestReport, MapOutcome
+from ingest.report.values import IngestReport
 from ingest.sfm.mapper import SfmOptions
 
 _LISTED = 40  # photos that are named on the terminal
@@ -152,7 +152,11 @@ def summary(report: IngestReport) -> str:
         if outcome.status == "refused":
             lines.append(f"refused: {outcome.name}: {outcome.reason_code}: {outcome.reason}")
         elif outcome.status == "unplaced":
-            lines += _unplaced_lines(outcome)
+            lines += [
+                f"map {outcome.map_id} ({outcome.name}): without a place, {outcome.photos} photos, "
+                f"{outcome.points} points; {outcome.reason_code}: {outcome.reason}",
+                "  `featuredb maps` says what would give it one; named by --map it answers in its own frame",
+            ]
         else:
             lines.append(
                 f"map {outcome.map_id} ({outcome.name}): {outcome.status.replace('_', ' ')}, "
@@ -173,11 +177,3 @@ def summary(report: IngestReport) -> str:
     lines.extend(f"warning: {warning}" for outcome in report.maps for warning in outcome.warnings)
     lines.extend(f"warning: {warning}" for warning in report.warnings)
     return "\n".join(lines) + "\n"
-
-
-def _unplaced_lines(outcome: MapOutcome) -> list[str]:
-    return [
-        f"map {outcome.map_id} ({outcome.name}): without a place, {outcome.photos} photos, "
-        f"{outcome.points} points; {outcome.reason_code}: {outcome.reason}",
-        "  `featuredb maps` says what would give it one; named by --map it answers in its own frame",
-    ]

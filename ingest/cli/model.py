@@ -12,6 +12,13 @@ if TYPE_CHECKING:
     from ingest.models_in.place import Stated
 
 
+# Arguments and fields of ModelOptions alike.
+_AS_ASKED = (
+    *("photos", "reconstruction", "descriptors", "height_datum", "min_track_length"),
+    *("name", "owner", "licence"),
+)
+
+
 def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     """What of the model is where."""
     parser.add_argument(
@@ -57,8 +64,7 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
         type=sigmas_m,
         metavar="M[,M]",
         help="how well that is known, horizontally and vertically: one standard deviation in metres; alone: "
-        "how "
-        "well OpenSfM's own reference is",
+        "how well OpenSfM's own reference is",
     )
     place.add_argument(
         "--height-datum", default="unknown", help="ellipsoidal, egm96, egm2008, navd88 or unknown (default)"
@@ -77,17 +83,10 @@ def run_model(args: argparse.Namespace) -> int:
 
     stated = _stated(args)
     options = ModelOptions(
-        photos=args.photos,
         stated=stated,
         sigma_m=args.sigma if stated is None else None,
-        reconstruction=args.reconstruction,
         colmap_database=args.database,
-        descriptors=args.descriptors,
-        height_datum=args.height_datum,
-        min_track_length=args.min_track_length,
-        name=args.name,
-        owner=args.owner,
-        licence=args.licence,
+        **{name: getattr(args, name) for name in _AS_ASKED},
     )
     place_for_database(args)
     made = map_of_model(args.folder, options)

@@ -256,8 +256,7 @@ def _center_priors(block: Block, image_ids: list[int], photos: tuple[SfmPhoto, .
     if len(told) < 3:
         return None
     measured = np.array([photos[image_ids[k] - 1].prior_position for k in told])
-    covariance = np.array([photos[image_ids[k] - 1].prior_covariance for k in told])
-    sigmas = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    sigmas = np.array([photos[image_ids[k] - 1].prior_sigma_m for k in told])
     centers = block.centers()[told]
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = 3.0 * float(np.linalg.norm(sigmas, axis=1).max())

@@ -4,7 +4,7 @@ In come photos as values, out go reconstructions as plain arrays.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -57,15 +57,15 @@ class SfmPhoto:
         name: unique.
         camera_row: row of the cameras.
         keypoints: (n, 2) float32 pixels.
-        prior_position: (3,) camera centre in a local metric frame, or None.
-        prior_covariance: (3, 3) square metres.
+        prior_position: camera centre in a local metric frame, or None.
+        prior_sigma_m: standard deviations of the position.
     """
 
     name: str
     camera_row: int
     keypoints: NDArray[np.float32]
-    prior_position: FloatArray | None = None
-    prior_covariance: FloatArray | None = None
+    prior_position: tuple[float, float, float] | None = None
+    prior_sigma_m: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,13 +204,12 @@ def _write_photo(database: Any, image_id: int, photo: SfmPhoto) -> None:
 
 
 def run_incremental(
-    database: Path, images: Path, output: Path, settings: Mapping[str, Any], on_image: Callable[[], None]
+    database: Path, images: Path, output: Path, settings: Mapping[str, Any]
 ) -> frozenset[int]:
     """COLMAP's incremental mapping; models land in numbered folders of `output`.
 
     Args:
         settings: of pycolmap.IncrementalPipelineOptions, nested by dots ("mapper.filter_max_reproj_error").
-        on_image: called after each registered photo.
 
     Returns:
         Rows of the photos that are registered in models of at least the settings' size.
@@ -223,9 +222,7 @@ def run_incremental(
             target = getattr(target, parent)
         setattr(target, last, value)
     with quiet():
-        models = pycolmap.incremental_mapping(
-            str(database), str(images), str(output), options, next_image_callback=on_image
-        )
+        models = pycolmap.incremental_mapping(str(database), str(images), str(output), options)
     large = [m.reg_image_ids() for m in models.values() if m.num_reg_images() >= options.min_model_size]
     return frozenset(image_id - 1 for ids in large for image_id in ids)
 

@@ -4,14 +4,8 @@ Nothing heavy is imported here: a worker sets its thread caps before numpy, Open
 because they read them when they are.
 """
 
-from ingest.executor.interface import (
-    Executor,
-    InProcessExecutor,
-    Lost,
-    Progress,
-    no_progress,
-)
-from ingest.executor.pool import PoolExecutor
+from ingest.executor.interface import Executor, InProcessExecutor, Lost, Progress, no_progress
+from ingest.executor.pool import PoolExecutor, open_executor
 
 __all__ = [
     "Executor",
@@ -20,4 +14,5 @@ __all__ = [
     "PoolExecutor",
     "Progress",
     "no_progress",
+    "open_executor",
 ]

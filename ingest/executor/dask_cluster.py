@@ -4,7 +4,6 @@ Tasks and workers exchange results as files of the work folder, so every worker 
 under the same paths: a shared file system. That is checked before the first task.
 """
 
-import logging
 import os
 import queue
 import uuid
@@ -14,10 +13,9 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from featuredb.errors import IngestError
-from ingest.executor.interface import Lost, Progress, no_progress
+from ingest.executor.interface import Lost, Progress, given_up, no_progress
 from ingest.executor.worker import cap_threads
 
-_LOG = logging.getLogger(__name__)
 _QUEUED_PER_THREAD = 4  # keeps workers busy without a scheduler full of pending tasks
 _CONNECT_S = 30.0
 # A cluster whose last worker went may get others from its batch system; so long is waited for them.
@@ -42,12 +40,7 @@ class DaskExecutor:
             one of them does not see the folders or has another version of featuredb.
     """
 
-    def __init__(
-        self,
-        address: str,
-        *,
-        shared: Sequence[Path] = (),
-    ) -> None:
+    def __init__(self, address: str, *, shared: Sequence[Path] = ()) -> None:
         self._address = address
         self._client = _connected(address)
         try:
@@ -118,12 +111,7 @@ class DaskExecutor:
             try:
                 return future.result(timeout=_POLL_S)
             except KilledWorker as error:
-                _LOG.warning("%s: %s ends every worker that runs it", stage, item)
-                return Lost(
-                    task=str(item),
-                    reason=f"ended {error.allowed_failures + 1} Dask workers (killed, or out of memory); the "
-                    "same command tries it again",
-                )
+                return given_up(stage, item, f"ended {error.allowed_failures + 1} Dask workers")
             except TimeoutError:
                 if future.status == "error":
                     raise  # the task's own

@@ -1,8 +1,11 @@
 """What every executor does, and the simplest one."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
+
+_LOG = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -21,6 +24,12 @@ class Lost:
 
     task: str
     reason: str
+
+
+def given_up(stage: str, item: object, ended: str) -> Lost:
+    """A task that ended every worker that ran it, which and how many `ended` says."""
+    _LOG.warning("%s: %s ends every worker that runs it", stage, item)
+    return Lost(task=str(item), reason=f"{ended} (killed, or out of memory); the same command tries it again")
 
 
 def no_progress(stage: str, done: int, total: int) -> None:

@@ -10,12 +10,14 @@ import multiprocessing.connection
 import pickle
 import signal
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from ingest.executor.interface import Lost, Progress, no_progress
+from ingest.executor.interface import Executor, InProcessExecutor, Lost, Progress, given_up, no_progress
 from ingest.executor.worker import READY, capped_environment, serve
 
 _LOG = logging.getLogger(__name__)
@@ -70,7 +72,8 @@ class PoolExecutor:
                     if not list(self._run(stage, function, items, [index], 1, done)):
                         break
                 else:
-                    done(index, self._lost(stage, items[index]))
+                    ended = f"ended {_RUNS_ALONE + 1} worker processes, at last alone"
+                    done(index, given_up(stage, items[index], ended))
         except BaseException:
             self._drop_busy()
             raise
@@ -146,19 +149,32 @@ class PoolExecutor:
                 f"starting ({end}); what was finished is kept: see their output above, or use --workers 1"
             )
 
-    def _lost(self, stage: str, item: object) -> Lost:
-        _LOG.warning("%s: %s ends every worker that runs it", stage, item)
-        return Lost(
-            task=str(item),
-            reason=f"ended {_RUNS_ALONE + 1} worker processes, at last alone (killed, or out of memory); the "
-            "same command tries it again",
-        )
-
     def _drop_busy(self) -> None:
         """End the workers whose answers nobody waits for any more."""
         for worker in [w for w in self._workers if w.task is not None or not w.ready]:
             worker.kill()
             self._workers.remove(worker)
+
+
+@contextmanager
+def open_executor(workers: int, dask: str | None = None, shared: Sequence[Path] = ()) -> Iterator[Executor]:
+    """The executor that somebody asks for.
+
+    Args:
+        workers: processes; 1 runs everything in this one.
+        dask: address of a scheduler, whose workers run the tasks instead.
+        shared: folders that all of these must see, the work folder first.
+    """
+    if dask is not None:
+        from ingest.executor.dask_cluster import DaskExecutor
+
+        with DaskExecutor(dask, shared=shared) as cluster:
+            yield cluster
+    elif workers == 1:
+        yield InProcessExecutor()
+    else:
+        with PoolExecutor(workers) as pool:
+            yield pool
 
 
 class _Worker:
@@ -176,17 +192,13 @@ class _Worker:
         self.ready = False
         self.task: int | None = None
 
-    @property
-    def pid(self) -> int:
-        return self._process.pid or 0
-
     def send(self, index: int, function: Callable[[Any], Any], items: Sequence[Any]) -> None:
         message = pickle.dumps((function, items[index]))
         self.task = index
         try:
             self.connection.send_bytes(message)
         except OSError:
-            _LOG.debug("worker %d died between two tasks", self.pid)  # seen again when its answer is read
+            _LOG.debug("%s died between two tasks", self._process)  # seen again when its answer is read
 
     def receive(self) -> tuple[bool, Any] | None:
         """Its answer; None for the word that it is ready.

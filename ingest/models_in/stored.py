@@ -17,7 +17,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
-from ingest.sfm.extract import LazyFeatures, PhotoFeatures
+from ingest.sfm.extract import PhotoFeatures
 
 # RootSIFT in 8 bits has length 512. Its mean value tells it from SIFT that was normalised by L2: on photos of
 # `brighton` 37.3 (this extractor), 37.0 (COLMAP's, L1_ROOT) and 29.1 (COLMAP's, L2).
@@ -138,8 +138,8 @@ def as_rootsift(data: NDArray[np.generic], name: str, count: int) -> NDArray[np.
     return data.astype(np.uint8)
 
 
-class ModelFeatures(LazyFeatures):
-    """Features of the model's images, each read when it is asked for, and not kept.
+class ModelFeatures(Sequence[PhotoFeatures]):
+    """Features of the model's images, each read when it is asked for, and not kept; there are no slices.
 
     Args:
         fingerprint: of the extractor whose descriptors they have.
@@ -157,7 +157,7 @@ class ModelFeatures(LazyFeatures):
         self._stored, self._keypoints, self._fingerprint = stored, keypoints, fingerprint
         self._photos = photos
 
-    def read(self, index: int) -> PhotoFeatures:
+    def __getitem__(self, index: int) -> PhotoFeatures:  # type: ignore[override]
         stored, name = self._stored, self._stored.names[index]
         found = self._keypoints(index, self._photos is None)
         if self._photos is not None:

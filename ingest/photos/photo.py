@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.features.exif.gps import AltitudeReference
 from featuredb.features.exif.read import UNNAMED_MAKE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -42,8 +41,6 @@ class Photo:
         gps_is_hint: nobody answers for the position (a photo site's table): good enough to look for
             neighbours there, not to place an active map by.
         angles: how the camera was turned, from EXIF, XMP or a table, or None.
-        altitude_reference: what gps.height_m is counted from: sea_level, ellipsoid or unknown.
-        relative_altitude_m: height above take-off by a drone's barometer, or None.
         owner, licence: attribution from a table, EXIF (Artist, Copyright) or the ingest's options.
         contributor: who gave it to the database, as the wire has authenticated (`Candidate.owner`); "" for
             photos that come from this machine.
@@ -70,8 +67,6 @@ class Photo:
     gps: GeoPrior | None = None
     gps_is_hint: bool = False
     angles: CameraAngles | None = None
-    altitude_reference: AltitudeReference = "unknown"
-    relative_altitude_m: float | None = None
     owner: str = ""
     licence: str = ""
     contributor: str = ""
@@ -154,15 +149,16 @@ def whose_cameras(photos: Sequence[Photo], focals_px: Sequence[float] = ()) -> N
 
 
 def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
-    """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
+    """A frame at the photos' median position."""
     gps = _geodetic(photos)
-    if not len(gps):
-        return None
-    latitude, longitude, height = np.median(gps, axis=0)
+    return rounded_frame(np.median(gps, axis=0)) if len(gps) else None
+
+
+def rounded_frame(lat_lon_h: FloatArray) -> LocalFrame:
+    """A frame at about this place (3,), whose origin does not hang on the last digit."""
+    latitude, longitude, height = lat_lon_h.tolist()
     return LocalFrame(
-        latitude_deg=round(float(latitude), 5),
-        longitude_deg=round(float(longitude), 5),
-        height_m=round(float(height)),
+        latitude_deg=round(latitude, 5), longitude_deg=round(longitude, 5), height_m=round(height)
     )
 
 

@@ -23,21 +23,20 @@ from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
-from ingest.photos.duplicates import (
-    MAX_BITS,
-    exact_duplicates,
-    near_duplicates,
-    picture_hash,
-)
+from ingest.photos.duplicates import MAX_BITS, exact_duplicates, near_duplicates, picture_hash
 from ingest.photos.photo import Photo
-from ingest.photos.table import PhotoTable, TableRow, is_table, missing_reason, summary_of
-from ingest.photos.walk import ExaminedFile, FoundFile, read_cache, walk, write_cache
+from ingest.photos.table import PhotoTable, TableRow, is_table, summary_of
+from ingest.photos.walk import ExaminedFile, FoundFile, read_cache, refused, walk, write_cache
 
 # Raised when the same file would be judged differently, so that old caches are not used.
 _VERSION = 3
 # The cache is written after so many files, or a quarter of those that it has: writing it stays linear.
 _SAVE_EVERY = 200
-
+# Of ExifInfo and Photo alike.
+_AS_IN_EXIF = (
+    *("width", "height", "orientation", "make", "model", "camera_key", "focal_px", "capture_time"),
+    *("angles", "warnings"),
+)
 
 # Standard deviation of a table's position that does not say its own. Geotags of photo sites are tens of
 # metres off, where they are not wrong altogether.
@@ -130,13 +129,13 @@ def scan_table(
     result = _scan_files(sorted(files, key=lambda f: f.name), options, progress, cache_file, rows)
     bad = [
         Photo(
-            name=f"row {row.number}",
-            path=Path(f"row {row.number}"),
+            name=f"row {number}",
+            path=Path(f"row {number}"),
             status="skipped",
             reason_code="bad_row",
-            reason=f"row {row.number} of the table: {row.reason}",
+            reason=f"row {number} of the table: {reason}",
         )
-        for row in table.bad
+        for number, reason in table.bad
     ]
     return replace(result, photos=(*result.photos, *bad), notes=tuple(summary_of(table)))
 
@@ -145,9 +144,11 @@ def _table_file(row: TableRow) -> FoundFile:
     try:
         info = row.path.stat()
     except (OSError, ValueError):
-        return FoundFile(name=row.name, path=row.path, reason_code="missing", reason=missing_reason(row))
+        return refused(
+            row.name, row.path, "missing", f"row {row.number} of the table: {row.path.name} is not there"
+        )
     if not stat.S_ISREG(info.st_mode):
-        return FoundFile(name=row.name, path=row.path, reason_code="unreadable", reason="not a regular file")
+        return refused(row.name, row.path, "unreadable", "not a regular file")
     return FoundFile(name=row.name, path=row.path, size=info.st_size, mtime_ns=info.st_mtime_ns)
 
 
@@ -163,8 +164,7 @@ def _scan_files(
     examined, read = _examine_all(files, known, options, progress, cache_file, key)
     photos = [_as_photo(file, examined.get(file.name), options) for file in files]
     photos = [_with_row(p, rows[p.name], options) if p.name in rows else p for p in photos]
-    photos = _mark_exact(photos)
-    photos = _mark_near(photos, {name: e.picture_hash for name, e in examined.items()})
+    photos = _without_copies(photos, {name: e.picture_hash for name, e in examined.items()})
     return ScanResult(photos=tuple(photos), read=read)
 
 
@@ -222,21 +222,11 @@ def examine(file: FoundFile, limits: DecodeLimits) -> ExaminedFile:
         data = read_image_bytes(file.path, limits)
         sha256 = hashlib.sha256(data).hexdigest()
         header = probe(data, limits)
-        gray = decode_gray(data, limits)
+        gray = decode_gray(data, limits, header=header)
     except ImageError as error:
-        return ExaminedFile(
-            size=file.size,
-            mtime_ns=file.mtime_ns,
-            sha256=sha256,
-            reason_code=error.code,
-            reason=str(error),
-        )
+        return ExaminedFile(file.size, file.mtime_ns, sha256, reason_code=error.code, reason=str(error))
     return ExaminedFile(
-        size=file.size,
-        mtime_ns=file.mtime_ns,
-        sha256=sha256,
-        picture_hash=picture_hash(gray),
-        exif=read_exif(data, header),
+        file.size, file.mtime_ns, sha256, picture_hash=picture_hash(gray), exif=read_exif(data, header)
     )
 
 
@@ -266,22 +256,11 @@ def _as_photo(file: FoundFile, examined: ExaminedFile | None, options: ScanOptio
         name=file.name,
         path=file.path,
         sha256=examined.sha256,
-        width=exif.width,
-        height=exif.height,
-        orientation=exif.orientation,
-        make=exif.make,
-        model=exif.model,
-        camera_key=exif.camera_key,
-        focal_px=exif.focal_px,
-        capture_time=exif.capture_time,
         gps=prior_from_exif(exif),
-        angles=exif.angles,
-        altitude_reference=exif.altitude_reference,
-        relative_altitude_m=exif.relative_altitude_m,
+        **{name: getattr(exif, name) for name in _AS_IN_EXIF},
         owner=exif.artist or options.owner,
         licence=exif.copyright or options.licence,
         film=file.name.rpartition("/")[0] if options.films else "",
-        warnings=exif.warnings,
     )
 
 
@@ -326,27 +305,16 @@ def _sigma_of_height(row: TableRow, photo: Photo) -> float:
     return _GEOTAG_SIGMA_M if photo.gps is None else photo.gps.sigma_vertical_m
 
 
-def _mark_exact(photos: list[Photo]) -> list[Photo]:
-    copies = exact_duplicates(photos)
-    return [
-        _skipped(photo, "duplicate", f"the same bytes as {copies[photo.name]}", copies[photo.name])
-        if photo.name in copies
-        else photo
-        for photo in photos
-    ]
-
-
-def _mark_near(photos: list[Photo], hashes: dict[str, str]) -> list[Photo]:
-    usable = [photo for photo in photos if photo.status == "ok"]
-    copies = near_duplicates(usable, [hashes[photo.name] for photo in usable])
-    marked = []
-    for photo in photos:
-        if photo.name in copies:
-            kept, bits = copies[photo.name]
-            reason = f"the same picture as {kept} ({bits} of 256 bits differ, the limit is {MAX_BITS})"
-            photo = _skipped(photo, "near_duplicate", reason, kept)
-        marked.append(photo)
-    return marked
+def _without_copies(photos: list[Photo], hashes: Mapping[str, str]) -> list[Photo]:
+    """The photos, those that are copies of others skipped."""
+    exact = exact_duplicates(photos)
+    usable = [photo for photo in photos if photo.status == "ok" and photo.name not in exact]
+    near = near_duplicates(usable, [hashes[photo.name] for photo in usable])
+    copies = {name: ("duplicate", f"the same bytes as {kept}", kept) for name, kept in exact.items()}
+    for name, (kept, bits) in near.items():
+        reason = f"the same picture as {kept} ({bits} of 256 bits differ, the limit is {MAX_BITS})"
+        copies[name] = ("near_duplicate", reason, kept)
+    return [_skipped(photo, *copies[photo.name]) if photo.name in copies else photo for photo in photos]
 
 
 def _skipped(photo: Photo, code: str, reason: str, duplicate_of: str) -> Photo:
@@ -371,9 +339,8 @@ def require_photos(folder: Path) -> None:
 
 def _begins_as_photo(path: Path) -> bool:
     try:
-        with path.open("rb") as file:
-            check_signature(file.read(32))
-    except (OSError, ImageError):
+        _check_head(path)
+    except ImageError:
         return False
     return True
 

@@ -21,7 +21,7 @@ import csv
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, cast
@@ -32,22 +32,7 @@ from featuredb.geometry.camera_angles import CameraAngles
 from ingest.photos.geo_txt import COLUMNS as GEO_TXT_COLUMNS
 from ingest.photos.geo_txt import read_geo_txt
 
-COLUMNS = (
-    "path",
-    "id",
-    "lat",
-    "lon",
-    "height",
-    "accuracy",
-    "accuracy_height",
-    "yaw",
-    "pitch",
-    "roll",
-    "time",
-    "owner",
-    "licence",
-    "title",
-)
+COLUMNS = ("id", *GEO_TXT_COLUMNS, "time", "owner", "licence", "title")
 GEO_TXT = "geo.txt"
 TABLE_SUFFIXES = (".csv", ".tsv", ".parquet", ".jsonl", ".ndjson")
 _ALIASES = {
@@ -88,26 +73,18 @@ class TableRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BadRow:
-    """A row that names no photo, or names one again."""
-
-    number: int
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoTable:
     """A table as it was read.
 
     Attributes:
         rows: in the table's order; names are unique.
-        bad: rows that cannot be used.
+        bad: numbers of rows that cannot be used, as they name no photo or name one again, with the reason.
         unknown_columns: names that mean nothing here.
     """
 
     rows: tuple[TableRow, ...]
-    bad: tuple[BadRow, ...] = ()
-    unknown_columns: tuple[str, ...] = field(default=())
+    bad: tuple[tuple[int, str], ...] = ()
+    unknown_columns: tuple[str, ...] = ()
 
 
 def is_table(path: Path) -> bool:
@@ -131,16 +108,15 @@ def read_table(path: Path) -> PhotoTable:
             f"{path}: expected a column `path` or `id`, found {', '.join(columns) or 'no columns'}"
         )
     rows: dict[str, TableRow] = {}
-    bad: list[BadRow] = []
+    bad: list[tuple[int, str]] = []
     for number, record in records:
-        if isinstance(record, str):
-            bad.append(BadRow(number=number, reason=record))
-            continue
-        row = _row(number, {names.get(k, k): v for k, v in record.items()}, path.parent)
+        row: TableRow | str = record if isinstance(record, str) else ""
+        if not isinstance(record, str):
+            row = _row(number, {names.get(k, k): v for k, v in record.items()}, path.parent)
         if isinstance(row, TableRow) and row.name in rows:
-            row = BadRow(number=number, reason=f"{row.name} is in row {rows[row.name].number} already")
-        if isinstance(row, BadRow):
-            bad.append(row)
+            row = f"{row.name} is in row {rows[row.name].number} already"
+        if isinstance(row, str):
+            bad.append((number, row))
         else:
             rows[row.name] = row
     unknown = tuple(sorted(column for column, name in names.items() if name not in COLUMNS))
@@ -201,12 +177,12 @@ def _separated(text: str) -> tuple[list[str], _Records]:
     return columns, rows()
 
 
-def _row(number: int, record: Mapping[str, Any], folder: Path) -> TableRow | BadRow:
-    """One row; values that cannot be read are left out with a warning."""
+def _row(number: int, record: Mapping[str, Any], folder: Path) -> TableRow | str:
+    """One row, or why it is none; values that cannot be read are left out with a warning."""
     named = _text(record, "path")
     name = named or _text(record, "id")
     if not name or "\0" in name:
-        return BadRow(number=number, reason="neither a path nor an id")
+        return "neither a path nor an id"
     warnings: list[str] = []
     latitude, longitude = _position(record, warnings)
     return TableRow(
@@ -215,9 +191,9 @@ def _row(number: int, record: Mapping[str, Any], folder: Path) -> TableRow | Bad
         path=folder / name if named else _file_of(folder, name),
         latitude_deg=latitude,
         longitude_deg=longitude,
-        height_m=_height(record, warnings),
-        accuracy_m=_accuracy(record, "accuracy", warnings),
-        accuracy_height_m=_accuracy(record, "accuracy_height", warnings),
+        height_m=_metres(record, "height", -12_000.0, 100_000.0, warnings),
+        accuracy_m=_metres(record, "accuracy", 0.0, 1e7, warnings),
+        accuracy_height_m=_metres(record, "accuracy_height", 0.0, 1e7, warnings),
         angles=_angles(record, warnings),
         time=_time(record, warnings),
         owner=_text(record, "owner"),
@@ -247,18 +223,12 @@ def _position(record: Mapping[str, Any], warnings: list[str]) -> tuple[float | N
     return latitude, longitude
 
 
-def _height(record: Mapping[str, Any], warnings: list[str]) -> float | None:
-    value = _number(record, "height", warnings)
-    if value is not None and not -12_000.0 < value < 100_000.0:
-        warnings.append(f"table: a height of {value} m is none; it is left out")
-        return None
-    return value
-
-
-def _accuracy(record: Mapping[str, Any], name: str, warnings: list[str]) -> float | None:
+def _metres(
+    record: Mapping[str, Any], name: str, low: float, high: float, warnings: list[str]
+) -> float | None:
     value = _number(record, name, warnings)
-    if value is not None and not 0 < value < 1e7:
-        warnings.append(f"table: an {name} of {value} m is none; it is left out")
+    if value is not None and not low < value < high:
+        warnings.append(f"table: {name} {value} m cannot be; it is left out")
         return None
     return value
 
@@ -321,18 +291,12 @@ def _text(record: Mapping[str, Any], name: str) -> str:
     return str(value).strip()
 
 
-def missing_reason(row: TableRow) -> str:
-    """Why the file of a row is not used: it is not there."""
-    return f"row {row.number} of the table: {row.path.name} is not there"
-
-
 def summary_of(table: PhotoTable) -> Sequence[str]:
     """What a person should know of the table besides its photos."""
     lines = []
     if table.unknown_columns:
         lines.append(f"table: columns without a meaning here are ignored: {', '.join(table.unknown_columns)}")
-    for row in table.bad[:20]:
-        lines.append(f"table: row {row.number} is left out: {row.reason}")
+    lines += [f"table: row {number} is left out: {reason}" for number, reason in table.bad[:20]]
     if len(table.bad) > 20:
         lines.append(f"table: {len(table.bad) - 20} more rows are left out")
     return lines

@@ -5,7 +5,7 @@ import logging
 import os
 import stat
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
 from pydantic import TypeAdapter
@@ -61,47 +61,48 @@ def _entries(folder: Path, names: list[str], prefix: str, seen: set[tuple[int, i
         text = os.fsencode(raw).decode("utf-8", "backslashreplace")
         name = prefix + text
         if text != raw:
-            yield _refused(name, path, "bad_name", "the name is not valid UTF-8; rename the file")
+            yield refused(name, path, "bad_name", "the name is not valid UTF-8; rename the file")
             continue
         if raw.startswith("."):
-            yield _refused(name, path, "hidden", "hidden: the name begins with a dot")
+            yield refused(name, path, "hidden", "hidden: the name begins with a dot")
             continue
         try:
             info = path.stat()
         except OSError as error:
-            yield _refused(name, path, "unreadable", f"cannot be read: {error.strerror or error}")
+            yield refused(name, path, "unreadable", f"cannot be read: {error.strerror or error}")
             continue
         if stat.S_ISDIR(info.st_mode):
             yield from _subfolder(path, name, (info.st_dev, info.st_ino), seen)
         elif stat.S_ISREG(info.st_mode):
             yield FoundFile(name=name, path=path, size=info.st_size, mtime_ns=info.st_mtime_ns)
         else:
-            yield _refused(name, path, "unreadable", "not a regular file (a pipe, socket or device)")
+            yield refused(name, path, "unreadable", "not a regular file (a pipe, socket or device)")
 
 
 def _subfolder(
     path: Path, name: str, identity: tuple[int, int], seen: set[tuple[int, int]]
 ) -> Iterator[FoundFile]:
     if identity in seen:
-        yield _refused(name, path, "folder_again", "a link to a folder that was entered already")
+        yield refused(name, path, "folder_again", "a link to a folder that was entered already")
         return
     seen.add(identity)
     try:
         names = sorted(os.listdir(path))  # noqa: PTH208
     except OSError as error:
-        yield _refused(name, path, "unreadable", f"the folder cannot be listed: {error.strerror or error}")
+        yield refused(name, path, "unreadable", f"the folder cannot be listed: {error.strerror or error}")
         return
     yield from _entries(path, names, name + "/", seen)
 
 
-def _refused(name: str, path: Path, code: str, reason: str) -> FoundFile:
+def refused(name: str, path: Path, code: str, reason: str) -> FoundFile:
+    """An entry that is not looked into."""
     return FoundFile(name=name, path=path, reason_code=code, reason=reason)
 
 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ExaminedFile:
     """One file after reading it.
 
@@ -116,6 +117,7 @@ class ExaminedFile:
     size: int
     mtime_ns: int
     sha256: str = ""
+    _: KW_ONLY
     reason_code: str = ""
     reason: str = ""
     picture_hash: str = ""

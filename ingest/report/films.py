@@ -2,9 +2,9 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ingest.html_parts import pill, table
 
@@ -76,11 +76,6 @@ class FilmOutcome:
         return sum(len(shot.keyframes) for shot in self.shots)
 
 
-def films_json(films: Sequence[FilmOutcome]) -> list[dict[str, Any]]:
-    """For the report's JSON; what became of the keyframes is with the photos of their names."""
-    return [asdict(film) | {"frames": film.frames} for film in films]
-
-
 def films_text(films: Sequence[FilmOutcome], photos: Sequence["PhotoOutcome"]) -> list[str]:
     """Lines for the terminal: every shot, and where its keyframes are."""
     known = {photo.name: photo for photo in photos}
@@ -135,18 +130,14 @@ def _kept(shot: ShotOutcome, known: Mapping[str, "PhotoOutcome"]) -> str:
     said = ", ".join(f"{count} {text}" for text, count in where.most_common())
     text = f"{len(shot.keyframes)} keyframes" + (f" ({said})" if said else "")
     if any(shot.bars):
-        text += f", bars over {1.0 - _inside(shot):.0%} of the picture"
+        left, top, right, bottom = shot.bars
+        text += f", bars over {1.0 - (1.0 - left - right) * (1.0 - top - bottom):.0%} of the picture"
     if shot.overlay_share:
         text += f", {shot.overlay_share:.1%} under logos or captions"
     lenses = {known[name].camera_key for name in shot.keyframes if name in known}
     if len(lenses) > 1:
         text += f", the lens zooms ({len(lenses)} focal lengths)"
     return text
-
-
-def _inside(shot: ShotOutcome) -> float:
-    left, top, right, bottom = shot.bars
-    return (1.0 - left - right) * (1.0 - top - bottom)
 
 
 def _dropped(shot: ShotOutcome) -> str:

@@ -19,6 +19,7 @@ from ingest.plot_parts import PlanView
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage
 from ingest.report.values import CameraOutcome, MapOutcome, PhotoOutcome
 
+_AS_IN_PHOTO = ("name", "width", "height", "camera_key", "capture_time", "warnings")
 _NO_POSE = (
     "it has matches, but they fit no reconstruction of three photos or more: most are with photos that are "
     "left out, too, or on points that no other two see. Photos between it and the map's help"
@@ -37,7 +38,7 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         "cameras": _cameras(component, options),
         "control": control,
     }
-    made = _map_of(component)
+    made = component.feature_map or component.unplaced
     if made is None:
         return MapOutcome(
             map_id="",
@@ -67,24 +68,16 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
     if isinstance(made, UnplacedMap):
         why = made.no_place
         return replace(outcome, status="unplaced", reason_code=why.reason_code, reason=why.reason)
+    centers = [image.cam_from_local.center for image in made.images]
     return replace(
         outcome,
         epsg=made.epsg,
         height_datum=made.height_datum,
         scale=made.placement.local_from_sfm.scale,
         residual_rms_m=made.placement.residual_rms_m,
-        place=PlaceBounds.of(made.placement.covariance, _middle(made)),
+        place=PlaceBounds.of(made.placement.covariance, np.median(centers, axis=0)),
         plan=_plan(component, made),
     )
-
-
-def _middle(feature_map: FeatureMap) -> FloatArray:
-    """(3,) median of the cameras' centres, in its frame."""
-    return np.median([image.cam_from_local.center for image in feature_map.images], axis=0)
-
-
-def _map_of(component: Component) -> AnyMap | None:
-    return component.feature_map if component.unplaced is None else component.unplaced
 
 
 def photo_outcomes(
@@ -126,7 +119,7 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
 
 def registered_photos(component: Component, result: Reconstructed) -> dict[str, PhotoOutcome]:
     """The photos of one component; those of a refused one are in no map, and have its reason."""
-    made = _map_of(component)
+    made = component.feature_map or component.unplaced
     why = {"code": component.reason_code.lower(), "reason": component.reason}
     if made is None:
         return {p.name: _outcome(p, result, status="not_registered", **why) for p in component.photos}
@@ -169,19 +162,15 @@ def _counts_and_errors(any_map: AnyMap) -> tuple[NDArray[np.int64], FloatArray]:
 def _outcome(
     photo: Photo, result: Reconstructed, *, status: str, code: str = "", reason: str = "", **more: object
 ) -> PhotoOutcome:
+    same = {name: getattr(photo, name) for name in _AS_IN_PHOTO}
     return PhotoOutcome(
-        name=photo.name,
         status=status,  # type: ignore[arg-type]
         reason_code=code,
         reason=reason,
-        width=photo.width,
-        height=photo.height,
-        camera_key=photo.camera_key,
-        capture_time=photo.capture_time,
         has_gps=photo.gps is not None,
         features=result.features_per_photo.get(photo.name),
         matches=result.matches_per_photo.get(photo.name),
-        warnings=photo.warnings,
+        **same,
         **more,  # type: ignore[arg-type]
     )
 

@@ -53,13 +53,11 @@ FIGURES = {
 }
 
 
-def write_report(folder: Path, report: IngestReport) -> tuple[Path, Path]:
-    """Write `report.json` and `report.html` into the folder, each atomically; returns both paths."""
-    json_path, html_path = folder / REPORT_JSON, folder / "report.html"
-    write_json(json_path, report_json(report))
-    with atomic_file(html_path) as temporary:
+def write_report(folder: Path, report: IngestReport) -> None:
+    """Write `report.json` and `report.html` into the folder, each atomically."""
+    write_json(folder / REPORT_JSON, report_json(report))
+    with atomic_file(folder / "report.html") as temporary:
         temporary.write_text(report_page(report), encoding="utf-8")
-    return json_path, html_path
 
 
 def report_page(report: IngestReport) -> str:

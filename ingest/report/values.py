@@ -3,18 +3,17 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.maps.place_bounds import PlaceBounds
 from featuredb.plain_json import plain
 from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
 from ingest.plot_parts import PlanView
 from ingest.register.control.placement import GcpPlacement
-from ingest.report.films import FilmOutcome, films_json
+from ingest.report.films import FilmOutcome
 
 FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
 MapOutcomeStatus = Literal["committed", "already_there", "unplaced", "refused"]
@@ -30,6 +29,7 @@ _BETTER = (
     "over a larger area, or photos that tell their gimbal's angles"
 )
 _PERCENTILES = (50, 90, 99)
+_AS_IT_IS = ("job_id", "database", "folder", "started", "seconds", "options", "versions", "warnings")
 _DRAWN = ("errors_px", "track_lengths", "plan", "control")  # what the page shows of a map
 
 
@@ -204,13 +204,6 @@ class IngestReport:
     films: tuple[FilmOutcome, ...] = ()
     warnings: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.started.tzinfo is None:
-            raise InvalidValueError("IngestReport.started: expected a time with its zone, found none")
-        names = [photo.name for photo in self.photos]
-        if len(set(names)) != len(names):
-            raise InvalidValueError("IngestReport.photos: a file occurs twice")
-
     def count(self, status: FileStatus) -> int:
         """Number of files with that status."""
         return sum(photo.status == status for photo in self.photos)
@@ -226,29 +219,16 @@ def report_json(report: IngestReport) -> dict[str, Any]:
     document: dict[str, Any] = plain(
         {
             "schema": SCHEMA_ID,
-            "job_id": report.job_id,
-            "database": report.database,
-            "folder": report.folder,
-            "started": report.started.isoformat(),
-            "seconds": report.seconds,
-            "options": report.options,
-            "versions": report.versions,
-            "warnings": report.warnings,
+            **{name: getattr(report, name) for name in _AS_IT_IS},
             "pairs": {"tried": report.pairs, "verified": report.verified_pairs},
             "files": {
                 "all": len(report.photos),
-                "registered": report.count("registered"),
-                "unplaced": report.count("unplaced"),
-                "not_registered": report.count("not_registered"),
-                "skipped": report.count("skipped"),
+                **{status: report.count(status) for status in get_args(FileStatus)},
             },
             "stages": [asdict(stage) for stage in report.stages],
             "maps": [_map_json(outcome) for outcome in report.maps],
-            "films": films_json(report.films),
-            "photos": [
-                asdict(photo) | {"capture_time": photo.capture_time and photo.capture_time.isoformat()}
-                for photo in report.photos
-            ],
+            "films": [asdict(film) | {"frames": film.frames} for film in report.films],
+            "photos": [asdict(photo) for photo in report.photos],
         }
     )
     return document

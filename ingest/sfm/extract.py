@@ -1,10 +1,8 @@
 """Stage: the features of each photo, on a pool of processes, one file each."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
 import cv2
 import numpy as np
@@ -48,27 +46,18 @@ class PhotoFeatures:
     rgb: NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Extracted:
-    """What the stage did.
-
-    Attributes:
-        unreadable: photos by name whose pixels could not be read after all, with the reason.
-        reused: photos whose features were there already.
-    """
-
-    unreadable: dict[str, str]
-    reused: int
-
-
 def extract_photos(
     photos: list[Photo],
     workspace: Workspace,
     options: ExtractorOptions,
     executor: Executor,
     progress: Progress = no_progress,
-) -> Extracted:
-    """Write the features of every photo that has none yet."""
+) -> tuple[dict[str, str], int]:
+    """Write the features of every photo that has none yet.
+
+    Returns:
+        Photos by name whose pixels could not be read after all, with the reason; and how many had features.
+    """
     fingerprint = features_key(options)
     tasks: dict[str, ExtractTask] = {}
     for photo in photos:
@@ -77,10 +66,8 @@ def extract_photos(
             tasks[photo.name] = ExtractTask(photo=photo.path, target=target, options=options)
     outcomes = executor.map("extract", _extract_one, list(tasks.values()), progress)
     reasons = (o.reason if isinstance(o, Lost) else o for o in outcomes)
-    return Extracted(
-        unreadable={name: reason for name, reason in zip(tasks, reasons, strict=True) if reason},
-        reused=len(photos) - len(tasks),
-    )
+    unreadable = {name: reason for name, reason in zip(tasks, reasons, strict=True) if reason}
+    return unreadable, len(photos) - len(tasks)
 
 
 def features_key(options: ExtractorOptions) -> str:
@@ -106,32 +93,13 @@ def read_keypoints(path: Path) -> NDArray[np.float32]:
     return np.asarray(read_array(path, "xy"), dtype=np.float32)
 
 
-class LazyFeatures(Sequence[PhotoFeatures], ABC):
-    """Features of many photos, each read when it is asked for, and not kept; a slice reads all of its own."""
-
-    @abstractmethod
-    def read(self, index: int) -> PhotoFeatures:
-        """Those of one photo."""
-
-    @overload
-    def __getitem__(self, index: int) -> PhotoFeatures: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[PhotoFeatures]: ...
-
-    def __getitem__(self, index: int | slice) -> PhotoFeatures | Sequence[PhotoFeatures]:
-        if isinstance(index, slice):
-            return [self.read(k) for k in range(len(self))[index]]
-        return self.read(index)
-
-
-class FeatureFiles(LazyFeatures):
-    """Features of many photos, a file each."""
+class FeatureFiles(Sequence[PhotoFeatures]):
+    """Features of many photos, a file each, read when it is asked for and not kept; there are no slices."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self.paths = tuple(paths)
 
-    def read(self, index: int) -> PhotoFeatures:
+    def __getitem__(self, index: int) -> PhotoFeatures:  # type: ignore[override]
         return read_features(self.paths[index])
 
     def __len__(self) -> int:

@@ -9,8 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from featuredb.atomic import atomic_folder
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import SUPPORTED_MODELS, Camera
@@ -94,13 +92,12 @@ class SfmView:
 
     def photo(self) -> SfmPhoto:
         """With its keypoints."""
-        sigma = self.prior_sigma_m
         return SfmPhoto(
             name=self.name,
             camera_row=self.camera_row,
             keypoints=read_keypoints(self.features),
-            prior_position=None if self.prior_position is None else np.array(self.prior_position),
-            prior_covariance=None if sigma is None else np.diag(np.array(sigma) ** 2),
+            prior_position=self.prior_position,
+            prior_sigma_m=self.prior_sigma_m,
         )
 
 
@@ -203,7 +200,7 @@ def _map(task: SfmTask, database: Path, scratch: Path, output: Path) -> None:
     """Incremental mapping; again from another start where the first one may be why photos stay outside."""
     options = task.options
     settings = mapping_settings(options, task.side_px)
-    registered = len(run_incremental(database, scratch, output, settings, lambda: None))
+    registered = len(run_incremental(database, scratch, output, settings))
     if options.focal_from_view_graph and registered < len(task.views):
         focals = calibrate_focals(database, scratch, seed=options.seed)
         if focals:
@@ -212,7 +209,7 @@ def _map(task: SfmTask, database: Path, scratch: Path, output: Path) -> None:
             start = scratch / "start.db"
             shutil.copyfile(database, start)
             start_from(start, focals)
-            more = len(run_incremental(start, scratch, again, settings, lambda: None))
+            more = len(run_incremental(start, scratch, again, settings))
             logger.info("%s: %d registered, %d with focal lengths from the pairs", task, registered, more)
             if more > registered:
                 _take(again, output)

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from ingest.colmap.bridge import TwoView
-from ingest.executor import Executor, Lost, Progress, no_progress
+from ingest.executor import Executor, Lost, Progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.sfm.extract import read_features
 from ingest.sfm.overlays import is_copy
@@ -21,8 +21,9 @@ from ingest.workspace import Workspace, read_array, read_arrays, write_arrays
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoView:
-    """What matching needs of a photo: its digest, features file and camera as EXIF has it."""
+    """What matching needs of a photo: its name, digest, features file and camera as EXIF has it."""
 
+    name: str
     sha256: str
     features: Path
     camera: Camera
@@ -34,18 +35,16 @@ class MatchTask:
     """One photo with some others; travels to a worker.
 
     Attributes:
-        name: of the first photo.
         photo: whose features are read once.
         others: the photos that it is matched with, and the file of each pair.
     """
 
-    name: str
     photo: PhotoView
     others: tuple[tuple[PhotoView, Path], ...]
     options: MatchOptions
 
     def __str__(self) -> str:
-        return f"{self.name} with {len(self.others)} others"
+        return f"{self.photo.name} with {len(self.others)} others"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,14 +97,9 @@ def match_pairs(
     workspace: Workspace,
     options: MatchOptions,
     executor: Executor,
-    progress: Progress = no_progress,
-    names: Sequence[str] | None = None,
+    progress: Progress,
 ) -> Matched:
-    """Match and verify every pair that is not done yet.
-
-    Args:
-        names: of the photos, for messages.
-    """
+    """Match and verify every pair that is not done yet."""
     files = {pair: _match_file(views[pair[0]], views[pair[1]], workspace, options) for pair in pairs}
     todo: dict[int, list[Pair]] = {}
     counts: dict[Pair, _Outcome] = {}
@@ -115,12 +109,7 @@ def match_pairs(
         else:
             todo.setdefault(pair[0], []).append(pair)
     tasks = [
-        MatchTask(
-            name=names[i] if names is not None else views[i].sha256,
-            photo=views[i],
-            others=tuple((views[j], files[i, j]) for _, j in own),
-            options=options,
-        )
+        MatchTask(photo=views[i], others=tuple((views[j], files[i, j]) for _, j in own), options=options)
         for i, own in todo.items()
     ]
     reused = len(counts)

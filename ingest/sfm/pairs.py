@@ -266,9 +266,7 @@ def aggregate_photos(
     todo = [(f, t) for f, t in zip(features, targets, strict=True) if not t.exists()]
     tasks = [
         _AggregateTask(
-            vocabulary=vocabulary,
-            files=tuple(todo[k : k + _PER_TASK]),
-            features_per_photo=features_per_photo,
+            vocabulary=vocabulary, files=tuple(todo[k : k + _PER_TASK]), features_per_photo=features_per_photo
         )
         for k in range(0, len(todo), _PER_TASK)
     ]

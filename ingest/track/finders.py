@@ -81,15 +81,11 @@ def finder_for(database: Database, asked: FilmGround, camera: Camera | None, opt
         raise InvalidValueError(
             f"--by both follows the maps of one place, found {len(maps.grounds)}; name one by --map"
         )
-    area = maps.grounds[0].area
-    scan = _over(
-        area.frame,
-        area.image_center[area.searched_images()],
-        chosen_scans(database, asked.scans),
-        database,
-        rough,
-    )
-    return MapOverScanFinder(maps, scan)
+    area, scans = maps.grounds[0].area, chosen_scans(database, asked.scans)
+    centers = area.image_center[area.searched_images()]
+    low, high = np.min(centers, axis=0) - _MAP_MARGIN_M, np.max(centers, axis=0) + _MAP_MARGIN_M
+    box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return MapOverScanFinder(maps, _finder(database, scans, area.frame, box, rough))
 
 
 def _maps(database: Database, asked: FilmGround, options: TrackOptions) -> MapFinder:
@@ -108,19 +104,6 @@ def _on_scan(database: Database, asked: FilmGround, rough: RoughPose) -> ScanFin
     east, north, _ = rough.utm.tolist()
     frame = LocalFrame.from_utm(east, north, min(s.box.min_height for s in scans), epsg)
     return _finder(database, scans, frame, (-_REACH_M, -_REACH_M, _REACH_M, _REACH_M), rough)
-
-
-def _over(
-    frame: LocalFrame,
-    centers: FloatArray,
-    scans: list[ScanSummary],
-    database: Database,
-    rough: RoughPose | None,
-) -> ScanFinder:
-    """The scans around the cameras (n, 3) of a map."""
-    low, high = np.min(centers, axis=0) - _MAP_MARGIN_M, np.max(centers, axis=0) + _MAP_MARGIN_M
-    box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    return _finder(database, scans, frame, box, rough)
 
 
 def _finder(
@@ -153,10 +136,8 @@ class MapOverScan:
         self, gray: NDArray[np.uint8], camera: Camera, pose: Rigid3, options: TrackOptions
     ) -> Keyframe | Unmatched:
         """By the maps, or where they know nothing, by the scan; both reasons where that knows nothing."""
-        return self.first_of(
-            self.maps.match(gray, camera, pose, options),
-            lambda: self.scan.match(gray, camera, pose, options),
-        )
+        by_map = self.maps.match(gray, camera, pose, options)
+        return self.first_of(by_map, lambda: self.scan.match(gray, camera, pose, options))
 
     def first_of(
         self, by_map: Keyframe | Unmatched, ask_scan: Callable[[], Keyframe | Unmatched]
@@ -189,17 +170,8 @@ class MapOverScanFinder:
     def __init__(self, maps: MapFinder, scan: ScanFinder) -> None:
         """
         Args:
-            scan: in the frame of the maps' one area.
-
-        Raises:
-            InvalidValueError: the maps are of several areas, or in another frame than the scan.
+            maps: of one area. scan: in its frame.
         """
-        frames = [ground.frame for ground in maps.grounds]
-        if len(frames) != 1 or frames[0] != scan.ground.frame:
-            raise InvalidValueError(
-                f"expected the maps of one place, in the frame of the scan, found {len(frames)} places; name "
-                "one map by --map"
-            )
         self._maps, self._scan = maps, scan
         self._ground = MapOverScan(maps=maps.grounds[0], scan=scan.ground)
 
@@ -207,9 +179,8 @@ class MapOverScanFinder:
         self, gray: NDArray[np.uint8], request: LocaliseRequest, options: TrackOptions
     ) -> Keyframe | Unmatched:
         """By the maps, or where they do not know the frame, by the scan."""
-        return self._ground.first_of(
-            self._maps.find(gray, request, options), lambda: self._scan.find(gray, request, options)
-        )
+        by_map = self._maps.find(gray, request, options)
+        return self._ground.first_of(by_map, lambda: self._scan.find(gray, request, options))
 
     def has(self, ground: Ground) -> bool:
         """Whether the track is on these."""

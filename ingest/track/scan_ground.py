@@ -58,9 +58,6 @@ _TRACK_SIGMA_DEG = 1.0
 _LOST_SIGMA_M = 5.0
 _LOST_SIGMA_HEADING_DEG = 8.0
 _LOST_SIGMA_TILT_DEG = 3.0
-# See `KeyframeAverage`.
-_FADE = 0.75
-_MAX_CHI2 = 20.1
 
 
 class ScanGround:
@@ -79,7 +76,7 @@ class ScanGround:
         self._cloud, self._scan_id, self._epsg = cloud, scan_id, epsg
         self._source: RenderSource = available_sources(cloud)[0]
         self._covariances: list[FloatArray] = []  # by number of the keyframe, local axes
-        self._average = KeyframeAverage(_FADE, _MAX_CHI2)
+        self._average = KeyframeAverage()
         self._shown: deque[FloatArray] = deque(maxlen=_SHOWN_KEYFRAMES)
         self.last: Rigid3 | None = None
 
@@ -238,17 +235,16 @@ def _corners(gray: NDArray[np.uint8]) -> FloatArray:
 # better than a registration says where it is.
 
 
+_FADE = 0.75  # what a keyframe counts at the next one: about 1 / (1 - 0.75) of them take part
+# Squared normalised distance between the track and a registration; beyond it the track has gone astray, and
+# the average begins again.
+_MAX_CHI2 = 20.1
+
+
 class KeyframeAverage:
     """The fading average of the registrations of one uninterrupted track."""
 
-    def __init__(self, fade: float, max_chi2: float) -> None:
-        """
-        Args:
-            fade: what a keyframe counts at the next one, 0 to 1: about 1 / (1 - fade) of them take part.
-            max_chi2: squared normalised distance between the track and a registration; beyond it the track
-                has gone astray, and the average begins again.
-        """
-        self._fade, self._max_chi2 = fade, max_chi2
+    def __init__(self) -> None:
         self._information: FloatArray | None = None
         self._center = np.zeros(3)
 
@@ -274,11 +270,11 @@ class KeyframeAverage:
         # An error of the older keyframes' rotation moves the camera by what it has gone since.
         back = np.eye(6)
         back[3:, :3] = skew(tracked.center - self._center)
-        older = self._fade * back.T @ self._information @ back
+        older = _FADE * back.T @ self._information @ back
         own = np.linalg.inv(of_camera(registered, covariance))
         to_local = np.kron(np.eye(2), -tracked.rotation.T)
         apart = to_local @ (registered @ tracked.inverse()).log()
-        if apart @ np.linalg.solve(np.linalg.inv(older) + np.linalg.inv(own), apart) > self._max_chi2:
+        if apart @ np.linalg.solve(np.linalg.inv(older) + np.linalg.inv(own), apart) > _MAX_CHI2:
             self.begin(registered, covariance)
             return registered
         moved = np.linalg.solve(older + own, own @ apart)

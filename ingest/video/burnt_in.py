@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
-from ingest.video.motion import MAX_RATIO, SCENE_FEATURES, matched
+from ingest.video.motion import SCENE_FEATURES, matched
 
 Mask = NDArray[np.bool_]
 Gray = NDArray[np.uint8]
@@ -177,7 +177,7 @@ def _flow(one: Features, other: Features, shape: tuple[int, ...]) -> FloatArray 
 
     None where too little is matched.
     """
-    start, end = matched(one, other, MAX_RATIO)
+    start, end = matched(one, other)
     moves = end - start
     moving = np.linalg.norm(moves, axis=1) >= _STILL_PX
     start, moves = start[moving], moves[moving]

@@ -113,7 +113,8 @@ def measure_motion(frames: Iterable[VideoFrame]) -> Motion:
         broken.append(step is None)
         cut.append(False)
         kinds.append(int(kind))
-        sharpness.append(_sharpness(frame.gray))
+        edges = float(cv2.Laplacian(frame.gray, cv2.CV_32F).std())
+        sharpness.append(edges / max(float(frame.gray.std()), 1.0))
         before = frame.gray
         shown = shown if step is None else before
     return Motion(
@@ -163,11 +164,6 @@ def _step(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> FloatArray | Non
     return np.asarray(found, dtype=np.float64)
 
 
-def _sharpness(gray: NDArray[np.uint8]) -> float:
-    spread = float(gray.std())
-    return float(cv2.Laplacian(gray, cv2.CV_32F).std()) / max(spread, 1.0)
-
-
 SCENE_FEATURES = ExtractorOptions(first_octave_px=1280, max_features=600)  # of each frame
 MAX_RATIO = 0.8  # of a match's distance to that of the next best one
 
@@ -184,7 +180,7 @@ _MAX_ZOOM = 1.1  # between frames a moment apart; more is another lens
 def same_scene(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
     """Whether two grey frames (h, w) of one size show the same, moved and turned as may be."""
     a, b = (extract(gray, SCENE_FEATURES) for gray in (one, other))
-    start, end = matched(a, b, MAX_RATIO)
+    start, end = matched(a, b)
     if len(start) < 8:
         return False
     cv2.setRNGSeed(0)  # as in motion.py
@@ -200,7 +196,7 @@ def same_scene(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
     return len(held) >= _LEAST_CELLS * len(_cells(a.xy, one.shape))
 
 
-def matched(one: Features, other: Features, max_ratio: float) -> tuple[FloatArray, FloatArray]:
+def matched(one: Features, other: Features) -> tuple[FloatArray, FloatArray]:
     """Pixels (m, 2) of both frames of features that are each other's nearest, and clearly so."""
     if min(len(one), len(other)) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
@@ -210,7 +206,7 @@ def matched(one: Features, other: Features, max_ratio: float) -> tuple[FloatArra
     best = distance.argmin(axis=1)
     two = np.partition(distance, 1, axis=1)[:, :2]
     mutual = distance.argmin(axis=0)[best] == np.arange(len(best))
-    rows = np.flatnonzero(mutual & (two[:, 0] < max_ratio * two[:, 1]))
+    rows = np.flatnonzero(mutual & (two[:, 0] < MAX_RATIO * two[:, 1]))
     return one.xy[rows].astype(np.float64), other.xy[best[rows]].astype(np.float64)
 
 

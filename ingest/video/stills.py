@@ -1,9 +1,8 @@
 """From a film to photos: keyframes of its shots, written below the work folder."""
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
+from pydantic import TypeAdapter
 
 from featuredb.atomic import atomic_file
 from featuredb.errors import VideoError
@@ -31,7 +31,7 @@ from ingest.video.film_time import FilmTime
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes, shots_of
 from ingest.video.motion import FrameKind, Motion, measure_motion
 from ingest.video.positions import GimbalAngles, Position, digest_of_telemetry, lateness, places_at
-from ingest.workspace import write_json
+from ingest.workspace import read_json, write_json
 
 _DONE = "film.json"
 # Raised when a film gives other stills: with the constants of `motion`, `burnt_in`, `clocks`, `lag`, `match`.
@@ -135,7 +135,10 @@ def clean_keyframes(folder: Path, choice: KeyframeChoice, side_px: int) -> dict[
         What was found, by shot.
     """
     files = [folder / keyframe_name(index) for index in choice.index]
-    pictures = [_shrunk(file, side_px) for file in files]
+    pictures = []
+    for file in files:
+        with Image.open(file) as picture:
+            pictures.append(shrunk(np.asarray(picture.convert("L")), side_px))
     found = find_burnt_in(pictures, choice.shot)
     for file, shot in zip(files, choice.shot, strict=True):
         if found[shot].mask.any():
@@ -149,12 +152,6 @@ def _paint_over(file: Path, mask: NDArray[np.bool_]) -> None:
     size = (rgb.shape[1], rgb.shape[0])
     large = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     _save(file, painted_over(rgb, large), exif, xmp)
-
-
-def _shrunk(file: Path, side_px: int) -> NDArray[np.uint8]:
-    with Image.open(file) as picture:
-        gray = np.asarray(picture.convert("L"))
-    return shrunk(gray, side_px)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,6 +194,9 @@ class Stills:
     notes: tuple[str, ...]
 
 
+_STILLS = TypeAdapter(Stills)
+
+
 def make_stills(
     film: Path,
     telemetry: Telemetry | None,
@@ -211,12 +211,12 @@ def make_stills(
         TelemetryError: the telemetry has a clock of its own, and where the film lies on it is not clear.
     """
     options = options or StillsOptions()
-    content = _digest_of(film)
-    folder = (
-        root
-        / "stills"
-        / digest(_VERSION, content, options_fingerprint(options), digest_of_telemetry(telemetry))[:16]
-    )
+    try:
+        content = file_sha256(film)
+    except OSError as error:
+        raise VideoError(f"{film}: expected a film, {error.strerror or error}") from error
+    key = digest(_VERSION, content, options_fingerprint(options), digest_of_telemetry(telemetry))
+    folder = root / "stills" / key[:16]
     known = _known(folder)
     if known is not None:
         return known
@@ -253,8 +253,7 @@ def make_stills(
         late_s=late_s,
         notes=tuple(notes),
     )
-    record = {name: getattr(made, name) for name in Stills.__slots__ if name != "folder"}
-    write_json(folder / _DONE, record | {"shots": [asdict(shot) for shot in shots]})
+    write_json(folder / _DONE, _STILLS.dump_python(made, mode="json", exclude={"folder"}))
     return made
 
 
@@ -263,15 +262,9 @@ def _known(folder: Path) -> Stills | None:
     done = folder / _DONE
     if not done.is_file():
         return None
-    record = json.loads(done.read_text(encoding="utf-8"))
-    shots = tuple(
-        ShotOutcome(**{**shot, "keyframes": tuple(shot["keyframes"]), "bars": tuple(shot["bars"])})
-        for shot in record.pop("shots")
-    )
-    names = [name for shot in shots for name in shot.keyframes]
-    if not all((folder / name).is_file() for name in names):
-        return None
-    return Stills(**{**record, "folder": folder, "shots": shots, "notes": tuple(record["notes"])})
+    known = _STILLS.validate_python(read_json(done) | {"folder": folder})
+    names = [name for shot in known.shots for name in shot.keyframes]
+    return known if all((folder / name).is_file() for name in names) else None
 
 
 def _shots(
@@ -289,11 +282,8 @@ def _shots(
                 kind = FrameKind(motion.kind[row])
                 looked = "break" if alone[row] else "between"
                 other[looked if kind == FrameKind.PICTURE else kind.name.lower()] += 1
-        names = [
-            keyframe_name(index)
-            for index, shot in zip(choice.index, choice.shot, strict=True)
-            if shot == number
-        ]
+        mine = zip(choice.index, choice.shot, strict=True)
+        names = [keyframe_name(index) for index, shot in mine if shot == number]
         found = burnt_in.get(number)
         shots.append(
             ShotOutcome(
@@ -315,13 +305,6 @@ def _dropped(shots: tuple[ShotOutcome, ...]) -> str:
     for shot in shots:
         total.update(shot.dropped)
     return ", ".join(f"{count} {code}" for code, count in total.most_common()) or "there are none"
-
-
-def _digest_of(film: Path) -> str:
-    try:
-        return file_sha256(film)
-    except OSError as error:
-        raise VideoError(f"{film}: expected a film, {error.strerror or error}") from error
 
 
 def _video_options(options: StillsOptions, side_px: int | None) -> VideoOptions:

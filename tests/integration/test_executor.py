@@ -121,7 +121,7 @@ def test_tasks_that_a_dead_worker_had_run_again_and_no_others(tmp_path: Path) ->
 def test_a_worker_killed_from_outside_costs_nothing_but_time() -> None:
     def kill_one(_: str, done: int, __: int) -> None:
         if done == 10:
-            os.kill(pool._workers[0].pid, signal.SIGKILL)
+            pool._workers[0]._process.kill()
 
     with PoolExecutor(2) as pool:
         assert pool.map("squares", square, list(range(40)), kill_one) == [i * i for i in range(40)]

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import os
+import re
 import shutil
 import signal
 import struct
@@ -26,7 +27,7 @@ from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.features.exif.read import parse_exif, read_exif
-from featuredb.features.exif.tiff_ifd import TiffReader
+from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
 from featuredb.features.exif.write import gps_directory, with_gps, with_properties
 from featuredb.features.image_header import read_header
 from featuredb.maps.feature_map import FeatureMap
@@ -60,6 +61,17 @@ def exif_block(position: bool) -> bytes:
         gps[1], gps[2], gps[3], gps[4] = "N", (10.0, 20.0, 30.0), "E", (5.0, 6.0, 7.0)
         gps[7], gps[29], gps[11] = (11.0, 22.0, 33.0), "2026:05:01", 0.7
     return exif.tobytes()
+
+
+def _gps(tiff: bytes) -> Ifd:
+    reader = TiffReader(tiff)
+    return reader.read(reader.read(reader.first_offset).number(0x8825))
+
+
+def _above_ellipsoid(data: bytes) -> bool:
+    exif = read_header(data).exif
+    assert exif is not None
+    return _gps(data[slice(*exif)]).values[5][0] in (2, 3)
 
 
 def scans(data: bytes) -> bytes:
@@ -136,7 +148,7 @@ def test_copies_have_the_pose_and_the_very_picture(tmp_path: Path) -> None:
         found = read_exif(data)
         assert found.warnings == ()
         assert found.latitude_deg is not None
-        height = found.altitude_m if found.altitude_reference == "ellipsoid" else shot.map_height_m
+        height = found.altitude_m if _above_ellipsoid(data) else shot.map_height_m
         enu = feature_map.frame.enu_from_geodetic((found.latitude_deg, found.longitude_deg, height))
         np.testing.assert_allclose(enu, image.cam_from_local.center, atol=1e-3)
         heading, pitch, roll = shot.geopose.heading_pitch_roll_deg
@@ -222,8 +234,9 @@ def test_both_byte_orders_and_every_quadrant(order: str, has_gps: bool) -> None:
         # A hundred-thousandth of an arc second is 0.3 mm.
         assert found.latitude_deg == pytest.approx(lat, abs=2e-9)
         assert found.longitude_deg == pytest.approx(lon, abs=2e-9)
-        assert (found.altitude_m, found.altitude_reference) == (pytest.approx(h), "ellipsoid")
-        gps = TiffReader(out).read(TiffReader(out).read(TiffReader(out).first_offset).number(0x8825))
+        assert found.altitude_m == pytest.approx(h)
+        gps = _gps(out)
+        assert gps.values[5][0] == (3 if h < 0 else 2)
         assert gps.number(17) == 0.0
         assert found.warnings == ()
 
@@ -257,7 +270,8 @@ def test_a_drones_photo_keeps_its_makers_note_and_picture(shared_data: Path, sho
     assert (after.make, after.model, after.focal_px, after.capture_time) == (
         before.make, before.model, before.focal_px, before.capture_time,
     )  # fmt: skip
-    assert after.relative_altitude_m == before.relative_altitude_m
+    altitude = re.compile(rb'drone-dji:RelativeAltitude="[^"]+"')
+    assert altitude.findall(data) == altitude.findall(original) != []
     assert after.latitude_deg == pytest.approx(shot.geopose.latitude_deg, abs=2e-9)
     notes = [
         Image.open(io.BytesIO(d)).getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.MakerNote.value]

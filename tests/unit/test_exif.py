@@ -14,7 +14,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
-from featuredb.features.exif.read import ExifInfo, camera_key, parse_exif, read_exif
+from featuredb.features.exif.read import ExifInfo, parse_exif, read_exif
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.maps.exif_prior import prior_from_exif
 
@@ -71,7 +71,6 @@ def test_all_kinds_of_values_from_a_file() -> None:
     assert found.latitude_deg == pytest.approx(46 + 50 / 60 + 33.3855 / 3600, abs=1e-9)
     assert found.longitude_deg == pytest.approx(-(91 + 59 / 60 + 40.4156 / 3600), abs=1e-9)
     assert found.altitude_m == pytest.approx(198.309, abs=1e-6)
-    assert found.altitude_reference == "sea_level"
     assert found.focal_px == pytest.approx(24 * math.hypot(WIDTH, HEIGHT) / FULL_FRAME_MM, rel=1e-4)
     prior = prior_from_exif(found)
     assert prior is not None
@@ -170,19 +169,13 @@ class TestPosition:
         assert found.latitude_deg == -46.5
 
     @pytest.mark.parametrize(
-        ("reference", "altitude", "kind"),
-        [
-            (b"\0", 12.5, "sea_level"),
-            (b"\1", -12.5, "sea_level"),
-            (b"\2", 12.5, "ellipsoid"),
-            (b"\3", -12.5, "ellipsoid"),
-            (b"\7", 12.5, "unknown"),
-            (None, 12.5, "unknown"),
-        ],
+        ("reference", "altitude"),
+        [(b"\0", 12.5), (b"\1", -12.5), (b"\2", 12.5), (b"\3", -12.5), (b"\7", 12.5), (None, 12.5)],
     )
-    def test_altitude_and_its_reference(self, reference: bytes | None, altitude: float, kind: str) -> None:
+    def test_altitude_and_its_sign(self, reference: bytes | None, altitude: float) -> None:
         found = info(None, None, gps_tags(t5=reference, t6=12.5))
-        assert (found.altitude_m, found.altitude_reference) == (altitude, kind)
+        assert found.altitude_m == altitude
+        assert bool(found.warnings) == (reference == b"\7")
 
     @pytest.mark.parametrize("altitude", [IFDRational(0, 0), 4_000_000.0])
     def test_absurd_altitudes_leave_the_position(self, altitude: Any) -> None:
@@ -229,7 +222,7 @@ XMP = b"""<x:xmpmeta><rdf:Description drone-dji:RelativeAltitude="+39.80" drone-
 def test_dji_values_as_attributes_and_elements() -> None:
     found = info(None, None, gps_tags(), xmp=XMP)
     assert found.angles is not None
-    assert (found.relative_altitude_m, found.angles.yaw_deg, found.angles.pitch_deg) == (39.8, -45.0, -89.9)
+    assert (found.angles.yaw_deg, found.angles.pitch_deg) == (-45.0, -89.9)
     assert (found.sigma_horizontal_m, found.sigma_vertical_m) == (0.015, 0.03)
 
 
@@ -314,18 +307,18 @@ def test_accuracies_as_pix4d_names_them() -> None:
 
 
 def test_camera_key_tells_zoom_positions_and_bodies_apart() -> None:
-    key = camera_key("Maker", " Model", 400, 300, 277.4)
-    assert key == "maker|model|400x300|f277"
-    assert camera_key("maker", "model", 400, 300, 277.49) == key
+    photo = ExifInfo(make="Maker", model=" Model", width=400, height=300, focal_px=277.4)
+    assert photo.camera_key == "maker|model|400x300|f277"
+    assert replace(photo, make="maker", model="model", focal_px=277.49).camera_key == photo.camera_key
     others = [
-        camera_key("Maker", "Model", 400, 300, 280.0),
-        camera_key("Maker", "Model", 300, 400, 277.4),
-        camera_key("Maker", "Model", 400, 300, None),
-        camera_key("Maker", "Model", 400, 300, 277.4, "S1"),
-        camera_key("Maker", "Model", 400, 300, 277.4, resaved=True),
+        replace(photo, focal_px=280.0),
+        replace(photo, width=300, height=400),
+        replace(photo, focal_px=None),
+        replace(photo, serial="S1"),
+        replace(photo, resaved=True),
     ]
-    assert len({key, *others}) == 6
-    assert camera_key("", " ", 400, 300, 277.4) == ""
+    assert len({photo.camera_key, *(other.camera_key for other in others)}) == 6
+    assert replace(photo, make="", model=" ").camera_key == ""
 
 
 def test_photos_that_a_program_saved_anew_are_a_camera_of_their_own() -> None:

@@ -44,8 +44,8 @@ def test_a_line_that_cannot_be_read_costs_that_photo(tmp_path: Path) -> None:
     found = read_table(table(tmp_path, text))
     (row,) = found.rows
     assert (row.name, row.latitude_deg, row.longitude_deg, row.height_m) == ("a.jpg", 49.0, 8.4, None)
-    assert [bad.number for bad in found.bad] == [2, 3, 4]
-    assert "expected x and y" in found.bad[0].reason
+    assert [number for number, _ in found.bad] == [2, 3, 4]
+    assert "expected x and y" in found.bad[0][1]
 
 
 def test_without_a_system_nothing_is_guessed(tmp_path: Path) -> None:

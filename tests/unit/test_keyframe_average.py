@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from featuredb.geometry.rigid3 import Rigid3
@@ -38,9 +39,10 @@ def averaged(
     return np.array(fused_m), np.array(registered_m)
 
 
-def test_the_average_is_nearer_to_the_truth_than_its_registrations() -> None:
+def test_the_average_is_nearer_to_the_truth_than_its_registrations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ingest.track.scan_ground._MAX_CHI2", 40.0)
     rng = np.random.default_rng(3)
-    fused, registered = averaged(KeyframeAverage(0.75, 40.0), flight(400), rng)
+    fused, registered = averaged(KeyframeAverage(), flight(400), rng)
     # A window of four: half the error, were the track without any; the old turn moves the camera a little.
     assert fused[5:].mean() < 0.55 * registered[5:].mean()
     assert fused[5:].mean() > 0.25 * registered[5:].mean()
@@ -50,7 +52,7 @@ def test_what_does_not_fit_the_track_begins_the_average_anew() -> None:
     covariance = np.diag(_SIGMA**2)
     first, second = flight(2)
     astray = Rigid3.exp(np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0])) @ second
-    average = KeyframeAverage(0.75, 20.1)
+    average = KeyframeAverage()
     average.begin(first, covariance)
     np.testing.assert_array_equal(average.add(astray, second, covariance).matrix(), second.matrix())
     near = Rigid3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0])) @ second
@@ -62,19 +64,20 @@ def test_after_something_else_led_the_track_nothing_older_counts() -> None:
     covariance = np.diag(_SIGMA**2)
     first, second = flight(2)
     near = Rigid3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0])) @ second
-    average = KeyframeAverage(0.75, 20.1)
+    average = KeyframeAverage()
     average.begin(first, covariance)
     average.end()
     np.testing.assert_array_equal(average.add(near, second, covariance).matrix(), second.matrix())
 
 
-def test_the_surer_registration_counts_more() -> None:
+def test_the_surer_registration_counts_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ingest.track.scan_ground._MAX_CHI2", 1e6)
     rng = np.random.default_rng(1)
     (pose,) = flight(1)
     moved = disturbed(pose, rng)
     towards = []
     for times in (0.25, 1.0, 4.0):
-        average = KeyframeAverage(0.75, 1e6)
+        average = KeyframeAverage()
         average.begin(pose, np.diag(_SIGMA**2))
         fused = average.add(pose, moved, times * np.diag(_SIGMA**2))
         towards.append(

@@ -72,7 +72,7 @@ def test_what_is_wrong_costs_its_row_or_its_value_only(tmp_path: Path) -> None:
     assert "'48,99' is no number" in rows["one.jpg"].warnings[0]
     assert [len(r.warnings) for r in rows.values()] == [2, 3, 1, 0]
     assert (rows["five.jpg"].latitude_deg, rows["five.jpg"].accuracy_m) == (48.5, None)
-    assert [b.number for b in table.bad] == [3, 5, 6]
+    assert [number for number, _ in table.bad] == [3, 5, 6]
     told = "\n".join(summary_of(table))
     assert "row 3 is left out: neither a path nor an id" in told
     assert "row 5 is left out: one.jpg is in row 1 already" in told
@@ -95,7 +95,7 @@ def test_lines_of_json_that_are_none_are_told(tmp_path: Path) -> None:
     (tmp_path / "17.jpg").write_bytes(b"x")
     table = read_table(path)
     assert [(r.number, r.name, r.path.name) for r in table.rows] == [(1, "17", "17.jpg"), (5, "18", "18")]
-    assert [b.number for b in table.bad] == [3, 4]
+    assert [number for number, _ in table.bad] == [3, 4]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from featuredb.errors import TelemetryError
-from featuredb.video.telemetry import Telemetry, read_telemetry
+from featuredb.video.telemetry.read import read_telemetry
+from featuredb.video.telemetry.values import Telemetry
 
 pytestmark = pytest.mark.real_data
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry import Telemetry
+from featuredb.video.telemetry.values import Telemetry
 
 NAN = float("nan")
 LAWS = settings(deadline=None, max_examples=60, derandomize=True)

@@ -56,8 +56,7 @@ def test_frames_are_those_of_the_film_however_far_it_is_read_ahead(
     assert [f.time_s for f in found] == [f.time_s for f in expected]
     for frame, same in zip(found, expected, strict=True):
         np.testing.assert_array_equal(frame.gray, same.gray)
-    assert report.whole
-    assert report.decoded == 50
+    assert not report.complaints()
     assert ahead.seconds > 0.0
 
 

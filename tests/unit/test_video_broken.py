@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from featuredb.errors import VideoError
-from featuredb.video.film import VideoOptions
+from featuredb.video import container, opening
 from featuredb.video.frames import open_video
 from tests.support.films import (
     HEIGHT,
@@ -39,8 +39,8 @@ def _packets(path: Path) -> list[tuple[int, int]]:
         return [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
 
 
-def _refused(path: Path, **options: Any) -> str:
-    with pytest.raises(VideoError) as caught, open_video(path, VideoOptions(**options)) as video:
+def _refused(path: Path) -> str:
+    with pytest.raises(VideoError) as caught, open_video(path) as video:
         list(video)
     assert str(caught.value).startswith(path.name)
     return str(caught.value)
@@ -135,11 +135,19 @@ def test_no_frame_at_all(tmp_path: Path) -> None:
     assert "no frame of its h264 video can be decoded; 48 packets could not be decoded" in _refused(path)
 
 
-def test_films_that_are_too_large(tmp_path: Path) -> None:
+def _limit(monkeypatch: pytest.MonkeyPatch, side_px: int, pixels: int) -> None:
+    monkeypatch.setattr(opening, "MAX_FULL_SIDE_PX", side_px)
+    monkeypatch.setattr(opening, "MAX_FULL_PIXELS", pixels)
+
+
+def test_films_that_are_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_film(tmp_path / "film.mp4")
-    assert "160x120 pixels, the limit is 150 a side and 134 million" in _refused(path, max_full_side_px=150)
-    assert "160x120 pixels, the limit is 16384 a side and 0 million" in _refused(path, max_full_pixels=19_199)
-    assert len(read(path, max_full_side_px=160, max_full_pixels=19_200)) == 12
+    _limit(monkeypatch, 150, 1 << 27)
+    assert "160x120 pixels, the limit is 150 a side and 134 million" in _refused(path)
+    _limit(monkeypatch, 16_384, 19_199)
+    assert "160x120 pixels, the limit is 16384 a side and 0 million" in _refused(path)
+    _limit(monkeypatch, 160, 19_200)
+    assert len(read(path)) == 12
 
 
 def _huge_header(folder: Path) -> bytes:
@@ -185,16 +193,20 @@ def test_nothing_is_allocated_for_an_absurd_size(tmp_path: Path, make: Callable[
     assert "video can be decoded" in said
 
 
-def test_pictures_larger_than_their_header_says_are_not_decoded(tmp_path: Path) -> None:
+def test_pictures_larger_than_their_header_says_are_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = bytearray(film(tmp_path, "jpeg.avi").read_bytes())
     at = data.index(b"strf") + 12
     data[at : at + 8] = (8).to_bytes(4, "little") * 2
     path = tmp_path / "small.avi"
     path.write_bytes(bytes(data))
     assert len(read(path)) == 30  # a header that says less is no harm by itself
-    assert "no frame of its mjpeg video can be decoded" in _refused(
-        path, max_full_side_px=8, max_full_pixels=64
-    )
+    _limit(monkeypatch, 8, 64)
+    most = 64 + 2 * 128 * 8
+    monkeypatch.setattr(opening, "MAX_CODED_PIXELS", most)
+    monkeypatch.setattr(container, "MAX_CODED_PIXELS", most)
+    assert "no frame of its mjpeg video can be decoded" in _refused(path)
 
 
 def test_a_film_that_changes_its_size(tmp_path: Path) -> None:

@@ -29,8 +29,8 @@ def test_every_frame_comes_in_order_at_its_time(tmp_path: Path, kind: str) -> No
     # A transport stream begins at any time of its clock, which is taken off but for the codec's delay.
     assert start_s == pytest.approx(0.0, abs=0.1 if kind == "ts" else 1e-9)
     assert (video.info.width, video.info.height, video.info.rotation_deg) == (WIDTH, HEIGHT, 0)
-    assert (report.decoded, report.undecodable, report.damaged, report.missing) == (30, 0, 0, 0)
-    assert report.whole, report.complaints()
+    assert (report.undecodable, report.damaged, report.missing) == (0, 0, 0)
+    assert not report.complaints()
     assert report.at_end
 
 
@@ -135,7 +135,7 @@ def test_karma(shared_data: Path) -> None:
     assert info.creation_time == datetime(2017, 4, 17, 19, 27, 57, tzinfo=UTC)
     assert count == 362
     assert times == pytest.approx([i * 1001 / 30_000 for i in range(362)], abs=1e-4)
-    assert report.whole, report.complaints()
+    assert not report.complaints()
     later = read(path, start_s=6.0, end_s=6.5, max_side_px=400)
     assert [f.time_s for f in later] == [t for t in times if 6.0 <= t < 6.5]
     assert later[0].gray.shape == (225, 400)
@@ -200,7 +200,6 @@ def test_memory_stays_bounded(tmp_path: Path) -> None:
         {"max_side_px": 0},
         {"fps": 0.0},
         {"fps": float("nan")},
-        {"timeout_s": -1.0},
         {"start_s": 2.0, "end_s": 1.0},
         {"start_s": float("inf")},
     ],

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from featuredb.errors import VideoError
+from featuredb.video import opening
 from featuredb.video.film import VideoOptions
 from featuredb.video.frames import open_video
 from tests.support.films import (
@@ -66,7 +67,7 @@ def server(tmp_path: Path) -> Iterator[str]:
 
 def test_a_film_over_http(tmp_path: Path, server: str) -> None:
     film(tmp_path, "ts")
-    with open_video(f"{server}/film.ts", VideoOptions(timeout_s=20.0)) as video:
+    with open_video(f"{server}/film.ts") as video:
         assert video.info.live
         assert [shown(frame.gray) for frame in video] == list(range(30))
 
@@ -76,18 +77,22 @@ def test_an_address_without_a_film(server: str) -> None:
         open_video(f"{server}/none.mp4")
 
 
-def test_a_silent_source_times_out() -> None:
+def test_a_silent_source_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("featuredb.video.opening._TIMEOUT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
         for scheme in ("http", "tcp", "rtsp"):
             with pytest.raises(
                 VideoError, match=r"@?127\.0\.0\.1.*(nothing came within 0\.5 s|not a film)"
             ) as caught:
-                open_video(f"{scheme}://someone:secret@127.0.0.1:{port}/live", VideoOptions(timeout_s=0.5))
+                open_video(f"{scheme}://someone:secret@127.0.0.1:{port}/live")
             assert "secret" not in str(caught.value)
 
 
-def test_a_source_that_falls_silent(tmp_path: Path) -> None:
+def test_a_source_that_falls_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("featuredb.video.opening._TIMEOUT_S", 1.0)
+    less = {"probesize": "4000", "analyzeduration": "100000"}
+    monkeypatch.setattr("featuredb.video.opening._OF_NETWORK", opening._OF_NETWORK | less)
     data = film(tmp_path, "ts").read_bytes()
     with socket.create_server(("127.0.0.1", 0)) as listening:
         done = threading.Event()
@@ -99,12 +104,9 @@ def test_a_source_that_falls_silent(tmp_path: Path) -> None:
                 done.wait(30.0)
 
         threading.Thread(target=serve, daemon=True).start()
-        options = VideoOptions(
-            timeout_s=1.0, input_options={"probesize": "4000", "analyzeduration": "100000"}
-        )
         frames = []
         try:
-            with open_video(f"tcp://127.0.0.1:{listening.getsockname()[1]}", options) as video:
+            with open_video(f"tcp://127.0.0.1:{listening.getsockname()[1]}") as video:
                 reading = iter(video)
                 with pytest.raises(VideoError, match="nothing came within the timeout"):
                     frames.extend(iter(lambda: next(reading), None))

@@ -1,11 +1,8 @@
 """Where a photo's satellite receiver says it was, from EXIF's GPS directory (EXIF 3.0, 4.6.6)."""
 
 import math
-from typing import Literal
 
 from featuredb.features.exif.tiff_ifd import Ifd
-
-AltitudeReference = Literal["sea_level", "ellipsoid", "unknown"]
 
 # Consumer GNSS without better knowledge. The GPS standard positioning service promises 95 % within 8 m
 # horizontally and 13 m vertically (GPS SPS PS, 5th edition, 2020), that is 3.3 m and 6.6 m as one standard
@@ -63,23 +60,20 @@ def _angle(gps: Ifd, tag: int, ref_tag: int, signs: str, limit: float, warnings:
     return -angle if ref == signs[1] else angle
 
 
-def gps_altitude(gps: Ifd, warnings: list[str]) -> tuple[float | None, AltitudeReference]:
-    """Altitude in metres with its sign, and what it is counted from (EXIF 3.0 adds the ellipsoid)."""
+def gps_altitude(gps: Ifd, warnings: list[str]) -> float | None:
+    """Altitude in metres with its sign; what it is counted from, drones and phones tell wrongly."""
     value = gps.number(6)
     if value is None:
-        return None, "unknown"
+        return None
     # The deepest shore is the Dead Sea's, airliners fly at 13 km.
     if not -500.0 < value < 20_000.0:
         warnings.append(f"EXIF GPS: altitude {value} m is absurd")
-        return None, "unknown"
+        return None
     raw = gps.values.get(5)
     code = (raw[0] if raw else None) if isinstance(raw, (tuple, bytes)) else None
-    if code not in (0, 1, 2, 3):
-        if code is not None:
-            warnings.append(f"EXIF GPS: altitude reference {code} is not in 0..3")
-        return value, "unknown"
-    reference: AltitudeReference = "sea_level" if code in (0, 1) else "ellipsoid"
-    return (-abs(value) if code in (1, 3) else value), reference
+    if code not in (None, 0, 1, 2, 3):
+        warnings.append(f"EXIF GPS: altitude reference {code} is not in 0..3")
+    return -abs(value) if code in (1, 3) else value
 
 
 def gps_sigmas(gps: Ifd, xmp: dict[str, float], warnings: list[str]) -> tuple[float, float]:

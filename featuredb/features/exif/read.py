@@ -5,7 +5,7 @@ Nothing here raises on bad metadata: a wrong value becomes None, with a line in 
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 
 from featuredb.errors import ImageError, InvalidValueError
@@ -13,7 +13,6 @@ from featuredb.features.exif.angles import XMP_BODY, XMP_GIMBALS, camera_angles
 from featuredb.features.exif.gps import (
     DEFAULT_SIGMA_HORIZONTAL_M,
     DEFAULT_SIGMA_VERTICAL_M,
-    AltitudeReference,
     finer_position,
     gps_altitude,
     gps_position,
@@ -39,7 +38,7 @@ _XMP_NAMES = (  # of numbers, by an expression for their namespace
     (
         "drone(?:-dji)?",
         (
-            *("RelativeAltitude", "RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
+            *("RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
             *("GpsLatitude", "GpsLongitude", "GpsLongtitude"),
         ),
     ),
@@ -73,7 +72,7 @@ def shot_model(model: str, shot: int) -> str:
 
 
 def is_of_film(camera_key: str, film: str) -> bool:
-    """Whether an EXIF key (`featuredb.features.exif.read.camera_key`) is of some shot of a film's model."""
+    """Whether a `ExifInfo.camera_key` is of some shot of a film's model."""
     start = f"{UNNAMED_MAKE}|{film}".lower()
     return camera_key.startswith((f"{start}|", f"{start} {_SHOT} "))
 
@@ -90,9 +89,8 @@ class ExifInfo:
         focal_px: focal length in pixels of the image as stored.
         capture_time: when taken; timezone-aware only where the photo gives its offset.
         latitude_deg, longitude_deg: WGS84 degrees, both or none.
-        altitude_m: metres above `altitude_reference`, which for drones is often neither.
+        altitude_m: metres above the sea or the ellipsoid, as the photo says; for drones often neither.
         sigma_horizontal_m, sigma_vertical_m: one standard deviation per axis of the position.
-        relative_altitude_m: DJI: above take-off.
         angles: how the camera was turned.
         artist, copyright: attribution.
         warnings: what was wrong, for people.
@@ -110,10 +108,8 @@ class ExifInfo:
     latitude_deg: float | None = None
     longitude_deg: float | None = None
     altitude_m: float | None = None
-    altitude_reference: AltitudeReference = "unknown"
     sigma_horizontal_m: float = DEFAULT_SIGMA_HORIZONTAL_M
     sigma_vertical_m: float = DEFAULT_SIGMA_VERTICAL_M
-    relative_altitude_m: float | None = None
     angles: CameraAngles | None = None
     artist: str = ""
     copyright: str = ""
@@ -121,16 +117,18 @@ class ExifInfo:
 
     @property
     def camera_key(self) -> str:
-        """Name of the intrinsics shared with other photos of the same camera, "" where it is unknown."""
-        return camera_key(
-            self.make,
-            self.model,
-            self.width,
-            self.height,
-            self.focal_px,
-            self.serial,
-            resaved=self.resaved,
-        )
+        """Name of the intrinsics that a photo shares with others of the same camera; "" for an unknown one.
+
+        The focal length counts to three digits, so that zoom positions differ and rounding does not. Photos
+        that a program has saved anew are a camera of their own: pictures turned by 180 degrees have their
+        principal point on the other side, and nothing else in the file tells it.
+        """
+        make, model, serial = self.make.strip(), self.model.strip(), self.serial.strip()
+        if not (make or model):
+            return ""
+        focal = f"f{float(f'{self.focal_px:.3g}'):.0f}" if self.focal_px else "unknown"
+        parts = [make, model, f"{self.width}x{self.height}", focal, *([serial] if serial else [])]
+        return "|".join([*parts, "jfif"] if self.resaved else parts).lower()
 
 
 def read_exif(data: bytes, header: ImageHeader | None = None) -> ExifInfo:
@@ -147,16 +145,14 @@ def read_exif(data: bytes, header: ImageHeader | None = None) -> ExifInfo:
             return ExifInfo(warnings=(f"no metadata: {error}",))
     tiff = data[slice(*header.exif)] if header.exif else b""
     xmp = data[slice(*header.xmp)] if header.xmp else b""
-    found = parse_exif(tiff, xmp, header.width, header.height, header.orientation)
-    return replace(found, resaved=header.jfif and not _of_featuredb(tiff))
+    return parse_exif(
+        tiff, xmp, header.width, header.height, orientation=header.orientation, jfif=header.jfif
+    )
 
 
-def _of_featuredb(tiff: bytes) -> bool:
-    """Whether it is a picture of a film that featuredb saved, unturned."""
-    return _directories(tiff)[0].text(305) == _SOFTWARE
-
-
-def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: int | None = None) -> ExifInfo:
+def parse_exif(
+    tiff: bytes, xmp: bytes, width: int, height: int, *, orientation: int | None = None, jfif: bool = False
+) -> ExifInfo:
     """Metadata from the TIFF stream of EXIF and the XMP packet (either may be empty).
 
     Args:
@@ -164,11 +160,11 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: in
         xmp: XML text.
         width, height: of the stored image, pixels; the focal length is given for these.
         orientation: said by the format, which EXIF then only repeats.
+        jfif: see `ImageHeader`; pictures of films that featuredb saved have it, too, and are unturned.
     """
     main, exif, gps, warnings = _directories(tiff)
     values = _xmp_values(xmp)
     position = finer_position(gps_position(gps, warnings), values)
-    altitude, reference = gps_altitude(gps, warnings) if position else (None, "unknown")
     orientation = orientation or _orientation(main, warnings)
     sigma_h, sigma_v = gps_sigmas(gps, values, warnings)
     return ExifInfo(
@@ -178,44 +174,19 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int, orientation: in
         model=main.text(272)[:_MAX_TEXT],
         serial=exif.text(42033)[:_MAX_TEXT],
         orientation=orientation,
+        resaved=jfif and main.text(305) != _SOFTWARE,
         focal_px=_focal_px(exif, width, height, warnings),
         capture_time=_capture_time(main, exif, warnings),
         latitude_deg=position[0] if position else None,
         longitude_deg=position[1] if position else None,
-        altitude_m=altitude,
-        altitude_reference=reference,
+        altitude_m=gps_altitude(gps, warnings) if position else None,
         sigma_horizontal_m=sigma_h,
         sigma_vertical_m=sigma_v,
-        relative_altitude_m=values.get("RelativeAltitude"),
         angles=camera_angles(gps, values, main.text(271), orientation, warnings),
         artist=main.text(315)[:_MAX_TEXT],
         copyright=main.text(33432)[:_MAX_TEXT],
         warnings=tuple(warnings[:_MAX_WARNINGS]),
     )
-
-
-def camera_key(
-    make: str,
-    model: str,
-    width: int,
-    height: int,
-    focal_px: float | None,
-    serial: str = "",
-    *,
-    resaved: bool = False,
-) -> str:
-    """Name of the intrinsics that a photo shares with others of the same camera; "" for an unknown camera.
-
-    The focal length counts to three digits, so that zoom positions differ and rounding does not. Photos that
-    a program has saved anew are a camera of their own: pictures turned by 180 degrees have their principal
-    point on the other side, and nothing else in the file tells it.
-    """
-    if not (make.strip() or model.strip()):
-        return ""
-    focal = f"{focal_px:.3g}" if focal_px else "unknown"
-    parts = [make.strip(), model.strip(), f"{width}x{height}", f"f{float(focal):.0f}" if focal_px else focal]
-    parts += [serial.strip()] if serial.strip() else []
-    return "|".join([*parts, "jfif"] if resaved else parts).lower()
 
 
 def _directories(tiff: bytes) -> tuple[Ifd, Ifd, Ifd, list[str]]:

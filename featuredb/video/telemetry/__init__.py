@@ -5,8 +5,3 @@ file. Each format has its module (`srt`, `gpmf`, `gpx`, `csv_table`) and hands r
 which cleans them alike; what comes out is a `Telemetry` (`values.py`). Whatever the bytes are, the answer is
 a `Telemetry` or a `TelemetryError`.
 """
-
-from featuredb.video.telemetry.read import read_telemetry, telemetry_of_video
-from featuredb.video.telemetry.values import Telemetry, TelemetrySamples
-
-__all__ = ["Telemetry", "TelemetrySamples", "read_telemetry", "telemetry_of_video"]

@@ -10,7 +10,6 @@ from av.packet import Packet  # generic in its stubs only, hence the quotes
 from av.stream import Discard, Stream
 
 from featuredb.errors import TelemetryError, VideoError
-from featuredb.video.film import VideoOptions
 from featuredb.video.opening import open_input, opening_of
 from featuredb.video.telemetry.assemble import check_count
 from featuredb.video.telemetry.formats.gpmf import TimedPacket
@@ -45,9 +44,8 @@ def read_tracks(path: Path) -> TelemetryTracks:
     Raises:
         TelemetryError: not a video, or more data in such tracks than any recording has.
     """
-    options = VideoOptions()
     try:
-        container = open_input(opening_of(path, options), options)
+        container = open_input(opening_of(path))
     except VideoError as error:
         raise TelemetryError(str(error)) from error
     with container:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.datum import HeightDatum, check_datum
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze, frozen_array
 
 Clock = Literal["utc", "local", "none"]
 CLOCKS: tuple[Clock, ...] = get_args(Clock)
@@ -17,7 +17,9 @@ CLOCKS: tuple[Clock, ...] = get_args(Clock)
 # in 3 s, as much as its receiver does.
 _MAX_GAP_S = 3.0
 
-_OPTIONAL = ("height_m", "relative_height_m", "clock_s")
+# All but the first two may be left out.
+_COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "relative_height_m", "gimbal_ypr_deg", "clock_s")
+_STRAIGHT = ("latitude_deg", "height_m", "relative_height_m", "clock_s")  # others go around the circle
 
 
 def _not_known() -> FloatArray:
@@ -46,15 +48,14 @@ class TelemetrySamples:
     clock_s: FloatArray = field(default_factory=_not_known)
 
     def __post_init__(self) -> None:
-        times = frozen_array("TelemetrySamples.times_s", self.times_s, (None,))
-        n = len(times)
-        checked: dict[str, FloatArray] = {"times_s": times}
-        for name in ("latitude_deg", "longitude_deg", *_OPTIONAL):
-            checked[name] = _column(name, getattr(self, name), (n,), optional=name in _OPTIONAL)
-        checked["gimbal_ypr_deg"] = _column("gimbal_ypr_deg", self.gimbal_ypr_deg, (n, 3), optional=True)
-        _check_positions(checked["latitude_deg"], checked["longitude_deg"])
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        freeze(self, times_s=(None,))
+        for name in _COLUMNS:
+            given, shape = getattr(self, name), (len(self), 3) if name == "gimbal_ypr_deg" else (len(self),)
+            if name in _COLUMNS[2:] and not np.size(given):
+                given = np.full(shape, np.nan)
+            column = frozen_array(f"TelemetrySamples.{name}", given, shape, nan=True)
+            object.__setattr__(self, name, column)
+        _check_positions(self.latitude_deg, self.longitude_deg)
 
     def __len__(self) -> int:
         return len(self.times_s)
@@ -125,33 +126,10 @@ class Telemetry(TelemetrySamples):
         def line(values: FloatArray, circle: bool = False) -> FloatArray:
             return _interpolated(self.times_s, values, wanted, reach, circle)
 
-        return TelemetrySamples(
-            times_s=wanted,
-            latitude_deg=line(self.latitude_deg),
-            longitude_deg=line(self.longitude_deg, circle=True),
-            height_m=line(self.height_m),
-            relative_height_m=line(self.relative_height_m),
-            gimbal_ypr_deg=np.stack([line(angle, circle=True) for angle in self.gimbal_ypr_deg.T], axis=1),
-            clock_s=line(self.clock_s),
-        )
-
-
-def _column(name: str, value: ArrayLike, shape: tuple[int, ...], optional: bool = False) -> FloatArray:
-    """A read-only float64 copy in which NaN is allowed and infinity is not."""
-    given = np.asarray(value)
-    if optional and given.size == 0:
-        column = np.full(shape, np.nan)
-    else:
-        if given.dtype.kind not in "biuf" or given.shape != shape:
-            raise InvalidValueError(
-                f"TelemetrySamples.{name}: expected numbers of shape {shape}, found {given.dtype} of shape "
-                f"{given.shape}"
-            )
-        column = given.astype(np.float64)
-    if np.isinf(column).any():
-        raise InvalidValueError(f"TelemetrySamples.{name}: expected finite numbers or NaN, found infinity")
-    column.setflags(write=False)
-    return column
+        columns = {name: line(getattr(self, name)) for name in _STRAIGHT}
+        ypr = np.stack([line(angle, circle=True) for angle in self.gimbal_ypr_deg.T], axis=1)
+        longitude = line(self.longitude_deg, circle=True)
+        return TelemetrySamples(times_s=wanted, longitude_deg=longitude, gimbal_ypr_deg=ypr, **columns)
 
 
 def _check_positions(latitude_deg: FloatArray, longitude_deg: FloatArray) -> None:

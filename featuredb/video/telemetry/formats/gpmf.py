@@ -85,12 +85,6 @@ def find(streams: list[Stream], key: str, fields: int) -> tuple[Stream, FloatArr
     return None
 
 
-def first_number(stream: Stream, key: str) -> float:
-    """The first number of an entry, NaN where there is none."""
-    entry = stream.get(key)
-    return float(numbers(entry)[0, 0]) if entry is not None and entry.count else float("nan")
-
-
 def _check_degrees(stream: Stream, key: str) -> None:
     unit, first = stream.get("UNIT"), _ANGLES_FIRST.get(key)
     if unit is None or first is None or not unit.size:
@@ -259,10 +253,11 @@ def _gps5(streams: list[Stream]) -> Decoded | None:
         return None
     stream, values = found
     datum, warnings = _datum(stream, "ellipsoidal")
-    fix = first_number(stream, "GPSF")
-    if np.isnan(fix):
+    entry, fix = stream.get("GPSF"), float(_FIX_3D)
+    if entry is not None and entry.count:
+        fix = float(numbers(entry)[0, 0])
+    else:
         warnings.append("GPS5 without its fix status (GPSF): whether positions are fresh is not known")
-        fix = _FIX_3D
     start = _utc(stream.get("GPSU")) if fix >= _MIN_FIX else float("nan")
     return Decoded(_fixed(values, np.full(len(values), fix)), start, datum, warnings)
 

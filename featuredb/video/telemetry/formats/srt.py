@@ -43,9 +43,10 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
     """The telemetry of subtitles that were read already; arguments and errors as for `read_srt`."""
     check_count(len(blocks), origin)
     if not any(looks_like_telemetry(block.text) for block in blocks):
+        first = next((f"; the first says {block.text[:60]!r}" for block in blocks if block.text), "")
         raise TelemetryError(
             f"{origin}: {len(blocks)} subtitles, none with a drone's telemetry (expected words like GPS(...) "
-            f"or [latitude: ...]){_sample_of(blocks)}"
+            f"or [latitude: ...]){first}"
         )
     parsed = [parse_block(block.text) for block in blocks]
     warnings: list[str] = []
@@ -73,11 +74,6 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
         in_video_time="times_s" in times,
         warnings=warnings,
     )
-
-
-def _sample_of(blocks: Sequence[Subtitle]) -> str:
-    text = next((block.text for block in blocks if block.text), "")
-    return f"; the first says {text[:60]!r}" if text else ""
 
 
 def _whole(blocks: Sequence[Subtitle], parsed: list[BlockFields], warnings: list[str]) -> int:
