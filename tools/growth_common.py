@@ -27,7 +27,6 @@ from reloc.localiser import Localiser
 from reloc.service.handler import decode_photo, localise_request
 from reloc.wire.query import LocaliseWireRequest
 from tools.figures import say, study_parser, write_figures
-from tools.growth_gates import WRONG_M, recorded
 from tools.worlds.album import TABLE_FILE, AlbumFact, PlannedPhoto, read_facts, write_album
 
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
@@ -39,6 +38,7 @@ _MAKING = MapMakingOptions(
 GROWING = GrowingOptions(making=_MAKING, workers=_WORKERS)
 W = TypeVar("W")
 _UNSAID_M = 30.0  # accuracy of a geotag that names none
+WRONG_M = 2.0  # a photo registered further off than this is wrong
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -239,15 +239,9 @@ def conclude(out: Path, name: str, verdicts: Sequence[Verdict]) -> int:
     return 0 if all(v.holds for v in verdicts) else 1
 
 
-def grown(database: Database, out: Path, album: Album, gates: str = "gates") -> Counter[str]:
-    """Grow once, with what the gates say recorded (`tools.growth_gates`): how many photos wait, by reason."""
-
-    def true_place(name: str) -> FloatArray | None:
-        image = album.truth.images.get(_album_name(album, name))
-        return None if image is None else image.cam_from_local.center
-
-    with recorded(out / f"{gates}.jsonl", album.truth.frame, true_place):
-        report = grow_candidates(database, GROWING)
+def grown(database: Database) -> Counter[str]:
+    """Grow once: how many photos wait, by reason."""
+    report = grow_candidates(database, GROWING)
     for line in report.as_text().splitlines():
         say(line[:300])
     return Counter(p.reason_code for p in report.photos if p.reason_code)

@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     album = made(community_album, out / "world", world)
     database = anchored(out / "db", album, "survey")
     give(database, album, album.of(*_OWN, *_FOREIGN, "copy"))
-    waiting = grown(database, out, album)
+    waiting = grown(database)
     verdicts = [*judge(album, registered(database, album)), none_failed(waiting["FAILED"])]
     return conclude(out, "community", verdicts)
 

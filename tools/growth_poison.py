@@ -110,7 +110,7 @@ def honest_base(path: Path, album: Album) -> Database:
         )
         add_canary(database, fact.photo_id, (album.folder / fact.name).read_bytes(), pose, origin="person")
     give(database, album, album.of("honest"))
-    grown(database, path.parent, album)
+    grown(database)
     return database
 
 
@@ -121,7 +121,7 @@ def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) ->
     failed = 0
     for arrived in (sent, album.of("late")):
         give(database, album, arrived)
-        failed += grown(database, out, album, "gates-poisoned")["FAILED"]
+        failed += grown(database)["FAILED"]
     found = registered(database, album)
     active = [r for r in found if r.status == "active" and r.generation > 0]
     poisoned = {r.map_id for r in active if r.fact.kind in POISONS}

@@ -16,7 +16,6 @@
 
 import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -40,7 +39,6 @@ from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_p
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
 from tools.figures import laid_on, median, poses_in, say, study_parser, write_figures
-from tools.growth_gates import recorded
 
 _PORTIONS = 3
 _LEAST_FIRST = 5  # photos of the first map: three or four do not tell its lens from its heights
@@ -62,7 +60,6 @@ class State:
         frame: of the first map.
         growth: without a drift budget where the first map's metre is made up.
         joint: camera centres of the joint reconstruction, in its own frame, by name.
-        gates: where what the gates say is recorded, beside the joint reconstruction's places.
     """
 
     photos: list[Photo]
@@ -73,13 +70,11 @@ class State:
     frame: LocalFrame | None = None
     growth: GrowthOptions = field(default_factory=GrowthOptions)
     joint: dict[str, FloatArray] = field(default_factory=dict)
-    gates: Path | None = None
 
 
 def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--cut", choices=("interleaved", "consecutive"), default="interleaved")
-    parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
     args = parser.parse_args()
     found = require_usable(scan_folder(args.photos, ScanOptions()), args.photos, least=2)
     photos = [replace(photo, owner=_OWNER) for photo in found]
@@ -90,7 +85,6 @@ def main() -> None:
             work=args.work,
             database=Database.create(Path(scratch) / "portions"),
             joint={p.name: c for p, c in zip(joint.photos, joint.model.centers(), strict=True)},
-            gates=args.gates,
         )
         for rows in [*portions(len(photos), args.cut), []]:
             state.waiting = sorted([*state.waiting, *rows])
@@ -114,8 +108,7 @@ def _take_in(state: State) -> None:
     if state.frame is None or not state.waiting:
         return
     made = _reconstructed(state.photos, state.waiting, state.work)
-    with nullcontext() if state.gates is None else _recording(state, state.gates):
-        report = grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
+    report = grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
     say(f"{report.as_text()}")
     _find_centers(state)
 
@@ -154,18 +147,6 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
     return build_map(
         model, placement, _MADE_UP_FRAME, component.photos, features, _identity(rows), _MAKING.maps
     )
-
-
-def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
-    """The joint reconstruction's places, carried to the first map's frame by the photos that are in both."""
-    carried = laid_on(state.joint, state.centers)
-    if carried is None or state.frame is None:
-        return nullcontext()
-
-    def place(name: str) -> FloatArray | None:
-        return carried.act(state.joint[name]) if name in state.joint else None
-
-    return recorded(gates, state.frame, place)
 
 
 def _find_centers(state: State) -> None:

@@ -93,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measure(database: Database, album: Album, batch: int) -> Step:
     """Grow once: maps and probes of all steps up to this one against the truth."""
-    waiting = grown(database, Path(database.url).parent, album)
+    waiting = grown(database)
     edge = max(_along(album, f) for f in album.of("survey"))
     active = [r for r in registered(database, album) if r.generation > 0 and r.status == "active"]
     return Step(

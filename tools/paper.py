@@ -18,14 +18,15 @@ import numpy as np
 
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
+from ingest.workspace import default_root
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from tools.commands import featuredb
 from tools.figures import kept, say, study_parser, write_figures
+from tools.made_maps import make
 from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import judge_film, smooth_film
-from tools.video_map import frame_of, stills_of, unplaced_film
 from tools.worlds.film_world import FilmTruth
 from tools.worlds.scan_world import make_scan_world
 
@@ -66,7 +67,8 @@ def placed_film(film: Path, scan: Path, truth: FilmTruth, work: Path) -> dict[st
     """The film's map in `work`/db, placed by picks in one frame: its id and seconds; or why not."""
     shutil.rmtree(work, ignore_errors=True)
     database = work / "db"
-    made = unplaced_film(film, database)
+    work.mkdir(parents=True)
+    made = make(database, "video", Path(shutil.copy(film, work)))  # with no telemetry beside it
     featuredb("lidar", "add", str(database), str(scan), "--quiet")
     unplaced = Database.open(database).snapshot().unplaced_maps()
     if not unplaced:
@@ -74,12 +76,18 @@ def placed_film(film: Path, scan: Path, truth: FilmTruth, work: Path) -> dict[st
     biggest = max(unplaced, key=lambda one: one.images)
     seen = seen_in_the_middle(database, biggest.map_id, truth)
     cloud = read_scan(scan, truth.frame, truth.epsg)
-    placed = place_by_picks(database, biggest.map_id, stills_of(database), seen, cloud, work, _SEED)
+    (stills,) = (default_root(Database.open(database).url) / "films").iterdir()
+    placed = place_by_picks(database, biggest.map_id, stills, seen, cloud, work, _SEED)
     return {
         "refused": "" if placed else "the map was not placed by the picks of one frame",
         "map_id": biggest.map_id,
         "made_s": made["seconds"],
     }
+
+
+def frame_of(image: str) -> int:
+    """The number of the film's frame that a keyframe is, by its name."""
+    return int("".join(c for c in Path(image).stem if c.isdigit()))
 
 
 def from_keyframes(tracked: TrackedVideo, feature_map: FeatureMap) -> float:

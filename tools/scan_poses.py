@@ -4,17 +4,13 @@
 
 Registers every photo of the folder (tools/scan_to_photo.py, which shares no code with the map, with
 anchoring or with localisation), estimates one lens over the photos of each camera, which EXIF tells apart
-as in a map (`ExifInfo.camera_key`), and measures its own accuracy:
-
-- halves of the correspondences: each photo's pose from two disjoint sets of picture blocks;
-- halves of the photos: poses from two disjoint sets of photos, each with a lens of its own. This is the
-  larger one, for it shows how far focal length, principal point and height trade.
+as in a map (`ExifInfo.camera_key`).
 """
 
 import argparse
 import json
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +34,6 @@ from tools.scan_to_photo import (
     read_scan,
 )
 
-_BLOCK_PX = 200  # correspondences of one block, in the full photo, stay in one half
 _ROUNDS = ((0, 3), (0, 1, 2, 3, 4), tuple(range(7)))  # lens parameters that are free, coarse to fine
 
 
@@ -100,7 +95,7 @@ def write_poses(scan: Path, photos: Path, path: Path) -> None:
 
 
 def register(scan_path: Path, folder: Path) -> dict[str, Any]:
-    """Poses of all photos of a folder that register, with the cameras and the accuracy, JSON-able."""
+    """Poses of all photos of a folder that register, with the cameras, JSON-able."""
     scan = read_scan(scan_path)
     raster = nadir_raster(scan)
     features = raster_features(raster)
@@ -123,7 +118,7 @@ def register(scan_path: Path, folder: Path) -> dict[str, Any]:
             photos = [correspond(photo, lens, scan) for photo in photos]
             photos, lens = adjust(photos, lens, free)
             _say(f"{sum(len(p.world) for p in photos)} correspondences, focal length {lens.f:.1f} px")
-        cameras[key] = _camera(photos, lens)
+        cameras[key] = _camera(lens)
         poses |= {photo.name: _pose(photo, key) for photo in photos}
     return {"crs": scan.crs, "origin": list(scan.origin), "cameras": cameras, "poses": poses}
 
@@ -134,15 +129,13 @@ def _start(gray: NDArray[np.uint8]) -> Lens:
     return Lens(width, height, 0.6 * width, width / 2 - 0.5, height / 2 - 0.5)
 
 
-def _camera(photos: list[PosedPicture], lens: Lens) -> dict[str, Any]:
+def _camera(lens: Lens) -> dict[str, Any]:
     return {
         "model": "OPENCV",
         "width": lens.width,
         "height": lens.height,
         # COLMAP's pixels: centre of the top-left pixel at (0.5, 0.5).
         "params": [lens.f, lens.f, lens.cx + 0.5, lens.cy + 0.5, lens.k1, lens.k2, lens.p1, lens.p2],
-        "halves_of_correspondences": halves_of_correspondences(photos, lens),
-        "halves_of_photos": halves_of_photos(photos, lens),
     }
 
 
@@ -151,42 +144,6 @@ def _pose(photo: PosedPicture, key: str) -> dict[str, Any]:
         "camera": key,
         "cam_from_local_rotation": cv2.Rodrigues(photo.pose[:3])[0].tolist(),
         "cam_from_local_translation": photo.pose[3:].tolist(),
-    }
-
-
-def halves_of_correspondences(photos: list[PosedPicture], lens: Lens) -> dict[str, float]:
-    """How far poses from two disjoint halves of each photo's blocks differ, with the same lens."""
-    halves = []
-    for parity in (0, 1):
-        chosen = []
-        for photo in photos:
-            rows = ((photo.pixels // _BLOCK_PX).astype(int).sum(axis=1) % 2) == parity
-            chosen.append(replace(photo, world=photo.world[rows], pixels=photo.pixels[rows]))
-        halves.append(adjust(chosen, lens, ())[0])
-    return _difference(halves[0], halves[1])
-
-
-def halves_of_photos(photos: list[PosedPicture], lens: Lens) -> dict[str, float]:
-    """How far poses with the camera of the even photos are from those with the camera of the odd ones."""
-    full = tuple(range(7))
-    lenses = [adjust(photos[parity::2], lens, full)[1] for parity in (0, 1)]
-    fixed = [adjust(photos, half, ())[0] for half in lenses]
-    return _difference(fixed[0], fixed[1]) | {"focal_px": abs(lenses[0].f - lenses[1].f)}
-
-
-def _difference(first: list[PosedPicture], second: list[PosedPicture]) -> dict[str, float]:
-    shifts, turns = [], []
-    for a, b in zip(first, second, strict=True):
-        ra, rb = cv2.Rodrigues(a.pose[:3])[0], cv2.Rodrigues(b.pose[:3])[0]
-        shifts.append(ra.T @ a.pose[3:] - rb.T @ b.pose[3:])
-        turns.append(np.degrees(np.linalg.norm(cv2.Rodrigues(ra @ rb.T)[0])))
-    east, north, up = np.median(np.abs(shifts), axis=0).tolist()
-    return {
-        "east_m": east,
-        "north_m": north,
-        "up_m": up,
-        "position_m": float(np.median(np.linalg.norm(shifts, axis=1))),
-        "rotation_deg": float(np.median(turns)),
     }
 
 

@@ -9,8 +9,7 @@
 3. Each is tracked as `featuredb track` does, with the lens of its camera. --on says by what: the map, or the
    scan alone (from a pose of the first frame that is off by 10 m and 5 degrees).
 
-Writes into track.json for each film what `judge_film` says; with --draw how far a layer that `featuredb draw`
-lays over the film by that track is from where it belongs (tools/drawn_layer.py), too.
+Writes into track.json for each film what `judge_film` says.
 """
 
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_log
 from featuredb.lidar.load import load_cloud
-from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.simworld.world import WorldOptions
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from ingest.register.frame_registration import FramePrior
@@ -35,7 +34,6 @@ from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored
-from tools.drawn_layer import drawn_marks
 from tools.figures import inside, off_pose, say, squared, study_parser, write_figures
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, film_truth, write_film
 from tools.worlds.flight_path import FlightStyle, PathOptions
@@ -53,7 +51,6 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=_FRAMES)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
-    parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     inputs = args.inputs or args.out
@@ -69,9 +66,6 @@ def main() -> None:
         tracked = track_video(film, finder, camera=truth.camera)
         results[name] = judge_film(tracked, truth)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
-        if args.draw:
-            scene, track = town_of(options.world), tracked.trajectory
-            results[f"{name}_layer"] = drawn_marks(args.out, film, truth, scene, track, database)
     write_figures(args.out / "track.json", results)
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,7 +36,6 @@ from tests.support.scenes import (
     ring,
     scene_map,
 )
-from tools.growth_gates import read_judgements, recorded
 
 _PAIRS = [(0, 1), (0, 2), (1, 2)]
 
@@ -57,20 +55,6 @@ def localised(new: NewPhotos, area: IndexedArea) -> dict[int, LocalisedPhoto]:
     found, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area])
     assert not reasons
     return found
-
-
-def test_what_the_gates_say_is_recorded_beside_the_truth(
-    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea, tmp_path: Path
-) -> None:
-    """One photo has no place here: it is the wrong one."""
-    true = {photo.name: pose.center for photo, pose in zip(new.photos, new.poses, strict=True)}
-    del true[new.photos[0].name]
-    with recorded(tmp_path / "gates.jsonl", FRAME, true.get):
-        grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
-    placed, refined = read_judgements([tmp_path / "gates.jsonl"])
-    assert (placed.step, refined.step) == ("place", "refine")
-    assert (placed.right, placed.wrong, placed.refused_by) == (len(new.photos) - 1, 1, [])
-    assert "visibility" in placed.gates
 
 
 def test_a_reconstruction_is_placed_and_becomes_a_map(

@@ -112,17 +112,6 @@ SPEED: tuple[Row, ...] = (
         minutes=15,
     ),
     _row(
-        name="many-servers",
-        claim="servers of one database behind a router, each of whose workers takes 100 ms for a photo: "
-        "queries a second of two and four, in those of one; and queries lost when one of two is killed",
-        commands=f"tools.many_servers {OUT}",
-        figures=same("one_per_s killed_answered"),
-        text="{two_times:.2f} and {four_times:.2f} times the queries of one; {killed_lost:.0f} of "
-        "{killed_answered:.0f} lost",
-        limits="1.8 <= two_times, 3.4 <= four_times, killed_lost <= 0",
-        minutes=3,
-    ),
-    _row(
         name="bridge-latency",
         claim="`live --json | bridge` on a film that shows a photo of `brighton`: from a reply as any "
         "subscriber gets it to the bridge's message, decoded (pymavlink from UDP, rosbags from Zenoh), pose "

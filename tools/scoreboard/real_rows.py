@@ -1,7 +1,6 @@
 """Rows of real photos, films and scans."""
 
 from functools import partial
-from itertools import product
 
 from tools.scoreboard.row import Form, Row
 from tools.scoreboard.words import ANSWERS, BRIGHTON, BRIGHTON_LENS, ERRORS, HELD_OUT, OUT, POSES, SCAN, same
@@ -192,17 +191,6 @@ REAL: tuple[Row, ...] = (
         minutes=1,
     ),
     _row(
-        name="shifted-positions",
-        claim="`brighton`, the positions of every second photo shifted by 50 km together: they become a map "
-        "there, in quarantine; `ingest` beside the map of the others, `anchor` on the scan and `grow` say by "
-        "how far",
-        commands=f"tools.shifted_positions --photos {BRIGHTON} --scan {SCAN} --work {{work}}/maps {OUT}",
-        text="{photos} photos placed; said: {ingest_km:.1f} km from the other map by the ingest, "
-        "{anchor_km:.1f} km from the scan, {grow_km:.1f} km where the photos are contributed",
-        limits="1 <= quarantined, 49 <= ingest_km <= 51, 49 <= anchor_km <= 51, 49 <= grow_km <= 51",
-        minutes=4,
-    ),
-    _row(
         name="karma-in-map",
         claim="`karma.mp4`, 12 s by a drone, becomes a map without a place (paper: 98 of 115 films), and is "
         "followed in its frame; at keyframes the track agrees with the map's own cameras, relative to the "
@@ -322,20 +310,4 @@ REAL: tuple[Row, ...] = (
     _portions("lewis/images", "consecutive", 20),
     _portions("copr/images", "consecutive", 15),
     _portions("sacre_coeur/mapping", "interleaved", 4),
-    _row(
-        name="growth-gates",
-        claim="what gates of growth let pass is right, of `brighton` and `sacre_coeur` in three portions",
-        commands="".join(
-            f"tools.growth_portions --photos {{data}}/{photos} --cut {cut} --work {{work}}/cache "
-            f"--gates {{work}}/{k}.jsonl\n"
-            for k, (photos, cut) in enumerate(
-                product(("brighton/images", "sacre_coeur/mapping"), ("interleaved", "consecutive"))
-            )
-        )
-        + f"tools.growth_gates {{work}}/0.jsonl {{work}}/1.jsonl {{work}}/2.jsonl {{work}}/3.jsonl {OUT}",
-        text="{judged} placements judged; {refine_right} right and {refine_wrong} wrong photos pass; gates "
-        "that alone refuse a placement cost {alone_right} right photos and keep out {alone_wrong} wrong ones",
-        limits="refine_wrong <= 0",
-        minutes=8,
-    ),
 )

@@ -107,16 +107,6 @@ SIMULATED: tuple[Row, ...] = (
         minutes=15,
     ),
     _row(
-        name="rtk-placed",
-        claim="18 photos with positions good to 2 cm, said by XMP of DJI, of Autel and of Pix4D (senseFly, "
-        "Parrot), by EXIF, by a table and by geo.txt; then heights 20 m off, against control points",
-        commands=f"tools.rtk_placed --work {{work}}/rtk --inputs {{cache}} {OUT}",
-        text="{active} of 6 maps answer, worst median {worst_m:.3f} m, place known to {worst_sigma_m:.3f} m; "
-        "heights said to be {told_m:.2f} m off, {told_wrongly} times wrongly",
-        limits="6 <= active, worst_m <= 0.03, worst_sigma_m <= 0.04, 19 <= told_m <= 21, told_wrongly <= 0",
-        minutes=6,
-    ),
-    _row(
         name="rolling-shutter",
         claim="photos of four simulated flights, smooth and jerky, with rows read out over 30 ms, placed by "
         "a drone's receiver and by RTK: what answers is inside 99.9 %, and the rolling shutter is named",
@@ -142,43 +132,23 @@ SIMULATED: tuple[Row, ...] = (
     _row(
         name="track-short",
         form="quick",
-        claim="films of 150 frames over the town, smooth and with a cut to another town, tracked on its map; "
-        "the marks of a GeoJSON layer that `draw` lays over them, against where they belong",
+        claim="films of 150 frames over the town, smooth and with a cut to another town, tracked on its map",
         commands="tools.track_evaluation --out {work} --inputs {cache} --frames 150 --films "
-        "smooth cut --on map --draw",
+        "smooth cut --on map",
         json="{work}/track.json",
         figures={
             f"{film}_{name}": f"{film}.{name}"
             for film in ("smooth", "cut")
             for name in ("frames", "lost", "invented", "mean_m", "largest_m", "rate_hz", "found_s")
-        }
-        | {
-            f"{film}_layer_{name}": f"{film}_layer.{name}"
-            for film in ("smooth", "cut")
-            for name in ("frames", "marks", "stray", "median_px", "largest_px")
         },
         text="smooth: {smooth_lost} lost, mean {smooth_mean_m:.3f} m, {smooth_rate_hz:.0f} frames/s; "
-        "cut: {cut_lost} lost, mean {cut_mean_m:.3f} m, {cut_invented} invented; {smooth_layer_marks} marks "
-        "in {smooth_layer_frames} smooth frames: median {smooth_layer_median_px:.1f} px, largest "
-        "{smooth_layer_largest_px:.1f} px; {cut_layer_marks} in {cut_layer_frames} with the cut: "
-        "{cut_layer_median_px:.1f} px, {cut_layer_largest_px:.1f} px",
+        "cut: {cut_lost} lost, mean {cut_mean_m:.3f} m, {cut_invented} invented",
         limits="smooth_lost <= 0, smooth_mean_m <= 0.1, cut_mean_m <= 0.1, cut_largest_m <= 1, "
-        "cut_invented <= 0, cut_found_s <= 1, smooth_layer_largest_px <= 2, cut_layer_largest_px <= 2, "
-        "smooth_layer_stray <= 0, cut_layer_stray <= 0, 150 <= smooth_layer_frames",
+        "cut_invented <= 0, cut_found_s <= 1",
         minutes=4,
     ),
     _track("jerky", "map", 0.25),
     _track("smooth", "scan", 0.20),
-    _row(
-        name="film-map",
-        claim="a film of 1,200 frames with telemetry becomes a map that is placed on the scan",
-        commands="tools.video_map --out {work}",
-        json="{work}/video_map.json",
-        text="{keyframes} keyframes, median {keyframes_m:.3f} m, largest {keyframes_largest_m:.3f} m; "
-        "{made_s:.0f} s, and {anchored_s:.0f} s for placing",
-        limits="1 <= placed, keyframes_largest_m <= 0.1",
-        minutes=20,
-    ),
     _row(
         name="frames-on-scan",
         claim="ten towns, scans with intensities alone: photos from 70 m, each from 15 m and 10 degrees off, "
@@ -204,17 +174,6 @@ SIMULATED: tuple[Row, ...] = (
         limits="0.6 <= right_share, outside <= 0, elsewhere_placed <= 0",
         resumes=True,
         minutes=120,
-    ),
-    _row(
-        name="film-near",
-        claim="a film of 1,200 frames without telemetry, looked for within 250 m of a point 100 m off on a "
-        "scan with intensities alone; ten points, and ten on the scan of another town",
-        commands=f"tools.film_near --work {{work}}/near --inputs {{cache}} {OUT}",
-        text="{here_placed} of {draws} placed, {here_wrong} wrong, cameras median {here_m:.3f} m; on the "
-        "other scan: {elsewhere_placed}",
-        limits="7 <= here_placed, here_wrong <= 0, elsewhere_placed <= 0",
-        resumes=True,
-        minutes=40,
     ),
     _row(
         name="paper-film",
