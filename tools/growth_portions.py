@@ -59,7 +59,6 @@ class State:
         centers: of registered photos in the first map's frame, metres, by name.
         frame: of the first map.
         growth: without a drift budget where the first map's metre is made up.
-        joint: camera centres of the joint reconstruction, in its own frame, by name.
     """
 
     photos: list[Photo]
@@ -69,7 +68,6 @@ class State:
     centers: dict[str, FloatArray] = field(default_factory=dict)
     frame: LocalFrame | None = None
     growth: GrowthOptions = field(default_factory=GrowthOptions)
-    joint: dict[str, FloatArray] = field(default_factory=dict)
 
 
 def main() -> None:
@@ -84,7 +82,6 @@ def main() -> None:
             photos=photos,
             work=args.work,
             database=Database.create(Path(scratch) / "portions"),
-            joint={p.name: c for p, c in zip(joint.photos, joint.model.centers(), strict=True)},
         )
         for rows in [*portions(len(photos), args.cut), []]:
             state.waiting = sorted([*state.waiting, *rows])
@@ -181,11 +178,11 @@ def _identity(rows: Sequence[int]) -> MapIdentity:
 
 def _judged(state: State, joint: Component) -> dict[str, float]:
     """Where growth has the photos against the joint reconstruction."""
-    metric = joint.placement.local_from_sfm is not None and joint.placement.reason is None
-    sim = joint.placement.local_from_sfm if metric else None
-    scale = _EXTENT_M / float(np.linalg.norm(np.ptp(joint.model.centers(), axis=0)))
-    sim = sim or Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3))
-    reference = {name: sim.act(center) for name, center in state.joint.items()}
+    centers, sim = joint.model.centers(), joint.placement.local_from_sfm
+    if sim is None or joint.placement.reason is not None:
+        scale = _EXTENT_M / float(np.linalg.norm(np.ptp(centers, axis=0)))
+        sim = Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3))
+    reference = {photo.name: at for photo, at in zip(joint.photos, sim.act(centers), strict=True)}
     both = sorted(reference.keys() & state.centers.keys())
     aligned = laid_on(state.centers, reference)
     apart = np.full(len(both), np.nan)

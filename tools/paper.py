@@ -1,12 +1,10 @@
 """The paper's film beside ours (Bodensteiner et al., sections 3.1.2 and 3.2).
 
-    python -m tools.paper --out DIR [--inputs FOLDER]
+    python -m tools.paper --work DIR [--inputs FOLDER]
 
 A simulated film without any telemetry becomes a map; six picks in one frame place it on an intensity-only
 scan; all frames are tracked. The paper measures distances from a bundle adjustment; here from the truth,
 which no adjustment's own error softens, and beside it from the map's adjusted keyframes.
-
-Writes paper.json.
 """
 
 import json
@@ -34,8 +32,8 @@ _SEED = 1
 
 
 def main() -> None:
-    args = study_parser(__doc__, "--out", "--inputs").parse_args()
-    write_figures(args.out / "paper.json", film_figures(args.out / "film", args.inputs or args.out))
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
+    write_figures(args.json, film_figures(args.work / "film", args.inputs or args.work))
 
 
 def film_figures(work: Path, inputs: Path) -> dict[str, Any]:

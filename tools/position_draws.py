@@ -21,7 +21,6 @@ from threadpoolctl import threadpool_limits
 
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
@@ -31,10 +30,10 @@ from ingest.register.gps import GpsPlacement, place_by_gps
 from tools.figures import inside_figures, say, squared, study_parser, write_figures
 from tools.made_maps import all_maps, make, once
 
-SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
+_SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
 _SHUFFLES = 4  # of each flight
-PARTS = ("position", "orientation")
+_PARTS = ("position", "orientation")
 _CHANCE, _SEED = 1000, 1  # draws of random positions
 _COMMON_ROLL_DEG = 1.5  # of simulated flights, as placements assume
 
@@ -43,28 +42,27 @@ _COMMON_ROLL_DEG = 1.5  # of simulated flights, as placements assume
 class Flight:
     """Where cameras were (n, 3), metres, when (n,), seconds, in this order, and how they were turned."""
 
-    name: str
     xyz: FloatArray
     times_s: FloatArray
     cam_from_local: tuple[Rigid3, ...]
 
-    def placed(self, positions: FloatArray, angles: Sequence[CameraAngles | None] = ()) -> GpsPlacement:
-        """Its reconstruction by positions of a plain receiver, and by the cameras' angles."""
-        sigmas = np.tile(SIGMAS, (len(positions), 1))
+    def placed(self, positions: FloatArray) -> GpsPlacement:
+        """Its reconstruction by positions of a plain receiver."""
+        sigmas = np.tile(_SIGMAS, (len(positions), 1))
         centers = _TRUE.inverse().act(self.xyz[: len(positions)])
         held = [
             Rigid3(rotation=pose.rotation @ _TRUE.rotation, translation=pose.translation)
             for pose in self.cam_from_local[: len(positions)]
         ]
         times_s = self.times_s[: len(positions)]
-        return place_by_gps(centers, positions, sigmas, times_s, held_of(held, angles))
+        return place_by_gps(centers, positions, sigmas, times_s, held_of(held, ()))
 
 
 def _white(sigma_m: float) -> Callable[[Flight, np.random.Generator], FloatArray]:
     """Noise, and as much bias as it leaves of what a plain receiver says."""
 
     def error(flight: Flight, rng: np.random.Generator) -> FloatArray:
-        rest = np.sqrt(np.maximum(SIGMAS**2 - sigma_m**2, 0.0))
+        rest = np.sqrt(np.maximum(_SIGMAS**2 - sigma_m**2, 0.0))
         return rng.normal(0.0, sigma_m, flight.xyz.shape) + rng.normal(0.0, 1.0, 3) * rest
 
     return error
@@ -86,7 +84,7 @@ def _outliers(flight: Flight, rng: np.random.Generator) -> FloatArray:
 
 def _one_height(flight: Flight, rng: np.random.Generator) -> FloatArray:
     error = _white(2.0)(flight, rng)
-    error[:, 2] = float(np.median(flight.xyz[:, 2])) + rng.normal(0.0, SIGMAS[2]) - flight.xyz[:, 2]
+    error[:, 2] = float(np.median(flight.xyz[:, 2])) + rng.normal(0.0, _SIGMAS[2]) - flight.xyz[:, 2]
     return error
 
 
@@ -103,7 +101,7 @@ _KINDS: dict[str, Callable[[Flight, np.random.Generator], FloatArray]] = {
     "noise of 5 m": _white(5.0),
     "noise of 15 m": _white(15.0),
     "drift of 20 and 60 m": _drift,
-    "a bias": lambda flight, rng: rng.normal(0.0, 1.0, 3) * SIGMAS + rng.normal(0.0, 0.3, flight.xyz.shape),
+    "a bias": lambda flight, rng: rng.normal(0.0, 1.0, 3) * _SIGMAS + rng.normal(0.0, 0.3, flight.xyz.shape),
     "a fifth far out": _outliers,
     "one height for all": _one_height,
     "a lag of 2 s": _lag,
@@ -154,7 +152,7 @@ def bounds(real: Sequence[Flight], draws: int) -> dict[str, float]:
 def shares(name: str, scores: Sequence[dict[str, float]]) -> dict[str, float]:
     """Of what `squares` says: shares inside the bounds of position and orientation; `name` before each."""
     figures: dict[str, float] = {}
-    for part in PARTS:
+    for part in _PARTS:
         figures |= inside_figures(f"{name}{part}", [score[part] for score in scores])
     return figures
 
@@ -179,9 +177,7 @@ def unrelated(flights: Sequence[Flight], chance: int) -> dict[str, float]:
         flight, count = flights[draw % len(flights)], int(rng.integers(3, 9))
         rows = np.sort(rng.choice(len(flight.xyz), count, replace=False))
         held = tuple(flight.cam_from_local[row] for row in rows)
-        part = Flight(
-            name=flight.name, xyz=flight.xyz[rows], times_s=flight.times_s[rows], cam_from_local=held
-        )
+        part = Flight(xyz=flight.xyz[rows], times_s=flight.times_s[rows], cam_from_local=held)
         drawn = np.column_stack([rng.uniform(-500.0, 500.0, (count, 2)), rng.uniform(0.0, 100.0, count)])
         found["random"].append(part.placed(drawn))
     for k, flight in enumerate(flights):
@@ -211,7 +207,6 @@ def real_flight(folder: Path, work: Path) -> Flight:
     ]
     xyz: FloatArray = np.array([image.cam_from_local.center for image in images])
     return Flight(
-        name=folder.parent.name,
         xyz=xyz - xyz.mean(axis=0),
         times_s=np.array(seconds),
         cam_from_local=tuple(image.cam_from_local for image in images),
@@ -223,28 +218,24 @@ def simulated_flights(draw: int) -> list[Flight]:
     rng = np.random.default_rng((_SEED, 7, draw))
     flights = []
     rolls = np.radians(rng.normal(0.0, _COMMON_ROLL_DEG, 5))
-    for name, lines, per, size in (("strips", 4, 8, 160.0), ("two strips", 2, 9, 120.0)):
+    for lines, per, size in ((4, 8, 160.0), (2, 9, 120.0)):
         x = np.linspace(-0.5, 0.5, per) * size
         plan = [(v, 0.25 * size * k) for k in range(lines) for v in (x if k % 2 == 0 else x[::-1])]
-        flights.append((name, np.column_stack([plan, np.full(len(plan), 60.0)]), 4.0))
+        flights.append((np.column_stack([plan, np.full(len(plan), 60.0)]), 4.0))
     turn = np.linspace(0.0, 5.0 * np.pi, 40)
-    flights.append(
-        ("spiral", np.column_stack([4 * turn * np.cos(turn), 4 * turn * np.sin(turn), 30 + 2 * turn]), 3.0)
-    )
+    flights.append((np.column_stack([4 * turn * np.cos(turn), 4 * turn * np.sin(turn), 30 + 2 * turn]), 3.0))
     turn = np.linspace(0.0, 2.0 * np.pi, 24)
-    flights.append(
-        ("orbit", np.column_stack([40 * np.cos(turn), 30 * np.sin(turn), 25 + 5 * np.sin(3 * turn)]), 3.0)
-    )
+    orbit = np.column_stack([40 * np.cos(turn), 30 * np.sin(turn), 25 + 5 * np.sin(3 * turn)])
+    flights.append((orbit, 3.0))
     along = np.linspace(0.0, 300.0, 50)
-    flights.append(("street", np.column_stack([along, 40 * np.sin(along / 40), 2 + 0.02 * along]), 4.0))
+    flights.append((np.column_stack([along, 40 * np.sin(along / 40), 2 + 0.02 * along]), 4.0))
     return [
         Flight(
-            name=name,
             xyz=xyz + rng.normal(0.0, 0.5, xyz.shape),
             times_s=np.asarray(step * np.arange(len(xyz), dtype=np.float64)),
             cam_from_local=tuple(_held(xyz, k, rolls[row], rng) for k in range(len(xyz))),
         )
-        for row, (name, xyz, step) in enumerate(flights)
+        for row, (xyz, step) in enumerate(flights)
     ]
 
 

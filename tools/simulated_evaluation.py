@@ -1,6 +1,6 @@
 """How good are the answers on the simulated world, and do their reported uncertainties mean something?
 
-    python -m tools.simulated_evaluation --out DIR [--seed 1]
+    python -m tools.simulated_evaluation --work DIR [--seed 1]
 
 Makes a world whose drone photos carry exact positions, ingests them (both are kept in DIR and reused), asks
 for every held-out photo and every negative, and compares with the truth:
@@ -50,14 +50,12 @@ class Asked(NamedTuple):
 
 
 def main() -> None:
-    parser = study_parser(__doc__, "--seed")
-    parser.add_argument("--out", type=Path, default=Path("simulated-evaluation"))
-    args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    world = make_world(args.out / "world", size="full", seed=args.seed, exact_gps=True)
-    database = Database.create(args.out / "db")
+    args = study_parser(__doc__, "--work", "--seed").parse_args()
+    args.work.mkdir(parents=True, exist_ok=True)
+    world = make_world(args.work / "world", size="full", seed=args.seed, exact_gps=True)
+    database = Database.create(args.work / "db")
     if not database.snapshot().maps():
-        ingest_world(world, database, args.out / "report", exact_gps=True)
+        ingest_world(world, database, args.work / "report", exact_gps=True)
     localiser = Localiser.open(database)
     photos = {"drone": world.images("queries"), "street": world.images("street")}
     photos |= {kind: world.negatives(kind) for kind in NEGATIVE_KINDS}

@@ -1,16 +1,12 @@
 """Writes a simulated world: folders of photos, and the truth beside them."""
 
 import json
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from featuredb.errors import InvalidValueError
@@ -24,6 +20,7 @@ from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions, pedestrians, survey, survey_half_extent, visitors
 from featuredb.simworld.negatives import NEGATIVE_KINDS, NegativeKind
+from featuredb.simworld.pool import in_order
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
 
@@ -230,7 +227,8 @@ def write_world(folder: Path, options: WorldOptions, progress: Progress | None =
         (folder / _task_name(options, task)).parent.mkdir(parents=True, exist_ok=True)
     # truth.json comes last: a folder with it is complete.
     (folder / "truth.json").unlink(missing_ok=True)
-    for done, (name, data) in enumerate(_run(options, tasks), start=1):
+    made = in_order(partial(_make, options, tasks), len(tasks), options.workers)
+    for done, (name, data) in enumerate(made, start=1):
         (folder / name).write_bytes(data)
         if progress is not None:
             progress(done, len(tasks))
@@ -294,29 +292,9 @@ def _task_name(options: WorldOptions, task: _Task) -> str:
     return _shots(options, group)[index].name
 
 
-def _run(options: WorldOptions, tasks: list[_Task]) -> Iterator[tuple[str, bytes]]:
-    """Names and bytes of all files, in any order, from a pool of processes (or here, for one worker)."""
-    count = min(options.workers or os.cpu_count() or 1, len(tasks))
-    if count <= 1:
-        for task in tasks:
-            yield _make(options, task)
-        return
-    # Spawned, not forked: the caller may have threads (Zenoh, a progress bar) that a fork would cut off.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread) as pool:
-        futures = [pool.submit(_make, options, task) for task in tasks]
-        for future in as_completed(futures):
-            yield future.result()
-
-
-def _one_thread() -> None:
-    """The pool is the parallelism; OpenCV's own threads would fight over the same cores."""
-    cv2.setNumThreads(1)
-
-
-def _make(options: WorldOptions, task: _Task) -> tuple[str, bytes]:
+def _make(options: WorldOptions, tasks: list[_Task], number: int) -> tuple[str, bytes]:
     """Name and bytes of one file."""
-    name, (group, index) = _task_name(options, task), task
+    name, (group, index) = _task_name(options, tasks[number]), tasks[number]
     if group in NEGATIVE_KINDS:
         return name, _negative(options, group, index)
     return name, photo_bytes(town_of(options), _shots(options, group)[index], options.sensor)

@@ -48,14 +48,6 @@ def _laser(name: str, photos: int, form: Form, limits: str = "") -> Row:
     )
 
 
-_STRIPS = (
-    "{KIND_strips:.0f} KIND: with angles {KIND_answer:.0%} answer, turn {KIND_turn_deg:.1f} degrees, inside "
-    "68 and 95 % bounds position {KIND_position_68:.0%} and {KIND_position_95:.1%}, orientation "
-    "{KIND_orientation_68:.0%} and {KIND_orientation_95:.1%}; without {KIND_without_answer:.0%} answer, turn "
-    "{KIND_without_turn_deg:.1f} degrees, inside 95 % {KIND_without_position_95:.1%} and "
-    "{KIND_without_orientation_95:.1%}"
-)
-
 REAL: tuple[Row, ...] = (
     _row(
         name="mixed-folder",
@@ -259,21 +251,6 @@ REAL: tuple[Row, ...] = (
         "0.73, 0.92 <= orientation_95, 0.95 <= answering_position_95, 0.95 <= answering_orientation_95, "
         "random_answer <= 1, shuffled_answer <= 0, other_answer <= 0",
         minutes=30,
-    ),
-    _row(
-        name="strip-draws",
-        claim="single strips of photos, nine of `brighton` and simulated ones, placed by positions with the "
-        "cameras' angles and without",
-        commands=f"tools.strip_draws --photos {BRIGHTON} --scan {SCAN} --poses {POSES} --draws 300 {OUT}",
-        text="; ".join(_STRIPS.replace("KIND", kind) for kind in ("real", "simulated")),
-        limits="1 <= real_answer, real_without_answer <= 0, 0.85 <= simulated_answer, "
-        "simulated_without_answer <= 0.05, "
-        + ", ".join(
-            f"0.92 <= {kind}_{part}_95"
-            for kind in ("real", "simulated")
-            for part in ("position", "orientation", "without_position", "without_orientation")
-        ),
-        minutes=5,
     ),
     _row(
         name="copr-control-points",
