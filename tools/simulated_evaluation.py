@@ -84,7 +84,7 @@ def flat_figures(asked: dict[str, list[Asked]]) -> dict[str, float]:
     negatives = [a for kind in NEGATIVE_KINDS for a in asked[kind]]
     everything = [a for those in asked.values() for a in those]
     return {
-        "asked": drone.queries,
+        "asked": len(asked["drone"]),
         "answered": sum(a.pose is not None for a in asked["drone"]),
         "within": drone.within,
         "median_m": drone.position_m[0],

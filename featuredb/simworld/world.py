@@ -212,7 +212,7 @@ class World:
         return sorted((self.folder / "negatives").glob(f"{kind or '*'}/*.jpg"))
 
 
-_Task = tuple[str, int]  # one file: of a group of shots or a kind of negatives, and its number
+_GROUPS = ("drone", "queries", "street")
 
 
 def write_world(folder: Path, options: WorldOptions, progress: Progress | None = None) -> World:
@@ -222,20 +222,18 @@ def write_world(folder: Path, options: WorldOptions, progress: Progress | None =
         progress: called with (files done, files in all).
     """
     folder = Path(folder)
-    tasks = _tasks(options)
-    for task in tasks:
-        (folder / _task_name(options, task)).parent.mkdir(parents=True, exist_ok=True)
+    files = _files(options)
+    for parent in {(folder / name).parent for name, _ in files}:
+        parent.mkdir(parents=True, exist_ok=True)
     # truth.json comes last: a folder with it is complete.
-    (folder / "truth.json").unlink(missing_ok=True)
-    made = in_order(partial(_make, options, tasks), len(tasks), options.workers)
+    (folder / TRUTH_FILE).unlink(missing_ok=True)
+    made = in_order(partial(_made, options), len(files), options.workers)
     for done, (name, data) in enumerate(made, start=1):
         (folder / name).write_bytes(data)
         if progress is not None:
-            progress(done, len(tasks))
+            progress(done, len(files))
     scene = town_of(options)
-    images = [
-        true_image(scene, shot) for group in ("drone", "queries", "street") for shot in _shots(options, group)
-    ]
+    images = [true_image(scene, shot) for group in _GROUPS for shot in _shots(options, group)]
     truth = Truth(seed=options.seed, epsg=scene.epsg, frame=scene.frame, images={i.name: i for i in images})
     write_truth(folder, truth)
     return open_world(folder)
@@ -277,27 +275,28 @@ def _shots(options: WorldOptions, group: str, other: bool = False, seed_shift: i
     return tuple(pedestrians(scene, options.street, seed, width=options.street_width, extent_m=extent))
 
 
-def _tasks(options: WorldOptions) -> list[_Task]:
-    counts = {"drone": options.flight.lines * options.flight.per_line + options.flight.oblique}
-    counts |= {"queries": options.queries, "street": options.street}
+@lru_cache(maxsize=2)
+def _files(options: WorldOptions) -> tuple[tuple[str, Callable[[], bytes]], ...]:
+    """Names of all files, and what makes their bytes."""
+    files = [
+        (shot.name, partial(_photo, options, shot)) for group in _GROUPS for shot in _shots(options, group)
+    ]
     # Kind by kind, so that a process paints the other town once at most.
-    counts |= dict.fromkeys(NEGATIVE_KINDS, options.negatives_per_kind)
-    return [(group, index) for group, count in counts.items() for index in range(count)]
+    for kind in NEGATIVE_KINDS:
+        for index in range(options.negatives_per_kind):
+            name = f"negatives/{kind}/{kind}_{index + 1:04d}.jpg"
+            files.append((name, partial(_negative, options, kind, index)))
+    return tuple(files)
 
 
-def _task_name(options: WorldOptions, task: _Task) -> str:
-    group, index = task
-    if group in NEGATIVE_KINDS:
-        return f"negatives/{group}/{group}_{index + 1:04d}.jpg"
-    return _shots(options, group)[index].name
-
-
-def _make(options: WorldOptions, tasks: list[_Task], number: int) -> tuple[str, bytes]:
+def _made(options: WorldOptions, number: int) -> tuple[str, bytes]:
     """Name and bytes of one file."""
-    name, (group, index) = _task_name(options, tasks[number]), tasks[number]
-    if group in NEGATIVE_KINDS:
-        return name, _negative(options, group, index)
-    return name, photo_bytes(town_of(options), _shots(options, group)[index], options.sensor)
+    name, make = _files(options)[number]
+    return name, make()
+
+
+def _photo(options: WorldOptions, shot: Shot) -> bytes:
+    return photo_bytes(town_of(options), shot, options.sensor)
 
 
 def _negative(options: WorldOptions, kind: str, index: int) -> bytes:
