@@ -94,14 +94,16 @@ class MavlinkSender:
 
     def _gps(self, pose: RobotPose, origin: LocalFrame) -> Any:
         altitude = altitude_m(pose, self._geoid_m)
-        ignored = ["HDOP", "VDOP", "VEL_HORIZ", "VEL_VERT", "SPEED_ACCURACY"]
-        ignored += ["ALT", "VERTICAL_ACCURACY"] if altitude is None else []
+        ignored = "HDOP VDOP VEL_HORIZ VEL_VERT SPEED_ACCURACY"
+        ignored += " ALT VERTICAL_ACCURACY" if altitude is None else ""
         gps_s = pose.time_s - _GPS_EPOCH_S + _LEAP_S
         yaw, _, _ = yaw_pitch_roll(NED_FROM_ENU @ pose.true_enu_from_body @ FLU_FROM_FRD)
         return self._dialect.MAVLink_gps_input_message(
             time_usec=round(pose.time_s * 1e6),
             gps_id=0,
-            ignore_flags=sum(getattr(self._dialect, f"GPS_INPUT_IGNORE_FLAG_{name}") for name in ignored),
+            ignore_flags=sum(
+                getattr(self._dialect, f"GPS_INPUT_IGNORE_FLAG_{name}") for name in ignored.split()
+            ),
             time_week_ms=round(gps_s % _WEEK_S * 1000.0),
             time_week=int(gps_s // _WEEK_S),
             fix_type=3,
