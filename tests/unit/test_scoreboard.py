@@ -17,10 +17,7 @@ from tools.scoreboard.run import Folders, run
 _TOOL = "import json, pathlib, sys; pathlib.Path(sys.argv[1]).write_text(json.dumps({'a': {'m': 0.25}}))"
 _ARGV = "['', '{work}/figures.json', '{data}/set']"
 # Rows that are no longer run; what was measured of them stays.
-_GONE = {
-    *("bridge-latency", "film-map", "film-near", "growth-gates", "many-servers", "rtk-placed"),
-    *("shifted-positions", "strip-draws"),
-}
+_GONE = {"bridge-latency", "film-map"}
 
 
 def row(text: str = "{m:.2f} m in {seconds:.0f} s", limit: float = 0.3, code: str = _TOOL) -> Row:
