@@ -18,7 +18,7 @@ from pathlib import Path
 import zenoh
 
 from tools.bombs import png, progressive_jpeg, zeros
-from tools.serve_process import children
+from tools.serve_process import grandchildren
 
 _AT_ONCE = 8  # questions of the attacker that wait
 _SIDE = 10_944  # 120 million pixels, the most that are taken
@@ -130,7 +130,7 @@ def _kills(target: Target) -> None:
     """A worker is killed every two seconds, whatever it does."""
     while True:
         time.sleep(2.0)
-        os.kill(random.choice(_grandchildren(target.pid)), signal.SIGKILL)
+        os.kill(random.choice(grandchildren(target.pid)), signal.SIGKILL)
 
 
 def _connections(target: Target) -> None:
@@ -206,10 +206,6 @@ def connected(host: str, port: int, source: str = "") -> socket.socket:
 def _say(connection: socket.socket, data: bytes) -> None:
     with suppress(OSError):
         connection.sendall(data)
-
-
-def _grandchildren(pid: int) -> list[int]:
-    return [w for child in children(pid) for w in children(child)]
 
 
 ATTACKS: dict[str, Callable[[Target], None]] = {

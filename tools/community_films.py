@@ -11,8 +11,6 @@
    3 px of error in one keyframe.
 4. `featuredb track` of every film, without being told a lens. A frame's errors are inside their bounds where
    all six together are in the region that the stated covariance gives 95 %.
-
-Prints the maps and tracks.
 """
 
 import shutil
@@ -31,6 +29,7 @@ from tools.commands import featuredb, newest_copy
 from tools.figures import median, say, squared, study_parser, write_figures
 from tools.film_folder import FilmsTruth, place_scene, six_films, write_films
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
+from tools.made_maps import once
 from tools.picked import place_by_picks, read_scan
 from tools.track_evaluation import axis_errors
 
@@ -71,13 +70,18 @@ def main() -> None:
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     made = work / "made"
-    _ingest(made, inputs / "films", work)
+    featuredb("init", str(made))
+    words = ("ingest", "video", str(made), str(inputs / "films"), "--no-telemetry", "--quiet")
+    featuredb(*words, "--report", str(work / "report"), "--work", str(work / "stages"), refusals=(1,))
     found = read_film_maps(made, work / "report", truth)
-    say(found.as_text())
     figures: dict[str, Any] = found.figures(scripts) | {"placed": 0}
     if found.of_place:
         database = newest_copy(made, work / "placed")
-        placed = _placed(database, found, truth, _scan(inputs, args.seed), work, args.seed)
+        town = place_scene(args.seed)
+        scan = once(
+            inputs / "scan.laz", lambda file: write_scan(file, scan_town(town, AirborneScanOptions()))
+        )
+        placed = _placed(database, found, truth, scan, work, args.seed)
         figures["placed"] = int(placed)
         tracks = _tracked(database, inputs / "films", work, truth) if placed else {}
         figures |= track_figures(tracks, truth)
@@ -85,36 +89,20 @@ def main() -> None:
     write_figures(args.json, figures)
 
 
-def _ingest(database: Path, films: Path, work: Path) -> None:
-    featuredb("init", str(database))
-    words = ("ingest", "video", str(database), str(films), "--no-telemetry", "--quiet")
-    featuredb(*words, "--report", str(work / "report"), "--work", str(work / "stages"), may_refuse=True)
-
-
-def _scan(inputs: Path, seed: int) -> Path:
-    """The place's scan, made once."""
-    file = inputs / "scan.laz"
-    if not file.exists():
-        part = file.with_name("scan.part.laz")
-        write_scan(part, scan_town(place_scene(seed), AirborneScanOptions()))
-        part.rename(file)
-    return file
-
-
 def _placed(database: Path, found: FilmMaps, truth: FilmsTruth, scan: Path, work: Path, seed: int) -> bool:
     """Place the largest map of the place."""
     featuredb("lidar", "add", str(database), str(scan), "--quiet")
-    biggest = max(found.of_place, key=lambda one: len(one.keyframes))
-    photos, seen = keyframe_to_pick_in(biggest, work / "stages" / "films")
+    biggest, keyframes = max(found.of_place.items(), key=lambda one: len(one[1]))
+    photos, seen = keyframe_to_pick_in(keyframes, work / "stages" / "films")
     cloud = read_scan(scan, truth.frame, truth.epsg)
-    return place_by_picks(database, biggest.map_id, photos, seen, cloud, work, seed)
+    return place_by_picks(database, biggest, photos, seen, cloud, work, seed)
 
 
 def _tracked(database: Path, films: Path, work: Path, truth: FilmsTruth) -> dict[str, Trajectory]:
     tracks = {}
     for film in truth.films:
         out = work / "tracks" / f"{film}.csv"
-        featuredb("track", str(database), str(films / film), "--out", str(out), may_refuse=True)
+        featuredb("track", str(database), str(films / film), "--out", str(out), refusals=(1,))
         tracks[film] = read_trajectory_csv(out)
     return tracks
 

@@ -3,21 +3,19 @@
 uv run --extra dev python -m tools.evaluations --json FILE
 """
 
-import argparse
-import json
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+from tools.figures import study_parser, write_figures
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Run the tests marked as studies.")
-    parser.add_argument("--json", type=Path, required=True, help="file to write the counts to")
-    args = parser.parse_args()
+    args = study_parser(__doc__).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
         command = [sys.executable, "-m", "pytest", "-q", "--evaluations", f"--junitxml={report}"]
@@ -26,7 +24,7 @@ def main() -> None:
     counts = {name: int(suite.get(name, 0)) for name in ("tests", "failures", "errors", "skipped")}
     failed = counts["failures"] + counts["errors"]
     figures = {"tests": counts["tests"], "failed": failed, "skipped": counts["skipped"]}
-    args.json.write_text(json.dumps(figures))
+    write_figures(args.json, figures)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from featuredb.plain_json import plain
 
 _SHARED: dict[str, dict[str, Any]] = {
     "--json": {"metavar": "FILE", "help": "write the figures there, too"},
-    "--out": {"metavar": "FOLDER", "required": True, "help": "what is made is kept there, and the figures"},
     "--photos": {"metavar": "FOLDER", "required": True},
     "--scan": {"metavar": "LAZ", "required": True},
     "--work": {"metavar": "FOLDER", "required": True, "help": "what is made is kept there"},
@@ -34,12 +33,9 @@ _LEVELS = (0.68, 0.95)
 
 
 def study_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
-    """The parser of a program, with the shared arguments of these names; `doc`: of its module.
-
-    Without --out, whose folder has the figures, it has --json as well.
-    """
+    """The parser of a program, with --json and the shared arguments of these names; `doc`: of its module."""
     parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
-    for name in shared if "--out" in shared else ("--json", *shared):
+    for name in ("--json", *shared):
         parser.add_argument(name, **{"type": Path, **_SHARED[name]})
     return parser
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,34 +34,19 @@ class MapKeyframe:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FilmMap:
-    """A map and its keyframes."""
-
-    map_id: str
-    keyframes: tuple[MapKeyframe, ...]
-
-    @property
-    def of_place(self) -> bool:
-        """Whether most of it shows the place."""
-        return 2 * sum(k.truth.kind == "place" for k in self.keyframes) > len(self.keyframes)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FilmMaps:
     """All maps.
 
     Attributes:
+        of_place: keyframes by map, of maps most of whose keyframes show the place. elsewhere: of other maps.
         left: keyframes that are in none.
         given_up: films and spans (seconds) of which the report says that no keyframe was made, and why.
     """
 
-    maps: tuple[FilmMap, ...]
-    left: tuple[MapKeyframe, ...]
-    given_up: tuple[tuple[str, float, float, str], ...]
-
-    @property
-    def of_place(self) -> tuple[FilmMap, ...]:
-        return tuple(one for one in self.maps if one.of_place)
+    of_place: dict[str, list[MapKeyframe]]
+    elsewhere: list[MapKeyframe]
+    left: list[MapKeyframe]
+    given_up: list[tuple[str, float, float, str]]
 
     def figures(self, scripts: Sequence[Script]) -> dict[str, int]:
         """Shots of the place, of which most keyframes are in maps of it; what is in them beside; losses."""
@@ -70,17 +56,16 @@ class FilmMaps:
             for n, piece in enumerate(s.pieces)
             if piece.kind == "place"
         }
-        inside = [k for one in self.of_place for k in one.keyframes]
-        elsewhere = [k for one in self.maps if not one.of_place for k in one.keyframes]
-        whole = [s for s in shots if _count(inside, s) > _count([*elsewhere, *self.left], s)]
-        unseen = [s for s in shots if not _count([*inside, *elsewhere, *self.left], s)]
-        silent = [s for s in unseen if not self._explained(s[0], shots[s])]
+        inside = [k for keyframes in self.of_place.values() for k in keyframes]
+        mapped, others = (Counter(k.shot for k in of) for of in (inside, [*self.elsewhere, *self.left]))
+        unseen = [shot for shot in shots if not mapped[shot] + others[shot]]
         return {
             "place_maps": len(self.of_place),
             "place_shots": len(shots),
-            "shots_in_maps": len(whole),
+            "shots_in_maps": sum(mapped[shot] > others[shot] for shot in shots),
             "foreign_in_maps": sum(k.truth.kind != "place" for k in inside),
-            "lost_without_reason": len(silent) + sum(not k.reason for k in self.left),
+            "lost_without_reason": sum(not self._explained(shot[0], shots[shot]) for shot in unseen)
+            + sum(not k.reason for k in self.left),
         }
 
     def _explained(self, film: str, span_s: tuple[float, float]) -> bool:
@@ -88,35 +73,28 @@ class FilmMaps:
         first, last = span_s
         return any(f == film and a < last and first < b and why for f, a, b, why in self.given_up)
 
-    def as_text(self) -> str:
-        """A line for each map and shot, and for what was left."""
-        lines = []
-        for one in self.maps:
-            shots = sorted({k.shot for k in one.keyframes})
-            parts = (f"{film} {piece}: {_count(one.keyframes, (film, piece))}" for film, piece in shots)
-            kinds = sorted({k.truth.kind for k in one.keyframes})
-            lines.append(f"map {one.map_id} of {'/'.join(kinds)}: {', '.join(parts)}")
-        lines += [f"in no map: {k.image} ({k.truth.kind}): {k.reason}" for k in self.left]
-        lines += [f"no keyframes: {film}, {a:.2f} to {b:.2f} s: {why}" for film, a, b, why in self.given_up]
-        return "\n".join(lines)
-
 
 def read_film_maps(database: Path, report: Path, truth: FilmsTruth) -> FilmMaps:
     """What the database and the report of the ingest say."""
     snapshot = Database.open(database).snapshot()
-    loaded = [snapshot.load_unplaced(one.map_id) for one in snapshot.unplaced_maps()]
-    maps = [
-        FilmMap(map_id=one.map_id, keyframes=tuple(_keyframe(image.name, truth) for image in one.images))
-        for one in loaded
-    ]
-    mapped = {k.image for one in maps for k in one.keyframes}
+    maps = {
+        one.map_id: [_keyframe(image.name, truth) for image in snapshot.load_unplaced(one.map_id).images]
+        for one in snapshot.unplaced_maps()
+    }
+    mapped = {k.image for keyframes in maps.values() for k in keyframes}
     document: dict[str, Any] = json.loads((report / REPORT_JSON).read_text(encoding="utf-8"))
-    left = [
-        _keyframe(photo["name"], truth, photo["reason"])
-        for photo in document["photos"]
-        if photo["name"] not in mapped
-    ]
-    return FilmMaps(maps=tuple(maps), left=tuple(left), given_up=tuple(_given_up(document["films"])))
+    photos = [photo for photo in document["photos"] if photo["name"] not in mapped]
+    of_place = {
+        map_id: those
+        for map_id, those in maps.items()
+        if 2 * sum(k.truth.kind == "place" for k in those) > len(those)
+    }
+    return FilmMaps(
+        of_place=of_place,
+        elsewhere=[k for map_id in maps.keys() - of_place.keys() for k in maps[map_id]],
+        left=[_keyframe(photo["name"], truth, photo["reason"]) for photo in photos],
+        given_up=list(_given_up(document["films"])),
+    )
 
 
 def _given_up(films: Sequence[dict[str, Any]]) -> Iterator[tuple[str, float, float, str]]:
@@ -131,11 +109,11 @@ def _given_up(films: Sequence[dict[str, Any]]) -> Iterator[tuple[str, float, flo
                 yield name, shot["start_s"], shot["end_s"], reasons
 
 
-def keyframe_to_pick_in(one: FilmMap, stills: Path) -> tuple[Path, Seen]:
-    """Folder of the map's images, below `stills`, and the one to pick in: whole and rich in detail."""
+def keyframe_to_pick_in(keyframes: Sequence[MapKeyframe], stills: Path) -> tuple[Path, Seen]:
+    """Folder of a map's images, below `stills`, and the one to pick in: whole and rich in detail."""
     files = {file.as_posix(): file for file in stills.rglob("*.jpg")}
     best: tuple[int, Path, Seen] | None = None
-    for keyframe in one.keyframes:
+    for keyframe in keyframes:
         pose, camera = keyframe.truth.pose, keyframe.truth.camera
         (file,) = [file for name, file in files.items() if name.endswith("/" + keyframe.image)]
         size = file.stat().st_size
@@ -147,22 +125,16 @@ def keyframe_to_pick_in(one: FilmMap, stills: Path) -> tuple[Path, Seen]:
             folder = file.parents[len(Path(keyframe.image).parts) - 1]
             best = size, folder, Seen(image=keyframe.image, camera=camera, cam_from_local=pose)
     if best is None:
-        raise SystemExit(f"map {one.map_id} has no keyframe to pick in")
+        raise SystemExit("the map has no keyframe to pick in")
     return best[1:]
 
 
 def _keyframe(image: str, truth: FilmsTruth, reason: str = "") -> MapKeyframe:
     """The film is a part of the image's path, and the last number of its name the frame."""
     path = Path(image)
-    stems = {Path(film).stem: film for film in truth.films}
-    named = [film for stem, film in stems.items() if stem in path.parts[:-1]]
+    named = [film for film in truth.films if Path(film).stem in path.parts[:-1]]
     numbers = re.findall(r"\d+", path.stem)
     if len(named) != 1 or not numbers:
         raise SystemExit(f"{image}: expected FILM/FRAME.jpg of {', '.join(truth.films)}")
-    return MapKeyframe(
-        image=image, film=named[0], truth=truth.films[named[0]][int(numbers[-1])], reason=reason
-    )
-
-
-def _count(keyframes: Sequence[MapKeyframe], shot: Shot) -> int:
-    return sum(k.shot == shot for k in keyframes)
+    frame = truth.films[named[0]][int(numbers[-1])]
+    return MapKeyframe(image=image, film=named[0], truth=frame, reason=reason)

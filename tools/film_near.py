@@ -15,11 +15,11 @@ import numpy as np
 
 from featuredb.store import Database
 from tools.commands import anchor, newest_copy
-from tools.figures import median, study_parser, write_figures
+from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
 from tools.made_maps import once, with_scan
+from tools.paper import frame_of, stills_of, unplaced_film
 from tools.track_evaluation import smooth_film
 from tools.unplaced_brighton import all_drawn, near_words
-from tools.video_map import keyframe_errors, stills_of, unplaced_film
 from tools.worlds.film_world import FilmTruth
 from tools.worlds.scan_world import make_scan_world
 
@@ -50,7 +50,10 @@ def _draw(number: int, made: Path, work: Path, truth: FilmTruth) -> dict[str, fl
     near = near_words(database, number)
     if not anchor(database, biggest.map_id, stills_of(made), work / "anchor", near, refusals=(1, 2)):
         return None
-    off = keyframe_errors(Database.open(database).snapshot().load_map(biggest.map_id), truth)
+    feature_map = Database.open(database).snapshot().load_map(biggest.map_id)
+    poses = {image.name: truth.cam_from_local[frame_of(image.name)] for image in feature_map.images}
+    true = {name: pose for name, pose in poses.items() if pose is not None}
+    off = pose_errors(poses_in(truth.frame, feature_map), true)[0]
     return {"median_m": float(np.median(off)), "largest_m": float(off.max())}
 
 

@@ -66,7 +66,7 @@ def film_in_map(film: Path, work: Path) -> dict[str, float]:
     """Ingest and track a film in a folder: keyframes and frames that are in the map, and against the map's
     own cameras at keyframes the medians of distance, relative, and angle."""
     database = work / "db"
-    featuredb("ingest", "video", str(database), str(film), "--no-telemetry", "--quiet", may_refuse=True)
+    featuredb("ingest", "video", str(database), str(film), "--no-telemetry", "--quiet", refusals=(1,))
     snapshot = Database.open(database).snapshot()
     largest = max(snapshot.unplaced_maps(), key=lambda m: m.images).map_id
     rows = _tracked(database, largest, film, work)
@@ -89,7 +89,7 @@ def film_in_map(film: Path, work: Path) -> dict[str, float]:
 def _tracked(database: Path, map_id: str, film: Path, work: Path) -> list[dict[str, str]]:
     """The rows of a film's track by a map."""
     track = work / "track.csv"
-    featuredb("track", str(database), str(film), "--map", map_id, "--out", str(track), may_refuse=True)
+    featuredb("track", str(database), str(film), "--map", map_id, "--out", str(track), refusals=(1,))
     with track.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 

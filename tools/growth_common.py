@@ -1,5 +1,6 @@
 """What the programs that measure growth share: an anchored database, contributions, errors."""
 
+import argparse
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -102,17 +103,17 @@ class Verdict(NamedTuple):
 
 def world_told(
     doc: str | None, argv: Sequence[str] | None, seed: int, world: Callable[..., W]
-) -> tuple[Path, W]:
-    """The folder that a program of a made world is told, made, and the world.
+) -> tuple[argparse.Namespace, W]:
+    """What a program of a made world is told, its folder made, and the world.
 
     Args:
         doc: of the program's module. seed: where none is told. world: by seed.
     """
-    parser = study_parser(doc, "--out", "--seed")
+    parser = study_parser(doc, "--work", "--seed")
     parser.set_defaults(seed=seed)
     args = parser.parse_args(argv)
-    args.out.mkdir(parents=True, exist_ok=True)
-    return args.out, world(seed=args.seed)
+    args.work.mkdir(parents=True, exist_ok=True)
+    return args, world(seed=args.seed)
 
 
 def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) -> "Album":
@@ -228,14 +229,14 @@ def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, header), header.size)
 
 
-def conclude(out: Path, name: str, verdicts: Sequence[Verdict]) -> int:
-    """Print what holds, write `<name>.json`; 0 if everything holds."""
+def conclude(path: Path | None, verdicts: Sequence[Verdict]) -> int:
+    """Print what holds, and write it to a path; 0 if everything holds."""
     document = {
         "lines": {v.name: {"figure": v.text, "holds": v.holds} for v in verdicts},
         "failed": sum(not v.holds for v in verdicts),
         "summary": "; ".join(f"{v.name}: {v.text}" for v in verdicts),
     }
-    write_figures(out / f"{name}.json", document)
+    write_figures(path, document)
     return 0 if all(v.holds for v in verdicts) else 1
 
 

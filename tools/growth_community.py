@@ -1,13 +1,13 @@
 """Twelve people's photos of a town that a survey has mapped in part: how many register, and how well?
 
-    python -m tools.growth_community --out DIR [--seed N]
+    python -m tools.growth_community --work DIR [--seed N]
 
 The world is that of `tools.worlds.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
 most of the photos, as on photo sites.
 
-Writes community.json. Exit code 0 if at least 70 % of the town's photos are in
+Exit code 0 if at least 70 % of the town's photos are in
 active maps with a median error of at most 0.30 m, none of another town or of nowhere, and none is wrong by
 more than 2 m.
 """
@@ -37,13 +37,13 @@ _SHARE, _MEDIAN_M = 0.70, 0.30
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = world_told(__doc__, argv, 1, CommunityOptions)
-    album = made(community_album, out / "world", world)
-    database = anchored(out / "db", album, "survey")
+    args, world = world_told(__doc__, argv, 1, CommunityOptions)
+    album = made(community_album, args.work / "world", world)
+    database = anchored(args.work / "db", album, "survey")
     give(database, album, album.of(*_OWN, *_FOREIGN, "copy"))
-    waiting = grown(database, out, album)
+    waiting = grown(database, args.work, album)
     verdicts = [*judge(album, registered(database, album)), none_failed(waiting["FAILED"])]
-    return conclude(out, "community", verdicts)
+    return conclude(args.json, verdicts)
 
 
 def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:

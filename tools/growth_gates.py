@@ -200,7 +200,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "alone_right": sum(right for *_, right, _ in rows),
         "alone_wrong": sum(wrong for *_, wrong in rows),
     }
-    for step in dict.fromkeys(j.step for j in judgements):
+    for step in ("place", "refine", "budget", "trust"):
         passed = [j for j in judgements if j.step == step and not j.refused_by]
         right, wrong = sum(j.right for j in passed), sum(j.wrong for j in passed)
         figures |= {f"{step}_right": right, f"{step}_wrong": wrong}

@@ -1,6 +1,6 @@
 """Poison: look-alike blocks, mirrors, liars and forgers send photos. Is anything wrong promoted?
 
-    python -m tools.growth_poison --out DIR [--seed N]
+    python -m tools.growth_poison --work DIR [--seed N]
 
 The world is that of `tools.worlds.poison_world`. The survey is ingested, honest photos are grown, and
 held-out photos become canaries with their true poses. Then a copy of that database gets all kinds of poison
@@ -16,7 +16,7 @@ Then wrong maps are forced in by hand: every quarantined map with poison, and, s
 honest grown map moved by 3 m under a new id. Answers to the canaries and to honest photos are compared,
 before, while it is in service, and after `retire`: bit for bit, but for the number of the snapshot.
 
-Writes poison.json. Exit code 0 if nothing wrong was promoted and every answer came back.
+Exit code 0 if nothing wrong was promoted and every answer came back.
 """
 
 import json
@@ -82,14 +82,14 @@ class PoisonOutcome:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = world_told(__doc__, argv, 4, PoisonOptions)
-    album = made(poison_album, out / "world", world)
-    base = honest_base(out / "db", album)
+    args, world = world_told(__doc__, argv, 4, PoisonOptions)
+    album = made(poison_album, args.work / "world", world)
+    base = honest_base(args.work / "db", album)
     clean = max(off_shares(base, album, world).values(), default=0.0)
-    outcome = try_poison(out, base, album, world)
-    forced = Database.open(newest_copy(out / "db", out / "db-forced"))
+    outcome = try_poison(args.work, base, album, world)
+    forced = Database.open(newest_copy(args.work / "db", args.work / "db-forced"))
     fabricated = force_and_retire(forced, album, [], fabricate=True)
-    return conclude(out, "poison", judge(outcome, clean, fabricated))
+    return conclude(args.json, judge(outcome, clean, fabricated))
 
 
 def honest_base(path: Path, album: Album) -> Database:

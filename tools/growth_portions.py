@@ -24,9 +24,12 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
+from ingest.colmap.bridge import Model
 from ingest.executor import InProcessExecutor
 from ingest.fingerprint import digest
 from ingest.growing import reconstructed_photos
@@ -58,10 +61,10 @@ class State:
 
     Attributes:
         photos: all of the set. waiting: rows that are in no map yet.
-        centers: of registered photos in the first map's frame, metres, by name.
+        poses: of registered photos in the first map's frame, by name.
         frame: of the first map.
         growth: without a drift budget where the first map's metre is made up.
-        joint: camera centres of the joint reconstruction, in its own frame, by name.
+        joint: poses of the joint reconstruction, in its own frame, by name. reach: of its cameras, median.
         gates: where what the gates say is recorded, beside the joint reconstruction's places.
     """
 
@@ -69,10 +72,11 @@ class State:
     work: Path
     database: Database
     waiting: list[int] = field(default_factory=list)
-    centers: dict[str, FloatArray] = field(default_factory=dict)
+    poses: dict[str, Rigid3] = field(default_factory=dict)
     frame: LocalFrame | None = None
     growth: GrowthOptions = field(default_factory=GrowthOptions)
-    joint: dict[str, FloatArray] = field(default_factory=dict)
+    joint: dict[str, Rigid3]
+    reach: float
     gates: Path | None = None
 
 
@@ -89,7 +93,8 @@ def main() -> None:
             photos=photos,
             work=args.work,
             database=Database.create(Path(scratch) / "portions"),
-            joint={p.name: c for p, c in zip(joint.photos, joint.model.centers(), strict=True)},
+            joint={p.name: pose for p, pose in zip(joint.photos, joint.model.cam_from_sfm, strict=True)},
+            reach=_reach(joint.model),
             gates=args.gates,
         )
         for rows in [*portions(len(photos), args.cut), []]:
@@ -117,7 +122,7 @@ def _take_in(state: State) -> None:
     with nullcontext() if state.gates is None else _recording(state, state.gates):
         report = grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
     say(f"{report.as_text()}")
-    _find_centers(state)
+    _find_poses(state)
 
 
 def _first_map(state: State) -> None:
@@ -129,7 +134,7 @@ def _first_map(state: State) -> None:
             if component.feature_map is None:
                 state.growth = GrowthOptions(drift_budget_m=_NO_BUDGET_M)
             state.database.commit_maps([first])
-            _find_centers(state)
+            _find_poses(state)
             return
 
 
@@ -138,8 +143,7 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
     if any(photo.gps is not None for photo in component.photos):
         return None
     model = component.model
-    offsets = model.xyz[model.point_of] - model.centers()[model.photo_of]
-    scale = _MADE_UP_DISTANCE_M / float(np.median(np.linalg.norm(offsets, axis=1)))
+    scale = _MADE_UP_DISTANCE_M / _reach(model)
     placement = Placement(
         method="gcp",
         local_from_sfm=Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3)),
@@ -156,28 +160,46 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
     )
 
 
+def _reach(model: Model) -> float:
+    """Median distance of what its photos see, in its own unit."""
+    offsets = model.xyz[model.point_of] - model.centers()[model.photo_of]
+    return float(np.median(np.linalg.norm(offsets, axis=1)))
+
+
 def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
-    """The joint reconstruction's places, carried to the first map's frame by the photos that are in both."""
-    carried = laid_on(state.joint, state.centers)
-    if carried is None or state.frame is None:
+    """The joint reconstruction's places, carried to the first map's frame by the photos that are in both.
+
+    By what they look at as well: centres on a line leave the turn about it open.
+    """
+    both = sorted(state.joint.keys() & state.poses.keys())
+    if len(both) < 3 or state.frame is None:
+        return nullcontext()
+    mine, theirs = ([of[name] for name in both] for of in (state.joint, state.poses))
+    extents = [np.linalg.norm(np.ptp([pose.center for pose in of], axis=0)) for of in (mine, theirs)]
+    reaches = state.reach, state.reach * float(extents[1] / extents[0])
+    seen = [
+        np.concatenate([pose.center + reach * np.vstack([np.zeros(3), pose.rotation]) for pose in of])
+        for of, reach in zip((mine, theirs), reaches, strict=True)
+    ]
+    carried = similarity_closed_form(*seen)
+    if carried is None:
         return nullcontext()
 
     def place(name: str) -> FloatArray | None:
-        return carried.act(state.joint[name]) if name in state.joint else None
+        return carried.act(state.joint[name].center) if name in state.joint else None
 
     return recorded(gates, state.frame, place)
 
 
-def _find_centers(state: State) -> None:
+def _find_poses(state: State) -> None:
     """Where the active maps have the photos, in the frame of the first map."""
     snapshot = state.database.snapshot()
     for summary in snapshot.maps():
         if summary.status == "active":
             feature_map = snapshot.load_map(summary.map_id)
             state.frame = state.frame or feature_map.frame
-            poses = poses_in(state.frame, feature_map)
-            state.centers |= {name: pose.center for name, pose in poses.items()}
-    state.waiting = [r for r in state.waiting if state.photos[r].name not in state.centers]
+            state.poses |= poses_in(state.frame, feature_map)
+    state.waiting = [r for r in state.waiting if state.photos[r].name not in state.poses]
 
 
 def _reconstruct(photos: Sequence[Photo], rows: Sequence[int], work: Path) -> list[Component]:
@@ -204,16 +226,17 @@ def _judged(state: State, joint: Component) -> dict[str, float]:
     sim = joint.placement.local_from_sfm if metric else None
     scale = _EXTENT_M / float(np.linalg.norm(np.ptp(joint.model.centers(), axis=0)))
     sim = sim or Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3))
-    reference = {name: sim.act(center) for name, center in state.joint.items()}
-    both = sorted(reference.keys() & state.centers.keys())
-    aligned = laid_on(state.centers, reference)
+    reference = {name: sim.act(pose.center) for name, pose in state.joint.items()}
+    centers = {name: pose.center for name, pose in state.poses.items()}
+    both = sorted(reference.keys() & centers.keys())
+    aligned = laid_on(centers, reference)
     apart = np.full(len(both), np.nan)
     if aligned is not None:
-        apart = np.array([np.linalg.norm(aligned.act(state.centers[n]) - reference[n]) for n in both])
+        apart = np.array([np.linalg.norm(aligned.act(centers[n]) - reference[n]) for n in both])
     return {
         "joint": len(reference),
         "grown": len(both),
-        "missing": len(reference.keys() - state.centers.keys()),
+        "missing": len(reference.keys() - centers.keys()),
         "median_m": median(apart),
         "largest_m": float(apart.max(initial=0)),
     }

@@ -1,13 +1,13 @@
 """A walk away from the anchor, from contributed queries alone: does coverage follow, and is the bound true?
 
-    python -m tools.growth_walk --out DIR [--seed N]
+    python -m tools.growth_walk --work DIR [--seed N]
 
 The world is that of `tools.worlds.walk_world`. Step by step the photos of three people are contributed
 and `featuredb grow` runs once. After each step photos that nobody contributes (probes) of all steps so far
 ask where they were taken, and the new maps are compared with the truth. When everything has arrived, the
 survey at the far end is ingested and growth runs again.
 
-Writes walk.json. Exit code 0 if: coverage follows for the way between the surveys; the true drift of every
+Exit code 0 if: coverage follows for the way between the surveys; the true drift of every
 map stays inside its bound at every step; growth stopped by itself and no active map exceeds the budget; after
 the second anchor every probe that is answered is within 0.3 m, and the maps that were there moved in one
 commit. At no step may a probe be answered more than 2 m off: one that shows land beyond the maps, too.
@@ -79,16 +79,16 @@ class Step:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    out, world = world_told(__doc__, argv, 2, WalkOptions)
-    album = made(plan_walk, out / "world", world)
-    database = anchored(out / "db", album, "survey")
+    args, world = world_told(__doc__, argv, 2, WalkOptions)
+    album = made(plan_walk, args.work / "world", world)
+    database = anchored(args.work / "db", album, "survey")
     steps = []
     for batch in sorted({f.batch for f in album.of("walk")}):
         give(database, album, album.of("walk", batch=batch))
         steps.append(measure(database, album, batch))
         say(f"{steps[-1]}")
     end, commits = second_anchor(database, album)
-    return conclude(out, "walk", judge(steps, end, commits, world))
+    return conclude(args.json, judge(steps, end, commits, world))
 
 
 def measure(database: Database, album: Album, batch: int) -> Step:

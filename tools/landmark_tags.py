@@ -95,7 +95,7 @@ def ingested(landmark: Landmark, photos: Path, work: Path) -> dict[str, float]:
     told = {landmark.names[k]: (f"{tag[0]:.7f}", f"{tag[1]:.7f}") for k, tag in zip(rows, tags, strict=True)}
     names = photo_names(photos)
     table = position_table(folder, [(name, *told.get(name, ("", "")), "", "", "") for name in names])
-    featuredb("ingest", "photos", str(work / "db"), str(table), "--trust-geotags", "--quiet", may_refuse=True)
+    featuredb("ingest", "photos", str(work / "db"), str(table), "--trust-geotags", "--quiet", refusals=(1,))
     snapshot = Database.open(work / "db").snapshot()
     places: dict[str, FloatArray] = {}
     for summary in snapshot.maps():

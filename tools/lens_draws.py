@@ -10,11 +10,6 @@ the map. Then twenty photos that the map has not seen are localised by EXIF alon
 
 For each sigma of the positions: shares of errors of position and orientation inside their 68 % and 95 %
 bounds, and how many lie outside twice their 99.9 % bound.
-
-Photos from above determine a lens' radial distortion badly, and what it is off by bends the map. One flight
-for five draws looks straight down from one height, by a barometer: heights are off by 5 m together and by
-0.2 m among themselves, and state 10 m, as EXIF's do; positions by 2 m together and 1.5 m among themselves,
-and state 4 m. Printed is how far the map's cameras are off in height after a similarity.
 """
 
 import tempfile
@@ -34,9 +29,9 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
 from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.pool import in_order
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
 from ingest.map_builder import MapIdentity, MapOptions, build_map
@@ -49,11 +44,9 @@ from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
 from tools.figures import inside_figures, pose_offset, squared, study_parser, write_figures
-from tools.worlds.film_frame import in_order
 
 _WIDTH, _HEIGHT, _FOCAL_PX = 1200, 900, 1000.0
 _SIGMAS_M = (0.02, 0.5, 3.0)  # of positions
-_DRAWS_A_LEVEL_FLIGHT = 5
 _KEYPOINT_PX = 0.5
 _SHOWN = 0.7  # of the points in view
 _QUERIES = 20
@@ -103,36 +96,12 @@ def main() -> None:
     args = parser.parse_args()
     figures: dict[str, float] = {}
     for sigma in _SIGMAS_M:
-        answers = [one for draw in in_order(partial(drawn, sigma_m=sigma), args.draws, 2, 1) for one in draw]
+        answers = [one for draw in in_order(partial(drawn, sigma_m=sigma), args.draws, 2) for one in draw]
         for k, kind in enumerate(("orientation", "position")):
             squares = [one[k] for one in answers]
             found = inside_figures(kind, squares) | {f"{kind}_far": sum(one > _FAR for one in squares)}
             figures |= {f"{name}_{100.0 * sigma:g}cm": value for name, value in found.items()}
-    level_flights = in_order(bent, max(args.draws // _DRAWS_A_LEVEL_FLIGHT, 1), 2, 1)
-    bends = [bend for bend in level_flights if bend is not None]
-    figures["level"] = float(len(bends))
-    if bends:
-        figures |= {"bent_m": float(np.median(bends)), "bent_90_m": float(np.quantile(bends, 0.9))}
     write_figures(args.json, figures)
-
-
-def bent(seed: int) -> float | None:
-    """Error in height of a level flight's cameras, metres (root mean square, after a similarity)."""
-    scene = scene_of(seed)
-    poses = flight(scene.rng, height_m=0.2, tilt_deg=0.5)
-    centers = np.array([pose.center for pose in poses])
-    measured = (
-        centers
-        + scene.rng.normal(0.0, [2.0, 2.0, 5.0])
-        + scene.rng.normal(0.0, [1.5, 1.5, 0.2], centers.shape)
-    )
-    shown = [scene.seen(pose) for pose in poses]
-    with tempfile.TemporaryDirectory() as scratch:
-        model = _model_of(shown, measured, np.array([4.0, 4.0, 10.0]), Path(scratch))
-    if model is None or len(model.rows) < len(poses):
-        return None
-    fit = similarity_closed_form(model.centers(), centers[model.rows])
-    return None if fit is None else float(np.std((fit.act(model.centers()) - centers[model.rows])[:, 2]))
 
 
 def drawn(seed: int, sigma_m: float) -> list[tuple[float, float]]:
@@ -188,13 +157,13 @@ def scene_of(seed: int) -> LensDraw:
     )
 
 
-def flight(rng: np.random.Generator, height_m: float = 0.5, tilt_deg: float = 4.0) -> list[Rigid3]:
-    """Four lines of six photos, there and back, that differ by so much."""
+def flight(rng: np.random.Generator) -> list[Rigid3]:
+    """Four lines of six photos, there and back."""
     poses = []
     for line, y in enumerate(np.linspace(-33.0, 33.0, 4)):
         for x in np.linspace(-40.0, 40.0, 6) * (1 if line % 2 == 0 else -1):
-            center = np.array([x, y, 45.0]) + rng.normal(0.0, [1.0, 1.0, height_m])
-            poses.append(look_pose(center, 90.0 + 180.0 * (line % 2), -90.0 - abs(rng.normal(0, tilt_deg))))
+            center = np.array([x, y, 45.0]) + rng.normal(0.0, [1.0, 1.0, 0.5])
+            poses.append(look_pose(center, 90.0 + 180.0 * (line % 2), -90.0 - abs(rng.normal(0, 4.0))))
     return poses
 
 
@@ -206,7 +175,7 @@ def _map_of(scene: LensDraw, poses: Sequence[Rigid3], frame: LocalFrame, sigma_m
     measured = centers + scene.rng.normal(0.0, part, 3) + scene.rng.normal(0.0, part, centers.shape)
     photos = [_photo(k, frame, position, sigma_m) for k, position in enumerate(measured)]
     with tempfile.TemporaryDirectory() as scratch:
-        model = _model_of(shown, measured, np.full(3, sigma_m), Path(scratch))
+        model = _model_of(shown, measured, sigma_m, Path(scratch))
     if model is None:
         return None
     chosen = [photos[row] for row in model.rows]
@@ -253,7 +222,7 @@ def _photo(number: int, frame: LocalFrame, position: FloatArray, sigma_m: float)
 def _model_of(
     shown: Sequence[tuple[NDArray[np.int64], Features]],
     measured: FloatArray,
-    sigmas_m: FloatArray,
+    sigma_m: float,
     work: Path,
 ) -> Model | None:
     """Structure from motion, with a camera that starts as EXIF says."""
@@ -264,7 +233,7 @@ def _model_of(
             camera_row=0,
             keypoints=features.xy,
             prior_position=tuple(position.tolist()),
-            prior_sigma_m=tuple(sigmas_m.tolist()),
+            prior_sigma_m=(sigma_m, sigma_m, sigma_m),
         )
         for k, ((_, features), position) in enumerate(zip(shown, measured, strict=True))
     )

@@ -13,7 +13,6 @@ disagree about its lens (`featuredb.adjust.lens_agreement`), and by how much sin
 (`ingest.colmap.picture_shear`).
 """
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from functools import cached_property
@@ -65,22 +64,21 @@ class Told:
         return np.array([lens_prior(self.mean, replace(none, **{name: 1.0})).covariance for name in WIDTHS])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     options = AdjustOptions()
     told: list[Told] = []
     disagreement: list[float] = []
     for folder in args.photos:
         found, factors = lenses_of(_database(folder, args.work), folder, options)
         disagreement += factors
-        sys.stderr.write(f"{folder}: {len(found)} lenses\n")
+        say(f"{folder}: {len(found)} lenses")
         told += found
     write_shears([_database(folder, args.work) for folder in args.photos])
     if not told:
-        sys.stderr.write("no lens of any map\n")
-        return 1
+        raise SystemExit("no lens of any map")
     assumed = assumed_widths(options)
     measured = measured_widths(told, assumed, options)
     limits = {name: limits_of(told, measured, k, options) for k, name in enumerate(WIDTHS)}
@@ -95,7 +93,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "disagreement": float(np.exp(np.mean(np.log(disagreement)))) if disagreement else float("nan"),
     }
     write_figures(args.json, figures)
-    return 0
 
 
 def write_shears(databases: Sequence[Path]) -> None:
@@ -218,4 +215,4 @@ def _database(folder: Path, work: Path) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -21,7 +21,8 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 from pyproj import CRS
 
 from tools.figures import study_parser, write_figures
-from tools.serve_process import beside, children
+from tools.made_maps import once
+from tools.serve_process import beside, process_tree
 
 CHUNK = 500_000
 EPSG = 32632
@@ -74,10 +75,8 @@ def _surface(
 
 def tree_rss_bytes(root: int) -> int:
     """Resident memory of a process and all its descendants."""
-    total, tree = 0, [root]
-    while tree:
-        process = tree.pop()
-        tree += children(process)
+    total = 0
+    for process in process_tree(root):
         with suppress(OSError):  # it has ended meanwhile
             total += int(Path(f"/proc/{process}/statm").read_text().split()[1])
     return total * os.sysconf("SC_PAGE_SIZE")
@@ -108,11 +107,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="for the scan and the database")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
-    scan = args.folder / f"scan-{args.points}.las"
-    if not scan.is_file():
-        part = scan.with_suffix(".part.las")
-        make_scan(part, args.points)
-        part.rename(scan)
+    scan = once(args.folder / f"scan-{args.points}.las", lambda path: make_scan(path, args.points))
     database = args.folder / "scans.db"
     shutil.rmtree(database, ignore_errors=True)
     run = [sys.executable, "-m", "featuredb.cli", "lidar", "add", str(database), str(scan), "--quiet"]

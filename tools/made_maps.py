@@ -42,7 +42,7 @@ def make(database: Path, kind: str, source: Path, more: Sequence[str] = ()) -> d
     command, and the root mean square that is left of the first placed map.
     """
     start = time.monotonic()
-    featuredb("ingest", kind, str(database), str(source), "--quiet", *more, may_refuse=True)
+    featuredb("ingest", kind, str(database), str(source), "--quiet", *more, refusals=(1,))
     seconds = time.monotonic() - start
     snapshot = Database.open(database).snapshot()
     placed = snapshot.maps()
@@ -61,7 +61,7 @@ def make(database: Path, kind: str, source: Path, more: Sequence[str] = ()) -> d
 def once(target: Path, make: Callable[[Path], object]) -> Path:
     """`target`, which `make` makes once under another name: what is half made is made anew."""
     if not target.exists():
-        making = target.with_name("making")
+        making = target.with_name(f"making{target.suffix}")
         shutil.rmtree(making, ignore_errors=True)
         make(making)
         making.rename(target)

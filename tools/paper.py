@@ -1,12 +1,10 @@
 """The paper's film beside ours (Bodensteiner et al., sections 3.1.2 and 3.2).
 
-    python -m tools.paper --out DIR [--inputs FOLDER]
+    python -m tools.paper --work DIR [--inputs FOLDER]
 
 A simulated film without any telemetry becomes a map; six picks in one frame place it on an intensity-only
 scan; all frames are tracked. The paper measures distances from a bundle adjustment; here from the truth,
 which no adjustment's own error softens, and beside it from the map's adjusted keyframes.
-
-Writes paper.json.
 """
 
 import json
@@ -18,14 +16,15 @@ import numpy as np
 
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
+from ingest.workspace import default_root
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from tools.commands import featuredb
 from tools.figures import kept, say, study_parser, write_figures
+from tools.made_maps import make
 from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import judge_film, smooth_film
-from tools.video_map import frame_of, stills_of, unplaced_film
 from tools.worlds.film_world import FilmTruth
 from tools.worlds.scan_world import make_scan_world
 
@@ -33,8 +32,8 @@ _SEED = 1
 
 
 def main() -> None:
-    args = study_parser(__doc__, "--out", "--inputs").parse_args()
-    write_figures(args.out / "paper.json", film_figures(args.out / "film", args.inputs or args.out))
+    args = study_parser(__doc__, "--work", "--inputs").parse_args()
+    write_figures(args.json, film_figures(args.work / "film", args.inputs or args.work))
 
 
 def film_figures(work: Path, inputs: Path) -> dict[str, Any]:
@@ -80,6 +79,23 @@ def placed_film(film: Path, scan: Path, truth: FilmTruth, work: Path) -> dict[st
         "map_id": biggest.map_id,
         "made_s": made["seconds"],
     }
+
+
+def unplaced_film(film: Path, database: Path) -> dict[str, float]:
+    """Make a map of a film without its telemetry: what `make` says of it."""
+    database.parent.mkdir(parents=True, exist_ok=True)
+    return make(database, "video", Path(shutil.copy(film, database.parent)))  # with nothing beside it
+
+
+def stills_of(database: Path) -> Path:
+    """The folder of keyframes that the ingest of a film has left."""
+    (stills,) = (default_root(Database.open(database).url) / "films").iterdir()
+    return stills
+
+
+def frame_of(image: str) -> int:
+    """The number of the film's frame that a keyframe is, by its name."""
+    return int("".join(c for c in Path(image).stem if c.isdigit()))
 
 
 def from_keyframes(tracked: TrackedVideo, feature_map: FeatureMap) -> float:

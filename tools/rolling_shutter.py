@@ -27,11 +27,12 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.camera.photograph import exif_of
 from featuredb.simworld.camera.sensor import jpeg_bytes
 from featuredb.simworld.camera.shot import Device, Shot
+from featuredb.simworld.pool import in_order
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
-from tools.commands import said
+from tools.commands import featuredb
 from tools.figures import say, squared, study_parser, write_figures
-from tools.worlds.film_frame import Exposure, in_order
+from tools.worlds.film_frame import Exposure
 from tools.worlds.film_world import FilmOptions, film_frame, wandering_errors
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
@@ -55,7 +56,7 @@ def main() -> None:
                 name = f"{style}-{seed}-{receiver}"
                 photos = tagged(film, pictures, receiver == "rtk", args.work / name)
                 words = ("ingest", "photos", str(args.work / f"{name}.db"), str(photos))
-                report = said(*words, "--max-features", "4000", "--quiet")
+                told = featuredb(*words, "--max-features", "4000", "--quiet", refusals=(1,))
                 maps = Database.open(args.work / f"{name}.db").snapshot()
                 active = [m for m in maps.maps() if m.status == "active"]
                 squares = [normalised(film, maps.load_map(m.map_id)) for m in active]
@@ -63,7 +64,7 @@ def main() -> None:
                 figures["active"] += bool(active)
                 figures["outside"] += sum(max(one) > _OUTSIDE for one in squares)
                 figures["held_back"] += not active
-                figures["unnamed"] += "rolling shutter" not in report
+                figures["unnamed"] += "rolling shutter" not in told.stdout + told.stderr
                 worst = max([worst, *(max(one) for one in squares)])
                 words = ", ".join(f"position {a:.1f} and orientation {b:.1f}" for a, b in squares)
                 say(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}")

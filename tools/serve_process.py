@@ -53,7 +53,7 @@ class CommandProcess:
     def workers(self) -> list[int]:
         """Process ids of the workers, once there are some: grandchildren, since they are forked."""
         end = time.monotonic() + 20.0
-        while not (found := [w for child in children(self.process.pid) for w in children(child)]):
+        while not (found := grandchildren(self.process.pid)):
             assert time.monotonic() < end, "no worker is there"
             time.sleep(0.01)
         return found
@@ -63,12 +63,7 @@ class CommandProcess:
 
     def memory_mib(self) -> float:
         """Of the process and all that it has started; what they share counts once."""
-        tree, found = [self.process.pid], 0
-        while tree:
-            pid = tree.pop()
-            tree += children(pid)
-            found += _pss_kib(pid)
-        return found / 1024
+        return sum(map(_pss_kib, process_tree(self.process.pid))) / 1024
 
 
 class ServeProcess(CommandProcess):
@@ -87,6 +82,13 @@ def _pss_kib(pid: int) -> int:
     return next((int(line.split()[1]) for line in text.splitlines() if line.startswith("Pss:")), 0)
 
 
+def process_tree(pid: int) -> Iterator[int]:
+    """A process and all that it has started."""
+    yield pid
+    for child in children(pid):
+        yield from process_tree(child)
+
+
 def children(pid: int) -> list[int]:
     """Process ids of a process's children, of whichever of its threads."""
     found = []
@@ -98,6 +100,11 @@ def children(pid: int) -> list[int]:
         if int(parent) == pid and state != "Z":
             found.append(int(status.parent.name))
     return found
+
+
+def grandchildren(pid: int) -> list[int]:
+    """Process ids of the children's children."""
+    return [worker for child in children(pid) for worker in children(child)]
 
 
 @contextmanager

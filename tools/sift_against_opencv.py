@@ -1,15 +1,13 @@
 """Our SIFT beside OpenCV's: time, and matches of neighbouring photos with ours, with OpenCV's, and across.
 
-    python -m tools.sift_against_opencv FOLDER... [--side PX] [--features N] [--json FILE]
+    python -m tools.sift_against_opencv FOLDER... [--json FILE]
 
 Of each folder's photos, by name, every eighth and the one after it. Both extractors have the same thresholds
 and number of features, and choose them alike; matches are mutual and pass a ratio test of 0.85; inliers are
 those of a fundamental matrix to one pixel of the shrunk photos. Times are of one thread, without decoding.
 """
 
-import sys
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -27,6 +25,7 @@ from featuredb.index.nearest import nearest
 from tools.figures import study_parser, write_figures
 
 _EVERY, _RATIO, _TOLERANCE_PX = 8, 0.85, 1.0
+_SIDE_PX, _FEATURES = 1000, 3000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,20 +37,18 @@ class TimedFeatures:
     seconds: float
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = study_parser(__doc__)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
-    parser.add_argument("--side", type=int, default=1000, metavar="PX", help="longer side; default: 1000")
-    parser.add_argument("--features", type=int, default=3000, metavar="N", help="default: 3000")
-    args = parser.parse_args(argv)
-    options = ExtractorOptions(first_octave_px=2 * args.side, max_features=args.features, oversample=1.25)
+    args = parser.parse_args()
+    options = ExtractorOptions(first_octave_px=2 * _SIDE_PX, max_features=_FEATURES, oversample=1.25)
     cv2.setNumThreads(1)
     counts = {"ours": 0, "opencv": 0, "across": 0}
     ours_s, opencv_s = [], []
     for folder in args.folders:
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".jpg", ".jpeg"))
         for first, second in zip(paths[::_EVERY], paths[1::_EVERY], strict=False):
-            photos = [shrunk(decode_gray(path.read_bytes()), args.side) for path in (first, second)]
+            photos = [shrunk(decode_gray(path.read_bytes()), _SIDE_PX) for path in (first, second)]
             ours = [by_us(photo, options) for photo in photos]
             theirs = [by_opencv(photo, options) for photo in photos]
             counts["ours"] += inliers(ours[0], ours[1])
@@ -69,7 +66,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "across_ratio": counts["across"] / counts["opencv"],
     }
     write_figures(args.json, figures)
-    return 0
 
 
 def by_us(photo: NDArray[np.uint8], options: ExtractorOptions) -> TimedFeatures:
@@ -113,4 +109,4 @@ def inliers(first: TimedFeatures, second: TimedFeatures) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

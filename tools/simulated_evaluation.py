@@ -1,6 +1,6 @@
 """How good are the answers on the simulated world, and do their reported uncertainties mean something?
 
-    python -m tools.simulated_evaluation --out DIR [--seed 1]
+    python -m tools.simulated_evaluation --work DIR [--seed 1]
 
 Makes a world whose drone photos carry exact positions, ingests them (both are kept in DIR and reused), asks
 for every held-out photo and every negative, and compares with the truth:
@@ -50,14 +50,12 @@ class Asked(NamedTuple):
 
 
 def main() -> None:
-    parser = study_parser(__doc__, "--seed")
-    parser.add_argument("--out", type=Path, default=Path("simulated-evaluation"))
-    args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    world = make_world(args.out / "world", size="full", seed=args.seed)
-    database = Database.create(args.out / "db")
+    args = study_parser(__doc__, "--work", "--seed").parse_args()
+    args.work.mkdir(parents=True, exist_ok=True)
+    world = make_world(args.work / "world", size="full", seed=args.seed)
+    database = Database.create(args.work / "db")
     if not database.snapshot().maps():
-        ingest_world(world, database, args.out / "report")
+        ingest_world(world, database, args.work / "report")
     localiser = Localiser.open(database)
     photos = {"drone": world.images("queries"), "street": world.images("street")}
     photos |= {kind: world.negatives(kind) for kind in NEGATIVE_KINDS}
@@ -86,7 +84,7 @@ def flat_figures(asked: dict[str, list[Asked]]) -> dict[str, float]:
     negatives = [a for kind in NEGATIVE_KINDS for a in asked[kind]]
     everything = [a for those in asked.values() for a in those]
     return {
-        "asked": drone.queries,
+        "asked": len(asked["drone"]),
         "answered": sum(a.pose is not None for a in asked["drone"]),
         "within": drone.within,
         "median_m": drone.position_m[0],

@@ -1,6 +1,6 @@
 """How right tracked films are: flights over the simulated town, anchored on its scan, against true poses.
 
-    python -m tools.track_evaluation --out DIR [--films smooth jerky cut]
+    python -m tools.track_evaluation --work DIR [--films smooth jerky cut]
 
 1. The world of `tools.worlds.scan_world`: `featuredb ingest photos` maps the drone's photos,
    `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
@@ -9,8 +9,8 @@
 3. Each is tracked as `featuredb track` does, with the lens of its camera. --on says by what: the map, or the
    scan alone (from a pose of the first frame that is off by 10 m and 5 degrees).
 
-Writes into track.json for each film what `judge_film` says; with --draw how far a layer that `featuredb draw`
-lays over the film by that track is from where it belongs (tools/drawn_layer.py), too.
+Figures of each film: what `judge_film` says; with --draw how far a layer that `featuredb draw` lays over the
+film by that track is from where it belongs (tools/drawn_layer.py), too.
 """
 
 from collections.abc import Sequence
@@ -49,15 +49,15 @@ _CUT = (0.4, 0.55)  # of the film
 
 
 def main() -> None:
-    parser = study_parser(__doc__, "--out", "--inputs")
+    parser = study_parser(__doc__, "--work", "--inputs")
     parser.add_argument("--frames", type=int, default=_FRAMES)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    inputs = args.inputs or args.out
-    database, placed = anchored(args.out, make_scan_world(inputs), other=False)
+    args.work.mkdir(parents=True, exist_ok=True)
+    inputs = args.inputs or args.work
+    database, placed = anchored(args.work, make_scan_world(inputs), other=False)
     if not placed:
         raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
     results: dict[str, dict[str, float]] = {}
@@ -71,8 +71,8 @@ def main() -> None:
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
         if args.draw:
             scene, track = town_of(options.world), tracked.trajectory
-            results[f"{name}_layer"] = drawn_marks(args.out, film, truth, scene, track, database)
-    write_figures(args.out / "track.json", results)
+            results[f"{name}_layer"] = drawn_marks(args.work, film, truth, scene, track, database)
+    write_figures(args.json, results)
 
 
 def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:

@@ -43,7 +43,7 @@ def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
     copied(args.photos, names[1::2], work / "loose", strip=True)
     copied(args.strange, photo_names(args.strange)[:_STRANGE], work / "strange", strip=True)
     for folder in ("placed", "loose", "strange"):
-        featuredb("ingest", "photos", url, str(work / folder), "--quiet", may_refuse=True)
+        featuredb("ingest", "photos", url, str(work / folder), "--quiet", refusals=(1,))
     featuredb("grow", url)
     ingest(work / "whole", args.photos, ())
     truth = reference(work / "whole")

@@ -154,14 +154,7 @@ def lens_numbers(camera: Camera) -> tuple[float, ...]:
     The radial factor is (1 + n1 q + n2 q^2 + n3 q^3 + n4 q^4) / (1 + d1 q + d2 q^2 + d3 q^3), q being the
     squared tangent of the angle off the axis, or the squared angle in a fisheye.
     """
-    one_focal = camera.model in (
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-    )
-    p = camera.params
+    p, one_focal = camera.params, "SIMPLE" in camera.model or "RADIAL" in camera.model
     fx, fy, cx, cy, *k = (p[0], *p) if one_focal else p
     lens = np.zeros(LENS_SIZE)
     lens[:4] = fx, fy, cx, cy

@@ -2,6 +2,6 @@
 
 `scene` says what stands where (no pixels), `town` and `blocks` lay one out, `noise`, `materials` and
 `ground` paint its textures, `raster` is the ray-exact camera, `sensor` turns a rendered picture into a
-photo, `flight` plans who looks from where, `world` writes files and truth. Every part is deterministic
-by seed.
+photo, `flight` plans who looks from where, `world` writes files and truth, drawn in the processes of `pool`.
+Every part is deterministic by seed.
 """

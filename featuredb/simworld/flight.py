@@ -108,7 +108,7 @@ def survey(scene: Scene, options: FlightOptions, seed: int) -> list[Shot]:
                 device=device,
                 cam_from_local=look_pose(positions[i], heading + turn + sway[0], pitch + sway[1], sway[2]),
                 time=times[i],
-                seed=_shot_seed(seed, 1, i),
+                seed=shot_seed(seed, 1, i),
                 gps_enu=believed[i],
             )
         )
@@ -138,7 +138,7 @@ def visitors(scene: Scene, flight: FlightOptions, count: int, seed: int, *, widt
                 device=devices[i % 2],
                 cam_from_local=look_pose(position, heading, pitch, float(rng.normal(0, 3))),
                 time=_START + timedelta(days=21, seconds=40 * i),
-                seed=_shot_seed(seed, 2, i),
+                seed=shot_seed(seed, 2, i),
                 gps_enu=received_positions(position[None], 1.0, flight.gps_error, rng)[0],
             )
         )
@@ -176,7 +176,7 @@ def pedestrians(
                     position, heading, float(rng.normal(6, 3)), float(rng.normal(0, 1.5))
                 ),
                 time=_START + timedelta(days=35, seconds=90 * i),
-                seed=_shot_seed(seed, 3, i),
+                seed=shot_seed(seed, 3, i),
                 gps_enu=None if error is None else position + error,
             )
         )
@@ -239,5 +239,6 @@ def _town_direction(scene: Scene, heading_deg: float) -> FloatArray:
     return np.asarray((scene.enu_from_town.T @ np.array([np.sin(h), np.cos(h), 0.0]))[:2])
 
 
-def _shot_seed(seed: int, kind: int, i: int) -> int:
-    return int(np.random.SeedSequence((seed, kind, i)).generate_state(1)[0])
+def shot_seed(seed: int, *what: int) -> int:
+    """Seed of one shot."""
+    return int(np.random.SeedSequence((seed, *what)).generate_state(1)[0])

@@ -13,25 +13,10 @@ from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseError:
-    """Distance of an answered pose from the true one.
+    """Distance of an answered pose from the true one, and the angle between the orientations."""
 
-    Attributes:
-        east_m, north_m, up_m: answer minus truth along the axes of the truth's local frame.
-        angle_deg: between the orientations.
-    """
-
-    east_m: float
-    north_m: float
-    up_m: float
+    position_m: float
     angle_deg: float
-
-    @property
-    def horizontal_m(self) -> float:
-        return float(np.hypot(self.east_m, self.north_m))
-
-    @property
-    def position_m(self) -> float:
-        return float(np.hypot(self.horizontal_m, self.up_m))
 
 
 def pose_difference(
@@ -44,12 +29,9 @@ def pose_difference(
         cam_from_utm_xyzw: (4,) rotation of grid axes into camera axes.
     """
     center = frame.enu_from_utm(np.asarray(utm, dtype=np.float64), epsg)
-    offset = center - cam_from_local.center
     rotation = matrix_from_quaternion(cam_from_utm_xyzw) @ frame.grid_from_enu(center, epsg)
     return PoseError(
-        east_m=float(offset[0]),
-        north_m=float(offset[1]),
-        up_m=float(offset[2]),
+        position_m=float(np.linalg.norm(center - cam_from_local.center)),
         angle_deg=float(np.degrees(rotation_angle(rotation @ cam_from_local.rotation.T))),
     )
 
@@ -64,8 +46,6 @@ class Summary:
         wrong: answers more than 5 m off.
     """
 
-    queries: int
-    localised: int
     position_m: tuple[float, float]
     angle_deg: tuple[float, float]
     within: float
@@ -77,8 +57,6 @@ def summarise(errors: Sequence[PoseError | None]) -> Summary:
     found = [e for e in errors if e is not None]
     close = sum(e.position_m <= 0.25 and e.angle_deg <= 0.3 for e in found)
     return Summary(
-        queries=len(errors),
-        localised=len(found),
         position_m=_median_and_95([e.position_m for e in found]),
         angle_deg=_median_and_95([e.angle_deg for e in found]),
         within=close / len(errors) if errors else float("nan"),

@@ -1,16 +1,12 @@
 """Writes a simulated world: folders of photos, and the truth beside them."""
 
 import json
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from featuredb.errors import InvalidValueError
@@ -24,6 +20,7 @@ from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
 from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions, pedestrians, survey, survey_half_extent, visitors
 from featuredb.simworld.negatives import NEGATIVE_KINDS, NegativeKind
+from featuredb.simworld.pool import in_order
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
 
@@ -215,7 +212,7 @@ class World:
         return sorted((self.folder / "negatives").glob(f"{kind or '*'}/*.jpg"))
 
 
-_Task = tuple[str, int]  # one file: of a group of shots or a kind of negatives, and its number
+_GROUPS = ("drone", "queries", "street")
 
 
 def write_world(folder: Path, options: WorldOptions, progress: Progress | None = None) -> World:
@@ -225,19 +222,18 @@ def write_world(folder: Path, options: WorldOptions, progress: Progress | None =
         progress: called with (files done, files in all).
     """
     folder = Path(folder)
-    tasks = _tasks(options)
-    for task in tasks:
-        (folder / _task_name(options, task)).parent.mkdir(parents=True, exist_ok=True)
+    files = _files(options)
+    for parent in {(folder / name).parent for name, _ in files}:
+        parent.mkdir(parents=True, exist_ok=True)
     # truth.json comes last: a folder with it is complete.
-    (folder / "truth.json").unlink(missing_ok=True)
-    for done, (name, data) in enumerate(_run(options, tasks), start=1):
+    (folder / TRUTH_FILE).unlink(missing_ok=True)
+    made = in_order(partial(_made, options), len(files), options.workers)
+    for done, (name, data) in enumerate(made, start=1):
         (folder / name).write_bytes(data)
         if progress is not None:
-            progress(done, len(tasks))
+            progress(done, len(files))
     scene = town_of(options)
-    images = [
-        true_image(scene, shot) for group in ("drone", "queries", "street") for shot in _shots(options, group)
-    ]
+    images = [true_image(scene, shot) for group in _GROUPS for shot in _shots(options, group)]
     truth = Truth(seed=options.seed, epsg=scene.epsg, frame=scene.frame, images={i.name: i for i in images})
     write_truth(folder, truth)
     return open_world(folder)
@@ -279,47 +275,28 @@ def _shots(options: WorldOptions, group: str, other: bool = False, seed_shift: i
     return tuple(pedestrians(scene, options.street, seed, width=options.street_width, extent_m=extent))
 
 
-def _tasks(options: WorldOptions) -> list[_Task]:
-    counts = {"drone": options.flight.lines * options.flight.per_line + options.flight.oblique}
-    counts |= {"queries": options.queries, "street": options.street}
+@lru_cache(maxsize=2)
+def _files(options: WorldOptions) -> tuple[tuple[str, Callable[[], bytes]], ...]:
+    """Names of all files, and what makes their bytes."""
+    files = [
+        (shot.name, partial(_photo, options, shot)) for group in _GROUPS for shot in _shots(options, group)
+    ]
     # Kind by kind, so that a process paints the other town once at most.
-    counts |= dict.fromkeys(NEGATIVE_KINDS, options.negatives_per_kind)
-    return [(group, index) for group, count in counts.items() for index in range(count)]
+    for kind in NEGATIVE_KINDS:
+        for index in range(options.negatives_per_kind):
+            name = f"negatives/{kind}/{kind}_{index + 1:04d}.jpg"
+            files.append((name, partial(_negative, options, kind, index)))
+    return tuple(files)
 
 
-def _task_name(options: WorldOptions, task: _Task) -> str:
-    group, index = task
-    if group in NEGATIVE_KINDS:
-        return f"negatives/{group}/{group}_{index + 1:04d}.jpg"
-    return _shots(options, group)[index].name
-
-
-def _run(options: WorldOptions, tasks: list[_Task]) -> Iterator[tuple[str, bytes]]:
-    """Names and bytes of all files, in any order, from a pool of processes (or here, for one worker)."""
-    count = min(options.workers or os.cpu_count() or 1, len(tasks))
-    if count <= 1:
-        for task in tasks:
-            yield _make(options, task)
-        return
-    # Spawned, not forked: the caller may have threads (Zenoh, a progress bar) that a fork would cut off.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread) as pool:
-        futures = [pool.submit(_make, options, task) for task in tasks]
-        for future in as_completed(futures):
-            yield future.result()
-
-
-def _one_thread() -> None:
-    """The pool is the parallelism; OpenCV's own threads would fight over the same cores."""
-    cv2.setNumThreads(1)
-
-
-def _make(options: WorldOptions, task: _Task) -> tuple[str, bytes]:
+def _made(options: WorldOptions, number: int) -> tuple[str, bytes]:
     """Name and bytes of one file."""
-    name, (group, index) = _task_name(options, task), task
-    if group in NEGATIVE_KINDS:
-        return name, _negative(options, group, index)
-    return name, photo_bytes(town_of(options), _shots(options, group)[index], options.sensor)
+    name, make = _files(options)[number]
+    return name, make()
+
+
+def _photo(options: WorldOptions, shot: Shot) -> bytes:
+    return photo_bytes(town_of(options), shot, options.sensor)
 
 
 def _negative(options: WorldOptions, kind: str, index: int) -> bytes:

@@ -16,6 +16,8 @@ from tools.scoreboard.run import Folders, run
 
 _TOOL = "import json, pathlib, sys; pathlib.Path(sys.argv[1]).write_text(json.dumps({'a': {'m': 0.25}}))"
 _ARGV = "['', '{work}/figures.json', '{data}/set']"
+# Rows that are no longer run; what was measured of them stays.
+_GONE = {"bridge-latency", "film-map"}
 
 
 def row(text: str = "{m:.2f} m in {seconds:.0f} s", limit: float = 0.3, code: str = _TOOL) -> Row:
@@ -119,7 +121,8 @@ def test_rows_have_names_of_their_own_and_real_sets_are_not_outnumbered() -> Non
 
 
 def test_every_result_is_of_a_row() -> None:
-    assert {r.row for r in read_results()} <= {r.name for r in ROWS}
+    assert {r.row for r in read_results()} <= {r.name for r in ROWS} | _GONE
+    assert not _GONE & {r.name for r in ROWS}
     assert all(json.dumps(r.figures) for r in read_results())
 
 

@@ -123,19 +123,6 @@ SPEED: tuple[Row, ...] = (
         minutes=3,
     ),
     _row(
-        name="bridge-latency",
-        claim="`live --json | bridge` on a film that shows a photo of `brighton`: from a reply as any "
-        "subscriber gets it to the bridge's message, decoded (pymavlink from UDP, rosbags from Zenoh), pose "
-        "by pose; the server has a core of its own",
-        commands=f"{_MADE}tools.bridge_latency {{work}}/db {BRIGHTON}/DJI_0025.JPG {OUT}",
-        figures=same("load mavlink_poses ros2_poses"),
-        text="MAVLink: median {mavlink_median_ms:.1f} ms, 99 % within {mavlink_99_ms:.1f} ms of "
-        "{mavlink_decoded}; ROS 2: {ros2_median_ms:.1f} ms, {ros2_99_ms:.1f} ms of {ros2_decoded}",
-        # 1,000 messages: the 99th percentile is ten of them.
-        limits=", ".join(f"{kind}_99_ms <= 5, 1000 <= {kind}_decoded" for kind in ("mavlink", "ros2")),
-        minutes=4,
-    ),
-    _row(
         name="service-attacks",
         claim="a real map of `brighton` with copies of it to 200,000 points, served with keys: honest "
         "clients' answer times and the server's memory under eleven attacks (tools/attacks.py)",

@@ -333,9 +333,11 @@ REAL: tuple[Row, ...] = (
             )
         )
         + f"tools.growth_gates {{work}}/0.jsonl {{work}}/1.jsonl {{work}}/2.jsonl {{work}}/3.jsonl {OUT}",
-        text="{judged} placements judged; {refine_right} right and {refine_wrong} wrong photos pass; gates "
-        "that alone refuse a placement cost {alone_right} right photos and keep out {alone_wrong} wrong ones",
-        limits="refine_wrong <= 0",
+        text="{judged} placements judged; {refine_right} right and {refine_wrong} wrong photos pass the "
+        "refinement, {budget_right} and {budget_wrong} the drift budget, {trust_right} and {trust_wrong} all "
+        "gates; gates that alone refuse a placement cost {alone_right} right photos and keep out "
+        "{alone_wrong} wrong ones",
+        limits="trust_wrong <= 0",
         minutes=8,
     ),
 )

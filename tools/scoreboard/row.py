@@ -55,9 +55,9 @@ class Row:
         name: by which it is asked for. group: table in which it stands. form: with which it runs.
         claim: what is claimed, for readers.
         commands: one a line, run one after the other by this Python; `{data}` is the folder of real sets,
-            `{work}` an empty folder of the row, `{cache}` one that rows and commits share, for inputs that do
-            not depend on the program. The first word is a module (`tools.x`, `featuredb.cli`).
-        json: file with the figures, which the last command writes.
+            `{work}` an empty folder of the row, whose figures.json the last one writes, `{cache}` one that
+            rows and commits share, for inputs that do not depend on the program. The first word is a module
+            (`tools.x`, `featuredb.cli`).
         text: the figures in words, a format string.
         limits: all must hold; between commas, each as `Limit` reads it.
         figures: name -> where it is in the file, keys joined by dots: of those that are kept beside what
@@ -74,7 +74,6 @@ class Row:
     text: str
     limits: str
     figures: Mapping[str, str] = field(default_factory=dict)
-    json: str = "{work}/figures.json"
     resumes: bool = False
     readme: bool = False
     minutes: float = 1.0

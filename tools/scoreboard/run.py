@@ -42,7 +42,7 @@ def run(row: Row, places: Folders, commit: str) -> Result:
     cache.mkdir(exist_ok=True)
     names = {"data": str(places.data.resolve()), "work": str(work), "cache": str(cache)}
     start, code, failure = time.monotonic(), 0, ""
-    figures_file = Path(row.json.format(**names))
+    figures_file = work / "figures.json"
     with (places.work / f"{row.name}.log").open("w+", encoding="utf-8") as log:
         for words in row.calls():
             command = [sys.executable, "-m", *(word.format(**names) for word in words)]

@@ -20,11 +20,11 @@ from featuredb.errors import InvalidValueError
 from featuredb.simworld.camera.photograph import exif_of, take_photo
 from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
 from featuredb.simworld.camera.shot import Shot
+from featuredb.simworld.pool import in_order
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
 from tools.worlds.edits import Edit, edited, edited_camera
-from tools.worlds.film_frame import in_order, process_count
 from tools.worlds.indoors import indoor_photo, portrait_photo
 
 FACTS_FILE = "facts.jsonl"
@@ -154,9 +154,7 @@ def write_album(
     # The same scenes lie together: a process takes a part of the list, and paints few scenes.
     todo = sorted((p for p in photos if not (folder / p.shot.name).exists()), key=lambda p: p.scene)
     there = len(photos) - len(todo)
-    # A row of its own for each process.
-    share = -(-len(todo) // max(process_count(workers, len(todo)), 1))
-    written = in_order(partial(_write, folder, world, todo), len(todo), workers, max(share, 1))
+    written = in_order(partial(_write, folder, world, todo), len(todo), workers, None)
     for done, _ in enumerate(written, start=there + 1):
         if progress is not None:
             progress(done, len(photos))

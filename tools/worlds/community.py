@@ -11,7 +11,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.shot import Shot, look_pose
-from featuredb.simworld.flight import FlightOptions
+from featuredb.simworld.flight import FlightOptions, shot_seed
 from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto, Subject, renamed
 from tools.worlds.edits import Edit
@@ -19,7 +19,7 @@ from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.geotags import ACCURACY_SHARE, GeotagOptions, geotag_at
 from tools.worlds.people import Person, community, planned
 from tools.worlds.sights import find_sights
-from tools.worlds.surveyed import DAYS, TownOptions, moment, shot_seed, survey_photos
+from tools.worlds.surveyed import DAYS, TownOptions, moment, survey_photos
 
 # Of another town's visits: claimed here, or at their own place; the rest not at all.
 _TAGGED_HERE, _TAGGED_THERE = 0.6, 0.8

@@ -1,15 +1,10 @@
 """One frame of a film of a scene: cars drive, water glitters, and the camera moves while it is exposed."""
 
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +13,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.photograph import moving_cars, scene_look
 from featuredb.simworld.camera.raster import render
 from featuredb.simworld.camera.sensor import SensorOptions, expose
+from featuredb.simworld.pool import in_order
 from featuredb.simworld.town.scene import Faces, Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
@@ -27,7 +23,6 @@ _SHUTTER_S = 1 / 100
 _SENSOR = SensorOptions(exposure_sigma_ev=0.0, white_balance_sigma=0.0)
 _BANDS = 12  # of rows, where they are not exposed at once
 _CHUNK = 4  # frames that travel to a process at a time
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,41 +87,13 @@ def write_frames(
     if mark.is_file() and mark.read_text(encoding="utf-8") == stamp:
         return
     mark.unlink(missing_ok=True)
-    pictures = in_order(draw, count, workers)
+    pictures = in_order(draw, count, workers, _CHUNK)
     first = next(pictures)
     height, width = first.shape[:2]
     with VideoWriter(file, width=width, height=height, fps=rate_hz, options=options) as writer:
         for picture in chain([first], pictures):
             writer.write(picture)
     mark.write_text(stamp, encoding="utf-8")
-
-
-def in_order(draw: Callable[[int], T], count: int, workers: int = 0, chunk: int = _CHUNK) -> Iterator[T]:
-    """`draw(i)` of all i below `count` in their order, from a pool of processes (or here, for one worker)."""
-    processes = process_count(workers, count)
-    if processes <= 1:
-        yield from map(draw, range(count))
-        return
-    # Spawned, not forked: the caller may have threads that a fork would cut off.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, cv2.setNumThreads, (1,)) as pool:
-        # A few chunks ahead of the writer, so that a slow disk does not fill the memory.
-        chunks = [range(first, min(first + chunk, count)) for first in range(0, count, chunk)]
-        ahead = 4 * processes
-        waiting = [pool.submit(_drawn, draw, frames) for frames in chunks[:ahead]]
-        for k in range(len(chunks)):
-            yield from waiting.pop(0).result()
-            if k + ahead < len(chunks):
-                waiting.append(pool.submit(_drawn, draw, chunks[k + ahead]))
-
-
-def process_count(workers: int, tasks: int) -> int:
-    """Processes for so many tasks; 0 workers: one per core."""
-    return min(workers or os.cpu_count() or 1, tasks)
-
-
-def _drawn(draw: Callable[[int], T], frames: range) -> list[T]:
-    return [draw(frame) for frame in frames]
 
 
 def _shifted(camera: Camera, k: int, n: int) -> Camera:

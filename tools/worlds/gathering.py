@@ -9,13 +9,14 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shot import Device, Shot
+from featuredb.simworld.flight import shot_seed
 from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto, renamed
 from tools.worlds.edits import Edit
 from tools.worlds.geotags import GeotagOptions, Tagging, give_geotags
 from tools.worlds.people import Person, planned, stored_upright, zoomed
 from tools.worlds.sights import Sight, Surroundings, look_at
-from tools.worlds.surveyed import DAYS, day_key, moment, photo_ids, shot_seed
+from tools.worlds.surveyed import DAYS, day_key, moment, photo_ids
 
 _AHEAD = 15  # photos that somebody may be ahead of his share: two visits
 _VISIT_TRIES = 4  # visits per wanted photo: then the sights cannot be photographed by these people

@@ -100,11 +100,6 @@ def survey_photos(
     return photos
 
 
-def shot_seed(seed: int, *what: int) -> int:
-    """Seed of one shot."""
-    return int(np.random.SeedSequence((seed, *what)).generate_state(1)[0])
-
-
 @lru_cache(maxsize=64)
 def photo_ids(seed: int, count: int) -> tuple[str, ...]:
     """Numbers as a photo site gives them, all different."""

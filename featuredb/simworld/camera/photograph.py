@@ -74,15 +74,11 @@ def moving_cars(scene: Scene, moment: int, time_s: float = 0.0) -> Faces:
 
 def photo_bytes(scene: Scene, shot: Shot, sensor: SensorOptions) -> bytes:
     """The JPEG file of a shot."""
-    return jpeg_bytes(take_photo(scene, shot, sensor), exif_of(shot, gps_geodetic(scene, shot)))
-
-
-def gps_geodetic(scene: Scene, shot: Shot) -> tuple[float, float, float] | None:
-    """Latitude, longitude (degrees) and ellipsoidal height (m) that the shot's receiver believes."""
-    if shot.gps_enu is None:
-        return None
-    latitude, longitude, height = scene.frame.geodetic_from_enu(shot.gps_enu)
-    return float(latitude), float(longitude), float(height)
+    believed: tuple[float, float, float] | None = None
+    if shot.gps_enu is not None:
+        latitude, longitude, height = scene.frame.geodetic_from_enu(shot.gps_enu).tolist()
+        believed = latitude, longitude, height
+    return jpeg_bytes(take_photo(scene, shot, sensor), exif_of(shot, believed))
 
 
 def exif_of(shot: Shot, lat_lon_h: tuple[float, float, float] | None) -> Image.Exif:

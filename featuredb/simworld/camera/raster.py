@@ -18,7 +18,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rays import pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shading import Float32, Look, ellipsoid_colour, face_colour, sky_colour
-from featuredb.simworld.camera.view import EllipsoidView, FaceView, view_ellipsoids, view_faces
+from featuredb.simworld.camera.view import EllipsoidView, view_ellipsoids, view_faces
 from featuredb.simworld.town.scene import SKY_ID, Ellipsoids, Faces
 from featuredb.simworld.town.texture import Image8
 
@@ -45,10 +45,13 @@ class Rendered:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Tile:
-    """One tile of the ray grid; x0, y0 in rays, center_x and center_y are the rays of the pixels' centres."""
+    """One tile of the ray grid, and the pixels that it makes.
 
-    x0: int
-    y0: int
+    Attributes:
+        pixels: rows and columns of the picture. x, y: of the rays. center_x, center_y: of pixels' centres.
+    """
+
+    pixels: Part
     x: Float32
     y: Float32
     center_x: Float32
@@ -56,21 +59,6 @@ class _Tile:
     inverse_depth: Float32
     object_id: NDArray[np.int32]
     rgb: Image8 | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Job:
-    """Everything about one picture that the drawing functions share."""
-
-    faces: Faces
-    face_view: FaceView
-    ellipsoids: Ellipsoids
-    ellipsoid_view: EllipsoidView
-    look: Look | None
-    pixels_per_unit: float
-    centers: tuple[Float32, Float32]
-    scratch: Float32
-    supersample: int
 
 
 def render(
@@ -88,63 +76,107 @@ def render(
         faces, ellipsoids: in the local frame, metres.
         supersample: rays per pixel and direction.
     """
-    job = _Job(
-        faces=faces,
-        face_view=view_faces(faces, camera, cam_from_local),
-        ellipsoids=ellipsoids,
-        ellipsoid_view=view_ellipsoids(ellipsoids, camera, cam_from_local),
-        look=look,
-        pixels_per_unit=camera.focal_px,
-        centers=pixel_rays(camera),
-        scratch=np.empty((4, _TILE_PX**2), np.float32),
-        supersample=supersample,
-    )
-    x, y = pixel_rays(camera, supersample)
+    drawing = _Drawing(faces, ellipsoids, camera, cam_from_local, look)
     h, w = camera.height, camera.width
     rgb = np.empty((h, w, 3), np.uint8) if look is not None else None
-    depth, object_id = np.empty((h, w), np.float32), np.empty((h, w), np.int32)
-    step = _TILE_PX - _TILE_PX % supersample
-    up = cam_from_local.rotation[:, 2]
-    for y0 in range(0, h * supersample, step):
-        for x0 in range(0, w * supersample, step):
-            tile = _draw_tile(
-                job, x0, y0, x[y0 : y0 + step, x0 : x0 + step], y[y0 : y0 + step, x0 : x0 + step]
+    picture = Rendered(rgb=rgb, depth=np.empty((h, w), np.float32), object_id=np.empty((h, w), np.int32))
+    rays, centers = pixel_rays(camera, supersample), pixel_rays(camera)
+    side = _TILE_PX // supersample
+    for row in range(0, h, side):
+        for column in range(0, w, side):
+            pixels = (slice(row, min(row + side, h)), slice(column, min(column + side, w)))
+            part = tuple(slice(s.start * supersample, s.stop * supersample) for s in pixels)
+            (x, y), (center_x, center_y) = (of[part] for of in rays), (of[pixels] for of in centers)
+            tile = _Tile(
+                pixels=pixels,
+                x=x,
+                y=y,
+                center_x=center_x,
+                center_y=center_y,
+                inverse_depth=np.zeros(x.shape, np.float32),
+                object_id=np.full(x.shape, SKY_ID, np.int32),
+                rgb=np.zeros((*x.shape, 3), np.uint8) if look is not None else None,
             )
-            _finish(job, tile, up, rgb, depth, object_id)
-    return Rendered(rgb=rgb, depth=depth, object_id=object_id)
+            drawing.draw(tile, supersample)
+            _finish(tile, cam_from_local.rotation[:, 2], supersample, picture)
+    return picture
 
 
-def _draw_tile(job: _Job, x0: int, y0: int, x: Float32, y: Float32) -> _Tile:
-    shape = x.shape
-    n = job.supersample
-    rows, columns = (
-        slice(start // n, (start + size) // n) for start, size in ((y0, shape[0]), (x0, shape[1]))
-    )
-    tile = _Tile(
-        x0=x0,
-        y0=y0,
-        x=x,
-        y=y,
-        center_x=job.centers[0][rows, columns],
-        center_y=job.centers[1][rows, columns],
-        inverse_depth=np.zeros(shape, np.float32),
-        object_id=np.full(shape, SKY_ID, np.int32),
-        rgb=np.zeros((*shape, 3), np.uint8) if job.look is not None else None,
-    )
-    box = np.array([x0, y0, x0 + shape[1], y0 + shape[0]])
-    for view, draw in ((job.face_view, _draw_face), (job.ellipsoid_view, _draw_ellipsoid)):
-        window = view.window * n
-        low, high = np.maximum(window[:, :2], box[:2]), np.minimum(window[:, 2:], box[2:])
-        for i in np.flatnonzero((low < high).all(axis=1)):
-            a, b = low[i] - box[:2], high[i] - box[:2]
-            draw(job, tile, int(i), (slice(a[1], b[1]), slice(a[0], b[0])))
-    return tile
+class _Drawing:
+    """The primitives as the camera meets them, drawn tile by tile."""
 
+    def __init__(
+        self,
+        faces: Faces,
+        ellipsoids: Ellipsoids,
+        camera: Camera,
+        cam_from_local: Rigid3,
+        look: Look | None,
+    ) -> None:
+        self._faces, self._face_view = faces, view_faces(faces, camera, cam_from_local)
+        self._ellipsoids = ellipsoids
+        self._ellipsoid_view = view_ellipsoids(ellipsoids, camera, cam_from_local)
+        self._look, self._pixels_per_unit = look, camera.focal_px
+        self._scratch = np.empty((4, _TILE_PX**2), np.float32)
 
-def _buffers(job: _Job, shape: tuple[int, ...]) -> list[Float32]:
-    """The job's scratch arrays, cut to a shape; fresh ones would cost more than the arithmetic."""
-    size = shape[0] * shape[1]
-    return [row[:size].reshape(shape) for row in job.scratch]
+    def draw(self, tile: _Tile, n: int) -> None:
+        """Draw what the tile shows; n: rays per pixel and direction."""
+        rows, columns = tile.pixels
+        start, end = (np.array([columns.start, rows.start]) * n, np.array([columns.stop, rows.stop]) * n)
+        for view, draw in (
+            (self._face_view, self._draw_face),
+            (self._ellipsoid_view, self._draw_ellipsoid),
+        ):
+            window = view.window * n
+            low, high = np.maximum(window[:, :2], start), np.minimum(window[:, 2:], end)
+            for i in np.flatnonzero((low < high).all(axis=1)):
+                a, b = low[i] - start, high[i] - start
+                draw(tile, int(i), (slice(a[1], b[1]), slice(a[0], b[0])))
+
+    def _buffers(self, shape: tuple[int, ...]) -> list[Float32]:
+        """Scratch arrays, cut to a shape; fresh ones would cost more than the arithmetic."""
+        size = shape[0] * shape[1]
+        return [row[:size].reshape(shape) for row in self._scratch]
+
+    def _draw_face(self, tile: _Tile, i: int, part: Part) -> None:
+        """Draw face i of the view into its part of the tile."""
+        view = self._face_view
+        if tile.inverse_depth[part].min() > view.nearest[i]:
+            return  # wholly behind what is drawn already
+        x, y = tile.x[part], tile.y[part]
+        k, s, t, spare = self._buffers(x.shape)
+        for row, out in zip(view.planes[i].astype(np.float32), (k, s, t), strict=True):
+            _linear(row, x, y, out, spare)
+        index = int(view.index[i])
+        mask = k > tile.inverse_depth[part]
+        np.minimum(s, t, out=spare)
+        mask &= spare >= 0
+        (np.add if self._faces.triangle[index] else np.maximum)(s, t, out=spare)
+        mask &= spare <= k
+        tight = _write_geometry(tile, part, k, mask.view(np.uint8), int(self._faces.object_id[index]))
+        if tight is not None and self._look is not None:
+            rays = tile.center_x[tight.pixels], tile.center_y[tight.pixels]
+            unit = self._pixels_per_unit
+            _paint(tile, tight, face_colour(self._look, self._faces, view, i, rays, tight.far_near, unit))
+
+    def _draw_ellipsoid(self, tile: _Tile, i: int, part: Part) -> None:
+        """Draw ellipsoid i of the view into its part of the tile."""
+        view = self._ellipsoid_view
+        x, y = tile.x[part], tile.y[part]
+        k, inside = _ellipsoid_depth(view, i, x, y, self._buffers(x.shape))
+        mask = inside & (k > tile.inverse_depth[part])
+        index = int(view.index[i])
+        object_id = int(self._ellipsoids.object_id[index])
+        visible = _write_geometry(tile, part, k, mask.view(np.uint8), object_id)
+        if visible is not None and self._look is not None:
+            x, y = tile.center_x[visible.pixels], tile.center_y[visible.pixels]
+            k, _ = _ellipsoid_depth(view, i, x, y, self._buffers(x.shape))
+            z = 1.0 / np.maximum(k, np.float32(visible.far_near[0]))
+            m = view.unit_from_cam[i].astype(np.float32)
+            w0 = view.w0[i].astype(np.float32)
+            on_unit = [(x * row[0] + (y * row[1] + row[2])) * z + w for row, w in zip(m, w0, strict=True)]
+            footprint = max(float(view.depth[i]), 0.1) / self._pixels_per_unit
+            _paint(tile, visible, ellipsoid_colour(self._look, self._ellipsoids, index, on_unit, footprint))
 
 
 def _linear(row: Float32, x: Float32, y: Float32, out: Float32, spare: Float32) -> None:
@@ -153,27 +185,6 @@ def _linear(row: Float32, x: Float32, y: Float32, out: Float32, spare: Float32) 
     np.multiply(y, row[1], out=spare)
     out += spare
     out += row[2]
-
-
-def _draw_face(job: _Job, tile: _Tile, i: int, part: Part) -> None:
-    """Draw face i of the view into its part of the tile."""
-    if tile.inverse_depth[part].min() > job.face_view.nearest[i]:
-        return  # wholly behind what is drawn already
-    x, y = tile.x[part], tile.y[part]
-    k, s, t, spare = _buffers(job, x.shape)
-    for row, out in zip(job.face_view.planes[i].astype(np.float32), (k, s, t), strict=True):
-        _linear(row, x, y, out, spare)
-    index = int(job.face_view.index[i])
-    mask = k > tile.inverse_depth[part]
-    np.minimum(s, t, out=spare)
-    mask &= spare >= 0
-    (np.add if job.faces.triangle[index] else np.maximum)(s, t, out=spare)
-    mask &= spare <= k
-    tight = _write_geometry(tile, part, k, mask.view(np.uint8), int(job.faces.object_id[index]))
-    if tight is not None and job.look is not None:
-        rays = tile.center_x[tight.pixels], tile.center_y[tight.pixels]
-        colour = face_colour(job.look, job.faces, job.face_view, i, rays, tight.far_near, job.pixels_per_unit)
-        _paint(tile, tight, colour)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -217,25 +228,6 @@ def _paint(tile: _Tile, visible: _Visible, colour: Image8) -> None:
     cv2.copyTo(spread, visible.mask, tile.rgb[visible.rays])
 
 
-def _draw_ellipsoid(job: _Job, tile: _Tile, i: int, part: Part) -> None:
-    """Draw ellipsoid i of the view into its part of the tile."""
-    view = job.ellipsoid_view
-    x, y = tile.x[part], tile.y[part]
-    k, inside = _ellipsoid_depth(view, i, x, y, _buffers(job, x.shape))
-    mask = inside & (k > tile.inverse_depth[part])
-    index = int(view.index[i])
-    visible = _write_geometry(tile, part, k, mask.view(np.uint8), int(job.ellipsoids.object_id[index]))
-    if visible is not None and job.look is not None:
-        x, y = tile.center_x[visible.pixels], tile.center_y[visible.pixels]
-        k, _ = _ellipsoid_depth(view, i, x, y, _buffers(job, x.shape))
-        z = 1.0 / np.maximum(k, np.float32(visible.far_near[0]))
-        m = view.unit_from_cam[i].astype(np.float32)
-        w0 = view.w0[i].astype(np.float32)
-        on_unit = [(x * row[0] + (y * row[1] + row[2])) * z + w for row, w in zip(m, w0, strict=True)]
-        footprint = max(float(view.depth[i]), 0.1) / job.pixels_per_unit
-        _paint(tile, visible, ellipsoid_colour(job.look, job.ellipsoids, index, on_unit, footprint))
-
-
 def _ellipsoid_depth(
     view: EllipsoidView, i: int, x: Float32, y: Float32, buffers: list[Float32]
 ) -> tuple[Float32, NDArray[np.bool_]]:
@@ -268,20 +260,16 @@ def _ellipsoid_depth(
     return k, inside
 
 
-def _finish(
-    job: _Job, tile: _Tile, up: FloatArray, rgb: Image8 | None, depth: Float32, object_id: NDArray[np.int32]
-) -> None:
-    """Put the sky behind everything and average the tile into the picture."""
-    n = job.supersample
-    rows = slice(tile.y0 // n, (tile.y0 + tile.x.shape[0]) // n)
-    columns = slice(tile.x0 // n, (tile.x0 + tile.x.shape[1]) // n)
+def _finish(tile: _Tile, up: FloatArray, n: int, picture: Rendered) -> None:
+    """Put the sky behind everything and average the tile, of n x n rays a pixel, into the picture."""
     with np.errstate(divide="ignore"):
-        depth[rows, columns] = 1.0 / tile.inverse_depth[n // 2 :: n, n // 2 :: n]
-    object_id[rows, columns] = tile.object_id[n // 2 :: n, n // 2 :: n]
-    if rgb is None or tile.rgb is None:
+        picture.depth[tile.pixels] = 1.0 / tile.inverse_depth[n // 2 :: n, n // 2 :: n]
+    picture.object_id[tile.pixels] = tile.object_id[n // 2 :: n, n // 2 :: n]
+    if picture.rgb is None or tile.rgb is None:
         return
     empty = tile.inverse_depth == 0
     if empty.any():
         cv2.copyTo(sky_colour((tile.x, tile.y), up), empty.view(np.uint8), tile.rgb)
-    size = (tile.x.shape[1] // n, tile.x.shape[0] // n)
-    rgb[rows, columns] = cv2.resize(tile.rgb, size, interpolation=cv2.INTER_AREA) if n > 1 else tile.rgb
+    size = tile.center_x.shape[::-1]
+    averaged = cv2.resize(tile.rgb, size, interpolation=cv2.INTER_AREA) if n > 1 else tile.rgb
+    picture.rgb[tile.pixels] = averaged

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -56,33 +57,21 @@ class Layout:
         size: tuple[float, float],
         storeys: float,
         *,
-        yaw_deg: float = 0.0,
-        ridge: float = 0.0,
-        facade: str = "facade_plaster",
-        roof: str = "roof_bitumen",
         look: tuple[float, float, float] | None = None,
-        tint: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        **more: Any,
     ) -> Building:
         """A building on the terrain; `look` (facade, detail, roof offsets) is shared by identical ones."""
         if look is None:
             bay = BAY_M * float(self.rng.integers(0, int(FACADE_LENGTH_M / BAY_M)))
             look = (bay, float(self.rng.uniform(0, 500)), float(self.rng.uniform(0, 500)))
-        probe = Building(
-            x=x,
-            y=y,
-            yaw_deg=yaw_deg,
-            width=size[0],
-            depth=size[1],
-            base=0,
-            eaves=1,
-            ridge=ridge,
-            facade=facade,
-            roof=roof,
-            facade_u=look[0],
-            detail_u=look[1],
-            roof_u=look[2],
-            tint=tint,
-        )
+        more |= {
+            "facade_u": look[0],
+            "detail_u": look[1],
+            "roof_u": look[2],
+            "width": size[0],
+            "depth": size[1],
+        }
+        probe = Building(x=x, y=y, base=0, eaves=1, **more)
         grounds = [self.height(float(corner[1])) for corner in probe.footprint()]
         building = replace(probe, base=min(grounds) - 0.3, eaves=max(grounds) + storeys * STOREY_M)
         self.buildings.append(building)
@@ -258,10 +247,7 @@ def _roof_machines(layout: Layout, b: Building, n: int) -> None:
     for _ in range(n):
         x = b.x + float(layout.rng.uniform(-0.42, 0.42)) * b.width
         y = b.y + float(layout.rng.uniform(-0.36, 0.36)) * b.depth
-        a, c, up = (
-            float(layout.rng.uniform(low, high)) for low, high in ((0.8, 2.6), (0.8, 2.0), (0.5, 1.6))
-        )
-        size = (a, c, up)
+        size = tuple(layout.rng.uniform([0.8, 0.8, 0.5], [2.6, 2.0, 1.6]).tolist())
         layout.small.append(
             box(x, y, b.eaves, size, layout.new_id(), texture="plain", detail=(x, y), tint=(0.8,) * 3)
         )

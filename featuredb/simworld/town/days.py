@@ -56,5 +56,4 @@ def _other_cars(scene: Scene, options: DayOptions) -> Faces:
         elif swapped:
             origin[mine, :2] += shift
             tint[mine] *= factors
-    changed = replace(faces, origin=origin, tint=tint)
-    return Faces(**{name: getattr(changed, name)[keep] for name in Faces.__dataclass_fields__})
+    return replace(faces, origin=origin, tint=tint).take(keep)

@@ -74,12 +74,15 @@ def _coloured(base: tuple[int, int, int], level: Canvas) -> Canvas:
     return np.asarray(level[..., None] * np.array(base, np.float32), dtype=np.float32)
 
 
+def _plain(base: tuple[int, int, int], level: Canvas, texel_m: float) -> Texture:
+    """One colour, as light as `level` (size, size) says."""
+    return Texture.from_image(to_image(_coloured(base, level.astype(np.float32))), texel_m)
+
+
 def _noisy(
     rng: np.random.Generator, base: tuple[int, int, int], strength: float, exponent: float = 0.8
 ) -> Texture:
-    return Texture.from_image(
-        to_image(_coloured(base, 1 + strength * periodic(512, rng, exponent=exponent))), 0.03
-    )
+    return _plain(base, 1 + strength * periodic(512, rng, exponent=exponent), 0.03)
 
 
 def _detail(rng: np.random.Generator) -> Texture:
@@ -114,44 +117,29 @@ def _facade(
     panel: bool = False,
     course: tuple[float, float] = (0.25, 0.094),
 ) -> Texture:
-    """Pieces of eight bays by eight storeys; row 0 is at the ground, so v grows upward."""
-    first, design = _facade_piece(rng, base, None, brick=brick, panel=panel, course=course)
-    more = [
-        _facade_piece(rng, base, design, brick=brick, panel=panel, course=course)[0] for _ in range(1, pieces)
-    ]
-    return Texture.from_image(to_image(np.concatenate([first, *more], axis=1)), _FACADE_TEXEL_M)
-
-
-def _facade_piece(
-    rng: np.random.Generator,
-    base: tuple[int, int, int],
-    design: tuple[float, float] | None,
-    *,
-    brick: bool,
-    panel: bool,
-    course: tuple[float, float],
-) -> tuple[Canvas, tuple[float, float]]:
-    """One piece, and its design: width and height of its windows, as shares of bay and storey."""
-    level = 1.0 + 0.05 * periodic(_SIZE, rng, exponent=0.9)
-    if brick:
-        level = level * _masonry(rng, _FACADE_TEXEL_M, course)
-    image = _coloured(base, level.astype(np.float32))
+    """Pieces of eight bays by eight storeys of one design; row 0 is at the ground, so v grows upward."""
+    images = []
+    design = (0.72, 0.5) if panel else None  # width and height of windows, as shares of bay and storey
     bay, storey = round(BAY_M / _FACADE_TEXEL_M), round(STOREY_M / _FACADE_TEXEL_M)
-    if design is None:
-        design = (0.72, 0.5) if panel else (float(rng.uniform(0.34, 0.46)), float(rng.uniform(0.46, 0.56)))
-    width, height = design
-    for row in range(_SIZE // storey):
-        if panel:
-            image[row * storey : row * storey + 3] *= 0.6
-        for column in range(_SIZE // bay):
-            x0, y0 = column * bay, row * storey
-            door = row == 0 and column % 3 == 1
-            w, h = int(bay * width), int(storey * (0.72 if door else height))
-            left, sill = x0 + (bay - w) // 2, y0 + (2 if door else int(0.3 * storey))
-            _window(image, rng, left, sill, w, h, door)
+    for _ in range(pieces):
+        level = 1.0 + 0.05 * periodic(_SIZE, rng, exponent=0.9)
+        if brick:
+            level = level * _masonry(rng, _FACADE_TEXEL_M, course)
+        image = _coloured(base, level.astype(np.float32))
+        design = design or (float(rng.uniform(0.34, 0.46)), float(rng.uniform(0.46, 0.56)))
+        for row in range(_SIZE // storey):
             if panel:
-                image[y0 : y0 + storey, x0 : x0 + 2] *= 0.75
-    return image, design
+                image[row * storey : row * storey + 3] *= 0.6
+            for column in range(_SIZE // bay):
+                x0, y0 = column * bay, row * storey
+                door = row == 0 and column % 3 == 1
+                w, h = int(bay * design[0]), int(storey * (0.72 if door else design[1]))
+                left, sill = x0 + (bay - w) // 2, y0 + (2 if door else int(0.3 * storey))
+                _window(image, rng, left, sill, w, h, door)
+                if panel:
+                    image[y0 : y0 + storey, x0 : x0 + 2] *= 0.75
+        images.append(image)
+    return Texture.from_image(to_image(np.concatenate(images, axis=1)), _FACADE_TEXEL_M)
 
 
 def _window(
@@ -201,7 +189,7 @@ def _bitumen(rng: np.random.Generator) -> Texture:
     """A flat roof: almost nothing to hold on to, a seam now and then."""
     level = 1.0 + 0.025 * periodic(_SIZE, rng, exponent=1.3) + 0.012 * periodic(_SIZE, rng, exponent=0.0)
     level[::256] *= 0.9
-    return Texture.from_image(to_image(_coloured((120, 120, 118), level.astype(np.float32))), 0.03)
+    return _plain((120, 120, 118), level, 0.03)
 
 
 def _metal(rng: np.random.Generator) -> Texture:
@@ -209,13 +197,13 @@ def _metal(rng: np.random.Generator) -> Texture:
     level = 1.0 + 0.02 * periodic(_SIZE, rng, exponent=1.4)
     level[:, ::32] *= 0.7
     level[:, 1::32] *= 1.2
-    return Texture.from_image(to_image(_coloured((150, 158, 160), level.astype(np.float32))), 0.02)
+    return _plain((150, 158, 160), level, 0.02)
 
 
 def _wood(rng: np.random.Generator) -> Texture:
     level = 1.0 + 0.15 * periodic(512, rng, exponent=0.9)
     level[::24] *= 0.55
-    return Texture.from_image(to_image(_coloured((140, 104, 70), level.astype(np.float32))), 0.01)
+    return _plain((140, 104, 70), level, 0.01)
 
 
 def _leaves(rng: np.random.Generator) -> Texture:

@@ -12,16 +12,11 @@ def fractal(
 ) -> Image32:
     """Noise (height, width) float32 with zero mean and unit standard deviation; each coarser octave is `gain`
     times as strong (gain 2 is close to a 1/f^2 spectrum, 1 is white). Not periodic."""
-    field: Image32 | None = None
+    field: Image32 = np.zeros((2, 2), np.float32)
     for k in range(octaves - 1, -1, -1):
         size = max(2, -(-height // 2**k)), max(2, -(-width // 2**k))
-        fresh = rng.standard_normal(size, dtype=np.float32) * np.float32(gain**k)
-        if field is None:
-            field = fresh
-        else:
-            field = np.asarray(cv2.resize(field, size[::-1], interpolation=cv2.INTER_CUBIC))
-            field += fresh
-    assert field is not None
+        field = np.asarray(cv2.resize(field, size[::-1], interpolation=cv2.INTER_CUBIC))
+        field += rng.standard_normal(size, dtype=np.float32) * np.float32(gain**k)
     return _normalised(field)
 
 

@@ -92,6 +92,10 @@ class Faces:
             return cls(**{n: np.zeros((0, c) if c else 0, dtype=t) for n, c, t in _FACE_COLUMNS})
         return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n, _, _ in _FACE_COLUMNS})
 
+    def take(self, rows: NDArray[np.bool_]) -> "Faces":
+        """The faces of these rows."""
+        return Faces(**{name: getattr(self, name)[rows] for name, _, _ in _FACE_COLUMNS})
+
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Faces":
         """The same faces at rotation @ x + translation; textures move with them."""
         turn, shift = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
@@ -169,14 +173,14 @@ class Building:
 
     x: float
     y: float
-    yaw_deg: float
+    yaw_deg: float = 0.0
     width: float
     depth: float
     base: float
     eaves: float
-    ridge: float
-    facade: str
-    roof: str
+    ridge: float = 0.0
+    facade: str = "facade_plaster"
+    roof: str = "roof_bitumen"
     facade_u: float
     detail_u: float
     roof_u: float
