@@ -19,9 +19,10 @@ from ingest.growth.place.component import AT_SEVERAL_PLACES
 from ingest.growth.run import grow
 from ingest.growth.values import GrowthPhotos, Refused
 from tests.support.few_canaries import few_canaries as few_canaries
-from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk
+from tests.support.growth_box import DESCRIPTORS, FRAME, KEY, POINTS, existing, prior, walk
 from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import looking_at
+from tools.growth_gates import read_judgements, recorded
 
 _JOINT = 25  # points of one facade that the joint rests on; photos see several hundred
 _APART_M = 60.0  # that the reconstruction has the two groups from where they are to each other
@@ -101,9 +102,11 @@ def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path) -> GrowthReport:
 
 
 def test_both_places_become_maps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """As a whole it is refused."""
-    with caplog.at_level(logging.INFO, "ingest.growth"):
+    """As a whole it is refused; each judgement can be written down."""
+    noted = tmp_path / "gates.jsonl"
+    with caplog.at_level(logging.INFO, "ingest.growth"), recorded(noted, FRAME, lambda name: None):
         report = _grown(_groups(5, 5), tmp_path)
+    assert [len(j.key.split()) for j in read_judgements([noted]) if j.step == "budget"] == [5, 5]
     names = [set(m.photos) for m in report.maps if m.map_id]
     apart = [r.message for r in caplog.records if "at several places" in r.message]
     assert len(apart) == 1
