@@ -23,7 +23,7 @@ def user_cache() -> Path:
 def atomic_file(path: Path) -> Iterator[Path]:
     """Yields a temporary path in the same folder; on success it is flushed and takes the name `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}-{path.name}")
+    temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}{path.suffix}")
     try:
         yield temporary
         _flush(temporary)

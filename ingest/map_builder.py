@@ -32,7 +32,6 @@ from ingest.photos.photo import Photo, answered_positions
 from ingest.positions.center_priors import center_priors
 from ingest.sfm.extract import PhotoFeatures
 
-_AS_IN_PHOTO = ("name", "sha256", "capture_time", "gps", "owner", "licence")
 _LEAST_POSITIONS = 3  # tell a similarity
 _MOST_PHOTOS = 1000  # whose normal equations are inverted densely
 
@@ -201,7 +200,12 @@ def _images(
             camera_id=int(model.camera_of[k]),
             cam_from_local=poses[k],
             covariance=spread[k],
-            **{name: getattr(photo, name) for name in _AS_IN_PHOTO},
+            name=photo.name,
+            sha256=photo.sha256,
+            capture_time=photo.capture_time,
+            gps=photo.gps,
+            owner=photo.owner,
+            licence=photo.licence,
         )
         for k, photo in enumerate(photos)
     ]

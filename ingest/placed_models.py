@@ -64,6 +64,11 @@ class Component:
     reason: str = ""
     control: GcpPlacement | None = None
 
+    @property
+    def made(self) -> FeatureMap | UnplacedMap | None:
+        """The map, with a place or without."""
+        return self.unplaced if self.feature_map is None else self.feature_map
+
 
 def place_models(
     done: Reconstructed,

@@ -61,7 +61,7 @@ class AnsweredView:
     def at(cls, utm: ArrayLike, epsg: int, cam_from_utm_xyzw: ArrayLike, **known: Any) -> Self:
         """A camera at a UTM place (3,), with the rotation (4,) of grid axes into camera axes.
 
-        `known`: what is not said by these.
+        `known`: camera, covariance and height_datum, and map_ids where they are known.
         """
         easting, northing, height = np.asarray(utm, dtype=np.float64).tolist()
         frame = LocalFrame.from_utm(easting, northing, height, epsg)

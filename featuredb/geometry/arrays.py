@@ -46,9 +46,10 @@ def frozen_array(
     if array.shape != shape and not _fits(array.shape, shape):
         wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
         raise InvalidValueError(f"{name}: expected shape {wanted}, found {array.shape}")
-    if array.dtype.kind == "f" and not (np.isfinite(array).all() or (nan and not np.isinf(array).any())):
-        found = "infinity" if nan else "NaN or infinity"
-        raise InvalidValueError(f"{name}: expected finite numbers, found {found}")
+    if array.dtype.kind == "f" and (np.isinf(array) if nan else ~np.isfinite(array)).any():
+        if nan:
+            raise InvalidValueError(f"{name}: expected finite numbers or NaN, found infinity")
+        raise InvalidValueError(f"{name}: expected finite numbers, found NaN or infinity")
     array.setflags(write=False)
     return array
 

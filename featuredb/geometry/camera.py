@@ -208,7 +208,6 @@ def _radial_polynomials(model: str, k: tuple[float, ...]) -> "tuple[Polynomial, 
     return Polynomial(numerator), Polynomial(denominator)
 
 
-@cache
 def _template(model: str) -> Any:
     """A pycolmap camera of the model, for its constants (parameter names and places).
 
@@ -219,4 +218,9 @@ def _template(model: str) -> Any:
         raise InvalidValueError(
             f"Camera.model: expected one of {', '.join(SUPPORTED_MODELS)}, found {model!r}"
         )
+    return _made(model)
+
+
+@cache
+def _made(model: str) -> Any:
     return _pycolmap().Camera.create_from_model_name(1, model, 1.0, 2, 2)

@@ -24,7 +24,6 @@ from featuredb.features.exif.read import ExifInfo, read_exif
 from featuredb.features.shrink import fitted_size, shrunk
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
 from featuredb.video.opening import MAX_FULL_PIXELS, MAX_FULL_SIDE_PX
-from featuredb.video.telemetry.formats.text import number
 
 _T = TypeVar("_T")
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".heic", ".heif", ".avif", ".png", ".webp", ".tif", ".tiff", ".bmp"})
@@ -185,8 +184,11 @@ def _from_table(path: Path, names: list[str]) -> list[tuple[float, str]]:
         if name in times:
             raise VideoError(f"{path}: line {rows.line_num}: {name} is there twice")
         told = (row["time_s"] or "").strip()
-        times[name] = number(told)
-        if math.isnan(times[name]):
+        try:
+            times[name] = float(told)
+        except ValueError:
+            times[name] = math.nan
+        if not math.isfinite(times[name]):
             raise VideoError(f"{path}: line {rows.line_num}: expected a time in seconds, found {told!r}")
     without = [name for name in names if name not in times]
     unknown = sorted(set(times) - set(names), key=natural_key)

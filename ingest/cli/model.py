@@ -12,13 +12,6 @@ if TYPE_CHECKING:
     from ingest.models_in.place import Stated
 
 
-# Arguments and fields of ModelOptions alike.
-_AS_ASKED = (
-    *("photos", "reconstruction", "descriptors", "height_datum", "min_track_length"),
-    *("name", "owner", "licence"),
-)
-
-
 def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     """What of the model is where."""
     parser.add_argument(
@@ -86,7 +79,14 @@ def run_model(args: argparse.Namespace) -> int:
         stated=stated,
         sigma_m=args.sigma if stated is None else None,
         colmap_database=args.database,
-        **{name: getattr(args, name) for name in _AS_ASKED},
+        photos=args.photos,
+        reconstruction=args.reconstruction,
+        descriptors=args.descriptors,
+        height_datum=args.height_datum,
+        min_track_length=args.min_track_length,
+        name=args.name,
+        owner=args.owner,
+        licence=args.licence,
     )
     place_for_database(args)
     made = map_of_model(args.folder, options)

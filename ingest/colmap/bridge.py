@@ -58,7 +58,7 @@ class SfmPhoto:
         camera_row: row of the cameras.
         keypoints: (n, 2) float32 pixels.
         prior_position: camera centre in a local metric frame, or None.
-        prior_sigma_m: standard deviations of the position.
+        prior_sigma_m: standard deviations of the position, metres along each axis.
     """
 
     name: str

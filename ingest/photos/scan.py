@@ -32,11 +32,6 @@ from ingest.photos.walk import ExaminedFile, FoundFile, read_cache, refused, wal
 _VERSION = 3
 # The cache is written after so many files, or a quarter of those that it has: writing it stays linear.
 _SAVE_EVERY = 200
-# Of ExifInfo and Photo alike.
-_AS_IN_EXIF = (
-    *("width", "height", "orientation", "make", "model", "camera_key", "focal_px", "capture_time"),
-    *("angles", "warnings"),
-)
 
 # Standard deviation of a table's position that does not say its own. Geotags of photo sites are tens of
 # metres off, where they are not wrong altogether.
@@ -256,8 +251,17 @@ def _as_photo(file: FoundFile, examined: ExaminedFile | None, options: ScanOptio
         name=file.name,
         path=file.path,
         sha256=examined.sha256,
+        width=exif.width,
+        height=exif.height,
+        orientation=exif.orientation,
+        make=exif.make,
+        model=exif.model,
+        camera_key=exif.camera_key,
+        focal_px=exif.focal_px,
+        capture_time=exif.capture_time,
+        angles=exif.angles,
+        warnings=exif.warnings,
         gps=prior_from_exif(exif),
-        **{name: getattr(exif, name) for name in _AS_IN_EXIF},
         owner=exif.artist or options.owner,
         licence=exif.copyright or options.licence,
         film=file.name.rpartition("/")[0] if options.films else "",

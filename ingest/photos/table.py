@@ -110,8 +110,10 @@ def read_table(path: Path) -> PhotoTable:
     rows: dict[str, TableRow] = {}
     bad: list[tuple[int, str]] = []
     for number, record in records:
-        row: TableRow | str = record if isinstance(record, str) else ""
-        if not isinstance(record, str):
+        row: TableRow | str
+        if isinstance(record, str):
+            row = record
+        else:
             row = _row(number, {names.get(k, k): v for k, v in record.items()}, path.parent)
         if isinstance(row, TableRow) and row.name in rows:
             row = f"{row.name} is in row {rows[row.name].number} already"
@@ -228,7 +230,7 @@ def _metres(
 ) -> float | None:
     value = _number(record, name, warnings)
     if value is not None and not low < value < high:
-        warnings.append(f"table: {name} {value} m cannot be; it is left out")
+        warnings.append(f"table: {name} {value} m is not usable; it is left out")
         return None
     return value
 

@@ -38,7 +38,7 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         "cameras": _cameras(component, options),
         "control": control,
     }
-    made = component.feature_map or component.unplaced
+    made = component.made
     if made is None:
         return MapOutcome(
             map_id="",
@@ -119,7 +119,7 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
 
 def registered_photos(component: Component, result: Reconstructed) -> dict[str, PhotoOutcome]:
     """The photos of one component; those of a refused one are in no map, and have its reason."""
-    made = component.feature_map or component.unplaced
+    made = component.made
     why = {"code": component.reason_code.lower(), "reason": component.reason}
     if made is None:
         return {p.name: _outcome(p, result, status="not_registered", **why) for p in component.photos}

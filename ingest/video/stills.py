@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from featuredb.atomic import atomic_file
 from featuredb.errors import VideoError
@@ -262,7 +262,10 @@ def _known(folder: Path) -> Stills | None:
     done = folder / _DONE
     if not done.is_file():
         return None
-    known = _STILLS.validate_python(read_json(done) | {"folder": folder})
+    try:
+        known = _STILLS.validate_python(read_json(done) | {"folder": folder})
+    except ValidationError:  # of another version, or damaged: they are made again
+        return None
     names = [name for shot in known.shots for name in shot.keyframes]
     return known if all((folder / name).is_file() for name in names) else None
 

@@ -140,17 +140,16 @@ async def read_form(request: Request, options: GatewayOptions) -> tuple[bytes, L
     if len(image) > options.max_image_bytes:
         text = f"image: expected at most {options.max_image_bytes} bytes, found {len(image)}"
         raise ServiceError(ErrorCode.TOO_LARGE, text)
-    said = LocaliseWireRequest(
+    raw = parts.get("request_id")
+    request_id = None if raw is None else request_id_of(raw.decode(errors="replace"))
+    if raw is not None and request_id is None:
+        raise bad_request("request_id: expected 1 to 128 of A-Z a-z 0-9 . _ : -")
+    return image, LocaliseWireRequest(
         camera=_json("camera", CameraRequest, parts),
         prior=_json("prior", PriorRequest, parts),
         options=_json("options", RequestOptions, parts) or RequestOptions(),
-        request_id=request_id_of(parts["request_id"].decode(errors="replace"))
-        if "request_id" in parts
-        else None,
+        request_id=request_id,
     )
-    if "request_id" in parts and said.request_id is None:
-        raise bad_request("request_id: expected 1 to 128 of A-Z a-z 0-9 . _ : -")
-    return image, said
 
 
 def _json(name: str, model: type[_Field], parts: dict[str, bytes]) -> _Field | None:

@@ -250,11 +250,10 @@ def _moved_points(
 
 def _lender(feature_map: FeatureMap, camera: Camera) -> int | None:
     """The map's camera that this is, of pictures of any size; None if it is none."""
-    found = [
-        own.model == "OPENCV" and lens_for(own, camera.width, camera.height) == camera
-        for own in feature_map.cameras
-    ]
-    return found.index(True) if any(found) else None
+    for camera_id, own in enumerate(feature_map.cameras):
+        if own.model == "OPENCV" and lens_for(own, camera.width, camera.height) == camera:
+            return camera_id
+    return None
 
 
 def _as_lens_of(camera: Camera, modes: FloatArray, zoom: float = 1.0) -> FloatArray:

@@ -203,10 +203,10 @@ def _vote(reach: Sequence[_Reach], features: Features, options: CandidateOptions
     return votes
 
 
-_Nearest = tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]
+_Neighbours = tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]
 
 
-def _nearest(reach: Sequence[_Reach], asked: NDArray[np.uint8], k: int) -> _Nearest:
+def _nearest(reach: Sequence[_Reach], asked: NDArray[np.uint8], k: int) -> _Neighbours:
     """Of descriptors (n, 128) the k nearest points in reach of each index, best first.
 
     Areas of which most is in reach are searched by the index that they share. Of others, the points in reach
@@ -230,7 +230,7 @@ def _nearest(reach: Sequence[_Reach], asked: NDArray[np.uint8], k: int) -> _Near
 
 def _nearest_of(
     reach: Sequence[_Reach], group: NDArray[np.int64], asked: NDArray[np.uint8], k: int
-) -> _Nearest:
+) -> _Neighbours:
     """As `_nearest`, for the areas (g,) that share an index and have points in reach."""
     index = reach[group[0]].indexed.index
     in_reach = sum(len(reach[i].points) for i in group)

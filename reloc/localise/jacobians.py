@@ -20,13 +20,13 @@ def pixel_jacobians(
         local_from_cam = (R, C). With `lens` by its parameters, too, (k, 2, 6 + n), n as in `lens_of`.
     """
     in_camera = cam_from_local.act(points)
-    by_camera, by_lens = (
-        lens_jacobians(camera, in_camera) if lens else (camera.projection_jacobian(in_camera), None)
-    )
+    if lens:
+        by_camera, by_lens = lens_jacobians(camera, in_camera)
+    else:
+        by_camera, by_lens = camera.projection_jacobian(in_camera), np.zeros((len(points), 2, 0))
     by_point = by_camera @ cam_from_local.rotation
     by_turn = by_point @ skew(points - cam_from_local.center)
-    by_own = [by_turn, -by_point, *([] if by_lens is None else [by_lens])]
-    return by_point, np.concatenate(by_own, axis=2)
+    return by_point, np.concatenate([by_turn, -by_point, by_lens], axis=2)
 
 
 def lens_jacobians(camera: Camera, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:

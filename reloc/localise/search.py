@@ -158,7 +158,8 @@ class _ClusterSearch:
         if rival is None or rival.count < 4:
             return [best]
         second = self._refined(left, rival)
-        return [best, replace(second, pose=replace(second.pose, camera_source=best.pose.camera_source))]
+        source, prior = best.pose.camera_source, best.pose.lens_prior  # as free as the first pose's lens is
+        return [best, replace(second, pose=replace(second.pose, camera_source=source, lens_prior=prior))]
 
     def _best_pose(
         self, matches: Matches, cameras: list[tuple[Camera, CameraSource]]

@@ -56,7 +56,7 @@ class ServeOptions:
     # Of one query, or a frame of a live session, beyond the maps; the largest pictures allowed take 1.5 GiB.
     query_memory_bytes: int = 3 * 2**30
     # Queries that may wait; at 0.25 s a query and two workers these take 4 s, half of the deadline.
-    max_queue: int = 32
+    max_queue: int = 32  # each waiting query has a timer, which is a thread
     max_queued_bytes: int = 512 * 2**20  # of all waiting payloads together
     # From receipt to answer; under Zenoh's default timeout of 10 s, so that the client hears of it. A worker
     # has half of it for a query, so that those behind the slowest are still answered.

@@ -55,7 +55,10 @@ class PendingQuery:
         self.size = 0 if query.payload is None else len(query.payload)
 
     def watch(self) -> None:
-        """Say when the deadline is over, also while a worker has the query; again when it is earlier."""
+        """Say when the deadline is over, also while a worker has the query; again when it is earlier.
+
+        Raises RequestError: BUSY, the machine has no thread left for that.
+        """
         with self._lock:
             if self._timer is not None:
                 self._timer.cancel()
@@ -63,7 +66,11 @@ class PendingQuery:
                 left_s = max(0.0, self.deadline - time.perf_counter())
                 self._timer = threading.Timer(left_s, self._on_late, (self,))
                 self._timer.daemon = True
-                self._timer.start()
+                try:
+                    self._timer.start()
+                except RuntimeError as error:
+                    self._timer = None
+                    raise RequestError(ErrorCode.BUSY, "no thread is free; try again in a second") from error
 
     def bytes_of(self, part: Literal["attachment", "payload"]) -> bytes:
         """A part of the request; empty where there is none or it was answered meanwhile."""
@@ -105,6 +112,7 @@ class PendingQuery:
             self.answered = True
             if self._timer is not None:
                 self._timer.cancel()
+                self._timer = None  # it holds this query
             self._tally.add(kind, code, latency_ms)
             try:
                 with self._query as query:

@@ -122,7 +122,14 @@ class Server:
             config.insert_json5("listen/endpoints", json.dumps(endpoints))
         session = open_server_session(config, ", ".join(endpoints) or str(options.config_path))
         server = cls(
-            source, options, database, inbox, area, session, endpoints, authenticates=authenticates(config)
+            source=source,
+            options=options,
+            database=database,
+            inbox=inbox,
+            area=area,
+            session=session,
+            endpoints=endpoints,
+            authenticates=authenticates(config),
         )
         try:
             server._declare()
@@ -252,10 +259,9 @@ class Server:
                     "send a smaller or more compressed picture",
                 )
             self._queue.put(item)
+            item.watch()
         except RequestError as error:
             item.refuse(error)
-        else:
-            item.watch()
 
     def _on_status(self, query: zenoh.Query) -> None:
         with query:

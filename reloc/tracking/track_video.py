@@ -89,7 +89,7 @@ class ReadAhead:
     """
 
     def __init__(self, video: Video, most: int = 24) -> None:
-        """`most`: frames that are decoded before they are used; fewer of large films, for their memory."""
+        """`most`: frames that are decoded before they are used, 0 for none; fewer where they are large."""
         info = video.info
         bytes_each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
         self._frames: Iterator[VideoFrame] | None = None

@@ -376,7 +376,9 @@ def explain(error: ValidationError, whole: str = "attachment", *, inputs: bool =
         told = f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}"
         if inputs:
             shown = repr(item["input"])
-            told += f", found {shown[:_SHOWN_INPUT_CHARS]}{'...' * (len(shown) > _SHOWN_INPUT_CHARS)}"
+            if len(shown) > _SHOWN_INPUT_CHARS:
+                shown = shown[:_SHOWN_INPUT_CHARS] + "..."
+            told += f", found {shown}"
         parts.append(told)
     return "; ".join(parts)
 

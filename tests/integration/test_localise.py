@@ -9,11 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, IncompatibleExtractorError, InvalidValueError
-from featuredb.features.extractor import ExtractorOptions
+from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.lens_uncertainty import LensUncertainty
+from featuredb.stage_clock import StageClock
 from reloc.localise import search
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise
@@ -289,6 +290,24 @@ def test_a_prior_is_held_against_the_pose(
     assert result.reason == reason
     assert (result.pose is None) == (reason is not None)
     assert result.inliers > 200  # the evidence is told either way
+
+
+def test_another_pose_of_a_photo_knows_as_little_of_its_lens(
+    area: IndexedArea, texture: NDArray[np.uint8], photo: NDArray[np.uint8]
+) -> None:
+    """A picture of two views: what is left over by one has a lens that was estimated all the same."""
+    both = photo.copy()
+    both[:, :320] = render(texture, view(-9, 8, 45, 10, 200), seed=7)[:, :320]
+    options = LocaliseOptions()
+    features = extract(both, options.extractor)
+    unknown = LocaliseRequest(exif_focal_px=600.0)
+    candidates, _, refusal = search.search(features, unknown, [area], options, StageClock())
+    assert refusal is None
+    poses = [one.pose for one in candidates if one.evidence.inliers > 50]
+    assert len(poses) == 2
+    for pose in poses:
+        assert pose.camera_source == "exif"
+        assert pose.lens_prior is not None
 
 
 @pytest.mark.parametrize("apart_m", [150.0, 3000.0])

@@ -72,7 +72,7 @@ def shot_model(model: str, shot: int) -> str:
 
 
 def is_of_film(camera_key: str, film: str) -> bool:
-    """Whether a `ExifInfo.camera_key` is of some shot of a film's model."""
+    """Whether an `ExifInfo.camera_key` is of some shot of a film's model."""
     start = f"{UNNAMED_MAKE}|{film}".lower()
     return camera_key.startswith((f"{start}|", f"{start} {_SHOT} "))
 
@@ -126,7 +126,10 @@ class ExifInfo:
         make, model, serial = self.make.strip(), self.model.strip(), self.serial.strip()
         if not (make or model):
             return ""
-        focal = f"f{float(f'{self.focal_px:.3g}'):.0f}" if self.focal_px else "unknown"
+        focal = "unknown"
+        if self.focal_px:
+            digits = float(f"{self.focal_px:.3g}")
+            focal = f"f{digits:.0f}"
         parts = [make, model, f"{self.width}x{self.height}", focal, *([serial] if serial else [])]
         return "|".join([*parts, "jfif"] if self.resaved else parts).lower()
 

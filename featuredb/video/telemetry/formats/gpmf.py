@@ -256,7 +256,8 @@ def _gps5(streams: list[Stream]) -> Decoded | None:
     entry, fix = stream.get("GPSF"), float(_FIX_3D)
     if entry is not None and entry.count:
         fix = float(numbers(entry)[0, 0])
-    else:
+    if entry is None or not entry.count or np.isnan(fix):
+        fix = float(_FIX_3D)
         warnings.append("GPS5 without its fix status (GPSF): whether positions are fresh is not known")
     start = _utc(stream.get("GPSU")) if fix >= _MIN_FIX else float("nan")
     return Decoded(_fixed(values, np.full(len(values), fix)), start, datum, warnings)
