@@ -82,6 +82,11 @@ class GrowthReport:
     def count(self, outcome: PhotoOutcome) -> int:
         return sum(photo.outcome == outcome for photo in self.photos)
 
+    @property
+    def promoted(self) -> tuple[str, ...]:
+        """Maps that are active since this run."""
+        return tuple(p.map_id for p in self.promotions if p.promoted)
+
     def as_json(self) -> dict[str, Any]:
         return {**asdict(self), "started": self.started.isoformat(), "seconds": round(self.seconds, 3)}
 

@@ -37,9 +37,7 @@ _LOG = logging.getLogger(__name__)
 def place_unplaced_maps(
     database: Database, areas: Sequence[IndexedArea], work: Path, options: GrowthOptions
 ) -> tuple[list[GrownEntry], list[str]]:
-    """Try every map without a place in the active areas; a question is not asked twice.
-
-    An entry for each: now it has a place, in quarantine, or it is "unplaced" still. And notes for people.
+    """Entries of all maps without a place, tried in the active areas, never asked twice; notes for people.
 
     Raises:
         StoreError: the database cannot be read or written; what is committed stands.

@@ -47,9 +47,7 @@ _LEAST_GAIN = 0.1
 
 
 def checked_by_scan(database: Database, grown: GrownMap) -> tuple[GrownMap | Refused, str]:
-    """The map with the gate's figure in its evidence, or its refusal.
-
-    And why a scan that is there could not be compared, "" otherwise.
+    """The map with the gate in its evidence, or its refusal; and why a scan could not be compared, or "".
 
     Raises:
         StoreError: the scans cannot be read.
