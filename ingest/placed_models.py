@@ -37,7 +37,7 @@ _ELSEWHERE = (
     "their GPS agrees on a place {offset_m:.0f} m from where their matches put them: they show another place "
     "that looks like it, or their positions have one error"
 )
-HINTS = "placed by geotags that nobody answers for"
+HINTS = "placed by unverified geotags"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -62,7 +62,7 @@ def register(subparsers: Any) -> None:
     )
     check.add_argument("--json", action="store_true", help="the report as JSON")
     retire = add_command(
-        subparsers, "retire", run_retire, "take a map out of service, with all that hangs on it, or a scan"
+        subparsers, "retire", run_retire, "take a map out of service, with its descendants, or a scan"
     )
     retire.add_argument("map_id", metavar="MAP", help="id of a map or of a LiDAR scan")
     retire.add_argument("--reason", required=True, help="kept with the map or scan")

@@ -17,7 +17,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument(
         "--trusted",
         action="store_true",
-        help="vouch for the dataset: its maps keep their status; default: what was active is quarantined",
+        help="trust the dataset: its maps keep their status; default: active maps are quarantined",
     )
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
 

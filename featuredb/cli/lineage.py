@@ -20,12 +20,12 @@ def register(subparsers: Any) -> None:
         subparsers,
         "lineage",
         run_lineage,
-        "draw which map stands on which",
+        "draw which map placed which",
         description="Draw the tree of maps: which one placed which, how many steps each is from its anchor, "
-        "how far it may have drifted of what growth allows (95 %), and why some are not active.",
+        "its drift and the drift budget (95 %), and why some are not active.",
     )
     parser.add_argument(
-        "map_id", metavar="MAP", nargs="?", help="only this map, what it stands on and what stands on it"
+        "map_id", metavar="MAP", nargs="?", help="only this map, its ancestors and its descendants"
     )
     parser.add_argument("--all", action="store_true", help="retired maps, too (with MAP they always show)")
     add_as_of_argument(parser)

@@ -38,8 +38,8 @@ def _register_grow(subparsers: Any) -> None:
         action="append",
         default=[],
         metavar="IDENTITY",
-        help="vouch for this client: its photos need nobody else's confirmation; may be repeated. anonymous: "
-        "all that comes without a certificate",
+        help="trust this client: its photos need no confirmation by others; may be repeated. anonymous: all "
+        "that come without a certificate",
     )
     grow.add_argument("--max-features", type=int, help="per photo; default: 12000")
     grow.add_argument("--workers", type=int, default=1, help="processes; default: 1")
@@ -54,8 +54,8 @@ def _register_promote(subparsers: Any) -> None:
         "promote",
         run_promote,
         "take a quarantined map into service by hand",
-        description="Promote a map without confirmation. Canaries are asked, and refuse it where one "
-        "regresses, unless --force is given. `featuredb retire` takes it back.",
+        description="Promote a map without confirmation. Canaries are run first; if one "
+        "regresses, the promotion is refused unless --force is given. `featuredb retire` undoes it.",
     )
     promote.add_argument("map_id", metavar="MAP")
     promote.add_argument("--reason", required=True, help="kept with the map")
@@ -63,7 +63,7 @@ def _register_promote(subparsers: Any) -> None:
 
 
 def _register_canary(subparsers: Any) -> None:
-    canary = subparsers.add_parser("canary", help="known queries that are asked before every promotion")
+    canary = subparsers.add_parser("canary", help="known queries, run before every promotion")
     add_database_argument(canary)
     kinds = canary.add_subparsers(title="what to do", metavar="ACTION", required=True)
     add = kinds.add_parser("add", help="add a photo whose right answer is known")
@@ -84,7 +84,7 @@ def _register_canary(subparsers: Any) -> None:
     remove = kinds.add_parser("remove", help="remove one")
     remove.add_argument("name", metavar="NAME")
     remove.set_defaults(run=run_canary_remove)
-    ask = kinds.add_parser("run", help="ask all of them of the active maps; exit 1 if one is not right")
+    ask = kinds.add_parser("run", help="localise all of them in the active maps; exit 1 if one is wrong")
     ask.add_argument("--json", action="store_true")
     ask.set_defaults(run=run_canary_run)
 

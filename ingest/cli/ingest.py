@@ -23,8 +23,8 @@ def register(subparsers: Any) -> None:
         "photos",
         run_photos,
         "a folder of photos with GPS, or a table of photos",
-        description="Reconstruct photos, place them by their GPS and commit the maps. A killed ingest goes "
-        "on where it was when the same command runs again.",
+        description="Reconstruct photos, place them by their GPS and commit the maps. Run the "
+        "same command again to resume a killed ingest.",
     )
     photos.add_argument(
         "folder",
@@ -61,8 +61,8 @@ def _register_video(kinds: Any) -> None:
         run_video,
         "films and folders of them, with or without telemetry",
         description="Split films into shots, choose keyframes by the picture's motion, reconstruct those of "
-        "all films together, place them by the telemetry where there is some, and commit the maps. Goes on "
-        "where it was when it was killed.",
+        "all films together, place them by the telemetry where there is some, and commit the maps. Run the "
+        "same command again to resume a killed ingest.",
     )
     add_video_arguments(video)
     _add_arguments(video)
@@ -75,11 +75,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="GLOB",
-        help="leave out files whose name fits; may be repeated",
+        help="skip files that match this glob; may be repeated",
     )
     group.add_argument("--name", default="", help="name of the map; default: the folder's name")
-    group.add_argument("--owner", default="", help="of photos that do not name their own")
-    group.add_argument("--licence", default="", help="of the photos, e.g. CC-BY-4.0")
+    group.add_argument("--owner", default="", help="owner of photos that state none")
+    group.add_argument("--licence", default="", help="licence of photos that state none, e.g. CC-BY-4.0")
     group.add_argument(
         "--trust-geotags",
         action="store_true",
@@ -98,13 +98,18 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--keep-focal",
         action="store_true",
-        help="do not refine focal lengths: for nadir flights, whose photos cannot tell focal length from "
-        "height, with a camera that is known well",
+        help="hold focal lengths fixed: for nadir flights with a well-known camera, whose photos cannot "
+        "separate focal length from height",
     )
     group.add_argument(
         "--max-features", type=int, help="per photo; default: 12000, for films 5000; fewer match faster"
     )
-    group.add_argument("--max-side", type=int, metavar="PX", help="features are looked for at; default: 2400")
+    group.add_argument(
+        "--max-side",
+        type=int,
+        metavar="PX",
+        help="longest side at which features are extracted; default: 2400",
+    )
     group.add_argument(
         "--min-track-length",
         type=int,
@@ -146,7 +151,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="where unfinished work is kept; default: DB/_work, or a cache folder for object stores",
     )
     group.add_argument("--report", type=Path, metavar="DIR", help="write report.json and report.html there")
-    group.add_argument("--stop-after", choices=_STAGES, help="end after that stage; the next run goes on")
+    group.add_argument("--stop-after", choices=_STAGES, help="end after that stage; the next run resumes")
     group.add_argument("--quiet", action="store_true", help="no progress bars")
 
 

@@ -44,8 +44,7 @@ def register(subparsers: Any) -> None:
         "--by",
         choices=("map", "scan", "both"),
         default="map",
-        help="what the film is followed by: the maps, a scan alone, or the scan where the maps know nothing; "
-        "default: map",
+        help="track against the maps, a scan alone, or the scan where the maps have no points; default: map",
     )
     parser.add_argument(
         "--scan", action="append", metavar="ID", help="with --by scan or both; default: all scans there"

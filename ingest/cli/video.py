@@ -38,7 +38,7 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
         "beside it under its name",
     )
     group.add_argument(
-        "--no-telemetry", action="store_true", help="take no notice of telemetry in films or beside them"
+        "--no-telemetry", action="store_true", help="ignore telemetry in films and beside them"
     )
     group.add_argument(
         "--film-start",
@@ -54,7 +54,7 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
         "speeds of both; of a log with a clock of its own: beside --film-start only",
     )
     group.add_argument(
-        "--keyframes", type=int, default=60, metavar="N", help="of each film, about so many; default: 60"
+        "--keyframes", type=int, default=60, metavar="N", help="approximate number per film; default: 60"
     )
     group.add_argument("--start", type=float, metavar="S", help="default: each film's beginning")
     group.add_argument("--end", type=float, metavar="S", help="default: each film's end")

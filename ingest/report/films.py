@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 FilmStatus = Literal["used", "refused"]
 
 DROPPED: Mapping[str, str] = {
-    "between": "between keyframes, nothing more to see",
+    "between": "between keyframes, nothing new",
     "frozen": "repeat the frame before",
     "black": "black",
     "plain": "plain",
     "title": "titles",
-    "break": "hang on none of their neighbours: a blink, a blur, a dissolve",
+    "break": "match no neighbouring frame: a blink, a blur, a dissolve",
 }
 """Why no keyframe was made of a frame: for programs, and for people."""
 

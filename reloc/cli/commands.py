@@ -87,14 +87,13 @@ def add_request_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--prior",
         metavar="LAT,LON,SIGMA_M",
-        help="where it may have been taken, WGS84 degrees and metres; with an equals sign where the latitude "
-        "is negative: --prior=-33.86,151.21,25",
+        help="prior of the position, WGS84 degrees and metres; with an equals sign if the latitude is "
+        "negative: --prior=-33.86,151.21,25",
     )
     parser.add_argument(
         "--no-exif-prior",
         action="store_true",
-        help="leave out the position in the photo's EXIF, which settles what is ambiguous where there is no "
-        "--prior",
+        help="do not use the position in the photo's EXIF, which resolves ambiguity if there is no --prior",
     )
     parser.add_argument(
         "--camera",
@@ -116,7 +115,7 @@ def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
         "--shared-lens",
         action="store_true",
         help="photos of one camera, by EXIF and size, have one lens: it is estimated from all of them, three "
-        "or more, and each is then answered with it; a photo alone hardly tells its focal length from its "
+        "or more, and each is then answered with it; one photo hardly separates focal length from "
         "height. Not for zoom lenses without EXIF, nor for cropped pictures",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON reply per line")

@@ -21,7 +21,7 @@ def register(subparsers: Any) -> None:
     gateway.add_argument(
         "--insecure",
         action="store_true",
-        help="listen on an address that other machines reach; the gateway speaks no TLS and checks nobody",
+        help="listen on an address that other machines reach; the gateway has no TLS and no authentication",
     )
     gateway.add_argument("--port", type=int, default=8080, help="default 8080; 0 takes a free one")
     gateway.add_argument(

@@ -43,7 +43,7 @@ def register(subparsers: Any) -> None:
     serve.add_argument(
         "--insecure",
         action="store_true",
-        help="start even where machines that nobody has authenticated can reach the server",
+        help="start even if unauthenticated machines can reach the server",
     )
     serve.add_argument("--name", default="", help="database name on the wire; default: the folder's name")
     serve.add_argument(

@@ -211,7 +211,7 @@ def lone_groups(
         if len(rows) >= 2:
             own = {pair: view for pair, view in geometries.items() if pair[0] in rows}
             groups.append(_triangulated({r: photos[r] for r in rows}, own, new))
-    return groups, dict.fromkeys(alone, "ALONE: no other photo bears its pose out")
+    return groups, dict.fromkeys(alone, "ALONE: no other photo confirms its pose")
 
 
 def poses_fit(a: LocalisedPhoto, b: LocalisedPhoto, pixels_a: FloatArray, pixels_b: FloatArray) -> bool:
