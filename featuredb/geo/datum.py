@@ -91,26 +91,31 @@ def ellipsoidal_height(
     place = as_geodetic("ellipsoidal_height", (latitude_deg, longitude_deg, height_m)).rows
     if checked == "ellipsoidal":
         return HeightConversion(height_m=float(place[0, 2]))
-    reason, grid = "", find_geoid_grid(checked, grid_directories)
     if checked == "unknown":
-        known = ", ".join(d for d in HEIGHT_DATUMS if d != "unknown")
-        reason = f"the height's datum is unknown; state it (one of {known}) to convert it"
-    elif grid is None:
-        names = GEOID_GRIDS[checked]
-        reason = (
-            f"the geoid grid of {checked} ({' or '.join(names)}) is not installed; "
-            f"install it by 'projsync --file {names[0]}' in PROJ's data directory"
+        return HeightConversion(
+            height_m=None,
+            reason="the height's datum is unknown; state it (one of "
+            f"{', '.join(d for d in HEIGHT_DATUMS if d != 'unknown')}) to convert it",
         )
-    else:
-        try:
-            height = shift_heights(place, grid, _WGS84_FROM_NAD83 if checked == "navd88" else "")[0]
-        except GeodesyError as error:
-            return HeightConversion(height_m=None, reason=str(error))
-        if np.isfinite(height):
-            return HeightConversion(height_m=float(height))
-        where = f"latitude {latitude_deg}, longitude {longitude_deg}"
-        reason = f"{where} lies outside the geoid grid {grid.name} of {checked}"
-    return HeightConversion(height_m=None, reason=reason)
+    grid = find_geoid_grid(checked, grid_directories)
+    if grid is None:
+        names = " or ".join(GEOID_GRIDS[checked])
+        return HeightConversion(
+            height_m=None,
+            reason=f"the geoid grid of {checked} ({names}) is not installed; "
+            f"install it by 'projsync --file {GEOID_GRIDS[checked][0]}' in PROJ's data directory",
+        )
+    try:
+        height = shift_heights(place, grid, _WGS84_FROM_NAD83 if checked == "navd88" else "")[0]
+    except GeodesyError as error:
+        return HeightConversion(height_m=None, reason=str(error))
+    if not np.isfinite(height):
+        return HeightConversion(
+            height_m=None,
+            reason=f"latitude {latitude_deg}, longitude {longitude_deg} lies outside the geoid grid "
+            f"{grid.name} of {checked}",
+        )
+    return HeightConversion(height_m=float(height))
 
 
 def find_geoid_grid(datum: HeightDatum, directories: Sequence[Path] | None = None) -> Path | None:

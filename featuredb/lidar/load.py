@@ -1,7 +1,7 @@
 """Scans of a database, or parts of them, as a point cloud in a local frame."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -28,8 +28,12 @@ PlanBox = tuple[float, float, float, float]
 _LARGEST_POINTS = 20_000_000
 
 
-_Part = tuple[ScanSummary, int, pa.Table]
-"""One level of one scan."""
+class _Part(NamedTuple):
+    """One level of one scan."""
+
+    scan: ScanSummary
+    level: int
+    table: pa.Table
 
 
 def scan_frame(scan: ScanSummary) -> LocalFrame:
@@ -97,7 +101,7 @@ def load_cloud(
         for scan in touched:
             table = scan_points(database, scan, level, boxes[scan.scan_id], columns)
             if len(table):
-                parts.append((scan, level, table))
+                parts.append(_Part(scan, level, table))
     return _cloud(frame, scans[0].height_datum, parts, columns)
 
 
@@ -112,8 +116,8 @@ def chosen_scans(database: Database, scan_ids: Sequence[str] | None) -> list[Sca
         ids, meant = [scan.scan_id for scan in scans], set()
         for start in scan_ids:
             said = f"no scan {start}" if start else "expected a scan's id or its first letters, found nothing"
-            none = ScanNotFoundError(f"{said}; `featuredb lidar list` lists what there is")
-            meant.add(full_id(start, ids, "scans", none))
+            none = f"{said}; `featuredb lidar list` lists what there is"
+            meant.add(full_id(start, ids, "scans", ScanNotFoundError, none))
         scans = [s for s in scans if s.scan_id in meant]
     if not scans:
         raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
@@ -137,13 +141,13 @@ def _utm_box(frame: LocalFrame, box: PlanBox | None, epsg: int) -> PlanBox | Non
 def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], columns: Sequence[str]) -> PointCloud:
     """The parts one after the other, in the frame, with their nodes."""
     none = SPECS[LIDAR_POINTS].schema.empty_table().select(columns)
-    table = pa.concat_tables([none, *(part for _, _, part in parts)], promote_options="permissive")
+    table = pa.concat_tables([none, *(part.table for part in parts)], promote_options="permissive")
     xyz = np.empty((len(table), 3), np.float32)
     row = 0
-    for scan, _, part in parts:
-        utm = np.stack([part[name].to_numpy() for name in UTM_COORDINATES], axis=1)
-        xyz[row : row + len(part)] = frame.enu_from_utm(utm, scan.epsg)
-        row += len(part)
+    for part in parts:
+        utm = np.stack([part.table[name].to_numpy() for name in UTM_COORDINATES], axis=1)
+        xyz[row : row + len(utm)] = frame.enu_from_utm(utm, part.scan.epsg)
+        row += len(utm)
     return PointCloud(
         frame=frame,
         height_datum=datum,
@@ -168,14 +172,14 @@ def _bytes(table: pa.Table, name: str) -> NDArray[np.uint8]:
 def _nodes(xyz: NDArray[np.float32], table: pa.Table, parts: Sequence[_Part]) -> CloudNodes:
     """Runs of equal node keys, and the boxes around their points."""
     node, spacing = (table[name].to_numpy() for name in ("node", "node_spacing_m"))
-    part = np.repeat(np.arange(len(parts)), np.array([len(rows) for _, _, rows in parts], np.int64))
+    part = np.repeat(np.arange(len(parts)), np.array([len(p.table) for p in parts], np.int64))
     new = np.ones(len(node), np.bool_)
     new[1:] = (node[1:] != node[:-1]) | (spacing[1:] != spacing[:-1]) | (part[1:] != part[:-1])
     start = np.flatnonzero(new)
     return CloudNodes(
         start=start,
         count=np.diff(start, append=len(xyz)),
-        level=np.array([level for _, level, _ in parts], np.int16)[part[start]],
+        level=np.array([p.level for p in parts], np.int16)[part[start]],
         spacing_m=spacing[start],
         box_min=np.minimum.reduceat(xyz, start, axis=0) if len(start) else np.empty((0, 3), np.float32),
         box_max=np.maximum.reduceat(xyz, start, axis=0) if len(start) else np.empty((0, 3), np.float32),

@@ -26,6 +26,7 @@ class Change:
     Attributes:
         rows: all rows after the change.
         added: the new rows, where no old one is changed or gone, so that appending them is enough; else None.
+            (): nothing is to be committed.
         flagged: ids of maps put into quarantine, because a map that placed them gave way.
     """
 

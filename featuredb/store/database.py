@@ -249,7 +249,7 @@ class Database:
             MapNotFoundError, ConflictError, StoreError
         """
         retire = partial(retire_map, map_id=map_id, reason=reason)
-        return self.change_maps(f"retire {map_id}", "retire", reason, retire).changed
+        return self.change_rows(f"retire {map_id}", "retire", reason, retire).changed
 
     def set_status(
         self,
@@ -284,9 +284,9 @@ class Database:
             return change_status(rows, map_ids, status, reason)
 
         operation = "promote" if status == ACTIVE else "quarantine"
-        return self.change_maps(f"{status} for {', '.join(map_ids)}", operation, reason, decided)
+        return self.change_rows(f"{status} for {', '.join(map_ids)}", operation, reason, decided)
 
-    def change_maps(
+    def change_rows(
         self,
         what: str,
         operation: str,

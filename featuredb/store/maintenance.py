@@ -68,11 +68,14 @@ def vacuum(
         now = store_time(database.table(tables.MAPS).storage)
         history, grace = timedelta(hours=options.history_h), timedelta(hours=options.orphan_grace_h)
         kept_from = retry_stale("vacuum", lambda: _announce(database, now - history, dry_run))
-        # Asked before rows are removed, which gives those beside them newer files.
-        refused = _refused_images(database, now, history, grace)
         orphans: set[str] = set()
+        refused: set[str] = set()
         gone = {scan_id for scan_id, time in retired_since(database).items() if time <= now - history}
         for name, named in named_writes(database, kept_from, gone):
+            if name == tables.CANDIDATE_IMAGES:
+                # Asked as late as can be, as photos may be given again meanwhile; but before orphans are
+                # removed, which gives rows beside them newer files.
+                refused = _refused_images(database, now, history, grace)
             orphans |= _remove_orphans(database.table(name), named, now - grace, dry_run)
         if refused and not dry_run:
             database.table(tables.CANDIDATE_IMAGES).delete_rows("candidate_id", refused)
@@ -88,7 +91,7 @@ def vacuum(
 def named_writes(
     database: Database, first_version: int, gone: Collection[str] = ()
 ) -> Iterator[tuple[str, set[str]]]:
-    """The child tables that there are, and the write ids that what is above each of them names.
+    """Each child table there is, with the write ids that its parent table names.
 
     Args:
         first_version: of `maps`; what only earlier ones name does not count.
@@ -179,8 +182,6 @@ def _refused_images(database: Database, now: datetime, history: timedelta, grace
 
     Not those with bytes younger than `grace`: somebody may be giving the photo again just now.
     """
-    if not database.has(tables.CANDIDATES):
-        return set()
     live = live_maps(database)
     found = set()
     for candidate_id, events in by_candidate(read_events(database)).items():

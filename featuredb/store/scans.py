@@ -173,7 +173,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
             return Change(rows=rows, added=()), []
         return Change(rows=with_status(rows, [scan_id], RETIRED, reason, "scan_id")), [scan_id]
 
-    return bool(database.change_maps(f"retire {scan_id}", "retire", reason, retired, LIDAR).changed)
+    return bool(database.change_rows(f"retire {scan_id}", "retire", reason, retired, LIDAR).changed)
 
 
 def scan_points(

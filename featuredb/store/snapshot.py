@@ -205,7 +205,7 @@ class Snapshot:
         """
         live = [map_id for map_id, row in self._rows.items() if row["status"] != RETIRED]
         none = f"snapshot {self.version} has no live map {start}; `featuredb maps` lists what there is"
-        return self.get_any(full_id(start, live, "maps", MapNotFoundError(none)))
+        return self.get_any(full_id(start, live, "maps", MapNotFoundError, none))
 
     def lineages(self) -> dict[str, MapLineage]:
         """What each map of the snapshot stands on, retired ones included, by id."""
@@ -315,18 +315,18 @@ class Snapshot:
         return batches
 
 
-def full_id(start: str, ids: Collection[str], what: str, none: StoreError) -> str:
+def full_id(start: str, ids: Collection[str], what: str, error: type[StoreError], none: str) -> str:
     """The id that is meant by itself, or by its first letters if no other begins so.
 
     Raises:
-        StoreError: `none` where there is no such id; of the same kind where several begin so.
+        StoreError: of the class `error`; there is no such id, as `none` says, or several begin so.
     """
     found = [start] if start in ids else [i for i in ids if start and i.startswith(start)]
     if len(found) > 1:
         some = ", ".join(sorted(found)[:4])
-        raise type(none)(f"{start}: {len(found)} {what} begin so ({some}); write more of the id")
+        raise error(f"{start}: {len(found)} {what} begin so ({some}); write more of the id")
     if not found:
-        raise none
+        raise error(none)
     return found[0]
 
 

@@ -18,6 +18,7 @@ from featuredb.extras import require
 from featuredb.store import tables
 from featuredb.store.database import Database
 from featuredb.store.decode import plain_times
+from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.encode import rows_table
 from featuredb.store.scans import list_scans, scan_rows
 from featuredb.store.snapshot import Snapshot
@@ -167,7 +168,10 @@ class SqlSession(AbstractContextManager["SqlSession"]):
     def _register_growth(self, database: Database) -> None:
         for name, hidden in ((tables.CANDIDATES, "event_index"), (tables.CANARIES, "image")):
             columns = [n for n in tables.SPECS[name].schema.names if n not in (hidden, "write_id")]
-            rows = rows_table(name, database.rows(name, columns)).select(columns)
+            rows = tables.SPECS[name].schema.empty_table().select(columns)
+            if database.has(name):
+                with read_errors(f"cannot read the table {name}"):
+                    rows = database.table(name).dataset().to_table(columns)
             self._connection.register(name, plain_times(rows))
 
     def _fetch(self) -> Iterator[tuple[Any, ...]]:

@@ -323,7 +323,7 @@ def _check_canaries(database: Database) -> Iterator[Found]:
             yield f"canary {canary.name}", str(error)
 
 
-def _stored_digests(database: Database) -> Iterator[Found]:
+def _stored_digests(database: Database) -> Iterator[tuple[str, str]]:
     """Candidate and SHA-256 of each stored image, one in memory at a time."""
     dataset = database.table(tables.CANDIDATE_IMAGES).dataset()
     batches = dataset.to_batches(
@@ -344,7 +344,10 @@ def _said(problems: Iterable[Found]) -> tuple[DatabaseProblem, ...]:
 
 def _orphans(database: Database) -> list[str]:
     first = oldest_kept_version(database.table(tables.MAPS).commits())
+    # First what is there: a commit names its rows after it has written them.
+    children = [name for name in database.tables() if name not in tables.CHILDREN]
+    present = {name: set(write_ids_in(database.table(name))) for name in children}
     orphans: set[str] = set()
     for name, named in named_writes(database, first):
-        orphans |= write_ids_in(database.table(name)).keys() - named
+        orphans |= present.get(name, set()) - named  # a table may have been made meanwhile
     return sorted(orphans)

@@ -11,14 +11,20 @@ import pyarrow.parquet as pq
 import pytest
 
 from featuredb.errors import StoreError
-from featuredb.store import Database
+from featuredb.store import Database, maintenance
 from featuredb.store import verify as verify_module
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image
-from featuredb.store.candidates.photos import append_events, contribute, list_candidates, withdraw
+from featuredb.store.candidates.photos import (
+    append_events,
+    contribute,
+    list_candidates,
+    note_events,
+    withdraw,
+)
 from featuredb.store.commits import new_write_id
 from featuredb.store.delta import Table
 from featuredb.store.maintenance import VacuumOptions, vacuum
-from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, SPECS
+from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, OBSERVATIONS, SPECS
 from featuredb.store.verify import verify
 from tests.support.contributions import contribution, find_candidate, load_image
 from tests.support.growth_suite import DecisionsSuite
@@ -122,6 +128,23 @@ def test_a_withdrawal_that_was_interrupted(database: Database, monkeypatch: pyte
     no_grace = VacuumOptions(orphan_grace_h=0)
     assert vacuum(database, no_grace).candidate_images == (other,)
     assert verify(database).ok
+
+
+def test_a_photo_that_is_given_again_while_a_vacuum_runs(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (one,) = contribute(database, [contribution(1)])
+    note_events(database, {one: {"event": "withdrawn"}})
+    real = maintenance._remove_orphans
+
+    def meanwhile(table: Table, *args: Any) -> Any:
+        if table.spec.name == OBSERVATIONS:
+            contribute(database, [contribution(1)])
+        return real(table, *args)
+
+    monkeypatch.setattr(maintenance, "_remove_orphans", meanwhile)
+    assert vacuum(database, VacuumOptions(orphan_grace_h=0)).candidate_images == ()
+    assert load_image(database, one) == contribution(1).image
 
 
 @pytest.mark.parametrize("between", ["events and images", "files and their footers"])

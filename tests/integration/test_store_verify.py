@@ -13,10 +13,13 @@ from deltalake import DeltaTable, write_deltalake
 
 from featuredb.errors import StoreError
 from featuredb.store import Database
+from featuredb.store import verify as verify_module
+from featuredb.store.candidates.photos import contribute
 from featuredb.store.durable import log as log_module
 from featuredb.store.durable import publish
 from featuredb.store.durable.log import log_problems
 from featuredb.store.verify import DatabaseProblem, VerifyReport, verify
+from tests.support.contributions import contribution
 from tests.support.maps import random_map
 
 
@@ -159,6 +162,24 @@ def test_rows_of_an_unknown_write_are_orphans_and_no_damage(database: Database) 
     assert report.orphans == ("0" * 32,)
     points = database.snapshot().dataset("points").to_table(["write_id"])
     assert pc.count_distinct(points["write_id"]).as_py() == 1
+
+
+@pytest.mark.parametrize("before", ["write_ids_in", "named_writes"])
+def test_a_commit_while_orphans_are_sought(
+    database: Database, monkeypatch: pytest.MonkeyPatch, before: str
+) -> None:
+    contribute(database, [contribution(1)])
+    real, calls = getattr(verify_module, before), list[object]()
+
+    def meanwhile(*args: Any) -> Any:
+        if not calls:
+            calls.append(database.commit_map(random_map(2)))
+            contribute(database, [contribution(2)])
+        return real(*args)
+
+    monkeypatch.setattr(verify_module, before, meanwhile)
+    assert verify(database).orphans == ()
+    assert calls
 
 
 def test_each_log_entry_is_read_once(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:

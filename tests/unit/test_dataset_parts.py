@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pyproj
@@ -15,12 +16,14 @@ from featuredb.export.dataset.geoparquet import point_columns, wkb_of
 from featuredb.export.dataset.layout import check_sums, write_sums
 from featuredb.export.shots import pose_covariance
 from featuredb.geo.crs.wkt import utm_projjson
+from featuredb.geo.heights import HEIGHT_DATUMS
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.feature_map import FeatureMap, MapMethod
 from featuredb.store import Database
+from featuredb.store.tables import POINT_COVARIANCE
 from tests.support.datasets import map_at
 from tests.support.maps import random_map
 
@@ -191,6 +194,15 @@ def test_every_column_is_explained() -> None:
         assert all(meaning.values())
         assert set(table.words) <= set(meaning)
         assert set(table.repeating) <= set(table.schema.names)
+
+
+def test_columns_are_explained_as_a_dataset_has_them() -> None:
+    maps, points = columns.MAPS.meaning(), columns.POINTS.meaning()
+    assert "unplaced" not in maps["status"]
+    assert "hex" not in columns.OBSERVATIONS.meaning()["descriptor"]
+    assert all(datum in maps["height_datum"] for datum in HEIGHT_DATUMS)
+    assert all(method in maps["method"] for method in get_args(MapMethod))
+    assert all("local frame" in points[name] for name in POINT_COVARIANCE)
 
 
 def test_a_status_may_come_with_its_reason(tmp_path: Path) -> None:

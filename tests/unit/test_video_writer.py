@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from featuredb.atomic import atomic_file
 from featuredb.errors import InvalidValueError, VideoError
 from featuredb.video.frames import open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
@@ -178,18 +179,18 @@ def test_places_that_cannot_be_written(tmp_path: Path) -> None:
 
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """/dev/full takes every open and refuses every byte."""
-    path = tmp_path / "film.mp4"
-    (tmp_path / "part").symlink_to("/dev/full")
 
     @contextmanager
-    def part(_: Path) -> Iterator[Path]:
-        yield tmp_path / "part"
+    def full(path: Path) -> Iterator[Path]:
+        with atomic_file(path) as temporary:
+            temporary.symlink_to("/dev/full")
+            yield temporary
 
-    monkeypatch.setattr("featuredb.video.writer.atomic_file", part)
-    writer = VideoWriter(path, width=WIDTH, height=HEIGHT, fps=25.0)
+    monkeypatch.setattr("featuredb.video.writer.atomic_file", full)
+    writer = VideoWriter(tmp_path / "film.mp4", width=WIDTH, height=HEIGHT, fps=25.0)
     with pytest.raises(VideoError, match="No space left on device"), writer:
         writer.write(picture(0))
-    assert not path.exists()
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

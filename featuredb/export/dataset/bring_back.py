@@ -103,7 +103,7 @@ def _vouch_for(database: Database, rows: Sequence[Row], missing: Mapping[str, Se
     active = {row["map_id"] for row in rows if row["status"] == ACTIVE and row["map_id"] not in missing}
     reasons = {row["map_id"]: _vouched_reason(row, missing) for row in rows if row["status"] != RETIRED}
     vouch = partial(vouch_for, active=active, reasons=reasons)
-    database.change_maps("vouch for what was imported", "vouch", VOUCHED, vouch)
+    database.change_rows("vouch for what was imported", "vouch", VOUCHED, vouch)
 
 
 def _vouched_reason(row: Row, missing: Mapping[str, Sequence[str]]) -> str:

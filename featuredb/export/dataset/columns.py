@@ -68,7 +68,10 @@ _GEOMETRY = {
 }
 
 _MAPS_WORDS = {
+    "content_digest": "SHA-256 over everything in the map but its status, by `featuredb.store.encode`",
+    "status": "active: answers queries; quarantined: kept aside; retired: out of service",
     "created_at": "when it was committed to the database that this is from, UTC",
+    "epsg": "UTM zone of its points and images, 326zz or 327zz",
     "lineage": "JSON: chain of maps to its nearest anchor, anchors, drift and budget in metres",
     "points_file": "where its points are; null without any",
     "images_file": "where its images are; null without any",
@@ -100,6 +103,11 @@ _IMAGES_WORDS = {
     "earth_covariance": "6 x 6: rotation (rad) about true east, north, up, then position (m) along them; the "
     "pose's own, where it is known, and the placement's",
     **_GEOMETRY,
+}
+
+_OBSERVATIONS_WORDS = {
+    "descriptor": "128 bytes of RootSIFT, or null where the track is too short to be matched or has enough "
+    "of them elsewhere",
 }
 
 
@@ -154,4 +162,9 @@ POINTS = Columns(
     more=_POINT_GEOMETRY,
     repeating=("map_id", "red", "green", "blue", "track_length"),
 )
-OBSERVATIONS = Columns(stored=store.OBSERVATIONS, words={}, more=(), repeating=("map_id", "image_id"))
+OBSERVATIONS = Columns(
+    stored=store.OBSERVATIONS,
+    words=_OBSERVATIONS_WORDS,
+    more=(),
+    repeating=("map_id", "image_id"),
+)

@@ -19,9 +19,9 @@ from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.unplaced_map import UnplacedMap
+from featuredb.store import tables as store
 from featuredb.store.encode import EncodedMap, encode_map, rows_table
 from featuredb.store.snapshot import MapSummary, UnplacedSummary
-from featuredb.store.tables import MAPS, SPECS
 
 COLUMNS = {POINTS: columns.POINTS, IMAGES: columns.IMAGES, OBSERVATIONS: columns.OBSERVATIONS}
 
@@ -97,13 +97,13 @@ class OwnFrameFiles(AbstractContextManager["OwnFrameFiles"]):
         encoded = encode_map(unplaced, "", summary.created_at)
         row = encoded.row | {"status_reason": summary.status_reason}
         self.rows.append(row)
-        tables = {MAPS: rows_table(MAPS, [row]), **encoded.children}
+        tables = {store.MAPS: rows_table(store.MAPS, [row]), **encoded.children}
         for table, rows in tables.items():
             if table not in self._open:
                 path = self._folder / own_path(table)
-                self._open[table] = TableFile(path, SPECS[table].schema, ("map_id",))
+                self._open[table] = TableFile(path, store.SPECS[table].schema, ("map_id",))
             if len(rows):
-                self._open[table].write(rows.cast(SPECS[table].schema))
+                self._open[table].write(rows.cast(store.SPECS[table].schema))
 
     def __exit__(self, *failed: object) -> None:
         for file in self._open.values():

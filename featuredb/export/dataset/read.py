@@ -16,10 +16,9 @@ from featuredb.export.dataset.layout import check_sums
 from featuredb.export.dataset.partitions import COLUMNS
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import MapKind, UnplacedMap
+from featuredb.store import tables as store
 from featuredb.store.decode import decode_map
 from featuredb.store.encode import content_digest
-from featuredb.store.tables import CHILD_TABLES
-from featuredb.store.tables import MAPS as STORED_MAPS
 
 Row = dict[str, Any]
 
@@ -132,9 +131,9 @@ def own_rows(folder: Path, listed: frozenset[str]) -> list[Row]:
     Raises:
         ExportError: the table cannot be read.
     """
-    if layout.own_path(STORED_MAPS) not in listed:
+    if layout.own_path(store.MAPS) not in listed:
         return []
-    return list(read_table(folder / layout.own_path(STORED_MAPS)).to_pylist())
+    return list(read_table(folder / layout.own_path(store.MAPS)).to_pylist())
 
 
 def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> UnplacedMap:
@@ -143,12 +142,14 @@ def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> Un
     Raises:
         ExportError: its rows cannot be read, or are not the map that was exported.
     """
-    for table in CHILD_TABLES:
+    for table in store.CHILD_TABLES:
         check_listed(layout.own_path(table), listed, folder)
     only = ds.field("map_id") == row["map_id"]
     return decoded(
         folder,
         dict(row),
-        lambda: {t: read_table(folder / layout.own_path(t), only=only).to_batches() for t in CHILD_TABLES},
+        lambda: {
+            t: read_table(folder / layout.own_path(t), only=only).to_batches() for t in store.CHILD_TABLES
+        },
         UnplacedMap,
     )

@@ -200,7 +200,7 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
             row["lineage"] = json.dumps(stands_on, sort_keys=True)
             contents.maps.append(entry_of(feature_map, row))
             cameras += _camera_rows(feature_map)
-            del feature_map  # before the next one is loaded
+            del feature_map, encoded  # before the next one is loaded
     write_attribution(folder, credits)
     if not contents.maps:
         job.summaries()  # names what has no place

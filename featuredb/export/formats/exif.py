@@ -140,16 +140,18 @@ def properties(shot: PosedPhoto) -> dict[str, str]:
 
 
 def _copy(part: Path, name: Path, shot: PosedPhoto, original: Path | None) -> _File:
-    reason, file = "", name.as_posix()
-    try:
-        if original is None:
-            raise ExportError("no file of these bytes in the folder")
-        data = with_pose(original.read_bytes(), shot)
-    except FeatureDbError as error:
-        reason, file = str(error), ""
+    reason = ""
+    if original is None:
+        reason = "no file of these bytes in the folder"
     else:
-        (part / name).parent.mkdir(parents=True, exist_ok=True)
-        (part / name).write_bytes(data)
+        try:
+            data = with_pose(original.read_bytes(), shot)
+        except FeatureDbError as error:
+            reason = str(error)
+        else:
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            (part / name).write_bytes(data)
+    file = "" if reason else name.as_posix()
     return _File(
         map_id=shot.map_id, image=shot.image.name, sha256=shot.image.sha256, file=file, reason=reason
     )

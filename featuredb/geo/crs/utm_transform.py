@@ -88,24 +88,26 @@ def utm_transform(crs: ScanCrs, low: FloatArray, high: FloatArray, epsg: int | N
     epsg = utm_epsg((south + north) / 2.0, _middle(west, east)) if epsg is None else epsg
     zone_of(epsg)
     target = CRS.from_epsg(epsg)
-    best, how, accuracy = None, "none, it is in UTM already", 0.0
-    if crs.is_3d or not source.equals(target, ignore_axis_order=True):
-        box = (west, south, east, north)
-        group = _operations(source, target.to_3d() if crs.is_3d else target, box, DEMAND)
-        best = group.transformers[0]
-        how, accuracy = best.description, float(best.accuracy)
-        if not group.best_available and group.unavailable_operations:
-            missing = group.unavailable_operations[0]
-            notes.append(
-                f"a better datum transformation needs a grid that is not installed ({missing.name}, "
-                f"{missing.accuracy:g} m); PROJ's own tool `projsync` installs it"
-            )
+    if not crs.is_3d and source.equals(target, ignore_axis_order=True):
+        return UtmTransform(
+            epsg=epsg, description="none, it is in UTM already", accuracy_m=0.0, z_scale=crs.height_unit_m,
+            with_heights=False, notes=tuple(notes), _transformer=None,
+        )  # fmt: skip
+    group = _operations(source, target.to_3d() if crs.is_3d else target, (west, south, east, north), DEMAND)
+    best = group.transformers[0]
+    if not group.best_available and group.unavailable_operations:
+        missing = group.unavailable_operations[0]
+        notes.append(
+            f"a better datum transformation needs a grid that is not installed ({missing.name}, "
+            f"{missing.accuracy:g} m); PROJ's own tool `projsync` installs it"
+        )
+    accuracy = float(best.accuracy) if best.accuracy >= 0.0 else None
     # In a 3D CRS PROJ converts the unit of the third axis itself; what --height-unit says comes on top.
     axis_m = source.axis_info[2].unit_conversion_factor if crs.is_3d else 1.0
     return UtmTransform(
         epsg=epsg,
-        description=how,
-        accuracy_m=accuracy if accuracy >= 0.0 else None,
+        description=best.description,
+        accuracy_m=accuracy,
         z_scale=crs.height_unit_m / axis_m,
         with_heights=crs.is_3d,
         notes=tuple(notes),

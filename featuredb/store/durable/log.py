@@ -228,7 +228,8 @@ def check_end(url: str, files: fs.FileSystem, version: int) -> None:
     """
     if "://" in url:
         return
-    for end in sorted({max(acknowledged(files), version), version}, reverse=True):
+    head = acknowledged(files)
+    for end in ([head] if head > version else []) + [version]:
         try:
             _entry(files, end)
         except ValueError as error:
