@@ -75,6 +75,6 @@ def test_the_figures_are_those_of_the_program():
         f"a body over {options.max_body_bytes >> 20} MiB, an image over {options.max_image_bytes >> 20} MiB",
         f"the body took longer than {options.body_timeout_s:g} s",
         f"At most {options.max_in_flight} photos are in hand and {options.max_buffered_bytes >> 20} MiB",
-        f"at least {options.prior_floor_m:g} m; {options.prior_unknown_m:g} m where it is missing",
+        f"at least {options.prior_floor_m:g} m; {options.prior_unknown_m:g} m if it is missing",
     ):
         assert said in _TEXT

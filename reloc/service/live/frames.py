@@ -137,14 +137,14 @@ class FrameAnswerer:
 def pose_message(point: TrajectoryPoint, camera: Camera | None, **about: Any) -> TrackPose:
     """A frame on Earth as the wire says it, with its camera as the client sent it where there is a pose.
 
-    `about`: what neither says.
+    `about`: the other fields of TrackPose; a time goes before the point's.
     """
     pose: dict[str, Any] = dict.fromkeys(_PLACE)
     if point.pose is not None:
         assert camera is not None
         lens = Intrinsics(**asdict(camera))
         pose = {**place_fields(point.pose), "camera": lens, "map_id": point.pose.map_id}
-    same = {name: getattr(point, name) for name in ("state", "detail", "inliers")}
+    same = {name: getattr(point, name) for name in ("time_s", "state", "detail", "inliers")}
     return TrackPose(body_axes=BODY_AXES, **same | about | pose)
 
 
