@@ -136,6 +136,29 @@ def point_jacobian(points_target: ArrayLike) -> FloatArray:
     return jacobian
 
 
+def turns_about(middle: FloatArray) -> FloatArray:
+    """(7, 3) left perturbations of rotations about a place."""
+    return np.vstack([np.zeros((1, 3)), np.eye(3), skew(middle)])
+
+
+def left_jacobian(tangent: FloatArray) -> FloatArray:
+    """J (7, 7) with exp(x + dx) = exp(J dx) exp(x) to first order.
+
+    The integral over t in [0, 1] of exp(t ad), with ad the derivative of `Sim3.adjoint`: the corner of one
+    matrix exponential (Van Loan 1978).
+    """
+    from scipy.linalg import expm  # slow to import, and commands that list maps come by here
+
+    sigma, omega, nu = float(tangent[0]), tangent[1:4], tangent[4:]
+    both = np.zeros((14, 14))
+    both[1:4, 1:4] = skew(omega)
+    both[4:7, 0] = -nu
+    both[4:7, 1:4] = skew(nu)
+    both[4:7, 4:7] = sigma * np.eye(3) + skew(omega)
+    both[:7, 7:] = np.eye(7)
+    return np.asarray(expm(both)[:7, 7:], dtype=np.float64)
+
+
 def _translation_factor(sigma: float, omega: FloatArray) -> FloatArray:
     """W = integral over t in [0, 1] of exp(t sigma) exp(t [omega]x), so that exp's translation is W nu.
 

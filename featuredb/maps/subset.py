@@ -1,4 +1,7 @@
-"""A part of a map that is a map itself: some of its images with what they see, some of its points."""
+"""A part of a map that is a map itself: some of its images with what they see, some of its points.
+
+Or all of it, with descriptors for some of its points.
+"""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -61,6 +64,14 @@ def only_points(feature_map: MapKind, stays: NDArray[np.bool_]) -> MapKind:
         points=feature_map.points.take(stays),
         observations=replace(seen, point_index=new_row[seen.point_index]),
     )
+
+
+def answering_with(feature_map: MapKind, points: NDArray[np.bool_]) -> MapKind:
+    """The map with descriptors for some of its points (n,) only."""
+    seen = feature_map.observations
+    keep = seen.has_descriptor & points[seen.point_index]
+    descriptors = np.where(keep[:, None], seen.descriptors, np.uint8(0))
+    return replace(feature_map, observations=replace(seen, has_descriptor=keep, descriptors=descriptors))
 
 
 def _views(point_index: NDArray[np.int64], image_id: NDArray[np.int32], points: int) -> NDArray[np.int32]:

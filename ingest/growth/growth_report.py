@@ -136,10 +136,15 @@ def grown_entry(feature_map: FeatureMap) -> GrownEntry:
     """Of a map that was committed, in quarantine."""
     growth = growth_of(feature_map.placement.evidence)
     return GrownEntry(
-        **{name: getattr(feature_map, name) for name in ("map_id", "status", "parents", "generation")},
-        **{name: growth[name] for name in ("drift_m", "budget_m", "gates")},
+        map_id=feature_map.map_id,
+        status=feature_map.status,
         photos=tuple(image.name for image in feature_map.images),
         points=len(feature_map.points),
+        parents=feature_map.parents,
+        generation=feature_map.generation,
+        drift_m=growth.get("drift_m"),
+        budget_m=growth.get("budget_m"),
+        gates=growth.get("gates", {}),
     )
 
 

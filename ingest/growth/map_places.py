@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import skew
-from featuredb.geometry.sim3 import point_jacobian
+from featuredb.geometry.sim3 import point_jacobian, turns_about
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.place_bounds import NO_HEIGHT_M
@@ -63,21 +62,25 @@ def with_growth(feature_map: FeatureMap, **figures: Any) -> FeatureMap:
     return replace(feature_map, placement=replace(placement, evidence={**placement.evidence, GROWTH: growth}))
 
 
-def with_overlaps(
-    feature_map: FeatureMap, relative: FloatArray, edges: Sequence[Edge], budget_m: float
-) -> tuple[FeatureMap, float]:
-    """The map with these overlaps and its drift (m), by its covariance (7, 7) to anchors, in its evidence.
+def map_drift_m(feature_map: FeatureMap, covariance_relative: FloatArray) -> float:
+    """`drift_m` of a map, no less than at any of its photos' centres.
 
-    The drift is no less than at any of its photos' centres: these are few among thousands of places, and may
-    all be in the hundredth that `drift_m` leaves out.
+    These are few among thousands of places, and may all be in the hundredth that is left out.
     """
-    at_photos_m = SIGMAS_95 * float(place_sigmas_m(relative, centers_of(feature_map)).max(initial=0.0))
-    drift = max(at_photos_m, drift_m(relative, places_of(feature_map)))
+    at_photos_m = place_sigmas_m(covariance_relative, centers_of(feature_map)).max(initial=0.0)
+    return max(SIGMAS_95 * float(at_photos_m), drift_m(covariance_relative, places_of(feature_map)))
+
+
+def with_overlaps(
+    feature_map: FeatureMap, covariance_relative: FloatArray, edges: Sequence[Edge], budget_m: float
+) -> tuple[FeatureMap, float]:
+    """The map with these overlaps and its drift (m), by its covariance (7, 7) to anchors, in its evidence."""
+    drift = map_drift_m(feature_map, covariance_relative)
     noted = with_growth(
         feature_map,
         drift_m=round(drift, 6),
         budget_m=budget_m,
-        covariance_relative=relative.ravel().tolist(),
+        covariance_relative=covariance_relative.ravel().tolist(),
         edges=[edge.as_json() for edge in edges],
     )
     return noted, drift
@@ -87,11 +90,6 @@ def inflated(feature_map: FeatureMap) -> FeatureMap:
     """The map with its placement's covariance `isotropic_inflation`."""
     alike = isotropic_inflation(feature_map, feature_map.placement.covariance)
     return replace(feature_map, placement=replace(feature_map.placement, covariance=alike))
-
-
-def turns_about(middle: FloatArray) -> FloatArray:
-    """(7, 3) left perturbations of rotations about a place."""
-    return np.vstack([np.zeros((1, 3)), np.eye(3), skew(middle)])
 
 
 def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> FloatArray:

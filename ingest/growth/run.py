@@ -156,11 +156,8 @@ class _Run:
 
         A map that goes back to quarantine and is promoted again, round by round, would keep the run going.
         """
-        rows, threads = self._open_rows(), self.options.threads
-        outside = NewPhotos(
-            given=self.new, rows=rows, threads=threads, localised=self.localised, heard=self.heard
-        )
-        outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, outside)
+        new = NewPhotos(given=self.new, rows=self._open_rows(), localised=self.localised, heard=self.heard)
+        outcomes = promote_confirmed(self.database, self.localiser, self.options, self.work, new)
         for outcome in outcomes:
             self.promotions[outcome.map_id] = outcome
             entry = self.entries.get(outcome.map_id)

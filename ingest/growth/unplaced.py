@@ -23,7 +23,7 @@ from ingest.growth.graph.map_graph import grow_within_budget, placed_maps
 from ingest.growth.growth_report import GrownEntry, grown_entry, refused_entry
 from ingest.growth.place.component import GrownMap
 from ingest.growth.place.localised import localise_photos
-from ingest.growth.place.map_images import features_and_points, model_of
+from ingest.growth.place.map_images import features_and_points, model_of, observed_rows
 from ingest.growth.trust.scan_check import NOT_ASKED, checked_by_scan
 from ingest.growth.values import LEAST_PHOTOS, GrowthOptions, GrowthPhotos, Refused
 from ingest.map_builder import MapIdentity
@@ -108,9 +108,13 @@ def _grown(
     named = ("map_id", "name", "source", "licence", "provenance")
     identity = MapIdentity(**{name: getattr(unplaced, name) for name in named})
 
+    rows = [observed_rows(unplaced, image, described=False) for image in unplaced.images]
+
     def features_of(row: int, *, described: bool = False) -> PhotoFeatures:
         """Those that can be matched come first, so that they have the same rows alone."""
-        features, points = features_and_points(unplaced, unplaced.images[row], described=described)
+        own = rows[row]
+        own = own[unplaced.observations.has_descriptor[own]] if described else own
+        features, points = features_and_points(unplaced, unplaced.images[row], own)
         return PhotoFeatures(features=features, rgb=unplaced.points.rgb[points])
 
     photos = [_photo(unplaced, image) for image in unplaced.images]
@@ -150,8 +154,7 @@ def left_over(
 
 
 def _photo(unplaced: UnplacedMap, image: MapImage) -> Photo:
-    camera = unplaced.cameras[image.camera_id]
-    keys = unplaced.camera_keys
+    camera, keys = unplaced.cameras[image.camera_id], unplaced.camera_keys
     return Photo(
         path=Path(image.name),
         width=camera.width,

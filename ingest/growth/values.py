@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -24,7 +25,7 @@ from reloc.localise.lens_prior import LensPriors
 from reloc.localise.options import LocaliseOptions, PoseOptions
 from reloc.localise.result import LocaliseResult
 
-_OF_NONE: Any = {}.__getitem__
+_OF_NONE: Any = {}.__getitem__  # of no photos, and of no overlaps: nobody calls it
 DRIFT_BUDGET_M = 0.5  # what a survey's points are usually wanted for
 # Of a reconstruction, of a map without a place, of those by which two maps overlap, and of those that see a
 # point that is asked for what is there: two leave it along a ray.
@@ -114,7 +115,10 @@ class Edge:
 
     def as_json(self) -> dict[str, Any]:
         return {
-            **{name: getattr(self, name) for name in _TOLD_OF_EDGE},
+            "map_id": self.map_id,
+            "place": self.place,
+            "shared_points": self.shared_points,
+            "photos": self.photos,
             "parent_from_new": self.other_from_map.log().tolist(),
             "covariance": self.covariance.ravel().tolist(),
             "shared": self.shared.ravel().tolist(),
@@ -123,14 +127,14 @@ class Edge:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> "Edge":
         return cls(
-            **{name: value[name] for name in _TOLD_OF_EDGE if name in value},
+            map_id=str(value["map_id"]),
+            place=str(value.get("place", "")),
+            shared_points=int(value.get("shared_points", 0)),
+            photos=int(value.get("photos", 0)),
             other_from_map=Sim3.exp(value.get("parent_from_new") or np.zeros(7)),
             covariance=np.reshape(value["covariance"], (7, 7)),
             shared=np.reshape(value.get("shared") or np.zeros(21), (7, 3)),
         )
-
-
-_TOLD_OF_EDGE = ("map_id", "place", "shared_points", "photos")  # as they are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -172,6 +176,9 @@ class GrowthPhotos:
         models: their reconstructions, called once a round; rows of a model are rows of `photos`.
         candidate_ids: of contributed photos, by row.
         overlaps: pairs of rows whose matches were verified. geometry_of: of such a pair.
+
+    Raises:
+        InvalidValueError: photos without their features, or overlaps without their geometry.
     """
 
     photos: Sequence[Photo] = ()
@@ -180,3 +187,7 @@ class GrowthPhotos:
     overlaps: Collection[Pair] = ()
     geometry_of: Callable[[Pair], TwoView] = _OF_NONE
     candidate_ids: Mapping[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if (self.photos and self.features_of is _OF_NONE) or (self.overlaps and self.geometry_of is _OF_NONE):
+            raise InvalidValueError("GrowthPhotos: expected features of photos and geometry of overlaps")

@@ -67,7 +67,7 @@ class FrameRegistration:
         covariance: (6, 6) of the left perturbation of cam_from_local (rotation before translation, camera
             axes), None when refused.
         reason, message: of the refusal; None and "" when accepted.
-        source: what was rendered for the accepted pose.
+        source: what was rendered for the accepted pose; None when refused.
         points_local: (n, 3) scan points of the inlier correspondences, local frame, metres.
         pixels: (n, 2) where the photo shows them, full-size pixels.
         camera: intrinsics that belong to the pose: the ones given, or with the focal length estimated; None
@@ -88,10 +88,11 @@ class FrameRegistration:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        found = (self.cam_from_local, self.covariance, self.camera)
+        found = (self.cam_from_local, self.covariance, self.source, self.camera)
         if len({self.reason is not None, *(part is None for part in found)}) != 1:
             raise InvalidValueError(
-                "FrameRegistration: expected pose, covariance and camera without a reason, or a reason alone"
+                "FrameRegistration: expected pose, covariance, source and camera without a reason, or a "
+                "reason alone"
             )
         if self.covariance is not None:
             freeze(self, covariance=(6, 6))

@@ -108,7 +108,7 @@ def test_where_its_picture_from_above_agrees_photos_are_registered(
         right = Sim3.from_rigid3(cloud.frame.enu_from(frame)) @ off @ OWN_FROM_LOCAL.inverse()
         spread = np.diag(np.square([0.02, 0.03, 0.03, 0.03, 5.0, 5.0, 5.0]))
         words = "its photos agree with the scan's intensity by 9.5 deviations"
-        return FoundPlace(local_from_own=right, covariance=spread, evidence=9.5, words=words)
+        return FoundPlace(local_from_own=right, covariance=spread, evidence=9.5, sure=False, words=words)
 
     monkeypatch.setattr(first_place, "found_from_above", lambda *_: None)
     monkeypatch.setattr(first_place, "found_by_ortho", about_there)

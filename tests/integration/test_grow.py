@@ -124,6 +124,9 @@ def test_two_owners_at_once_are_promoted_in_one_run(grown: tuple[Path, GrowthRep
     assert {"agreement", "visibility", "drift", "confirmation", "canaries"} <= set(entry.gates)
     evidence = database.snapshot().load_map(entry.map_id).placement.evidence["growth"]
     assert evidence["drift_m"] == pytest.approx(entry.drift_m, abs=1e-6)
+    assert {"agreement", "visibility", "drift"} <= set(evidence["gates"])
+    assert len(evidence["covariance_relative"]) == 49
+    assert {edge["map_id"] for edge in evidence["edges"]} == set(entry.parents)
     images = database.snapshot().load_map(entry.map_id).images
     assert {image.owner for image in images} == {"name of anna", "name of ben"}  # whom to name, no owner
     owners = read_owners(database, database.snapshot())

@@ -95,7 +95,9 @@ def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> No
     made_of = [replace(image, sha256=photos[0].sha256) for image in existing().images[:1]]
     here = replace(existing(), images=(*made_of, *existing().images[1:]))
     overlaps = {(0, 2), (0, 3), (1, 4)}
-    given = GrowthPhotos(photos=photos, features_of=new.features_of, overlaps=overlaps)
+    given = GrowthPhotos(
+        photos=photos, features_of=new.features_of, overlaps=overlaps, geometry_of=new.geometry_of
+    )
     asked = CorroboratingPhotos(given=given, rows=range(1, len(photos)), localised={})
     # Other images of the map are not among the photos: nobody knows what overlaps with them.
     assert asked.that_may_see(here) == list(asked.rows)

@@ -18,13 +18,14 @@ from featuredb.store.verify import verify
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.confirmation import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
-from ingest.growth.values import GrowthOptions
+from ingest.growth.values import GrowthOptions, GrowthPhotos
 from reloc.localiser import Localiser
 from tests.support.few_canaries import few_canaries as few_canaries
 from tests.support.scene_strip import FRAME, note_contributed, put_on_record, strip_map
 
 _OLD = Path(__file__).parent.parent / "data" / "claimed_owners.db"
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])
+_NONE = NewPhotos(given=GrowthPhotos(), rows=(), localised={})
 
 
 @pytest.fixture
@@ -46,9 +47,7 @@ def _add(database: Database, feature_map: FeatureMap, owner: str = "") -> None:
 
 def _promoted(database: Database, *trusted: str) -> dict[str, Promotion]:
     work = Path(tempfile.mkdtemp(dir=database.url))
-    found = promote_confirmed(
-        database, Localiser.open(database), GrowthOptions(trusted=trusted), work, NewPhotos()
-    )
+    found = promote_confirmed(database, Localiser.open(database), GrowthOptions(trusted=trusted), work, _NONE)
     return {outcome.map_id: outcome for outcome in found}
 
 

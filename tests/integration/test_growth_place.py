@@ -91,7 +91,7 @@ def test_a_reconstruction_is_placed_and_becomes_a_map(
     assert feature_map.placement.method == "map"
     assert feature_map.height_datum == "ellipsoidal"
     assert all(gate.passes for gate in grown.placement.gates)
-    assert 0.0 < drift_m(grown.relative, places_of(feature_map)) < 0.5
+    assert 0.0 < drift_m(grown.covariance_relative, places_of(feature_map)) < 0.5
     # On Earth it is as uncertain as its parent, and a little more.
     earth = np.sqrt(np.diag(feature_map.placement.covariance)[4:])
     assert (earth > 0.5).all()
@@ -115,7 +115,7 @@ def test_the_bound_of_drift_holds(area: IndexedArea, seeds: range) -> None:
         found, _ = localise_photos(new.given, range(4), [area])
         grown = grow_component(new.model, new.given, found, [area], identity())
         assert isinstance(grown, GrownMap)
-        bound = drift_m(grown.relative, places_of(grown.feature_map))
+        bound = drift_m(grown.covariance_relative, places_of(grown.feature_map))
         beyond += int(centers_error(grown, new).max() > bound)
     assert beyond <= len(seeds) // 2
 

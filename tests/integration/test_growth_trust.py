@@ -20,7 +20,7 @@ from ingest.growth.place.map_images import features_and_points, measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, own_canaries, run_canaries
 from ingest.growth.trust.confirmation import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
-from ingest.growth.values import Edge, GrowthOptions
+from ingest.growth.values import Edge, GrowthOptions, GrowthPhotos
 from reloc.localise.localise import localise_features
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
@@ -63,9 +63,7 @@ def _add(database: Database, feature_map: FeatureMap) -> None:
 
 def _promoted(database: Database, trusted: tuple[str, ...] = ()) -> dict[str, Promotion]:
     work = Path(tempfile.mkdtemp(dir=database.url))
-    found = promote_confirmed(
-        database, Localiser.open(database), GrowthOptions(trusted=trusted), work, NewPhotos()
-    )
+    found = promote_confirmed(database, Localiser.open(database), GrowthOptions(trusted=trusted), work, _NONE)
     return {outcome.map_id: outcome for outcome in found}
 
 
@@ -74,6 +72,7 @@ def _status(database: Database, map_id: str) -> str:
 
 
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])
+_NONE = NewPhotos(given=GrowthPhotos(), rows=(), localised={})
 
 
 def test_a_map_of_two_owners_is_promoted(tmp_path: Path) -> None:
@@ -109,7 +108,7 @@ def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytes
     put_on_record(database, "anna")
 
     def ask() -> Promotion:
-        return promote_confirmed(database, Localiser.open(database), GrowthOptions(), work, NewPhotos())[0]
+        return promote_confirmed(database, Localiser.open(database), GrowthOptions(), work, _NONE)[0]
 
     first = ask()
     with monkeypatch.context() as patch:
@@ -221,6 +220,7 @@ def test_images_of_maps_by_another_extractor_are_not_asked(tmp_path: Path) -> No
     localiser = Localiser.open(database)
     run = run_canaries(database, localiser, localiser, [])
     assert {check.name.rpartition(" ")[2] for check in run.checks} == {"A"}
+    assert run.note.endswith("; 1 maps of another extractor are not asked")
 
 
 def test_canaries_are_the_same_in_every_run(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def grown_map(
     feature_map: FeatureMap,
     model: Any,
     *,
-    relative: FloatArray | None = None,
+    covariance_relative: FloatArray | None = None,
     bending_m: float = 0.0,
     left_out: Any = (),
 ) -> GrownMap:
@@ -86,7 +86,7 @@ def grown_map(
     none: Any = dict.fromkeys(Correspondences.__slots__[1:], np.zeros(0))
     return GrownMap(
         feature_map=feature_map,
-        relative=np.zeros((7, 7)) if relative is None else relative,
+        covariance_relative=np.zeros((7, 7)) if covariance_relative is None else covariance_relative,
         placement=MapsPlacement(
             frame=feature_map.frame,
             covariance=np.zeros((7, 7)),

@@ -229,7 +229,11 @@ def test_proposals_read_back_exactly_and_only_for_the_same_state(tmp_path: Path)
     for other in (("n", "w", "s"), ("m", "v", "s"), ("m", "w", "t")):
         with pytest.raises(RegistrationError, match="run the command without --confirm again"):
             load_proposals(tmp_path, other)
-    (tmp_path / "proposals.json").write_text("{}")
+    path = tmp_path / "proposals.json"
+    path.write_text(path.read_text().replace('"source": "rgb"', '"source": null'))
+    with pytest.raises(RegistrationError, match="propose anew"):
+        load_proposals(tmp_path, ("m", "w", "s"))
+    path.write_text("{}")
     with pytest.raises(RegistrationError, match="propose anew"):
         load_proposals(tmp_path, ("m", "w", "s"))
     with pytest.raises(RegistrationError, match="nothing has been proposed"):

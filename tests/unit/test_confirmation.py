@@ -46,8 +46,11 @@ def _confirm(
 
 
 def test_two_owners_on_record_confirm_each_other() -> None:
-    found = _confirm(_owned(["anna", "ben"]))
+    feature_map = _owned(["anna", "ben"])
+    found = _confirm(feature_map)
     assert found.gate.passes
+    confirmed = {image.owner for image in feature_map.images if image.image_id in found.confirmed}
+    assert confirmed == {"anna", "ben"}
     assert len(found.confirmed) == 8
     assert "8 photos confirmed by 2 owners" in found.gate.message
 

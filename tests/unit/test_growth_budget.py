@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import turns_about
 from featuredb.maps.feature_map import FeatureMap
 from ingest.growth import gates
 from ingest.growth.graph import map_graph
 from ingest.growth.graph.map_graph import rows_within, with_drift
-from ingest.growth.map_places import drift_m, places_of, turns_about
+from ingest.growth.map_places import drift_m, places_of
 from ingest.growth.place.component import GrownMap
 from ingest.growth.values import GrowthPhotos
 from tests.support.growth_box import grown_map
@@ -66,7 +67,7 @@ def test_photos_far_from_what_they_show_keep_the_budget_like_its_points() -> Non
     far = [looking_at(np.array([x, 0.0, 40.0]), np.array([0.0, 0.0, 3.0])) for x in (-400.0, 400.0)]
     plain = scene_map(points=points, descriptors=random_descriptors(RNG, 2000), poses=[*ring(4), *far])
     turn = turns_about(np.zeros(3)) @ turns_about(np.zeros(3)).T * 1e-3**2
-    grown = grown_map(plain, SimpleNamespace(), relative=turn)
+    grown = grown_map(plain, SimpleNamespace(), covariance_relative=turn)
     assert drift_m(turn, places_of(plain)) < 0.11
     feature_map, drift, relative = with_drift(grown, {}, BUDGET_M)
     assert drift == pytest.approx(1.96e-3 * np.hypot(400.0, 40.0), rel=1e-6)

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from featuredb.errors import InvalidValueError
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.subset import answering_with
 from featuredb.store import MapSummary
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
@@ -26,9 +28,10 @@ from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.map_places import drift_m, growth_of, places_of
 from ingest.growth.place.map_images import model_of
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
-from ingest.growth.trust.confirmation import OutsidePhoto, Source, answering_with, confirm
+from ingest.growth.trust.confirmation import OutsidePhoto, Source, confirm
 from ingest.growth.trust.promotion import Promotion
-from ingest.growth.values import Edge
+from ingest.growth.values import Edge, GrowthPhotos
+from ingest.photos.photo import Photo
 from ingest.sfm.links import keep_photos
 from tests.support.scene_strip import EDGE, FRAME, east, sources_of, strip_map
 
@@ -41,12 +44,14 @@ def _place_of(feature_map: FeatureMap) -> str:
 
 def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
     growth = growth_of(feature_map.placement.evidence)
-    own = {"map_id", "status", "generation", "parents", "frame", "placement"}
+    own = ("map_id", "status", "generation", "parents")
     told: dict[str, Any] = dict.fromkeys(field.name for field in fields(MapSummary))  # what no test asks for
     told |= {name: getattr(feature_map, name) for name in own}
     told |= {"write_id": f"{created_ms:012x}{'0' * 20}", "status_reason": ""}
     return PlacedMap(
-        **told,
+        summary=MapSummary(**told),
+        frame=feature_map.frame,
+        placement=feature_map.placement,
         place=_place_of(feature_map),
         corners=places_of(feature_map),
         edges=tuple(Edge.from_json(e) for e in growth.get("edges", ())),
@@ -62,6 +67,27 @@ def test_an_edge_survives_json() -> None:
     np.testing.assert_allclose(again.other_from_map.matrix(), edge.other_from_map.matrix(), atol=1e-12)
     np.testing.assert_array_equal(again.covariance, edge.covariance)
     assert (again.map_id, again.place, again.shared_points, again.photos) == ("x", "p", 5, 2)
+
+
+def test_counts_of_a_foreign_edge_are_whole_numbers() -> None:
+    told = {
+        "map_id": 7,
+        "place": "p",
+        "shared_points": 5.0,
+        "photos": "2",
+        "covariance": EDGE.ravel().tolist(),
+    }
+    edge = Edge.from_json(told)
+    assert (edge.map_id, edge.shared_points, edge.photos) == ("7", 5, 2)
+    assert isinstance(edge.shared_points, int)
+
+
+def test_photos_come_with_their_features_and_overlaps_with_their_geometry() -> None:
+    photo = Photo(name="a.jpg", path=Path("a.jpg"), width=100, height=100)
+    for incomplete in ({"photos": [photo]}, {"overlaps": [(0, 1)]}):
+        with pytest.raises(InvalidValueError, match="features of photos and geometry of overlaps"):
+            GrowthPhotos(**incomplete)  # type: ignore[arg-type]
+    assert GrowthPhotos().models() == ()
 
 
 def test_a_map_that_moves_has_another_place() -> None:

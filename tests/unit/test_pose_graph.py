@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.sim3 import Sim3, left_jacobian
 from ingest.growth.graph import pose_graph
-from ingest.growth.graph.pose_graph import GraphEdge, left_jacobian
+from ingest.growth.graph.pose_graph import GraphEdge
 from tests.support.pose_graphs import GraphNode, graph_edge, solved
 
 _SIGMA = np.array([1e-4, 2e-4, 2e-4, 3e-4, 0.03, 0.02, 0.04])

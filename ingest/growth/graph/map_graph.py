@@ -3,7 +3,7 @@
 import hashlib
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -34,7 +34,7 @@ OWN = "own_placement"  # key of an anchor's evidence of growth, once a graph has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlacedMap(MapSummary):
+class PlacedMap:
     """A map with its place, as its row has it, without its points.
 
     Attributes:
@@ -43,6 +43,7 @@ class PlacedMap(MapSummary):
         edges: overlaps that were measured when it was placed.
     """
 
+    summary: MapSummary
     frame: LocalFrame
     placement: Placement
     place: str
@@ -51,7 +52,7 @@ class PlacedMap(MapSummary):
 
     @property
     def is_anchor(self) -> bool:
-        return not self.parents
+        return not self.summary.parents
 
     @property
     def own_place(self) -> Edge:
@@ -76,7 +77,7 @@ def _placed(summary: MapSummary, row: Row) -> PlacedMap:
         low_and_high = np.reshape([row[name] for name in BOUNDS], (2, 3))
         corners = frame.enu_from_utm(list(product(*low_and_high.T)), row["epsg"])
     return PlacedMap(
-        **{field.name: getattr(summary, field.name) for field in fields(summary)},
+        summary=summary,
         frame=frame,
         placement=placement,
         place=place_key(frame, placement),
@@ -191,7 +192,7 @@ def with_drift(
     others = {m: placed for m, placed in maps.items() if m != me}
     solution = solve_maps(others, {me: edges}, feature_map.frame)
     covariance = solution.covariance.get(me, feature_map.placement.covariance)
-    relative = solution.covariance_relative.get(me, grown.relative)
+    relative = solution.covariance_relative.get(me, grown.covariance_relative)
     placed = replace(feature_map, placement=replace(feature_map.placement, covariance=covariance))
     noted, drift = with_overlaps(placed, relative, edges, budget_m)
     told = gates.figures([*grown.placement.gates, gates.drift(drift, budget_m)])

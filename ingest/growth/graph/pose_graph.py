@@ -12,15 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import expm
 from scipy.sparse import bsr_array, csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.stats import chi2
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import skew
-from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.sim3 import Sim3, left_jacobian
 from ingest.growth.gates import SIGMAS
 from ingest.growth.values import Edge, tied_together
 
@@ -241,19 +239,3 @@ def _solver(jacobian: csr_array) -> Callable[[FloatArray], FloatArray]:
     scale = diags_array(1.0 / np.sqrt(normal.diagonal()))
     solver = splu(csc_array(scale @ normal @ scale))
     return lambda right: np.asarray(scale @ solver.solve(scale @ right))
-
-
-def left_jacobian(tangent: FloatArray) -> FloatArray:
-    """J (7, 7) with exp(x + dx) = exp(J dx) exp(x) to first order.
-
-    The integral over t in [0, 1] of exp(t ad), with ad the derivative of Sim3.adjoint: the corner of one
-    matrix exponential (Van Loan 1978).
-    """
-    sigma, omega, nu = float(tangent[0]), tangent[1:4], tangent[4:]
-    both = np.zeros((14, 14))
-    both[1:4, 1:4] = skew(omega)
-    both[4:7, 0] = -nu
-    both[4:7, 1:4] = skew(nu)
-    both[4:7, 4:7] = sigma * np.eye(3) + skew(omega)
-    both[:7, 7:] = np.eye(7)
-    return np.asarray(expm(both)[:7, 7:], dtype=np.float64)

@@ -18,7 +18,7 @@ from featuredb.store.commits import write_time
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import OWN, PlacedMap, holds, place_key, placed_maps, solve_maps
 from ingest.growth.graph.pose_graph import GraphSolution
-from ingest.growth.map_places import growth_of, inflated, with_growth, with_overlaps
+from ingest.growth.map_places import growth_of, inflated, map_drift_m, with_growth, with_overlaps
 from ingest.growth.place.map_images import measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, check_known
 from ingest.growth.trust.promotion import PARENT_MOVED
@@ -90,7 +90,7 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
         return replace(told, reason="CANARY", message=f"nothing is moved: {canaries.gate.message}")
     ids = [m.map_id for m in moved]
     results = database.commit_maps(
-        moved, replaces=ids, based_on={map_id: maps[map_id].write_id for map_id in ids}
+        moved, replaces=ids, based_on={map_id: maps[map_id].summary.write_id for map_id in ids}
     )
     return replace(
         told,
@@ -104,20 +104,20 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
 def overlaps_to_measure(maps: Mapping[str, PlacedMap]) -> list[tuple[str, str]]:
     """Pairs of a grown map and a map that may hold it: parents placed anew, and anchors that came later."""
     pairs: set[tuple[str, str]] = set()
-    anchors = [m for m in maps.values() if m.is_anchor and m.status == "active"]
-    for me in maps.values():
+    anchors = [m for m in maps.values() if m.is_anchor and m.summary.status == "active"]
+    for map_id, me in maps.items():
         if me.is_anchor:
             continue
         places = {edge.map_id: edge.place for edge in me.edges}
-        pairs |= {(me.map_id, m) for m, place in places.items() if m in maps and maps[m].place != place}
+        pairs |= {(map_id, m) for m, place in places.items() if m in maps and maps[m].place != place}
         for anchor in anchors:
-            later = write_time(anchor.write_id) > write_time(me.write_id)
-            if anchor.map_id in places or not later or not len(me.corners) or not len(anchor.corners):
+            later = write_time(anchor.summary.write_id) > write_time(me.summary.write_id)
+            if anchor.summary.map_id in places or not later or not len(me.corners) or not len(anchor.corners):
                 continue
             box, other = me.corners[:, :2], me.frame.enu_from(anchor.frame).act(anchor.corners)[:, :2]
             apart = (other.min(axis=0) - box.max(axis=0), box.min(axis=0) - other.max(axis=0))
             if np.max(apart) <= _GAP_M:
-                pairs.add((me.map_id, anchor.map_id))
+                pairs.add((map_id, anchor.summary.map_id))
     return sorted(pairs)
 
 
@@ -178,8 +178,8 @@ def _moved(
                 edges.append(replace(now, place=places[edge.map_id]))
         finished, drift = _with_evidence(feature_map, before, edges, solution, frame, budget_m)
         # Active maps stay so; those that were quarantined for their parent's sake are active again.
-        again = PARENT_MOVED in before.status_reason and drift <= budget_m
-        active = before.status == "active" or again
+        again = PARENT_MOVED in before.summary.status_reason and drift <= budget_m
+        active = before.summary.status == "active" or again
         new.append(replace(finished, status="active" if active else "quarantined"))
         told = {"move_m": round(ways_m[map_id], 4), "drift_m": round(drift, 4)}
         drifted = growth_of(before.placement.evidence).get("drift_m")
@@ -219,20 +219,20 @@ def _with_evidence(
     """The moved map with its drift, overlaps and parents; and its drift."""
     map_id, own = feature_map.map_id, feature_map.frame
     relative = covariance_in_frame(solution.covariance_relative[map_id], frame, own)
-    noted, drift = with_overlaps(feature_map, relative, edges, budget_m)
     if before.is_anchor:
-        was = before.own_place
-        total = in_frame(solution.corrections[map_id], frame, own) @ was.other_from_map.inverse()
-        placed = {"covariance": was.covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
-        return with_growth(feature_map, **{OWN: placed}), drift
-    held = [edge.map_id for edge in edges]
+        first = before.own_place
+        total = in_frame(solution.corrections[map_id], frame, own) @ first.other_from_map.inverse()
+        placed = {"covariance": first.covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
+        return with_growth(feature_map, **{OWN: placed}), map_drift_m(feature_map, relative)
+    noted, drift = with_overlaps(feature_map, relative, edges, budget_m)
+    held, was = [edge.map_id for edge in edges], before.summary.parents
     # Only anchors join the parents: a map never becomes its own ancestor.
-    parents = tuple(dict.fromkeys([*(m for m in before.parents if m in held), *held])) or before.parents
+    parents = tuple(dict.fromkeys([*(m for m in was if m in held), *held])) or was
     return replace(noted, parents=parents), drift
 
 
 def _with_generations(new: list[FeatureMap], maps: Mapping[str, PlacedMap]) -> list[FeatureMap]:
-    generation = {m: placed.generation for m, placed in maps.items()}
+    generation = {m: placed.summary.generation for m, placed in maps.items()}
     parents = {m.map_id: m.parents for m in new if m.parents}
     for _ in range(len(new)):
         for map_id, of in parents.items():

@@ -60,7 +60,7 @@ class GrownMap(Refinement):
     """A refined reconstruction and its map, ready to be committed in quarantine."""
 
     feature_map: FeatureMap
-    relative: FloatArray  # (7, 7) covariance of its place relative to the anchors
+    covariance_relative: FloatArray  # (7, 7) of its place, relative to the anchors
 
 
 def grow_component(
@@ -72,6 +72,8 @@ def grow_component(
     max_bound_m: float = DRIFT_BUDGET_M,
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
+
+    The map has no evidence of growth until `graph.map_graph.with_drift`.
 
     Args:
         model: a connected reconstruction of new photos.
@@ -154,7 +156,7 @@ def _assembled(
         provenance=without_modes(feature_map.provenance),
     )
     as_refined = {f.name: getattr(refined, f.name) for f in fields(refined)}
-    return GrownMap(feature_map=grown, relative=relative, **as_refined)
+    return GrownMap(feature_map=grown, covariance_relative=relative, **as_refined)
 
 
 def _named(photos: Sequence[Photo]) -> MapIdentity:

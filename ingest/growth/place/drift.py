@@ -16,12 +16,11 @@ from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import Terms
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import point_jacobian
+from featuredb.geometry.sim3 import point_jacobian, turns_about
 from ingest.colmap.adjust import longest_side, residuals_of
 from ingest.colmap.anchored import MAPPING, FixedPoints, Lenses, block_and_marks
 from ingest.colmap.bridge import Model, with_observations
 from ingest.colmap.precision import design_effect
-from ingest.growth.map_places import turns_about
 
 _LEAST_FREEDOM = 0.1
 _PIECE = 5  # photos; a photo alone says more of its own noise than of where its neighbourhood looks

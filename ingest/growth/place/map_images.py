@@ -28,17 +28,20 @@ MOST_IMAGES = 24  # that are asked of a map or around one, nearest first; more o
 _LEAST_POINTS = 2 * LEAST_SHARED_POINTS  # behind an overlap; fewer leave scale and tilt open
 
 
-def features_and_points(
-    any_map: AnyMap, image: MapImage, *, described: bool = True
-) -> tuple[Features, NDArray[np.int64]]:
-    """What a map keeps of one of its photos, and the rows (n,) of the points that its features see.
-
-    Features with descriptors come first, or alone; then large ones.
-    """
-    seen, camera = any_map.observations, any_map.cameras[image.camera_id]
+def observed_rows(any_map: AnyMap, image: MapImage, *, described: bool = True) -> NDArray[np.int64]:
+    """Rows (n,) of a map's observations of one image, those with descriptors first, or alone; large first."""
+    seen = any_map.observations
     rows = np.flatnonzero(seen.image_id == image.image_id)
     rows = rows[np.lexsort((-seen.scale[rows], ~seen.has_descriptor[rows]))]
-    rows = rows[seen.has_descriptor[rows]] if described else rows
+    return rows[seen.has_descriptor[rows]] if described else rows
+
+
+def features_and_points(
+    any_map: AnyMap, image: MapImage, rows: NDArray[np.int64] | None = None
+) -> tuple[Features, NDArray[np.int64]]:
+    """`observed_rows` as features of that photo, and the rows (n,) of the points that they see."""
+    seen, camera = any_map.observations, any_map.cameras[image.camera_id]
+    rows = observed_rows(any_map, image) if rows is None else rows
     features = Features(
         xy=seen.xy[rows],
         scale=seen.scale[rows],
@@ -53,11 +56,12 @@ def features_and_points(
 
 
 def model_of(any_map: AnyMap, images: Sequence[MapImage], *, described: bool) -> Model:
-    """Images of a map as a reconstruction in its frame; keypoints as in `features_and_points`."""
-    seen = [features_and_points(any_map, image, described=described)[1] for image in images]
-    counts = [len(points) for points in seen]
+    """Images of a map as a reconstruction in its frame; keypoints of an image are its `observed_rows`."""
+    rows = [observed_rows(any_map, image, described=described) for image in images]
+    counts = [len(own) for own in rows]
     photo_of = np.repeat(np.arange(len(images), dtype=np.int64), counts)
-    used, point_of = np.unique(np.concatenate(seen), return_inverse=True)
+    points = any_map.observations.point_index[np.concatenate(rows)]
+    used, point_of = np.unique(points, return_inverse=True)
     order = np.lexsort((photo_of, point_of))
     return Model(
         cameras=any_map.cameras,
@@ -89,7 +93,7 @@ def measure_overlap(
     if len(localised) < LEAST_PHOTOS:
         return f"{len(localised)} of {len(images)} images are found, {LEAST_PHOTOS} are needed"
     model = model_of(feature_map, images, described=True)
-    keypoints = [features_and_points(feature_map, image)[0].xy.astype(float) for image in images]
+    keypoints = [feature_map.observations.xy[observed_rows(feature_map, i)].astype(float) for i in images]
     found = agreed_similarity(model, localised, keypoints, [Sim3.identity()])
     if found is None:
         return "no image agrees with another"
@@ -126,9 +130,9 @@ def _images_near(feature_map: FeatureMap, other: FeatureMap) -> list[MapImage]:
     middle, reach = np.median(places, axis=0), np.percentile(places, (2, 98), axis=0)
     found: list[tuple[float, int, MapImage]] = []
     for image in feature_map.images:
-        _, points = features_and_points(feature_map, image)
-        if len(points) >= LEAST_FEATURES:
-            seen = own[points]
+        rows = observed_rows(feature_map, image)
+        if len(rows) >= LEAST_FEATURES:
+            seen = own[feature_map.observations.point_index[rows]]
             inside = ((seen >= reach[0] - 5.0) & (seen <= reach[1] + 5.0)).all(axis=1).mean()
             distance = float(np.linalg.norm(np.median(seen, axis=0) - middle))
             found.append((-float(inside) + 1e-6 * distance, image.image_id, image))

@@ -145,15 +145,14 @@ def edges_of(model: Model, fit: FittedSimilarity, held: Correspondences) -> tupl
         if points < LEAST_SHARED_POINTS or photos < gates.LEAST_AGREEING:
             continue
         alone = fit_similarity(model, fit.local_from_sfm, mine)
-        found.append(
-            Edge(
-                map_id=map_id,
-                other_from_map=alone.local_from_sfm @ fit.local_from_sfm.inverse(),
-                covariance=alone.covariance,
-                shared_points=points,
-                photos=photos,
-            )
+        edge = Edge(
+            map_id=map_id,
+            other_from_map=alone.local_from_sfm @ fit.local_from_sfm.inverse(),
+            covariance=alone.covariance,
+            shared_points=points,
+            photos=photos,
         )
+        found.append(edge)
     return tuple(sorted(found, key=lambda e: (-e.shared_points, e.map_id)))
 
 

@@ -35,6 +35,7 @@ from reloc.wire.query import LocaliseWireRequest
 # What a map keeps of its images shows its own points alone: that an image does not show what a new map adds
 # around them says nothing against either.
 _OWN_FEATURES = LocaliseOptions(acceptance=AcceptanceOptions(min_spread=0.0, min_agreement=0.0))
+_EXTRACTOR = _OWN_FEATURES.extractor.fingerprint  # no query finds anything in maps of another one
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
 
@@ -112,6 +113,9 @@ def run_canaries(
     note = f"{len(known)} known queries, {len(own)} images of the active maps"
     if not known:
         note += "; the database has no known queries, `featuredb canary add` adds them"
+    others = [a.area for a in before.areas if a.area.extractor_fingerprint != _EXTRACTOR]
+    if others:
+        note += f"; {sum(len(area.maps) for area in others)} maps of another extractor are not asked"
     return CanaryRun(checks=tuple(checks), note=note)
 
 
@@ -143,11 +147,13 @@ def answer_now(database: Database, image: bytes) -> tuple[KnownPose | None, int]
     """
     localiser = Localiser.open(database)
     gray, header = decode_photo(image, localiser)
-    result = localiser.localise(gray, localise_request(LocaliseWireRequest(), image, header), header.size)
-    if result.pose is None:
+    pose = localiser.localise(gray, localise_request(LocaliseWireRequest(), image, header), header.size).pose
+    if pose is None:
         return None, localiser.snapshot
-    told = ("epsg", "utm", "height_datum", "cam_from_utm_xyzw")
-    return KnownPose(**{name: getattr(result.pose, name) for name in told}), localiser.snapshot
+    known = KnownPose(
+        epsg=pose.epsg, utm=pose.utm, height_datum=pose.height_datum, cam_from_utm_xyzw=pose.cam_from_utm_xyzw
+    )
+    return known, localiser.snapshot
 
 
 def _verdict(miss: _Miss | None, metres: float, degrees: float) -> Verdict:
@@ -164,7 +170,8 @@ def own_canaries(
 
     The choice hangs on the images' names only, so that another run asks the same.
     """
-    found: dict[bool, list[tuple[str, str, MapImage]]] = {True: [], False: []}  # around the new maps or not
+    near: list[tuple[str, str, MapImage]] = []
+    far: list[tuple[str, str, MapImage]] = []
     boxes = []  # in plan, (2, 2), of the maps' points without the few wild ones, with a margin
     for m in new_maps:
         if len(m.points):
@@ -172,8 +179,8 @@ def own_canaries(
             boxes.append((m.frame, low - NEAR_M, high + NEAR_M))
     snapshot = database.snapshot(before.snapshot)
     for indexed in before.areas:
-        if indexed.area.extractor_fingerprint != _OWN_FEATURES.extractor.fingerprint:
-            continue  # no query finds anything there
+        if indexed.area.extractor_fingerprint != _EXTRACTOR:
+            continue
         own = snapshot.images_of([m.map_id for m in indexed.area.maps])
         images = [(m, image) for m in indexed.area.maps for image in own[m.map_id]]
         for (feature_map, image), described in zip(images, np.diff(indexed.area.image_start), strict=True):
@@ -184,8 +191,9 @@ def own_canaries(
             for frame, low, high in boxes:
                 there = frame.enu_from(feature_map.frame).act(image.cam_from_local.center)[:2]
                 around |= bool(((there >= low) & (there <= high)).all())
-            found[around].append((key, feature_map.map_id, image))
-    near, far = (sorted(found[around], key=lambda e: e[0]) for around in (True, False))
+            (near if around else far).append((key, feature_map.map_id, image))
+    near.sort(key=lambda e: e[0])
+    far.sort(key=lambda e: e[0])
     load = cache(snapshot.load_map)
     return [(load(map_id), image) for _, map_id, image in near[:_OWN_NEAR] + far[: _OWN_NEAR // 2]]
 
@@ -219,15 +227,16 @@ def _checked(
 ) -> CanaryCheck:
     """What became of an answer: verdicts and misses before and after, and the result after."""
     (before, after), regression = verdicts, ""
-    before_m, error_m = (float("nan") if miss is None else miss.metres for miss in misses[:2])
+    was_m, is_m = (float("nan") if miss is None else miss.metres for miss in misses[:2])
     if before in ("right", "not_found") and after not in ("right", "not_found"):
         regression = f"now {misses[1]} off"
         if after == "found":
             regression = "a photo of elsewhere now finds a place"
         elif misses[1] is None:
             regression = f"no longer localised: {result.reason}: {result.detail}"
-    told = {"error_before_m": before_m, "error_m": error_m}
-    return CanaryCheck(name=name, before=before, after=after, regression=regression, **told)
+    return CanaryCheck(
+        name=name, before=before, after=after, regression=regression, error_before_m=was_m, error_m=is_m
+    )
 
 
 def _miss(pose: LocalisedPose | None, frame: LocalFrame, cam_from_local: Rigid3) -> _Miss | None:

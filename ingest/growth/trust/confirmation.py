@@ -106,16 +106,15 @@ class NewPhotos:
     """New photos that may corroborate.
 
     Attributes:
-        rows: of the given photos that may be asked. threads: how many at a time.
+        rows: of the given photos that may be asked.
         localised: those that the active maps localise, by row.
         heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
             map is examined again whenever another one changes, and its own photos are the same.
     """
 
-    given: GrowthPhotos = field(default_factory=GrowthPhotos)
-    rows: Sequence[int] = ()
-    threads: int = 1
-    localised: Mapping[int, LocalisedPhoto] = field(default_factory=dict)
+    given: GrowthPhotos
+    rows: Sequence[int]
+    localised: Mapping[int, LocalisedPhoto]
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
 
     def that_may_see(self, feature_map: FeatureMap) -> list[int]:
@@ -130,7 +129,13 @@ class NewPhotos:
 
 
 def corroborate(
-    feature_map: FeatureMap, others: Sequence[FeatureMap], new: NewPhotos, sources: Sources, *, write_id: str
+    feature_map: FeatureMap,
+    others: Sequence[FeatureMap],
+    new: NewPhotos,
+    sources: Sources,
+    *,
+    write_id: str,
+    threads: int = 1,
 ) -> list[OutsidePhoto]:
     """Photos of other owners than the map's, whose word counts, as far as the map alone localises them.
 
@@ -154,7 +159,7 @@ def corroborate(
         if photos[row].sha256 not in names and source.speaks_to(own):
             asked[row] = source
     unheard = [row for row in asked if (write_id, row) not in new.heard]
-    said = localise_photos(new.given, unheard, [indexed], new.threads)[0]
+    said = localise_photos(new.given, unheard, [indexed], threads)[0]
     new.heard.update({(write_id, row): said.get(row) for row in unheard})
     for row, source in asked.items():
         found, known_here = new.heard[write_id, row], None
@@ -213,8 +218,7 @@ def _images_around(
             if distance <= reach and source.speaks_to(own):
                 found.append((distance, f"{other.map_id} {image.name}", other, image, source))
     nearest = (entry[2:] for entry in sorted(found, key=lambda e: e[:2]))
-    kept = map_images.features_and_points
-    described = (e for e in nearest if len(kept(e[0], e[1])[0]) >= map_images.LEAST_FEATURES)
+    described = (e for e in nearest if len(map_images.observed_rows(*e[:2])) >= map_images.LEAST_FEATURES)
     return list(islice(described, map_images.MOST_IMAGES))
 
 
@@ -331,11 +335,3 @@ def _parallax(
             reach[k] = np.median(np.linalg.norm(points[rows] - centers[k], axis=1))
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     return np.asarray(apart / np.maximum(np.minimum(reach[:, None], reach[None]), 1e-9), dtype=np.float64)
-
-
-def answering_with(feature_map: FeatureMap, points: NDArray[np.bool_]) -> FeatureMap:
-    """The map with descriptors for the given points only."""
-    seen = feature_map.observations
-    keep = seen.has_descriptor & points[seen.point_index]
-    descriptors = np.where(keep[:, None], seen.descriptors, np.uint8(0))
-    return replace(feature_map, observations=replace(seen, has_descriptor=keep, descriptors=descriptors))

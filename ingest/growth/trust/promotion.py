@@ -8,6 +8,7 @@ from typing import Any
 
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.subset import answering_with
 from featuredb.store import Database, MapSummary, Snapshot
 from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.owners import read_owners
@@ -19,7 +20,7 @@ from ingest.growth import gates
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.place.map_images import NEAR_M
 from ingest.growth.trust.canaries import CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import NewPhotos, Sources, answering_with, confirm, corroborate
+from ingest.growth.trust.confirmation import NewPhotos, Sources, confirm, corroborate
 from ingest.growth.values import GrowthOptions
 from reloc.localiser import Localiser
 
@@ -84,7 +85,7 @@ def promote_confirmed(
 
     def examine(waiting: Sequence[MapSummary]) -> list[ExaminedMap | Promotion]:
         sources = Sources(owners=read_owners(database, database.snapshot()), trusted=options.trusted)
-        return _examined(waiting, snapshot, sources, new)
+        return _examined(waiting, snapshot, sources, new, options.threads)
 
     examined = examine(open_maps) if open_maps else []
     stay = [one for one in examined if isinstance(one, Promotion)]
@@ -104,11 +105,11 @@ def _remember(work: Path, outcomes: Sequence[Promotion], asked: str) -> None:
 
 
 def _examined(
-    waiting: Sequence[MapSummary], snapshot: Snapshot, sources: Sources, new: NewPhotos
+    waiting: Sequence[MapSummary], snapshot: Snapshot, sources: Sources, new: NewPhotos, threads: int
 ) -> list[ExaminedMap | Promotion]:
     """All of them, with the records that they make for each other: lost descriptors do not come back."""
     while True:
-        found = [_examine(summary, snapshot, sources, new) for summary in waiting]
+        found = [_examine(summary, snapshot, sources, new, threads) for summary in waiting]
         earned = [c for one in found if isinstance(one, ExaminedMap) for c in one.earned]
         more = sources.with_records(sources.owners.givers.get(c, ANONYMOUS) for c in earned)
         if more == sources:
@@ -149,11 +150,11 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
 
 
 def _examine(
-    summary: MapSummary, snapshot: Snapshot, sources: Sources, new: NewPhotos
+    summary: MapSummary, snapshot: Snapshot, sources: Sources, new: NewPhotos, threads: int
 ) -> ExaminedMap | Promotion:
     """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
     feature_map, others = snapshot.load_map(summary.map_id), _others(summary, snapshot)
-    heard = corroborate(feature_map, others, new, sources, write_id=summary.write_id)
+    heard = corroborate(feature_map, others, new, sources, write_id=summary.write_id, threads=threads)
     confirmation = confirm(feature_map, sources, heard)
     if not confirmation.gate.passes:
         return _stays(feature_map.map_id, confirmation.gate)

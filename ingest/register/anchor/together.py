@@ -13,7 +13,7 @@ import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -164,8 +164,12 @@ def prior_by_others(pose: Rigid3, seen: FloatArray) -> FramePrior:
     return FramePrior.around(pose, _BENT * distance_m, float(np.degrees(_BENT)))
 
 
-_Seen = tuple[AskedPhoto, FrameMatches, float]
-"""A photo, pieces of it with their points of the scan, and pixels of the render for one of the photo."""
+class _Seen(NamedTuple):
+    """A photo, pieces of it with their points of the scan, and pixels of the render for one of the photo."""
+
+    photo: AskedPhoto
+    pieces: FrameMatches
+    shrunk: float
 
 
 def fitted_together(
@@ -184,8 +188,8 @@ def fitted_together(
             side_px = views.side_px(spacing_px, MAX_SIDE_PX)
             for rendering in views.renders([pose], side_px):
                 pieces = near_places(views, rendering, source, piece_px, near_px)
-                seen.append((photo, pieces, side_px / max(camera.width, camera.height)))
-        if sum(len(pieces) for _, pieces, _ in seen) < _LEAST_PIECES:
+                seen.append(_Seen(photo, pieces, side_px / max(camera.width, camera.height)))
+        if sum(len(one.pieces) for one in seen) < _LEAST_PIECES:
             return None
         new_from_old = _moved(new_from_old, start, seen)
     return new_from_old
@@ -193,7 +197,7 @@ def fitted_together(
 
 def _moved(new_from_old: Sim3, start: Sim3, seen: Sequence[_Seen]) -> Sim3:
     """The similarity fitted to the pieces' places, from one near it."""
-    middle = np.median(np.vstack([pieces.points for _, pieces, _ in seen]), axis=0)
+    middle = np.median(np.vstack([one.pieces.points for one in seen]), axis=0)
     about = Sim3(scale=1.0, rotation=np.eye(3), translation=middle)
 
     def at(step: FloatArray) -> Sim3:

@@ -99,11 +99,12 @@ def hypotheses(block: Block, control: Control) -> list[Hypothesis]:
         for pair in itertools.islice(itertools.combinations(rows, 2), _MOST_PAIRS):
             consensus = _consensus(block, control, rows, pair)
             if consensus is not None:
-                places.setdefault(*consensus)
+                marks, xyz = consensus
+                places.setdefault(marks, xyz)
         for row in rows.tolist():
             ground = on_ground(block, int(control.photo_of[row]), control.xy[row])
             if ground is not None:
-                places[row,] = ground
+                places[(row,)] = ground
         found += [Hypothesis(point=point, xyz=xyz, marks=marks) for marks, xyz in places.items()]
     return found
 

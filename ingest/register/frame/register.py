@@ -127,12 +127,7 @@ def fit_vouched_for(
     with views.clock.stage("fit"):
         start = unmatched(prior.cam_from_local, camera, source)
         found = dense_fitted(views, loosened(prior), start) or start
-    fitted = _fitted(views, prior, found, evidence)
-    away = prior_sigmas(prior, found.pose.cam_from_local)
-    if fitted.accepted and away > MAX_PRIOR_SIGMAS:
-        words = f"the pose lies {away:.1f} deviations from where all photos together have it"
-        return _refused("CONTRADICTS_PRIOR", words, views.clock)
-    return fitted
+    return _fitted(views, prior, found, evidence, MAX_PRIOR_SIGMAS)
 
 
 def _views(
@@ -150,12 +145,20 @@ def _views(
 
 
 def _fitted(
-    views: FrameViews, prior: FramePrior, found: FrameHypothesis, evidence: dict[str, Any]
+    views: FrameViews,
+    prior: FramePrior,
+    found: FrameHypothesis,
+    evidence: dict[str, Any],
+    most_away: float = np.inf,
 ) -> FrameRegistration:
-    """A fitted pose that needs no more than inliers."""
+    """A fitted pose that needs no more than inliers, and to lie near its prior: `most_away` deviations."""
     if len(found.inliers) < MIN_INLIERS:
         words = f"{len(found.inliers)} independent inliers, {MIN_INLIERS} needed"
         return _refused("TOO_FEW_MATCHES", words, views.clock)
+    away = prior_sigmas(prior, found.pose.cam_from_local)
+    if away > most_away:
+        words = f"the pose lies {away:.1f} deviations from where all photos together have it"
+        return _refused("CONTRADICTS_PRIOR", words, views.clock)
     return _accepted(views, found, frame_covariance(views, prior, found), evidence)
 
 

@@ -61,6 +61,8 @@ class PickSession:
     def state(self) -> dict[str, Any]:
         """What the page shows first."""
         height, width = self.ground.height.shape
+        seen_by = self.map.image_rows(self.map.observations.image_id)
+        counts = np.bincount(seen_by, minlength=len(self.map.images)).tolist()
         return {
             "map": {
                 "id": self.map.map_id,
@@ -75,10 +77,10 @@ class PickSession:
                     "name": image.name,
                     "width": self.map.cameras[image.camera_id].width,
                     "height": self.map.cameras[image.camera_id].height,
-                    "points": len(self.map.points_in(image)),
+                    "points": count,
                     "least": least_picks(focal_sigma_rel(self.map, image)),
                 }
-                for image in self.map.images
+                for image, count in zip(self.map.images, counts, strict=True)
                 if image.image_id in self.files.paths
             ],
         }

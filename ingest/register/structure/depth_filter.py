@@ -99,7 +99,8 @@ def surface_at(rendering: Rendering, cloud: PointCloud, pixels: FloatArray) -> S
     inside = (column >= reach) & (row >= reach) & (column < width - reach) & (row < height - reach)
     rows = np.flatnonzero(inside)
     rows = rows[_reliable_at(rendering, row[rows], column[rows], stride)]
-    down, across = np.meshgrid(*[np.arange(-reach, reach + 1, stride)] * 2, indexing="ij")
+    offset = np.arange(-reach, reach + 1, stride)
+    down, across = np.meshgrid(offset, offset, indexing="ij")
     window = (row[rows, None] + down.ravel(), column[rows, None] + across.ravel())
     index, depth = rendering.index[window], rendering.depth[window]
     centre = rendering.depth[row[rows], column[rows]]

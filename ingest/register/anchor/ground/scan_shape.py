@@ -86,15 +86,16 @@ def shape_of(cloud: PointCloud, circle: tuple[float, float, float] | None = None
     window = int(_WIDEST_M / CELL_M) | 1
     ground = gaussian_filter(grey_opening(low, (window, window)), 4.0)
     walls = _walls(top, known, corner, xyz)
-    parts = zip(_surfaces(xyz, flat, top, lowest, seen), _standing(walls), strict=True)
-    points, normals = (np.vstack(part) for part in parts)
+    surface, surface_normals = _surfaces(xyz, flat, top, lowest, seen)
+    upright, upright_normals = _standing(walls)
+    points = np.vstack([surface, upright])
     return ScanShape(
         corner=corner,
         ground=ground,
         top=top,
         known=known,
         points=points,
-        normals=normals,
+        normals=np.vstack([surface_normals, upright_normals]),
         tree=cKDTree(points),
         walls=walls[:, :4],
     )

@@ -20,7 +20,7 @@ from featuredb.store.scans import ScanSummary
 from ingest.register.anchor.files import PhotoFiles
 from ingest.register.anchor.ground.place import place_on_outlines
 from ingest.register.anchor.ground.street_plan import looks_level
-from ingest.register.anchor.start.from_above import MIN_LOG_NFA, found_from_above
+from ingest.register.anchor.start.from_above import found_from_above
 from ingest.register.anchor.start.from_ortho import found_by_ortho
 from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks, read_picks
 from ingest.register.anchor.start.priors import RoughPose, image_named, place_by_photo, placed_on, read_pose
@@ -269,7 +269,7 @@ def _found_near(
             "heights alone; say where one photo is: --page, --picks FILE, --pose FILE"
         )
     by_features = found_from_above(unplaced, cloud)
-    by_look = by_features is None or by_features.evidence < MIN_LOG_NFA
+    by_look = by_features is None or not by_features.sure
     found = found_by_ortho(unplaced, cloud, photos) if by_look else by_features
     if found is None:
         words = "nothing of it matches the scan"

@@ -41,7 +41,7 @@ _BATCH, _BATCHES = 2000, 50  # samples of three: with 5 % of right matches a doz
 _MISSED = 1e-3  # chance that no sample was all right, below which no more are drawn
 _SCORED = 300  # matches that score a sample
 _TOLERANCES_PX = (8.0, 16.0, 32.0)  # of the pictures; the one that says most is taken, and three are paid for
-MIN_LOG_NFA = 3.0  # one map of a thousand would be proposed where it is not
+_MIN_LOG_NFA = 3.0  # one map of a thousand would be proposed where it is not
 _ROUNDS = 5  # of matches within the tolerance and the similarity that fits them
 _CORRELATED = 4.0  # matches that are worth one independent: neighbours share relief and the map's bend
 
@@ -52,21 +52,22 @@ class FoundPlace:
 
     Attributes:
         local_from_own: similarity. covariance: (7, 7) of its left perturbation.
-        evidence: how much more than chance speaks for it, by the figure of the search that found it.
+        evidence: how much more than chance speaks for it: a figure that only places of the same search share.
+        sure: whether that is enough to say that the map lies here; else it may be tried.
         words: on the evidence, for people.
     """
 
     local_from_own: Sim3
     covariance: FloatArray
     evidence: float
+    sure: bool
     words: str
 
 
 def found_from_above(unplaced: UnplacedMap, cloud: PointCloud) -> FoundPlace | None:
     """The best place of a map on all of a scan; None where nothing of both matches.
 
-    Its evidence is minus the decimal logarithm of the number of as good ones that chance gives; one with
-    MIN_LOG_NFA is sure.
+    Its evidence is minus the decimal logarithm of the number of as good ones that chance gives.
     """
     found = [_found(unplaced, cloud, source) for source in available_sources(cloud) if source != "shaded"]
     return max((one for one in found if one is not None), key=lambda one: one.evidence, default=None)
@@ -208,10 +209,12 @@ def _judged(
     spots = np.unique(np.floor(local[fits, :2] / tolerance_m), axis=0)
     fitting = min(len(np.unique(point[fits])), len(spots))
     evidence = log_nfa(matches, fitting, tolerance_m, area_m2, 1.0, _SAMPLE)
+    evidence -= float(np.log10(len(_TOLERANCES_PX)))
     return FoundPlace(
         local_from_own=sim,
         covariance=np.asarray(_CORRELATED * variance * np.linalg.inv(jacobian.T @ jacobian)),
-        evidence=evidence - float(np.log10(len(_TOLERANCES_PX))),
+        evidence=evidence,
+        sure=evidence >= _MIN_LOG_NFA,
         words=f"{fitting} of {matches} matches with the scan's {source} fit one place to within "
         f"{tolerance_m:.1f} m",
     )

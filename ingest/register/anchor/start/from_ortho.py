@@ -138,7 +138,8 @@ class ScanSearch:
 def found_by_ortho(unplaced: UnplacedMap, cloud: PointCloud, photos: PhotoFiles) -> FoundPlace | None:
     """The best place of a map on all of a scan; None where its mirror image fits as well.
 
-    Its evidence is in deviations, as in `best_place`; its covariance by the steps of the search.
+    Its evidence is in deviations, as in `best_place`, and never enough to be sure; its covariance by the
+    steps of the search.
     """
     upright = _upright(unplaced)
     there = [image for image in unplaced.images if image.image_id in photos.paths]
@@ -159,7 +160,6 @@ def _found(
     extent_m = float(np.ptp(cloud.xyz[:, :2], axis=0).max())
     drawn = picture_of_scan(cloud, source, max(extent_m / _CELLS, plan_spacing_m(cloud)))
     found = best_place(picture, drawn)
-    # Chance alone passes this in one case of two: what is placed is up to the photos that are registered.
     if found is None or found[1] <= found[2]:
         return None
     best, over_chance, elsewhere = found
@@ -172,6 +172,7 @@ def _found(
         local_from_own=best.similarity(picture, up) @ upright,
         covariance=about.carried(np.diag(np.square(sigmas))),
         evidence=over_chance,
+        sure=False,  # chance alone passes in one case of two: it is up to the photos that are registered
         words=f"its photos from above agree with the scan's {source} by {over_chance:.1f} deviations "
         f"more than their mirror images, elsewhere by {elsewhere:.1f}",
     )

@@ -113,21 +113,26 @@ class _Picked:
 
     def fitted(self, start: _Start, rows: list[int]) -> _Fitted | None:
         """Adjusted to some picks; None where no pose has all of them in front of the camera."""
-        numbers, zeros, xyz = np.arange(len(rows)), np.zeros(len(rows), dtype=np.int64), self.points[rows]
+        numbers, none, xyz = np.arange(len(rows)), np.zeros(0, dtype=np.int64), self.points[rows]
         block = Block(
             names=("picked",),
             cameras=(start[1],),
-            camera_of=zeros[:1],
+            camera_of=np.zeros(1, dtype=np.int64),
             cam_from_block=(start[0],),
             xyz=xyz,
-            point_of=zeros[:0],
-            photo_of=zeros[:0],
+            point_of=none,
+            photo_of=none,
             xy=np.zeros((0, 2)),
         )
         read_off = np.tile(_SIGMA_M**2 * np.eye(3), (len(rows), 1, 1))
         survey = PointPriors(point_of=numbers, xyz=xyz, covariance=read_off)
-        picked = self.pixels[rows]
-        targets = Targets(point_of=numbers, photo_of=zeros, xy=picked, sigma_px=self.sigma_px, survey=survey)
+        targets = Targets(
+            point_of=numbers,
+            photo_of=np.zeros(len(rows), dtype=np.int64),
+            xy=self.pixels[rows],
+            sigma_px=self.sigma_px,
+            survey=survey,
+        )
         lens = replace(_KNOWN_LENS, focal_rel=self.focal_sigma_rel)
         known = lens_prior(self.camera, lens, robust=False)
         problem = Problem(block, Terms(keypoint_px=1.0, lenses=(known,), targets=targets))

@@ -1,10 +1,15 @@
-"""Whether pictures confirm a pose: do pieces of the photo, each on its own, put the scan where it does?
+"""Whether pictures confirm a pose, of one photo or of all photos of a map together.
+
+Do pieces of a photo, each on its own, put the scan where the pose does?
 
 Each piece of the rendering at the pose is searched in the photo within a window; without any relation between
 the two its best place is anywhere in the window, and near the middle with the small probability that the area
 gives. A pose that is right has a third or more of its pieces at the middle; a wrong one, even when it was
 fitted to the same pictures, as many as chance and six free parameters give. The evidence is the binomial
 tail. It does not ask how the pose was found.
+
+All photos of a map are asked together of one similarity, which gives each its pose. How often chance agrees
+is then taken from wrong places, too.
 """
 
 from collections.abc import Sequence

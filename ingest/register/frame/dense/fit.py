@@ -38,7 +38,11 @@ _LEAST_ACROSS = 8  # pieces that are made larger still leave so many along the p
 def near_places(
     views: FrameViews, rendering: Rendering, source: RenderSource, piece_px: int, near_px: int
 ) -> FrameMatches:
-    """Pieces of a render, and where in the photo they fit best near where the render's pose puts them."""
+    """Pieces of a render, and where in the photo they fit best near where the render's pose puts them.
+
+    Args:
+        rendering: made with the views' camera, shrunk.
+    """
     templates = cut_templates(rendering, source, piece_px, _MAX_PIECES)
     size = (rendering.camera.width, rendering.camera.height)
     small = np.asarray(cv2.resize(views.gray, size, interpolation=cv2.INTER_AREA))

@@ -8,7 +8,7 @@ similarity, so another true match nearby has the same rotation and scale. False 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,19 +88,22 @@ class FrameHypothesis:
     rival_share: float = 0.0
 
 
-RenderGroup = tuple[Rigid3, Sequence[Rendering]]
-"""Renders whose features share one reference view, after its pose: neighbourhood is judged there."""
+class RenderGroup(NamedTuple):
+    """Renders whose features share the view at one pose: neighbourhood is judged there."""
+
+    pose: Rigid3
+    renderings: Sequence[Rendering]
 
 
 def prior_group(views: FrameViews, pose: Rigid3) -> RenderGroup:
     """The render at one pose alone."""
-    return pose, views.renders([pose], views.features_side_px)
+    return RenderGroup(pose, views.renders([pose], views.features_side_px))
 
 
 def star_groups(views: FrameViews, prior: FramePrior) -> Iterator[RenderGroup]:
     """Renders of the star around the prior, and one at each heading that it leaves out, if any."""
     poses = star_poses(prior, views.look.depth_m, views.camera)
-    yield prior.cam_from_local, views.renders(poses, views.features_side_px)
+    yield RenderGroup(prior.cam_from_local, views.renders(poses, views.features_side_px))
     for angle in fan_headings_deg(prior.sigma_heading_deg)[1:]:
         yield prior_group(views, turned_about_vertical(prior.cam_from_local, angle))
 
