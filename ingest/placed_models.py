@@ -24,7 +24,7 @@ from ingest.register.control.maps import Survey, place_by_survey, vertical_of
 from ingest.register.control.marks import control_frame
 from ingest.register.control.placement import GcpPlacement
 from ingest.register.gps import GpsPlacement, place_by_gps
-from ingest.register.tagged_elsewhere import TaggedElsewhere, tagged_elsewhere
+from ingest.register.tagged_elsewhere import TaggedElsewhere, joined_wrongly, tagged_elsewhere
 from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.held_lens import impossible
 from ingest.sfm.links import keep_photos, select_photos, tied_parts
@@ -80,8 +80,9 @@ def place_models(
     """Place every model and build its map; one at a time, so that the caller can commit and forget it.
 
     What hangs on the rest of its model by little is placed by itself; where that is a photo or two, they
-    follow as a component without map. Photos whose GPS together contradicts that of the others become a map
-    without a place. So does every model whose place nothing tells.
+    follow as a component without map. So is what look-alikes have joined to it wrongly. Photos whose GPS
+    together contradicts that of the others become a map without a place. So does every model whose place
+    nothing tells.
 
     Args:
         identity: of the map of the component with that number.
@@ -91,7 +92,9 @@ def place_models(
     elsewhere: list[tuple[Model, TaggedElsewhere]] = []
     for whole in done.reconstruction.models():
         loose: list[int] = []
-        for rows in tied_parts(whole, options.min_tie):
+        parts = tied_parts(whole, options.min_tie)
+        while parts:
+            rows = parts.pop(0)
             if len(rows) < options.sfm.min_model_photos:
                 loose += rows
                 continue
@@ -99,7 +102,14 @@ def place_models(
             groups = []
             if survey is None:  # groups of photos whose GPS contradicts a placement that is accepted
                 _, with_gps, placed = placed_by_gps(model, [done.usable[r] for r in model.rows])
-                groups = tagged_elsewhere(model, with_gps, placed) if placed.reason is None else []
+                if placed.reason is None:
+                    groups = tagged_elsewhere(model, with_gps, placed)
+                    apart = [] if groups else joined_wrongly(model, with_gps, placed)
+                    if apart:
+                        own = [model.rows[group].tolist() for group in apart]
+                        rest = select_photos(whole, set(rows).difference(*own))
+                        parts = [*tied_parts(rest, options.min_tie), *own, *parts]
+                        continue
             gone = {int(model.rows[k]) for group in groups for k in group.photos}
             kept = keep_photos(model, set(rows) - gone) if groups else model
             if kept is not None:

@@ -1,6 +1,6 @@
 """What hangs on a reconstruction by little is placed by itself, or in no map."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.placed_models import Component, impossible_lens, impossible_shear, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed
+from ingest.register.gps import GpsPlacement
 from ingest.sfm.extract import FeatureFiles
 from tests.support.growth_box import existing
 from tests.support.posed_models import model_of
@@ -69,6 +70,33 @@ def test_two_houses_that_little_ties_are_two_maps() -> None:
     # With as many points in common as are asked for they are one.
     (whole,) = _placed(model, MapMakingOptions(min_tie=29))
     assert whole.model is model
+
+
+def test_a_part_that_was_joined_wrongly_is_placed_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asked of the whole first, then of what is left and of the part, which are right."""
+    asked: list[int] = []
+
+    def joined_wrongly(model: Model, *_: object) -> list[list[int]]:
+        asked.append(len(model.rows))
+        return [[2, 3, 4]] if len(model.rows) == 6 else []
+
+    accepted = GpsPlacement(reason=None, message="", residuals_m=np.zeros((0, 3)), inliers=np.zeros(0, bool))
+
+    def component(model: Model, photos: Sequence[Photo], *_: object) -> Component:
+        chosen = tuple(photos[r] for r in model.rows)
+        return Component(model=model, photos=chosen, with_gps=(), placement=accepted, feature_map=None)
+
+    monkeypatch.setattr("ingest.placed_models.joined_wrongly", joined_wrongly)
+    monkeypatch.setattr("ingest.placed_models.tagged_elsewhere", lambda *_: [])
+    monkeypatch.setattr("ingest.placed_models.placed_by_gps", lambda *_: (None, (), accepted))
+    monkeypatch.setattr("ingest.placed_models._component", component)
+    one = range(200)
+    parts = _placed(model_of(*([one] * 6)))
+    assert asked == [6, 3, 3]
+    assert [[p.name.removesuffix(".jpg") for p in c.photos] for c in parts] == [
+        ["0", "1", "5"],
+        ["2", "3", "4"],
+    ]
 
 
 def test_photos_that_are_too_few_for_a_map_are_named_together() -> None:

@@ -9,7 +9,7 @@ import pytest
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsPlacement, place_by_gps
-from ingest.register.tagged_elsewhere import tagged_elsewhere
+from ingest.register.tagged_elsewhere import joined_wrongly, tagged_elsewhere
 from tests.support.posed_models import model_of
 
 _TWIN = (11, 12, 13)  # photos of a twin of the house that 10 shows
@@ -89,3 +89,35 @@ def test_a_receiver_that_lost_its_correction_for_a_while() -> None:
     placement = place_by_gps(model.centers(), positions, np.full((20, 3), 0.03))
     assert (~placement.inliers).sum() == 4
     assert found(model, list(range(20)), placement) == []
+
+
+def long_walk() -> Model:
+    """Sixty photos around a park."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    centers = 180.0 * np.column_stack([np.cos(angles), np.sin(angles), 0.1 * np.cos(3 * angles)])
+    poses = tuple(Rigid3(rotation=np.eye(3), translation=-center) for center in centers)
+    return replace(model_of(*(range(50 * k, 50 * k + 100) for k in range(60))), cam_from_sfm=poses)
+
+
+def half_turn(model: Model, rows: Iterable[int]) -> dict[int, tuple[float, float]]:
+    """How far positions are off where these photos were joined with half a turn about the first."""
+    centers = model.centers()[:, :2]
+    first = next(iter(rows))
+    offsets = 2.0 * (centers[first] - centers)
+    return {k: (float(offsets[k, 0]), float(offsets[k, 1])) for k in rows if k != first}
+
+
+def test_a_part_that_was_joined_with_half_a_turn_is_found() -> None:
+    model, turned = long_walk(), range(20, 32)
+    with_gps, placement = placed(model, half_turn(model, turned), without=(25,))
+    assert found(model, with_gps, placement) == []
+    (group,) = joined_wrongly(model, with_gps, placement)
+    assert set(range(22, 32)) <= set(group) <= set(turned)  # the first ones have hardly moved
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_positions_that_are_wrong_by_accident_are_no_part(seed: int) -> None:
+    model, rng = long_walk(), np.random.default_rng(seed)
+    off = {int(k): tuple(rng.uniform(-400.0, 400.0, 2)) for k in rng.choice(60, 12, replace=False)}
+    assert joined_wrongly(model, *placed(model, off)) == []
+    assert joined_wrongly(model, *placed(model, {})) == []
