@@ -24,7 +24,7 @@ from ingest.register.control.maps import Survey, place_by_survey, vertical_of
 from ingest.register.control.marks import control_frame
 from ingest.register.control.placement import GcpPlacement
 from ingest.register.gps import GpsPlacement, place_by_gps
-from ingest.register.tagged_elsewhere import TaggedElsewhere, joined_wrongly, tagged_elsewhere
+from ingest.register.tagged_elsewhere import TaggedElsewhere, rightly_joined, tagged_elsewhere
 from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.held_lens import impossible
 from ingest.sfm.links import keep_photos, select_photos, tied_parts
@@ -88,28 +88,26 @@ def place_models(
         identity: of the map of the component with that number.
         survey: control points, which then place the maps instead of GPS.
     """
+
+    def by_gps(model: Model) -> tuple[tuple[int, ...], GpsPlacement]:
+        return placed_by_gps(model, [done.usable[r] for r in model.rows])[1:]
+
     number = itertools.count()
     elsewhere: list[tuple[Model, TaggedElsewhere]] = []
     for whole in done.reconstruction.models():
         loose: list[int] = []
-        parts = tied_parts(whole, options.min_tie)
-        while parts:
-            rows = parts.pop(0)
+        tied = [select_photos(whole, rows) for rows in tied_parts(whole, options.min_tie)]
+        if survey is None:
+            tied = [part for one in tied for part in rightly_joined(one, by_gps, options.min_tie)]
+        for model in tied:
+            rows = model.rows.tolist()
             if len(rows) < options.sfm.min_model_photos:
                 loose += rows
                 continue
-            model = select_photos(whole, rows)
             groups = []
             if survey is None:  # groups of photos whose GPS contradicts a placement that is accepted
                 _, with_gps, placed = placed_by_gps(model, [done.usable[r] for r in model.rows])
-                if placed.reason is None:
-                    groups = tagged_elsewhere(model, with_gps, placed)
-                    apart = [] if groups else joined_wrongly(model, with_gps, placed)
-                    if apart:
-                        own = [model.rows[group].tolist() for group in apart]
-                        rest = select_photos(whole, set(rows).difference(*own))
-                        parts = [*tied_parts(rest, options.min_tie), *own, *parts]
-                        continue
+                groups = tagged_elsewhere(model, with_gps, placed) if placed.reason is None else []
             gone = {int(model.rows[k]) for group in groups for k in group.photos}
             kept = keep_photos(model, set(rows) - gone) if groups else model
             if kept is not None:

@@ -6,7 +6,7 @@ positions are all off by the same way is either at another place, or was tagged 
 cannot be told, so such photos are in no map.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.special import bdtrc
 
 from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsPlacement
-from ingest.sfm.links import link_shares
+from ingest.sfm.links import link_shares, select_photos, tied_parts
 
 # When positions that do not fit say that their photos are elsewhere. In two simulated communities (500 and
 # 5,000 photos, geotags of 8 m) five groups that look-alikes had joined were off by 5.4 to 11 times the noise,
@@ -31,6 +31,8 @@ _MIN_OFFSET_M = 10.0
 _MAX_SPREAD = 0.75  # distance of two offsets that agree, over the least common offset
 # Share of positions that may be wrong by accident, and how often so many of a group may be.
 _WRONG_SHARE, _ACCIDENT = 0.2, 1e-3
+
+PlaceModel = Callable[[Model], tuple[Sequence[int], GpsPlacement]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +75,24 @@ def tagged_elsewhere(model: Model, with_gps: Sequence[int], placed: GpsPlacement
         if offset_m >= least_m:
             found.append(TaggedElsewhere(photos=tuple(sorted([*members, *hanging])), offset_m=offset_m))
     return found
+
+
+def rightly_joined(model: Model, place: PlaceModel, least_tie: int) -> list[Model]:
+    """The model, or its parts where look-alikes have joined some of it wrongly.
+
+    Args:
+        place: a model by its positions: photos with one, by place among its rows, and the placement.
+        least_tie: points that two photos have in common if they tie what is left together.
+    """
+    with_gps, placed = place(model)
+    if placed.reason is not None or tagged_elsewhere(model, with_gps, placed):
+        return [model]
+    groups = [model.rows[group].tolist() for group in joined_wrongly(model, with_gps, placed)]
+    if not groups:
+        return [model]
+    rest = select_photos(model, set(model.rows.tolist()).difference(*groups))
+    parts = [select_photos(model, rows) for rows in [*tied_parts(rest, least_tie), *groups]]
+    return [one for part in parts for one in rightly_joined(part, place, least_tie)]
 
 
 def joined_wrongly(model: Model, with_gps: Sequence[int], placed: GpsPlacement) -> list[list[int]]:

@@ -86,8 +86,9 @@ def test_a_part_that_was_joined_wrongly_is_placed_by_itself(monkeypatch: pytest.
         chosen = tuple(photos[r] for r in model.rows)
         return Component(model=model, photos=chosen, with_gps=(), placement=accepted, feature_map=None)
 
-    monkeypatch.setattr("ingest.placed_models.joined_wrongly", joined_wrongly)
-    monkeypatch.setattr("ingest.placed_models.tagged_elsewhere", lambda *_: [])
+    monkeypatch.setattr("ingest.register.tagged_elsewhere.joined_wrongly", joined_wrongly)
+    for module in ("placed_models", "register.tagged_elsewhere"):
+        monkeypatch.setattr(f"ingest.{module}.tagged_elsewhere", lambda *_: [])
     monkeypatch.setattr("ingest.placed_models.placed_by_gps", lambda *_: (None, (), accepted))
     monkeypatch.setattr("ingest.placed_models._component", component)
     one = range(200)
