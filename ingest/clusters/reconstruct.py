@@ -21,8 +21,6 @@ from ingest.colmap.adjust import adjust_posed
 from ingest.colmap.bridge import Model, posed, read_model, read_models
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import digest
-from ingest.register.gps import GpsPlacement, place_by_gps
-from ingest.register.tagged_elsewhere import rightly_joined
 from ingest.sfm.mapper import (
     SfmOptions,
     SfmTask,
@@ -39,8 +37,6 @@ _LOG = logging.getLogger(__name__)
 # What numbers can do to a block, in COLMAP or here. A full disk is another thing: it ends the run.
 _OF_THE_DATA = (ArithmeticError, LookupError, RuntimeError, ValueError)
 _MOSTLY = 0.5  # of joined photos; right joints lose single ones
-_TIE = 30  # points in common that tie two photos of a block
-_VERSION = "2"  # of joining; raised when the same blocks would be joined otherwise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,7 +223,7 @@ def _join_task(
     good: list[tuple[PhotoBlock, _BlockTask]] = [
         (b, t) for b, t in zip(cluster.blocks, tasks, strict=True) if t.folder not in failed
     ]
-    key = digest(_VERSION, sfm.key(), *(t.folder.name for _, t in good))[:24]
+    key = digest(sfm.key(), *(t.folder.name for _, t in good))[:24]
     return _JoinTask(
         sfm=sfm,
         blocks=tuple(t.folder for _, t in good),
@@ -299,26 +295,13 @@ def _join(task: _JoinTask) -> None:
 
 
 def _block_models(task: _JoinTask) -> tuple[list[Model], list[frozenset[int]]]:
-    """All models of all blocks with the cluster's rows, and the block's own rows beside each.
-
-    What look-alikes have joined wrongly within a block is apart, as far as positions tell.
-    """
-
-    def place(model: Model) -> tuple[list[int], GpsPlacement]:
-        views = [task.sfm.views[row] for row in model.rows.tolist()]
-        known = [k for k, view in enumerate(views) if view.prior_position is not None]
-        positions = np.reshape([views[k].prior_position for k in known], (-1, 3))
-        sigmas = np.reshape([views[k].prior_sigma_m for k in known], (-1, 3))
-        return known, place_by_gps(model.centers()[known], positions, sigmas)
-
-    models: list[Model] = []
-    own: list[frozenset[int]] = []
+    """All models of all blocks with the cluster's rows, and the block's own rows beside each."""
+    models, own = [], []
     for folder, rows, mine in zip(task.blocks, task.rows, task.own, strict=True):
         number: NDArray[np.int64] = np.array(rows, dtype=np.int64)
         for model in disjoint(read_models(folder), task.sfm.options.min_model_photos):
-            parts = rightly_joined(replace(model, rows=number[model.rows]), place, _TIE)
-            models += [part for part in parts if len(part.rows) >= task.sfm.options.min_model_photos]
-            own += [mine] * (len(models) - len(own))
+            models.append(replace(model, rows=number[model.rows]))
+            own.append(mine)
     return models, own
 
 
