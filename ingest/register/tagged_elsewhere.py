@@ -56,8 +56,7 @@ def tagged_elsewhere(model: Model, with_gps: Sequence[int], placed: GpsPlacement
     outside = [k for k, fits in zip(with_gps, placed.inliers.tolist(), strict=True) if not fits]
     if len(outside) < _MIN_PHOTOS or placed.local_from_sfm is None:
         return []
-    noise_m = float(np.sqrt((placed.residuals_m[placed.inliers, :2] ** 2).sum(axis=1).mean()))
-    least_m = max(_MIN_OFFSET_M, _MIN_OFFSET * noise_m)
+    least_m = _least_offset_m(placed)
     links = link_shares(model)
     tied = links[np.ix_(outside, outside)] >= _MIN_LINK
     count, label = connected_components(sparse.csr_array(tied.astype(np.int8)), directed=False)
@@ -101,9 +100,12 @@ def joined_wrongly(model: Model, with_gps: Sequence[int], placed: GpsPlacement) 
     Look-alikes have joined such a part of the reconstruction to the rest, turned or at another place. Of
     1,000 photos over a simulated town 80 were turned by half a turn and up to 500 m off: their offsets do not
     agree, as `tagged_elsewhere`, whose arguments these are, wants it. Photos without position that hang on
-    them are of the group.
+    them are of the group. What is wrong in height alone, or by less than that function wants, tells nothing.
     """
-    fits = dict(zip(with_gps, placed.inliers.tolist(), strict=True))
+    near = np.linalg.norm(placed.residuals_m[:, :2], axis=1) < _least_offset_m(placed)
+    fits = dict(zip(with_gps, (placed.inliers | near).tolist(), strict=True))
+    if all(fits.values()):
+        return []
     links = link_shares(model)
     tied = links >= _MIN_LINK
     untagged = [k for k in range(len(model.rows)) if k not in fits]
@@ -119,3 +121,9 @@ def joined_wrongly(model: Model, with_gps: Sequence[int], placed: GpsPlacement) 
             hanging = [k for k in untagged if tied[k].any() and links[k].argmax() in members]
             found.append(sorted([*members, *hanging]))
     return found
+
+
+def _least_offset_m(placed: GpsPlacement) -> float:
+    """How far off horizontally positions must be to say that their photos are elsewhere."""
+    noise_m = float(np.sqrt((placed.residuals_m[placed.inliers, :2] ** 2).sum(axis=1).mean()))
+    return max(_MIN_OFFSET_M, _MIN_OFFSET * noise_m)

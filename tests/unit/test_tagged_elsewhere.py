@@ -115,6 +115,17 @@ def test_a_part_that_was_joined_with_half_a_turn_is_found() -> None:
     assert set(range(22, 32)) <= set(group) <= set(turned)  # the first ones have hardly moved
 
 
+def test_heights_that_are_wrong_for_a_part_of_a_flight_do_not_part_it() -> None:
+    """A barometer that is set anew on the way: where the photos are in plan, they are."""
+    model = long_walk()
+    positions = model.centers() + np.random.default_rng(4).normal(0.0, 2.0, (60, 3))
+    positions[20:32, 2] += 200.0
+    placement = place_by_gps(model.centers(), positions, np.full((60, 3), _SIGMA_M))
+    assert placement.reason is None
+    assert not placement.inliers[20:32].any()
+    assert joined_wrongly(model, list(range(60)), placement) == []
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_positions_that_are_wrong_by_accident_are_no_part(seed: int) -> None:
     model, rng = long_walk(), np.random.default_rng(seed)
