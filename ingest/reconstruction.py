@@ -24,6 +24,7 @@ from ingest.map_builder import MapOptions
 from ingest.photos.duplicates import copies_of
 from ingest.photos.photo import CameraSharing, Photo, gps_priors, local_frame_of, photo_cameras
 from ingest.sfm.extract import FeatureFiles, extract_photos, features_key, read_keypoints
+from ingest.sfm.far_pairs import far_pairs
 from ingest.sfm.mapper import SfmOptions, SfmView
 from ingest.sfm.matching import Matched, PhotoView, match_pairs
 from ingest.sfm.pair_geometry import MatchOptions
@@ -138,6 +139,10 @@ def reconstruct_photos(
         counts |= {"reused": matched.reused, "total": len(matched.files)}
     copies = copies_of(usable, matched)
     matched = matched.without(copies.keys())
+    far = far_pairs(usable, matched.inliers)
+    if far:
+        logger.info("%d pairs look alike and are too far apart by their positions", len(far))
+        matched = matched.without(pairs=far)
     done = replace(
         done,
         copies={usable[row].name: usable[kept].name for row, kept in copies.items()},

@@ -1,6 +1,6 @@
 """Stage: matches of each pair of photos, verified by two-view geometry, one file a pair."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -75,9 +75,9 @@ class Matched:
             lost=self.lost + other.lost,
         )
 
-    def without(self, rows: Collection[int]) -> "Matched":
-        """Without the verified pairs of some photos."""
-        kept = {(i, j): n for (i, j), n in self.inliers.items() if i not in rows and j not in rows}
+    def without(self, rows: Set[int] = frozenset(), pairs: Set[Pair] = frozenset()) -> "Matched":
+        """Without the verified pairs of some photos, and without some pairs."""
+        kept = {p: n for p, n in self.inliers.items() if p not in pairs and rows.isdisjoint(p)}
         return replace(self, inliers=kept, copies=self.copies & kept.keys())
 
     def geometry(self, pair: Pair) -> TwoView:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import GeoPrior
 from ingest.photos.photo import Photo
+from ingest.sfm.far_pairs import far_pairs
 from ingest.sfm.pairs import PairOptions, choose_pairs, more_pairs
 from tools.train_vocabulary import train_vocabulary
 
@@ -210,3 +211,43 @@ def test_keyframes_look_beyond_their_own_shot() -> None:
     assert not {(k, k + 20) for k in range(20)} & set(
         choose_pairs(photos, vectors, replace(options, other_shots=0))
     )
+
+
+def _overlapping(side: int) -> dict[tuple[int, int], int]:
+    """Verified matches of a grid's photos with those up to two rows and columns away."""
+    return {
+        (i, j): 300 // max(abs(i % side - j % side), abs(i // side - j // side))
+        for i, j in itertools.combinations(range(side * side), 2)
+        if max(abs(i % side - j % side), abs(i // side - j // side)) <= 2
+    }
+
+
+def test_pairs_that_look_alike_far_apart_go() -> None:
+    right = _overlapping(12)
+    alike = {(0, 140): 90, (3, 130): 40, (15, 143): 25}  # 200 m and more
+    assert far_pairs(_grid(12), right | alike) == alike.keys()
+
+
+def test_a_photo_with_a_wrong_position_keeps_its_pairs() -> None:
+    photos = _grid(12)
+    photos[30] = _photo(30, 9000.0, -4000.0)
+    assert not far_pairs(photos, _overlapping(12))
+
+
+def test_positions_that_are_all_wrong_cost_no_photo_more_than_a_tenth() -> None:
+    rng = np.random.default_rng(0)
+    photos = [_photo(k, *rng.uniform(0.0, 2000.0, 2).tolist()) for k in range(144)]
+    inliers = _overlapping(12)
+    total, lost = np.zeros(144), np.zeros(144)
+    far = far_pairs(photos, inliers)
+    for pair, count in inliers.items():
+        total[list(pair)] += count
+        lost[list(pair)] += count * (pair in far)
+    assert (lost <= 0.1 * total).all()
+
+
+def test_photos_of_few_pairs_and_without_positions_keep_them() -> None:
+    apart = {(0, 11): 100, (11, 143): 100}  # each is all that one of its photos has
+    assert not far_pairs(_grid(12), apart)
+    untagged = [_photo(k) for k in range(144)]
+    assert not far_pairs(untagged, _overlapping(12) | {(0, 140): 90})
