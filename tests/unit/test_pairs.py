@@ -231,10 +231,12 @@ def test_pairs_that_look_alike_far_apart_go() -> None:
 def test_a_photo_with_a_wrong_position_keeps_its_pairs() -> None:
     photos = _grid(12)
     photos[30] = _photo(30, 9000.0, -4000.0)
-    assert not far_pairs(photos, _overlapping(12))
+    right = _overlapping(12)
+    assert not far_pairs(photos, right)
+    assert far_pairs(photos, right | {(0, 140): 90}) == {(0, 140)}
 
 
-def test_positions_that_are_all_wrong_cost_no_photo_more_than_a_tenth() -> None:
+def test_positions_that_are_all_wrong_cost_no_photo_more_than_half() -> None:
     rng = np.random.default_rng(0)
     photos = [_photo(k, *rng.uniform(0.0, 2000.0, 2).tolist()) for k in range(144)]
     inliers = _overlapping(12)
@@ -243,7 +245,7 @@ def test_positions_that_are_all_wrong_cost_no_photo_more_than_a_tenth() -> None:
     for pair, count in inliers.items():
         total[list(pair)] += count
         lost[list(pair)] += count * (pair in far)
-    assert (lost <= 0.1 * total).all()
+    assert (lost <= 0.5 * total).all()
 
 
 def test_photos_of_few_pairs_and_without_positions_keep_them() -> None:

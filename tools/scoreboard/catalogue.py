@@ -64,6 +64,19 @@ SPEED: tuple[Row, ...] = (
         minutes=35,
     ),
     _row(
+        name="bulk-ingest",
+        claim="1,000 photos of one flight over a simulated town whose houses look alike, with a receiver's "
+        "positions, beside the first 200 of them: processor time a photo, the largest of its processes, its "
+        "maps against the truth",
+        commands=f"tools.bulk_ingest --work {{work}}/bulk --seed 5 {OUT}",
+        figures=same("photos maps placed share wrong median_m largest_m a_photo_s first_s ratio largest_mb"),
+        text="{placed:.0f} of {photos:.0f} photos in {maps:.0f} maps, {wrong:.0f} wrong, {median_m:.2f} m, "
+        "largest {largest_m:.2f} m; {a_photo_s:.2f} s a photo, {ratio:.2f} times that of the first; "
+        "{largest_mb:.0f} MB",
+        limits="0.99 <= share, wrong <= 0, maps <= 2, ratio <= 1.15, largest_mb <= 2048",
+        minutes=60,
+    ),
+    _row(
         name="memory-curve",
         claim="`seneca`'s map of all photos but every fifth, thinned to so many points for each image; the "
         "others over Zenoh, against a map of all",
