@@ -30,6 +30,7 @@ from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.localise.localise import localise
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest, LocaliseResult, PoseInMap
+from reloc.wire.query import Lineage
 
 _LOG = logging.getLogger(__name__)
 # Maps whose boxes come this close belong to one area: a photo may see both.
@@ -247,12 +248,12 @@ class Localiser:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""
         if result.pose is None:
             return result
-        told = []
-        for entry in result.pose.lineage:
-            found = self._lineages[entry["map_id"]]
-            names = ("steps", "anchors", "drift_m", "budget_m")
-            told.append(entry | {name: getattr(found, name) for name in names})
-        return replace(result, pose=replace(result.pose, lineage=tuple(told)))
+        names = ("steps", "anchors", "drift_m", "budget_m")
+        told = tuple(
+            Lineage(**dict(entry) | {name: getattr(self._lineages[entry.map_id], name) for name in names})
+            for entry in result.pose.lineage
+        )
+        return replace(result, pose=replace(result.pose, lineage=told))
 
 
 def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
