@@ -106,7 +106,7 @@ def _ros2(args: argparse.Namespace) -> int:
     with ExitStack() as opened:
         sinks: list[Callable[[RobotPose, LocalFrame], None]] = []
         if args.connect is not None:
-            from reloc.bridge.rmw_zenoh import RmwZenohNode
+            from reloc.bridge.ros2 import RmwZenohNode
 
             node = RmwZenohNode(args.connect, domain=args.domain)
             sinks.append(opened.enter_context(node).write)

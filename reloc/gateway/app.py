@@ -32,13 +32,19 @@ from reloc.gateway.failures import (
     STATUS_OF,
     ErrorBody,
 )
-from reloc.gateway.geopose import NotLocalisedError, check_version, parse, question_of, response_of
+from reloc.gateway.geopose import MEDIA_TYPE as GEOPOSE_TYPE
+from reloc.gateway.geopose import VERSION as GEOPOSE_VERSION
+from reloc.gateway.geopose import (
+    GeoPoseResp,
+    NotLocalisedError,
+    check_version,
+    parse,
+    question_of,
+    response_of,
+)
 from reloc.gateway.intake import Intake, read_form
 from reloc.gateway.link import Link
 from reloc.gateway.options import GatewayOptions
-from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
-from reloc.gateway.protocol import VERSION as GEOPOSE_VERSION
-from reloc.gateway.protocol import GeoPoseResp
 from reloc.service.logs import fields
 from reloc.wire.query import ErrorCode, LocaliseReply, LocaliseWireRequest
 from reloc.wire.server import MapsReply, StatusReply

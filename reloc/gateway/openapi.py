@@ -7,7 +7,7 @@ from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 
 from reloc.gateway.failures import ErrorBody
-from reloc.gateway.protocol import MEDIA_TYPE, GeoPoseReq, GeoPoseResp
+from reloc.gateway.geopose import MEDIA_TYPE, GeoPoseReq, GeoPoseResp
 from reloc.wire.query import CameraRequest, LocaliseReply, PriorRequest, RequestOptions
 from reloc.wire.server import MapsReply
 

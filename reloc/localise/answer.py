@@ -10,8 +10,7 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
-from reloc.localise.jacobians import lens_jacobians, pixel_jacobians
-from reloc.localise.lens_prior import lens_for, lens_of, opencv_by_lens
+from reloc.localise.lens_prior import lens_for, lens_jacobians, lens_of, opencv_by_lens, pixel_jacobians
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import Inliers, LocalisedPose, place_on_earth
 from reloc.wire.query import Lineage

@@ -15,8 +15,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.error_modes import LENS_SIZE, ErrorModes
 from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store import Database
-from reloc.gateway.geopose import NotLocalisedError, response_of
-from reloc.gateway.protocol import GeoPoseReq
+from reloc.gateway.geopose import GeoPoseReq, NotLocalisedError, response_of
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
