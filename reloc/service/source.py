@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from featuredb.geo.utm import geodetic_from_utm
+from featuredb.export.selection import degrees_around, touches
 from featuredb.store import Database, MapSummary
 from reloc.localiser import Localiser
 from reloc.wire.server import BoundingBox, MapInfo
@@ -65,35 +63,17 @@ class DatabaseSource:
         return ServedArea(localiser=localiser, maps=tuple(map_info(summary) for summary in active))
 
     def _serves(self, summary: MapSummary) -> bool:
-        if self._bbox is None:
-            return True
-        bounds, (west, south, east, north) = _bounds(summary), self._bbox
-        if bounds is None:
-            return False
-        return bounds.west <= east and bounds.east >= west and bounds.south <= north and bounds.north >= south
+        return self._bbox is None or touches(summary, self._bbox)
 
 
 def map_info(summary: MapSummary) -> MapInfo:
     """A map's summary as the wire says it."""
     same = [name for name in MapInfo.model_fields if name not in ("bounds", "tiles")]
+    around = degrees_around(summary)
     return MapInfo(
         **{name: getattr(summary, name) for name in same},
-        bounds=_bounds(summary),
+        bounds=None
+        if around is None
+        else BoundingBox(**dict(zip(BoundingBox.model_fields, around, strict=True))),
         tiles=tuple(f"{summary.epsg}-{tile}" for tile in summary.tiles),
     )
-
-
-def _bounds(summary: MapSummary) -> BoundingBox | None:
-    """Degrees around the map's box: those of its corners, which grid lines curve off by centimetres."""
-    box = summary.box
-    if box is None:
-        return None
-    corners = [
-        (easting, northing, 0.0)
-        for easting in (box.min_easting, box.max_easting)
-        for northing in (box.min_northing, box.max_northing)
-    ]
-    lat_lon_h = geodetic_from_utm(np.array(corners), summary.epsg)
-    south, west = (float(v) for v in lat_lon_h[:, :2].min(axis=0))
-    north, east = (float(v) for v in lat_lon_h[:, :2].max(axis=0))
-    return BoundingBox(west=west, south=south, east=east, north=north)
