@@ -81,7 +81,7 @@ class WorkerProcess:
             raise WorkerEndedError(None) from error
         self._limits = limits
         self._open: LocaliserFiles | None = None
-        self._killed = False
+        self.killed = False  # by `kill`
         self._process = _CONTEXT.Process(
             target=answer_all, args=(theirs, limits, answerer), name="localise", daemon=True
         )
@@ -96,11 +96,11 @@ class WorkerProcess:
 
     def is_alive(self) -> bool:
         """Between queries: then there is nothing to be read but the end. One that was told to end is not."""
-        return not self._killed and not self._connection.poll() and self._process.is_alive()
+        return not self.killed and not self._connection.poll() and self._process.is_alive()
 
     def kill(self) -> None:
         """From any thread: whoever waits for an answer gets WorkerEndedError."""
-        self._killed = True
+        self.killed = True
         self._process.kill()
 
     def close(self) -> None:
