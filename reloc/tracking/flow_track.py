@@ -12,9 +12,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.tracking.ground import Keyframe
-from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import FlowOptions, TrackOptions
-from reloc.tracking.pose_fit import FittedPose, fit_pose
+from reloc.tracking.pose_fit import FittedPose, LensWalk, fit_pose
 
 _HALF_PX = 0.5  # OpenCV's pixel (0, 0) is a centre, ours a corner
 

@@ -14,9 +14,8 @@ from featuredb.geometry.camera import Camera
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.flow_track import FlowTrack, RecentFrame, RecentFrames
 from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, Unmatched
-from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.pose_fit import FittedPose
+from reloc.tracking.pose_fit import FittedPose, LensWalk
 from reloc.wire.track import TrackState
 
 Answer = Keyframe | Unmatched
