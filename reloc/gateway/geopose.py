@@ -62,14 +62,12 @@ class CameraParam(Message):
 
 class ImageOrientation(Message):
     mirrored: bool = False
-    rotation: float = 0.0
 
 
 class CameraReading(Message):
     """One picture: `imageBytes` is base64 of an image file, or of raw pixels in RGBA32 or GRAY8."""
 
     timestamp: Milliseconds | None = None
-    sensorId: Text = ""  # noqa: N815
     imageFormat: Annotated[str, Field(max_length=64)] = ""  # noqa: N815
     size: Annotated[tuple[float, ...], Field(max_length=2)] = Field(default=(), description="width, height")
     imageBytes: str = Field(description="base64")  # noqa: N815
@@ -81,7 +79,6 @@ class GeolocationReading(Message):
     """As of the W3C's Geolocation: degrees, and metres that hold 95 % of the errors."""
 
     timestamp: Milliseconds | None = None
-    sensorId: Text = ""  # noqa: N815
     latitude: Degrees90
     longitude: Degrees180
     accuracy: float | None = None
@@ -90,11 +87,6 @@ class GeolocationReading(Message):
 class SensorReadings(Message):
     cameraReadings: Annotated[tuple[CameraReading, ...], Field(max_length=16)] = ()  # noqa: N815
     geolocationReadings: Annotated[tuple[GeolocationReading, ...], Field(max_length=1000)] = ()  # noqa: N815
-
-
-class Sensor(Message):
-    id: Text
-    type: Text
 
 
 class GeoPoseBasicQuaternion(Message):
@@ -123,7 +115,6 @@ class GeoPoseReq(Message):
     id: Text
     timestamp: Milliseconds
     type: Literal["geopose"]
-    sensors: Annotated[tuple[Sensor, ...], Field(max_length=1000)] = ()
     sensorReadings: SensorReadings  # noqa: N815
     priorPoses: Annotated[tuple[GeoPoseResp, ...], Field(max_length=1000)] | None = None  # noqa: N815
 

@@ -18,7 +18,6 @@ from reloc.service.workers.answering import (
     OUT_OF_MEMORY,
     REFUSAL,
     Answerer,
-    OpenFiles,
     WorkerLimits,
     answer_all,
 )
@@ -118,7 +117,7 @@ class WorkerProcess:
         if files is self._open:
             return
         try:
-            self._connection.send(OpenFiles(keys=tuple(file.key for file in files)))
+            self._connection.send(tuple(file.key for file in files))
             for file in files:
                 send_handle(self._connection, file.file.fileno(), self._process.pid)
             self._connection.recv_bytes()
