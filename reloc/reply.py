@@ -7,13 +7,11 @@ import numpy as np
 
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import quaternion_from_matrix
-from reloc.localise.result import Inliers, LocalisedPose, LocaliseResult, OnEarth, PoseInMap
+from reloc.localise.result import Inliers, LocalisedPose, LocaliseResult, OnEarth
 from reloc.wire.query import (
     Accuracy,
     CameraUsed,
     InlierPoints,
-    InMapPose,
     LocaliseReply,
     Position,
     Quaternion,
@@ -27,7 +25,7 @@ def reply_from_result(
     """Word a result as the wire does; `timings_ms` replaces the result's own."""
     fields: dict[str, Any] = _NO_POSE if result.pose is None else _pose_fields(result.pose)
     if result.in_map is not None:
-        fields = _NO_POSE | {"in_map": _in_map(result.in_map), "maps": (result.in_map.map_id,)}
+        fields = _NO_POSE | {"in_map": result.in_map, "maps": (result.in_map.map_id,)}
     return LocaliseReply(
         **{name: getattr(result, name) for name in _SAME},
         exif_prior=result.own_position,
@@ -86,20 +84,6 @@ def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
         "lineage": pose.lineage,
         "inlier_points": None if pose.inliers is None else _inlier_points(pose.inliers),
     }
-
-
-def _in_map(pose: PoseInMap) -> InMapPose:
-    return InMapPose(
-        map_id=pose.map_id,
-        metric=pose.frame.metric,
-        upright=pose.frame.upright,
-        cam_from_map_xyzw=_floats(quaternion_from_matrix(pose.cam_from_map.rotation)),
-        cam_from_map_translation=_floats(pose.cam_from_map.translation),
-        center=_floats(pose.cam_from_map.center),
-        covariance=tuple(_floats(row) for row in pose.covariance),
-        camera=CameraUsed(**asdict(pose.camera), source=pose.camera_source),
-        residual_rms_px=pose.residual_rms_px,
-    )
 
 
 def _floats(values: FloatArray) -> Any:

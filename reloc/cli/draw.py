@@ -9,7 +9,7 @@ from featuredb.cli.common import open_database
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from reloc.pixels.layer import Layer
+    from reloc.pixels.layer import Shape
 
 _NO_POSE = 1  # exit code: everything worked, and there is no pose
 _REACH_M = 150.0  # beyond the track of a film, of the scan that is loaded
@@ -90,7 +90,7 @@ def _draw(args: argparse.Namespace) -> int:
     return 0
 
 
-def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
+def _draw_film(args: argparse.Namespace, layer: "list[Shape]") -> int:
     import numpy as np
 
     from featuredb.video.frames import open_video

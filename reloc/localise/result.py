@@ -17,7 +17,7 @@ from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.unplaced_map import OwnFrame
 from reloc.localise.lens_prior import QueryLensPrior
-from reloc.wire.query import CameraSource, Lineage, OwnPositionUse, Reason, RunnerUpPose
+from reloc.wire.query import CameraSource, InMapPose, Lineage, OwnPositionUse, Reason, RunnerUpPose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,15 +177,6 @@ class OwnPose:
         freeze(self, covariance=(6, 6))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PoseInMap(OwnPose):
-    """That of a photo; `camera`, `camera_source`, `residual_rms_px`: as in LocalisedPose."""
-
-    camera: Camera
-    camera_source: CameraSource
-    residual_rms_px: float
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
     """The figures behind a decision.
@@ -235,7 +226,7 @@ class LocaliseResult:
     runner_up: RunnerUpPose | None = None
     evidence: Evidence | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
-    in_map: PoseInMap | None = None
+    in_map: InMapPose | None = None
     own_position: OwnPositionUse | None = None
 
     def __post_init__(self) -> None:

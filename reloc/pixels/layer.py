@@ -32,7 +32,11 @@ _REACH_M = 5.0  # to the scan's nearest point in plan, from which a height is ta
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Shape:
-    """A point (1, 3) or a line (n, 3) in a local frame, metres; NaN where the scan gives no height."""
+    """A point (1, 3) or a line (n, 3).
+
+    In a local frame, metres, NaN where the scan gives no height; of a file latitude, longitude (degrees) and
+    height (m), NaN where it has none. `name`: "" where the feature has none.
+    """
 
     points: FloatArray
     name: str
@@ -42,24 +46,7 @@ class Shape:
         return len(self.points) == 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Layer:
-    """What a file holds.
-
-    Attributes:
-        lines: (n, 3) each, latitude, longitude (degrees), height (m), NaN where the file has none.
-        names: of each, "" where the feature has none.
-    """
-
-    lines: tuple[FloatArray, ...]
-    names: tuple[str, ...]
-
-    @property
-    def has_heights(self) -> bool:
-        return all(np.isfinite(line).all() for line in self.lines)
-
-
-def read_layer(path: Path) -> Layer:
+def read_layer(path: Path) -> list[Shape]:
     """Points, lines and the rings of polygons of a GeoJSON file.
 
     Coordinates are longitude and latitude of WGS84, or of the system that a member `crs` of 2008's GeoJSON
@@ -71,19 +58,18 @@ def read_layer(path: Path) -> Layer:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         crs = survey_crs(_crs_of(document))
-        lines, names = [], []
+        layer = []
         for name, line in _lines(document):
             found = np.full((len(line), 3), np.nan)
             for row, position in zip(found, line, strict=True):
                 row[: min(len(position), 3)] = position[:3]
-            lines.append(geodetic_from_survey(crs, found))
-            names.append(name)
+            layer.append(Shape(points=geodetic_from_survey(crs, found), name=name))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, GeodesyError) as error:
         raise InvalidValueError(f"{path}: expected GeoJSON, found {type(error).__name__}: {error}") from error
-    return Layer(lines=tuple(lines), names=tuple(names))
+    return layer
 
 
-def laid_on(layer: Layer, frame: LocalFrame, cloud: PointCloud | None) -> list[Shape]:
+def laid_on(layer: Sequence[Shape], frame: LocalFrame, cloud: PointCloud | None) -> list[Shape]:
     """The layer in a local frame; vertices without heights, and what joins them, are laid on the scan.
 
     A height is that of the highest of the scan's four points that are nearest in plan.
@@ -94,13 +80,14 @@ def laid_on(layer: Layer, frame: LocalFrame, cloud: PointCloud | None) -> list[S
     Raises:
         InvalidValueError: heights are missing, and there is no scan.
     """
-    if cloud is None and not layer.has_heights:
+    has_heights = all(np.isfinite(shape.points).all() for shape in layer)
+    if cloud is None and not has_heights:
         raise InvalidValueError(
             "layer: expected heights, or a scan around the camera to lay it on, found neither"
         )
-    tree = None if cloud is None or layer.has_heights else cKDTree(cloud.xyz[:, :2])
+    tree = None if cloud is None or has_heights else cKDTree(cloud.xyz[:, :2])
     shapes = []
-    for line, name in zip(layer.lines, layer.names, strict=True):
+    for line, name in ((shape.points, shape.name) for shape in layer):
         flat = ~np.isfinite(line[:, 2])
         points = frame.enu_from_geodetic(np.where(flat[:, None] & [False, False, True], frame.height_m, line))
         if flat.any() and tree is not None and cloud is not None:

@@ -97,7 +97,7 @@ def test_what_the_map_may_be_off_by_is_in_the_answer(localiser: Localiser) -> No
     for map_id in ("adrift", "bent"):
         found = localiser.localise(photo, LocaliseRequest(camera=CAMERA, map_ids=(map_id,))).in_map
         assert found is not None
-        variance[map_id] = float(np.trace(found.covariance[3:, 3:]))
+        variance[map_id] = float(np.trace(np.array(found.covariance)[3:, 3:]))
     distance = 3.0 * 40.0  # of the camera above the field, in the own frame
     assert variance["bent"] - variance["adrift"] == pytest.approx((5e-3 * distance) ** 2, rel=0.3)
 
