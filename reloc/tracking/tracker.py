@@ -107,14 +107,15 @@ class Tracker:
                 self._lost(f"LOST: {self._track.why}")
         elif self._catching is not None:
             fitted, state = self._caught_up_by(self._options.catch_up), "relocalised"
-        answered, sent = self._answer(now)
+        sent = self._due(now)
+        answered = None if sent is None else sent.answer.result()
         if isinstance(answered, Unmatched):
             self._unconfirmed += 1
             if fitted is None or self._unconfirmed >= self._options.max_unconfirmed:
                 fitted = None
                 self._lost(f"{answered.reason}: {answered.detail}")
-        elif answered is not None and sent is not None:
-            found = self._taken(answered, sent.index, now, self._track)
+        elif sent is not None and answered is not None:
+            found = self._taken(answered, sent.index)
             if found is not None:
                 state = "tracking" if fitted is not None else "relocalised"
                 fitted = found
@@ -155,7 +156,7 @@ class Tracker:
         if sent is not None and last is not None:
             answered = sent.answer.result()
             if not isinstance(answered, Unmatched):
-                fitted = self._taken(answered, sent.index, last, None)
+                fitted = self._taken(answered, sent.index)
         if self._catching is not None:
             fitted = self._caught_up_by(_FAR)
         if fitted is not None and self._track is not None and last is not None:
@@ -193,32 +194,30 @@ class Tracker:
         searched = self._track is None and not self._options.live
         return self._sent.index - (self._options.earlier if searched else 0)
 
-    def _answer(self, now: RecentFrame) -> "tuple[Answer | None, _Sent | None]":
-        """What the thread has found: at the frame at which it is due; live: as soon as it is there."""
+    def _due(self, now: RecentFrame) -> _Sent | None:
+        """What the thread has answered: at the frame at which it is due; live: as soon as it is there."""
         sent = self._sent
         if sent is None:
-            return None, None
+            return None
         due = now.index >= sent.due or now.time_s >= sent.due_s
         ready = sent.answer.done() if self._options.live else due
         if not ready:
             if not self._options.live and (sent.slow or now.index >= sent.due - _LAST_FRAMES):
                 wait([sent.answer], timeout=_PACE_S if sent.slow else _LAST_PACE_S)
-            return None, None
+            return None
         self._sent = None
-        return sent.answer.result(), sent
+        return sent
 
-    def _taken(
-        self, found: Keyframe, index: int, now: RecentFrame, track: FlowTrack | None
-    ) -> FittedPose | None:
+    def _taken(self, found: Keyframe, index: int) -> FittedPose | None:
         """The pose of the frame at hand by what was found of frame `index`; None: it says nothing of it.
 
-        `track`: as it is at the frame at hand; None: it is lost, and begins again at what was found.
+        A track that is lost begins again at what was found.
         """
-        since = self._frames.since(index)
+        since, track = self._frames.since(index), self._track
         if not since:
             return None
         if track is not None:
-            return track.refresh(found, since[0], now) if found.ground is track.ground else None
+            return track.refresh(found, since[0], since[-1]) if found.ground is track.ground else None
         self._found, self._unconfirmed = True, 0
         begun = self._begun(found, since[0])
         fitted = begun.settle()
