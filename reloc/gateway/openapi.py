@@ -101,13 +101,21 @@ METRICS: dict[str, Any] = {
 
 
 def install(app: FastAPI) -> None:
-    """Make the document, with the bodies' schemas among its components; all routes are there."""
-    made = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-    schemas = made.setdefault("components", {}).setdefault("schemas", {})
-    bodies: tuple[type[BaseModel], ...] = (GeoPoseReq, CameraRequest, PriorRequest, RequestOptions)
-    for model in bodies:
-        schema = model.model_json_schema(ref_template=_REF)
-        for name, part in schema.pop("$defs", {}).items():
-            schemas.setdefault(name, part)
-        schemas[model.__name__] = schema
-    app.openapi_schema = made  # which FastAPI then answers
+    """Make `app.openapi` give the document with the bodies' schemas among its components."""
+
+    def document() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            made = get_openapi(
+                title=app.title, version=app.version, description=app.description, routes=app.routes
+            )
+            schemas = made.setdefault("components", {}).setdefault("schemas", {})
+            bodies: tuple[type[BaseModel], ...] = (GeoPoseReq, CameraRequest, PriorRequest, RequestOptions)
+            for model in bodies:
+                schema = model.model_json_schema(ref_template=_REF)
+                for name, part in schema.pop("$defs", {}).items():
+                    schemas.setdefault(name, part)
+                schemas[model.__name__] = schema
+            app.openapi_schema = made
+        return app.openapi_schema
+
+    app.openapi = document  # type: ignore[method-assign]
