@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.compiled import compiled_module
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -64,6 +65,7 @@ def fit_pose(
     focal_rel = doubt.focal_rel
     scale = max(camera.width, camera.height) / _REFERENCE_SIDE_PX
     seen = camera.unproject(pixels)
+    points = np.ascontiguousarray(points, dtype=np.float64)
     focal, loss = camera.focal_px, _LOSS_PX * scale
     pose, zoom = start, 0.0
     depth = max(float(np.median(start.act(points)[:, 2])), 1e-6)
@@ -71,11 +73,18 @@ def fit_pose(
     # What was known of the focal length weighs as much as pixels that are off by half the loss's scale.
     known_focal = (0.5 * loss / focal_rel) ** 2 if focal_rel > 0.0 else 0.0
     count = 7 if focal_rel > 0.0 else 6
+    linearised = compiled_module("reloc.tracking.fit_loops").linearised
+    residual, jacobian = np.empty((2, len(points))), np.empty((7, 2, len(points)))
+    normal, gradient = np.empty((7, 7)), np.empty(7)
+
+    def linearise() -> None:
+        longer = focal * float(np.exp(zoom))
+        rotation = np.ascontiguousarray(pose.rotation)  # the loop is compiled for this order alone
+        made = (residual, jacobian, normal, gradient)
+        linearised(rotation, pose.translation, points, seen, focal, longer, loss, *made)
+
     for _ in range(_ITERATIONS):
-        residual, jacobian = _linearised(pose.act(points), seen, focal, focal * float(np.exp(zoom)))
-        weighted = jacobian / (1.0 + (residual**2).sum(axis=0) / loss**2)
-        normal = _product(weighted, jacobian)
-        gradient = weighted.reshape(7, -1) @ np.where(np.isfinite(residual), residual, 0.0).ravel()
+        linearise()
         if not _is_determined(normal[:6, :6]):
             return None
         normal[6, 6] += known_focal
@@ -85,7 +94,7 @@ def fit_pose(
         zoom += float(step[6]) if count == 7 else 0.0
         if np.abs(step * still[:count]).max() < _STILL:
             break
-    residual, jacobian = _linearised(pose.act(points), seen, focal, focal * float(np.exp(zoom)))
+    linearise()
     distance = np.hypot(*residual)
     inlier = np.asarray(distance < _TOLERANCE_PX * scale)
     if inlier.sum() < 4:
@@ -113,34 +122,11 @@ def fit_pose(
     )
 
 
-def _linearised(
-    in_camera: FloatArray, seen: FloatArray, focal: float, longer: float
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals (2, n) of pixels, and derivatives (7, 2, n) by the pose's left perturbation and the focal
-    length's logarithm.
-
-    Points behind the camera have residuals of infinity and no derivatives.
-
-    Args:
-        in_camera: (n, 3) the points in camera axes.
-        seen: (n, 2) rays by the camera's focal length `focal`. longer: the focal length that is tried.
-    """
-    front = (in_camera[:, 2] > 1e-6) & np.isfinite(seen).all(axis=1)
-    depth = np.where(front, in_camera[:, 2], 1.0)
-    u, v = uv = np.where(front, in_camera[:, :2].T / depth, 0.0)
-    one = front.astype(np.float64)
-    none, near = np.zeros(len(depth)), one / depth
-    by_pose = [
-        [-u * v, -one - v * v],
-        [one + u * u, u * v],
-        [-v, u],
-        [near, none],
-        [none, near],
-        [-near * u, -near * v],
-        uv,
-    ]
-    residual = np.where(front, longer * uv - focal * seen.T, np.inf)
-    return residual, longer * np.array(by_pose)
+def warm_up() -> None:
+    """Load the compiled loop, or compile it, now: processes that are forked then have it."""
+    camera = Camera(model="PINHOLE", width=640, height=480, params=(600.0, 600.0, 320.0, 240.0))
+    points = np.array([[-1.0, -1.0, 9.0], [1.0, -1.0, 10.0], [1.0, 1.0, 11.0], [-1.0, 1.0, 12.0]])
+    fit_pose(camera, camera.project(points), points, Rigid3.identity())
 
 
 def _product(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -78,9 +78,9 @@ def test_workers_are_forked_with_compiled_loops() -> None:
     """To compile takes longer than a worker may take for a photo."""
     code = (
         "import reloc.service.workers.preload; from featuredb.features import pyramid_loops, sift_loops\n"
-        "from featuredb.index import distance_loops\n"
+        "from featuredb.index import distance_loops\nfrom reloc.tracking import fit_loops\n"
         "sets = ((pyramid_loops, 'blur'), (sift_loops, 'extrema orientations descriptors'),\n"
-        "    (distance_loops, 'pair_distances'))\n"
+        "    (distance_loops, 'pair_distances'), (fit_loops, 'linearised'))\n"
         "for loops, names in sets:\n"
         "    for name in names.split():\n"
         "        assert len(getattr(loops, name).signatures) == 1, name"

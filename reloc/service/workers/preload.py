@@ -8,5 +8,5 @@ signal.signal(signal.SIGTERM, signal.SIG_IGN)
 for _name in ("reloc.service.handler", "reloc.service.workers.answering", "reloc.service.live.frames"):
     importlib.import_module(_name)
 # Compiling takes more than a worker may take for a photo.
-for _name in ("featuredb.features.extractor", "featuredb.index.descriptor_index"):
+for _name in ("featuredb.features.extractor", "featuredb.index.descriptor_index", "reloc.tracking.pose_fit"):
     importlib.import_module(_name).warm_up()
