@@ -39,6 +39,8 @@ class GatewayOptions:
         for name in (field.name for field in fields(self) if field.type in (int, float)):
             if name != "port" and not getattr(self, name) > 0:
                 raise InvalidValueError(f"GatewayOptions.{name}: expected > 0, found {getattr(self, name)}")
+        if not 0 <= self.port <= 65_535:
+            raise InvalidValueError(f"GatewayOptions.port: expected 0..65535, found {self.port}")
         if not _PREFIX.fullmatch(self.prefix):
             raise InvalidValueError(
                 f"GatewayOptions.prefix: expected a path such as /vps, without a slash at its end, found "
