@@ -14,8 +14,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.maps.feature_map import GeoPrior
-from reloc.localise.jacobians import pixel_jacobians
-from reloc.localise.lens_prior import lens_of, opencv_by_lens
+from reloc.localise.lens_prior import lens_of, opencv_by_lens, pixel_jacobians
 from reloc.wire.query import CameraRequest, Intrinsics, LocaliseReply, PriorRequest
 from reloc.wire.track import TrackPose
 

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import datetime
 from functools import partial
 from typing import Any, Generic, TypeVar
@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.errors import FeatureDbError, MapNotFoundError, StoreError, UnplacedBesideOthersError
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area, join_segments
 from featuredb.index.segment import Segment, segment_of
@@ -29,7 +30,8 @@ from featuredb.store.tables import BOUNDS
 from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.localise.localise import localise
 from reloc.localise.options import LocaliseOptions
-from reloc.localise.result import LocaliseRequest, LocaliseResult, PoseInMap
+from reloc.localise.result import LocaliseRequest, LocaliseResult
+from reloc.wire.query import CameraUsed, InMapPose, Lineage
 
 _LOG = logging.getLogger(__name__)
 # Maps whose boxes come this close belong to one area: a photo may see both.
@@ -53,8 +55,18 @@ def in_own_frame(result: LocaliseResult, unplaced: UnplacedMap) -> LocaliseResul
     pose = result.pose
     if pose is None:
         return replace(result, runner_up=None)
-    same = {n: getattr(pose, n) for n in ("covariance", "camera", "camera_source", "residual_rms_px")}
-    in_map = PoseInMap(map_id=unplaced.map_id, frame=unplaced.frame, cam_from_map=pose.cam_from_local, **same)
+    turned = quaternion_from_matrix(pose.cam_from_local.rotation)
+    in_map = InMapPose(
+        map_id=unplaced.map_id,
+        metric=unplaced.frame.metric,
+        upright=unplaced.frame.upright,
+        cam_from_map_xyzw=tuple(turned.tolist()),
+        cam_from_map_translation=tuple(pose.cam_from_local.translation.tolist()),
+        center=tuple(pose.cam_from_local.center.tolist()),
+        covariance=tuple(map(tuple, pose.covariance.tolist())),
+        camera=CameraUsed(**asdict(pose.camera), source=pose.camera_source),
+        residual_rms_px=pose.residual_rms_px,
+    )
     return replace(result, pose=None, in_map=in_map, runner_up=None)
 
 
@@ -247,12 +259,12 @@ class Localiser:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""
         if result.pose is None:
             return result
-        told = []
-        for entry in result.pose.lineage:
-            found = self._lineages[entry["map_id"]]
-            names = ("steps", "anchors", "drift_m", "budget_m")
-            told.append(entry | {name: getattr(found, name) for name in names})
-        return replace(result, pose=replace(result.pose, lineage=tuple(told)))
+        names = ("steps", "anchors", "drift_m", "budget_m")
+        told = tuple(
+            Lineage(**dict(entry) | {name: getattr(self._lineages[entry.map_id], name) for name in names})
+            for entry in result.pose.lineage
+        )
+        return replace(result, pose=replace(result.pose, lineage=told))
 
 
 def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:

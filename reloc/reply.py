@@ -7,19 +7,14 @@ import numpy as np
 
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import quaternion_from_matrix
-from reloc.localise.result import Inliers, LocalisedPose, LocaliseResult, OnEarth, PoseInMap
+from reloc.localise.result import Inliers, LocalisedPose, LocaliseResult, OnEarth
 from reloc.wire.query import (
     Accuracy,
     CameraUsed,
     InlierPoints,
-    InMapPose,
-    Lineage,
     LocaliseReply,
-    OwnPositionUse,
     Position,
     Quaternion,
-    RunnerUpPose,
     UtmPose,
 )
 
@@ -28,14 +23,12 @@ def reply_from_result(
     result: LocaliseResult, *, request_id: str, timings_ms: dict[str, float]
 ) -> LocaliseReply:
     """Word a result as the wire does; `timings_ms` replaces the result's own."""
-    rival, own = result.runner_up, result.own_position
     fields: dict[str, Any] = _NO_POSE if result.pose is None else _pose_fields(result.pose)
     if result.in_map is not None:
-        fields = _NO_POSE | {"in_map": _in_map(result.in_map), "maps": (result.in_map.map_id,)}
+        fields = _NO_POSE | {"in_map": result.in_map, "maps": (result.in_map.map_id,)}
     return LocaliseReply(
         **{name: getattr(result, name) for name in _SAME},
-        runner_up=None if rival is None else RunnerUpPose.model_validate(rival, from_attributes=True),
-        exif_prior=None if own is None else OwnPositionUse(**asdict(own)),
+        exif_prior=result.own_position,
         timings_ms=timings_ms,
         request_id=request_id,
         body_axes=BODY_AXES,
@@ -44,7 +37,17 @@ def reply_from_result(
 
 
 # What a result and its reply call alike.
-_SAME = ("status", "reason", "detail", "confidence", "features", "matches", "inliers", "snapshot")
+_SAME = (
+    "status",
+    "reason",
+    "detail",
+    "confidence",
+    "features",
+    "matches",
+    "inliers",
+    "snapshot",
+    "runner_up",
+)
 _NO_POSE: dict[str, Any] = {
     **dict.fromkeys(("position", "quaternion", "height_datum", "utm", "covariance", "accuracy", "camera")),
     **dict.fromkeys(("residual_rms_px", "inlier_points")),
@@ -78,23 +81,9 @@ def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
         else tuple(_floats(row) for row in pose.view_covariance),
         "residual_rms_px": pose.residual_rms_px,
         "maps": pose.map_ids,
-        "lineage": tuple(Lineage(**entry) for entry in pose.lineage),
+        "lineage": pose.lineage,
         "inlier_points": None if pose.inliers is None else _inlier_points(pose.inliers),
     }
-
-
-def _in_map(pose: PoseInMap) -> InMapPose:
-    return InMapPose(
-        map_id=pose.map_id,
-        metric=pose.frame.metric,
-        upright=pose.frame.upright,
-        cam_from_map_xyzw=_floats(quaternion_from_matrix(pose.cam_from_map.rotation)),
-        cam_from_map_translation=_floats(pose.cam_from_map.translation),
-        center=_floats(pose.cam_from_map.center),
-        covariance=tuple(_floats(row) for row in pose.covariance),
-        camera=CameraUsed(**asdict(pose.camera), source=pose.camera_source),
-        residual_rms_px=pose.residual_rms_px,
-    )
 
 
 def _floats(values: FloatArray) -> Any:

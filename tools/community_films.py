@@ -23,7 +23,7 @@ from scipy.stats import chi2
 
 from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
 from featuredb.simworld.scan_world import write_scan
-from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.tracking.trajectory.files import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb, newest_copy
 from tools.figures import median, say, squared, study_parser, write_figures

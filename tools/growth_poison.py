@@ -220,7 +220,8 @@ def answers(database: Database, album: Album) -> dict[str, str]:
         pose = result.pose
         figures: list[Any] = [result.reason, result.inliers, result.matches, result.confidence]
         if pose is not None:
-            figures += [pose.utm, pose.cam_from_utm_xyzw, pose.covariance, pose.map_ids, pose.lineage]
+            figures += [pose.utm, pose.cam_from_utm_xyzw, pose.covariance, pose.map_ids]
+            figures += [dict(entry) for entry in pose.lineage]
         found[fact.name] = json.dumps(plain(figures))
     return found
 

@@ -22,7 +22,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from reloc.authority.folder import Authority
+from reloc.authority import Authority
 from reloc.client import Client, LocaliseReply
 from reloc.service.session import bind_free_port
 from tools.figures import study_parser

@@ -90,7 +90,7 @@ def selected_any(
         _some(found, f"maps that are {' or '.join(selection.statuses)}")
     if selection.bbox is not None:
         box = selection.bbox
-        found = [m for m in found if isinstance(m, MapSummary) and _touches(m, box)]
+        found = [m for m in found if isinstance(m, MapSummary) and touches(m, box)]
         _some(found, f"maps in {','.join(f'{v:g}' for v in selection.bbox)} (west,south,east,north)")
     if selection.where:
         with SqlSession(snapshot, database) as session:
@@ -171,17 +171,28 @@ def _spelled(licence: str) -> str:
     return re.sub(r"[\s_-]+", "-", licence.strip().casefold())
 
 
-def _touches(summary: MapSummary, bbox: tuple[float, float, float, float]) -> bool:
-    """By the geographic box of the corners of the map's box in UTM."""
+def degrees_around(summary: MapSummary) -> tuple[float, float, float, float] | None:
+    """West, south, east, north of the corners of a map's box in UTM; grid lines curve off by centimetres.
+
+    None without points. Of a map across the antimeridian they are around the whole Earth.
+    """
     box = summary.box
     if box is None:
-        return False
+        return None
     corners = [
         (e, n, 0.0) for e in (box.min_easting, box.max_easting) for n in (box.min_northing, box.max_northing)
     ]
-    lat_lon = geodetic_from_utm(corners, summary.epsg)
-    (s, w), (n, e) = lat_lon[:, :2].min(axis=0), lat_lon[:, :2].max(axis=0)
-    west, south, east, north = bbox
+    lat_lon = geodetic_from_utm(corners, summary.epsg)[:, :2]
+    (south, west), (north, east) = lat_lon.min(axis=0).tolist(), lat_lon.max(axis=0).tolist()
+    return west, south, east, north
+
+
+def touches(summary: MapSummary, bbox: tuple[float, float, float, float]) -> bool:
+    """Whether a map's box meets one of degrees, west, south, east, north."""
+    around = degrees_around(summary)
+    if around is None:
+        return False
+    (w, s, e, n), (west, south, east, north) = around, bbox
     if e - w > 180:  # the map lies across the antimeridian
         w, e = e, w
     return bool(s <= north and south <= n and _meet((w, e), (west, east)))

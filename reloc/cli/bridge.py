@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import numbers
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def register(subparsers: Any) -> None:
     for kind in (mavlink, ros2):
         kind.add_argument(
             "--origin",
+            type=lambda text: numbers(text, "LAT,LON,H in degrees and metres such as 47.37,8.54,408", 3),
             metavar="LAT,LON,H",
             help="of the local frame, WGS84 degrees and metres; with an equals sign where the latitude is "
             "negative: --origin=-33.86,151.21,20; default: the first pose",
@@ -106,7 +108,7 @@ def _ros2(args: argparse.Namespace) -> int:
     with ExitStack() as opened:
         sinks: list[Callable[[RobotPose, LocalFrame], None]] = []
         if args.connect is not None:
-            from reloc.bridge.rmw_zenoh import RmwZenohNode
+            from reloc.bridge.ros2 import RmwZenohNode
 
             node = RmwZenohNode(args.connect, domain=args.domain)
             sinks.append(opened.enter_context(node).write)
@@ -136,15 +138,9 @@ def _said(text: str, count: int) -> int:
     return 0 if count else _NO_POSE
 
 
-def _origin(text: str | None) -> "LocalFrame | None":
+def _origin(found: tuple[float, float, float] | None) -> "LocalFrame | None":
     from featuredb.geo.local_frame import LocalFrame
 
-    if text is None:
+    if found is None:
         return None
-    try:
-        latitude, longitude, height = (float(part) for part in text.split(","))
-        return LocalFrame(latitude_deg=latitude, longitude_deg=longitude, height_m=height)
-    except ValueError as error:
-        raise InvalidValueError(
-            f"--origin: expected LAT,LON,H in degrees and metres such as 47.37,8.54,408, found {text!r}"
-        ) from error
+    return LocalFrame(latitude_deg=found[0], longitude_deg=found[1], height_m=found[2])

@@ -9,7 +9,7 @@ from featuredb.cli.common import open_database
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from reloc.pixels.layer import Layer
+    from reloc.pixels.layer import Shape
 
 _NO_POSE = 1  # exit code: everything worked, and there is no pose
 _REACH_M = 150.0  # beyond the track of a film, of the scan that is loaded
@@ -56,8 +56,7 @@ def _draw(args: argparse.Namespace) -> int:
     from featuredb.features.decode import decode_rgb
     from reloc.cli.commands import require_an_image
     from reloc.cli.locate import answered_view
-    from reloc.pixels.draw import draw_layer
-    from reloc.pixels.layer import laid_on
+    from reloc.pixels.layer import draw_layer, laid_on
     from reloc.pixels.surfaces import scan_surface
 
     require_an_image([args.image])
@@ -91,17 +90,16 @@ def _draw(args: argparse.Namespace) -> int:
     return 0
 
 
-def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:
+def _draw_film(args: argparse.Namespace, layer: "list[Shape]") -> int:
     import numpy as np
 
     from featuredb.video.frames import open_video
     from featuredb.video.writer import VideoWriter
     from reloc.answered_view import AnsweredView, camera_of
     from reloc.cli.query_arguments import parse_camera
-    from reloc.pixels.draw import draw_layer
-    from reloc.pixels.layer import laid_on
+    from reloc.pixels.layer import draw_layer, laid_on
     from reloc.pixels.surfaces import scan_surface
-    from reloc.tracking.trajectory.read import read_trajectory_csv
+    from reloc.tracking.trajectory.files import read_trajectory_csv
 
     asked = parse_camera(args.camera)
     if asked is None:

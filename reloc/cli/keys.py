@@ -38,7 +38,7 @@ def _action(actions: Any, name: str, what: str, run: Any) -> argparse.ArgumentPa
 
 
 def _init(args: argparse.Namespace) -> int:
-    from reloc.authority.folder import Authority
+    from reloc.authority import Authority
 
     made = Authority.create(args.folder, tuple(args.host), args.port)
     sys.stdout.write(f"wrote the server's configuration, {made.server_config}; it knows no clients yet\n")
@@ -46,7 +46,7 @@ def _init(args: argparse.Namespace) -> int:
 
 
 def _client(args: argparse.Namespace) -> int:
-    from reloc.authority.folder import Authority
+    from reloc.authority import Authority
 
     authority = Authority(args.folder)
     path = authority.add_client(args.name)
@@ -58,7 +58,7 @@ def _client(args: argparse.Namespace) -> int:
 
 
 def _revoke(args: argparse.Namespace) -> int:
-    from reloc.authority.folder import Authority
+    from reloc.authority import Authority
 
     authority = Authority(args.folder)
     authority.revoke(args.name)

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from featuredb.store import Database
     from reloc.answered_view import AnsweredView
     from reloc.localiser import Localiser
-    from reloc.pixels.boxes import MarkedPixel
-    from reloc.pixels.locate import PixelPlace
+    from reloc.pixels.locate import MarkedPixel, PixelPlace
     from reloc.pixels.surfaces import RaySurface
     from reloc.wire.query import LocaliseReply
 
@@ -87,8 +86,7 @@ def _locate(args: argparse.Namespace) -> int:
     import json
 
     from reloc.cli.commands import require_an_image
-    from reloc.pixels.boxes import MarkedPixel, as_json, geojson
-    from reloc.pixels.locate import locate
+    from reloc.pixels.locate import MarkedPixel, as_json, geojson, locate
 
     if args.answer is None:
         require_an_image([args.image])
@@ -124,7 +122,7 @@ def _boxes(args: argparse.Namespace) -> "list[MarkedPixel]":
     from featuredb.features.exif.read import read_exif
     from featuredb.features.image_header import read_header
     from reloc.answered_view import AnsweredView
-    from reloc.pixels.boxes import read_coco
+    from reloc.pixels.locate import read_coco
 
     photo = Path(args.image)
     data = photo.read_bytes() if photo.is_file() else b""

@@ -54,7 +54,7 @@ def register(subparsers: Any) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from featuredb.cli.export import selection_of
-    from reloc.tracking.trajectory.read import read_trajectory_csv
+    from reloc.tracking.trajectory.files import read_trajectory_csv
     from reloc.viewer.page import DEFAULT_POINTS as STATIC_POINTS
     from reloc.viewer.page import write_static_page
     from reloc.viewer.photos import Pictures, Queries

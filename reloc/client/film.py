@@ -2,9 +2,8 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
@@ -50,7 +49,7 @@ class _Answers:
     """Poses so far, taken as they come by a thread: a camera's next frame does not hold them up."""
 
     def __init__(self, live: LiveTrack, on_pose: OnPose | None, pool: ThreadPoolExecutor) -> None:
-        self.live, self._on_pose = live, on_pose
+        self._live, self._on_pose = live, on_pose
         self.points: list[TrajectoryPoint] = []
         self.latency_ms: list[float] = []
         self._changed = threading.Condition()
@@ -72,8 +71,8 @@ class _Answers:
         self.check()
 
     def _take_all(self) -> None:
-        for pose in self.live:
-            latency_ms = self.live.latency_ms(pose.sequence)
+        for pose in self._live:
+            latency_ms = self._live.latency_ms(pose.sequence)
             if self._on_pose is not None:
                 self._on_pose(pose, latency_ms)
             if latency_ms is not None:
@@ -103,13 +102,6 @@ def point_of_message(message: TrackPose) -> TrajectoryPoint:
     return TrajectoryPoint(index=message.sequence, pose=pose, **same)
 
 
-@contextmanager
-def _answered(live: LiveTrack, on_pose: OnPose | None) -> Iterator[_Answers]:
-    """An open session whose poses are taken; both end with the block."""
-    with ThreadPoolExecutor(1, "poses") as pool, live:
-        yield _Answers(live, on_pose, pool)
-
-
 def stream_film(
     client: Client,
     source: Source,
@@ -130,8 +122,12 @@ def stream_film(
     options = options or VideoOptions(max_side_px=SENT_SIDE_PX)
     trouble: list[str] = []
     sent, last, last_sent = 0, -1, -1
-    with open_video(source, options) as video, _answered(client.track(camera, prior), on_pose) as answers:
-        live, info = answers.live, video.info
+    with (
+        open_video(source, options) as video,
+        ThreadPoolExecutor(1, "poses") as pool,
+        client.track(camera, prior) as live,
+    ):
+        answers, info = _Answers(live, on_pose, pool), video.info
         begun: float | None = None
         try:
             for frame in until_it_ends(video, trouble):

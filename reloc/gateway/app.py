@@ -22,7 +22,6 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from featuredb.errors import InvalidValueError, ServiceError
-from reloc.client import Client
 from reloc.gateway import openapi
 from reloc.gateway.failures import (
     METHOD_NOT_ALLOWED,
@@ -32,16 +31,22 @@ from reloc.gateway.failures import (
     STATUS_OF,
     ErrorBody,
 )
-from reloc.gateway.geopose import NotLocalisedError, check_version, parse, question_of, response_of
+from reloc.gateway.geopose import MEDIA_TYPE as GEOPOSE_TYPE
+from reloc.gateway.geopose import VERSION as GEOPOSE_VERSION
+from reloc.gateway.geopose import (
+    GeoPoseResp,
+    NotLocalisedError,
+    check_version,
+    parse,
+    question_of,
+    response_of,
+)
 from reloc.gateway.intake import Intake, read_form
 from reloc.gateway.link import Link
 from reloc.gateway.options import GatewayOptions
-from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
-from reloc.gateway.protocol import VERSION as GEOPOSE_VERSION
-from reloc.gateway.protocol import GeoPoseResp
 from reloc.service.logs import fields
 from reloc.wire.query import ErrorCode, LocaliseReply, LocaliseWireRequest
-from reloc.wire.server import MapsReply, StatusReply
+from reloc.wire.server import StatusReply
 from reloc.wire.status_metrics import Figures, status_metrics
 
 logger = logging.getLogger(__name__)
@@ -71,40 +76,6 @@ _NAME = "featuredb_gateway_"
 _BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 
-class GatewayMetrics:
-    """Counters that threads share."""
-
-    def __init__(self) -> None:
-        self._registry = CollectorRegistry()
-        self._requests = Counter(
-            f"{_NAME}requests", "HTTP requests answered.", ("route", "status"), registry=self._registry
-        )
-        self._seconds = Histogram(
-            f"{_NAME}request_seconds",
-            "Time to the answer.",
-            ("route",),
-            buckets=_BUCKETS_S,
-            registry=self._registry,
-        )
-
-    def observe(self, route: str, status: int, seconds: float) -> None:
-        """A request was answered."""
-        self._requests.labels(route, str(status)).inc()
-        self._seconds.labels(route).observe(seconds)
-
-    def text(self, in_flight: int, sessions: int, server: StatusReply | None) -> bytes:
-        """The whole page; `server` is what the server says of itself, None if it does not answer."""
-
-        def now() -> Iterator[Metric]:
-            yield GaugeMetricFamily(f"{_NAME}in_flight", "Photos in hand.", value=in_flight)
-            yield CounterMetricFamily(f"{_NAME}sessions", "Zenoh sessions opened.", value=sessions)
-            yield from status_metrics(server)
-
-        moment = CollectorRegistry()
-        moment.register(Figures(now))
-        return generate_latest(self._registry) + generate_latest(moment)
-
-
 def add_phone_page(app: FastAPI, prefix: str) -> None:
     """`prefix`/phone, and its script and style below it; it asks `prefix`/localise as any client does."""
     root = resources.files("reloc.gateway") / "assets"
@@ -131,27 +102,46 @@ class Gateway:
         self.options = options
         self.link = Link(options)
         self.intake = Intake(options)
-        self.metrics = GatewayMetrics()
+        self.registry = CollectorRegistry()
+        self._requests = Counter(
+            f"{_NAME}requests", "HTTP requests answered.", ("route", "status"), registry=self.registry
+        )
+        self._seconds = Histogram(
+            f"{_NAME}request_seconds",
+            "Time to the answer.",
+            ("route",),
+            buckets=_BUCKETS_S,
+            registry=self.registry,
+        )
+        self.registry.register(Figures(self._figures))
+        # Their own: routes that ask for figures have Starlette's, and an overrun server says how it is.
         self._photos = ThreadPoolExecutor(options.workers, thread_name_prefix="gateway-photo")
-        # Of their own, so that a server that is overrun still says how it is.
-        self._figures = ThreadPoolExecutor(2, thread_name_prefix="gateway-figures")
 
     async def in_thread(self, work: Callable[[], _T]) -> _T:
         """Run blocking work on a photo."""
         return await asyncio.get_running_loop().run_in_executor(self._photos, work)
 
-    async def figures(self, question: Callable[[Client], _T]) -> _T:
-        """Ask the server for figures."""
-        return await asyncio.get_running_loop().run_in_executor(
-            self._figures, lambda: self.link.ask(question)
-        )
+    def status(self) -> StatusReply:
+        return self.link.ask(lambda client: client.status(timeout_s=_STATUS_TIMEOUT_S))
 
-    async def status(self) -> StatusReply:
-        return await self.figures(lambda client: client.status(timeout_s=_STATUS_TIMEOUT_S))
+    def observe(self, route: str, status: int, seconds: float) -> None:
+        """A request was answered."""
+        self._requests.labels(route, str(status)).inc()
+        self._seconds.labels(route).observe(seconds)
+
+    def _figures(self) -> Iterator[Metric]:
+        """This gateway's at the moment, and what the server says of itself."""
+        status = None
+        try:
+            status = self.status()
+        except ServiceError as error:
+            logger.info("no figures of the server: %s", error)
+        yield GaugeMetricFamily(f"{_NAME}in_flight", "Photos in hand.", value=self.intake.in_flight)
+        yield CounterMetricFamily(f"{_NAME}sessions", "Zenoh sessions opened.", value=self.link.sessions)
+        yield from status_metrics(status)
 
     def close(self) -> None:
         self._photos.shutdown(wait=True, cancel_futures=True)
-        self._figures.shutdown(wait=True, cancel_futures=True)
         self.link.close()
 
     def geopose(self, body: bytes) -> tuple[GeoPoseResp, str, str]:
@@ -200,7 +190,7 @@ def create_app(options: GatewayOptions) -> FastAPI:
             allow_headers=["*"],
             expose_headers=["Featuredb-Height-Datum", "Featuredb-Request-Id", "Retry-After"],
         )
-    app.add_middleware(_Observed, metrics=gateway.metrics, paths=paths)
+    app.add_middleware(_Observed, gateway=gateway, paths=paths)
     openapi.install(app)
     return app
 
@@ -233,14 +223,13 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
         return _json(reply)
 
     @app.get(f"{prefix}/maps", **openapi.MAPS)
-    async def maps() -> Response:
-        answer: MapsReply = await gateway.figures(lambda client: client.maps(timeout_s=_STATUS_TIMEOUT_S))
-        return _json(answer)
+    def maps() -> Response:
+        return _json(gateway.link.ask(lambda client: client.maps(timeout_s=_STATUS_TIMEOUT_S)))
 
     @app.get(f"{prefix}/health", **openapi.HEALTH)
-    async def health() -> Response:
+    def health() -> Response:
         try:
-            status = await gateway.status()
+            status = gateway.status()
         except ServiceError as error:  # whatever is wrong: who balances load must not send anybody here
             return _json(ErrorBody(code=error.code, message=error.message), 503)
         if status.queue.ready == 0:
@@ -249,14 +238,8 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
         return _json(openapi.Health(database=status.database, snapshot=status.snapshot, maps=status.maps))
 
     @app.get(f"{prefix}/metrics", **openapi.METRICS)
-    async def metrics() -> Response:
-        status = None
-        try:
-            status = await gateway.status()
-        except ServiceError as error:
-            logger.info("no figures of the server: %s", error)
-        text = gateway.metrics.text(gateway.intake.in_flight, gateway.link.sessions, status)
-        return Response(text, media_type=METRICS_TYPE)
+    def metrics() -> Response:
+        return Response(generate_latest(gateway.registry), media_type=METRICS_TYPE)
 
     add_phone_page(app, prefix)
     return frozenset(
@@ -314,9 +297,9 @@ def _json(content: BaseModel, status: int = 200, headers: dict[str, str] | None 
 class _Observed:
     """Counts what every request was answered with, and how long it took."""
 
-    def __init__(self, app: ASGIApp, metrics: GatewayMetrics, paths: frozenset[str]) -> None:
+    def __init__(self, app: ASGIApp, gateway: Gateway, paths: frozenset[str]) -> None:
         self._app = app
-        self._metrics = metrics
+        self._gateway = gateway
         self._paths = paths
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -337,6 +320,6 @@ class _Observed:
             # Paths that do not exist are one: who asks for many cannot make many counters.
             path = scope["path"] if scope["path"] in self._paths else "other"
             seconds = time.perf_counter() - start
-            self._metrics.observe(path, status, seconds)
+            self._gateway.observe(path, status, seconds)
             said, ms = f"{scope['method']} {path} {status}", round(seconds * 1e3, 1)
             logger.info(said, extra=fields("http", route=path, status=status, ms=ms))

@@ -6,8 +6,8 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 
-from reloc.gateway.failures import ErrorBody
-from reloc.gateway.protocol import MEDIA_TYPE, GeoPoseReq, GeoPoseResp
+from reloc.gateway.failures import ErrorBody, responses
+from reloc.gateway.geopose import MEDIA_TYPE, GeoPoseReq, GeoPoseResp
 from reloc.wire.query import CameraRequest, LocaliseReply, PriorRequest, RequestOptions
 from reloc.wire.server import MapsReply
 
@@ -28,23 +28,6 @@ class Health(BaseModel):
 
 
 _REF = "#/components/schemas/{model}"
-_TOLD = {
-    400: "BAD_REQUEST: the body is not what it should be; the message names the field",
-    404: "NOT_FOUND",
-    406: "NOT_ACCEPTABLE: another version of the protocol is asked for",
-    408: "SLOW_BODY: the body did not arrive in time",
-    413: "TOO_LARGE: more bytes or pixels than are taken",
-    415: "UNSUPPORTED_MEDIA_TYPE, or BAD_IMAGE: the picture is no image file, or a broken one",
-    422: "NOT_LOCALISED: a valid request, and no place is known for its photo",
-    501: "UNSUPPORTED: a valid wish that the server does not fulfil",
-    502: "INTERNAL, INCOMPATIBLE_EXTRACTOR, BAD_REPLY: the server behind failed",
-    503: "BUSY, SHUTTING_DOWN, NO_SERVER: try again after Retry-After seconds",
-    504: "DEADLINE, TIMEOUT: no answer in time",
-}
-
-
-def _responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    return {status: {"model": ErrorBody, "description": _TOLD[status]} for status in statuses}
 
 
 def _body(media_type: str, **content: dict[str, Any]) -> dict[str, Any]:
@@ -64,7 +47,7 @@ GEOPOSE: dict[str, Any] = {
             "ellipsoid's.",
             "content": {MEDIA_TYPE: {"schema": _schema("GeoPoseResp")}},
         },
-        **_responses(400, 406, 408, 413, 415, 422, 501, 502, 503, 504),
+        **responses(400, 406, 408, 413, 415, 422, 501, 502, 503, 504),
     },
     "openapi_extra": _body("application/json", schema=_schema("GeoPoseReq")),
 }
@@ -81,7 +64,7 @@ LOCALISE: dict[str, Any] = {
             "model": LocaliseReply,
             "description": "The reply, localised or not: `status` tells, and `reason` why not",
         },
-        **_responses(400, 408, 413, 415, 501, 502, 503, 504),
+        **responses(400, 408, 413, 415, 501, 502, 503, 504),
     },
     "openapi_extra": _body(
         "multipart/form-data",
@@ -102,7 +85,7 @@ LOCALISE: dict[str, Any] = {
 }
 MAPS: dict[str, Any] = {
     "summary": "The maps that the server answers from",
-    "responses": {200: {"model": MapsReply}, **_responses(502, 503, 504)},
+    "responses": {200: {"model": MapsReply}, **responses(502, 503, 504)},
 }
 HEALTH: dict[str, Any] = {
     "summary": "200 only if a server answers over Zenoh",

@@ -1,7 +1,5 @@
 """From an accepted pose in the area's frame to an answer on Earth with its uncertainty."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,10 +10,10 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
-from reloc.localise.jacobians import lens_jacobians, pixel_jacobians
-from reloc.localise.lens_prior import lens_for, lens_of, opencv_by_lens
+from reloc.localise.lens_prior import lens_for, lens_jacobians, lens_of, opencv_by_lens, pixel_jacobians
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import Inliers, LocalisedPose, place_on_earth
+from reloc.wire.query import Lineage
 
 _DAMPING = 1e-9
 
@@ -150,13 +148,13 @@ def on_earth(
     return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
 
 
-def _lineage(feature_map: FeatureMap) -> dict[str, Any]:
-    return {
-        "map_id": feature_map.map_id,
-        "method": feature_map.placement.method,
-        "generation": int(feature_map.generation),
-        "parents": tuple(feature_map.parents),
-    }
+def _lineage(feature_map: FeatureMap) -> Lineage:
+    return Lineage(
+        map_id=feature_map.map_id,
+        method=feature_map.placement.method,
+        generation=int(feature_map.generation),
+        parents=tuple(feature_map.parents),
+    )
 
 
 def _inliers(area: Area, order: list[int], pixels: FloatArray, point_rows: NDArray[np.int64]) -> Inliers:

@@ -25,15 +25,9 @@ from reloc.localise.candidates import IndexedArea, usable_areas
 from reloc.localise.lens_prior import seen_by_a_map
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.pose import PoseUncertainty, pose_uncertainty
-from reloc.localise.result import (
-    LocalisedPose,
-    LocaliseRequest,
-    LocaliseResult,
-    OwnPosition,
-    RunnerUp,
-)
+from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult
 from reloc.localise.search import PoseCandidate, pairs, search
-from reloc.wire.query import PositionRole, Reason
+from reloc.wire.query import OwnPositionUse, PositionRole, Reason, RunnerUpPose
 
 # Chi-square with two degrees of freedom is above this once in 10,000 answers if the prior's sigma is honest.
 _CHI_SQUARE_LIMIT = 18.42
@@ -134,7 +128,7 @@ def _with_own_position(
     def said(chosen: Localised, role: PositionRole) -> Localised:
         pose = chosen.result.pose
         away_m = None if pose is None else float(np.linalg.norm(_offset(pose, position)))
-        own = OwnPosition(role=role, distance_m=away_m)
+        own = OwnPositionUse(role=role, distance_m=away_m)
         return replace(chosen, result=replace(chosen.result, own_position=own))
 
     if first.pose is not None and contradicts_prior(first.pose, position) is None:
@@ -174,7 +168,7 @@ def _decide(
         LocaliseResult, features=len(features), matches=matches, snapshot=snapshot, evidence=evidence
     )
 
-    def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None) -> Localised:
+    def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUpPose | None = None) -> Localised:
         result = answered(reason=reason, detail=detail, inliers=inliers, runner_up=rival)
         return Localised(result=result)
 
@@ -245,7 +239,7 @@ def contradicts_prior(answer: LocalisedPose, prior: GeoPrior | None) -> str | No
     )
 
 
-def runner_up(best: PoseCandidate, others: list[PoseCandidate]) -> RunnerUp | None:
+def runner_up(best: PoseCandidate, others: list[PoseCandidate]) -> RunnerUpPose | None:
     """The pose of another place with most inliers.
 
     Another place is further than 2 m or 5 degrees from the winner. Where two maps gave the poses, three
@@ -253,7 +247,7 @@ def runner_up(best: PoseCandidate, others: list[PoseCandidate]) -> RunnerUp | No
     metres apart. Heights of different datums are not compared.
     """
     winner = best.pose.cam_from_local
-    found: list[RunnerUp] = []
+    found: list[RunnerUpPose] = []
     for other in others:
         pose = _in_frame_of(best.area, other)
         offset = pose.center - winner.center
@@ -272,7 +266,7 @@ def runner_up(best: PoseCandidate, others: list[PoseCandidate]) -> RunnerUp | No
         if inliers and (distance_m > apart_m or angle_deg > apart_deg):
             lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center).tolist()
             found.append(
-                RunnerUp(inliers=inliers, distance_m=distance_m, angle_deg=angle_deg, lat=lat, lon=lon)
+                RunnerUpPose(inliers=inliers, distance_m=distance_m, angle_deg=angle_deg, lat=lat, lon=lon)
             )
     return max(found, key=lambda rival: rival.inliers, default=None)
 

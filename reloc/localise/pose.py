@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from reloc.localise.jacobians import pixel_jacobians
-from reloc.localise.lens_prior import LensPriors, QueryLensPrior
+from reloc.localise.lens_prior import LensPriors, QueryLensPrior, pixel_jacobians
 from reloc.localise.options import PoseOptions
 from reloc.localise.self_calibration import calibrate, covariance_from_information
 from reloc.wire.query import CameraSource

@@ -17,7 +17,7 @@ from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.unplaced_map import OwnFrame
 from reloc.localise.lens_prior import QueryLensPrior
-from reloc.wire.query import CameraSource, PositionRole, Reason
+from reloc.wire.query import CameraSource, InMapPose, Lineage, OwnPositionUse, Reason, RunnerUpPose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,8 +135,8 @@ class LocalisedPose(OnEarth):
             in the picture. None where the lens is exact: then it is `covariance`.
         camera: intrinsics used, full image size.
         map_ids: maps whose points are among the inliers, most inliers first.
-        lineage: for each of map_ids, what placed it: map_id, method, generation, parents; from a `Localiser`,
-            which knows the other maps, too, also steps, anchors, drift_m, budget_m (featuredb.maps.lineage).
+        lineage: for each of map_ids, what placed it; its steps, anchors, drift and budget only from a
+            `Localiser`, which knows the other maps, too (featuredb.maps.lineage).
         residual_rms_px: of the inliers, in full-size pixels.
     """
 
@@ -145,7 +145,7 @@ class LocalisedPose(OnEarth):
     camera: Camera
     camera_source: CameraSource
     map_ids: tuple[str, ...]
-    lineage: tuple[dict[str, Any], ...]
+    lineage: tuple[Lineage, ...]
     residual_rms_px: float
     inliers: Inliers | None = None
     view_covariance: FloatArray | None = None
@@ -175,48 +175,6 @@ class OwnPose:
 
     def __post_init__(self) -> None:
         freeze(self, covariance=(6, 6))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PoseInMap(OwnPose):
-    """That of a photo; `camera`, `camera_source`, `residual_rms_px`: as in LocalisedPose."""
-
-    camera: Camera
-    camera_source: CameraSource
-    residual_rms_px: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RunnerUp:
-    """The best pose elsewhere, which did not win.
-
-    Attributes:
-        inliers: its inlier count.
-        distance_m: from the winner's camera centre.
-        angle_deg: between the two orientations.
-        lat, lon: where it is, degrees.
-    """
-
-    inliers: int
-    distance_m: float
-    angle_deg: float
-    lat: float
-    lon: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OwnPosition:
-    """What a photo's own position did to its answer.
-
-    Attributes:
-        role: `agrees`: the answer is the same without it. `decided`: without it there is none.
-            `contradicted`: the photo shows another place; it is answered there, or refused where both places
-            fit. `no_help`: not localised with it either.
-        distance_m: of the answer from it, horizontally; None without an answer.
-    """
-
-    role: PositionRole
-    distance_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -265,11 +223,11 @@ class LocaliseResult:
     snapshot: int
     pose: LocalisedPose | None = None
     confidence: float = 0.0
-    runner_up: RunnerUp | None = None
+    runner_up: RunnerUpPose | None = None
     evidence: Evidence | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
-    in_map: PoseInMap | None = None
-    own_position: OwnPosition | None = None
+    in_map: InMapPose | None = None
+    own_position: OwnPositionUse | None = None
 
     def __post_init__(self) -> None:
         said = [value is not None for value in (self.reason, self.pose, self.in_map)]

@@ -12,8 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from reloc.localise.jacobians import pixel_jacobians
-from reloc.localise.lens_prior import QueryLensPrior, lens_of, whole_lens, with_lens
+from reloc.localise.lens_prior import QueryLensPrior, lens_of, pixel_jacobians, whole_lens, with_lens
 
 
 def calibrate(

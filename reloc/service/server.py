@@ -4,12 +4,15 @@ import json
 import logging
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from typing import Self
 
 import zenoh
+from pydantic import BaseModel
 
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.live.session import Follower
@@ -25,7 +28,7 @@ from reloc.service.session import (
     open_server_session,
     server_config,
 )
-from reloc.service.source import AreaWatcher, DatabaseSource, ServedArea
+from reloc.service.source import DatabaseSource, ServedArea
 from reloc.service.workers.pool import WorkerPool
 from reloc.service.workers.process import prepare_workers
 from reloc.wire.keys import Keys, client_of, is_addressed
@@ -45,6 +48,7 @@ from reloc.wire.server import (
 logger = logging.getLogger(__name__)
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
+_MAX_RETRY_S = 60.0  # a broken snapshot is tried again, ever less often up to this
 
 
 class Server:
@@ -77,13 +81,9 @@ class Server:
         self._queue = QueryQueue(options.max_queue, options.max_queued_bytes)
         self._inbox = inbox
         self._workers = WorkerPool(self._queue, options, inbox)
-        self._watcher = AreaWatcher(
-            source,
-            served_version=area.snapshot,
-            poll_interval_s=options.poll_interval_s,
-            on_area=self._swap,
-            on_failure=self._reload_failed,
-        )
+        self._source = source
+        self._watcher = threading.Thread(target=self._watch, name="area-watcher", daemon=True)
+        self._watched = threading.Event()  # enough
         self._live = LiveSessions(
             session,
             self._keys,
@@ -154,12 +154,14 @@ class Server:
         # `complete`: of several servers of one database the nearest answers, not all of them. One that has a
         # part of it answers who asks it by its id, and has no live sessions: others may have the place.
         whole = self._options.bbox is None
-        for key, callback in (
-            *([(self._keys.localise("*"), self._on_localise)] if whole else []),
-            (self._keys.localise("*", self.server_id), self._on_localise),
-            (self._keys.of("status"), self._on_status),
-            (self._keys.of("maps"), self._on_maps),
-        ):
+        answers: dict[str, Callable[[zenoh.Query], None]] = {
+            self._keys.localise("*", self.server_id): self._on_localise,
+            self._keys.of("status"): partial(self._say, "status", self.status),
+            self._keys.of("maps"): partial(self._say, "maps", self._maps),
+        }
+        if whole:
+            answers[self._keys.localise("*")] = self._on_localise
+        for key, callback in answers.items():
             self._declared.enter_context(self._session.declare_queryable(key, callback, complete=True))
         if whole:
             self._live.start()
@@ -192,7 +194,8 @@ class Server:
         self._declared.close()
         if self._inbox is not None:
             self._inbox.close(self._options.shutdown_grace_s)
-        self._watcher.close(timeout_s=self._options.shutdown_grace_s)
+        self._watched.set()
+        self._watcher.join(self._options.shutdown_grace_s)
         self._session.close()
         self._log("stopped", queries=self._queries().model_dump())
 
@@ -263,15 +266,13 @@ class Server:
         except RequestError as error:
             item.refuse(error)
 
-    def _on_status(self, query: zenoh.Query) -> None:
+    def _say(self, leaf: str, message: Callable[[], BaseModel], query: zenoh.Query) -> None:
         with query:
-            query.reply(self._keys.of("status"), encode(self.status()), encoding=_JSON)
+            query.reply(self._keys.of(leaf), encode(message()), encoding=_JSON)
 
-    def _on_maps(self, query: zenoh.Query) -> None:
+    def _maps(self) -> MapsReply:
         area = self._area
-        reply = MapsReply(database=self.database, snapshot=area.snapshot, maps=area.maps)
-        with query:
-            query.reply(self._keys.of("maps"), encode(reply), encoding=_JSON)
+        return MapsReply(database=self.database, snapshot=area.snapshot, maps=area.maps)
 
     # The deadline of a query calls this.
 
@@ -279,7 +280,26 @@ class Server:
         item.refuse(deadline_error(item))
         self._workers.abandon(item)
 
-    # The watcher calls these.
+    def _watch(self) -> None:
+        """Poll the source; a load that fails leaves everything as it is and is tried again."""
+        version = served = self._area.snapshot
+        wait_s = self._options.poll_interval_s
+        while not self._watched.wait(wait_s):
+            try:
+                version = self._source.version()
+                if version != served:
+                    area = self._source.load()
+                    if not self._watched.is_set():
+                        self._swap(area)
+                        served = area.snapshot
+                wait_s = self._options.poll_interval_s
+            except Exception as error:
+                # A store may break in many ways; the area in service is whole and stays.
+                told = fields("reload_failed", snapshot=version)
+                logger.exception("reload failed; the running snapshot stays in service", extra=told)
+                self._reload_error = f"snapshot {version}: {type(error).__name__}: {error}"
+                self._publish("reload_failed", detail=self._reload_error)
+                wait_s = min(2 * wait_s, _MAX_RETRY_S)
 
     def _swap(self, area: ServedArea) -> None:
         """Serve `area` from now on; queries in hand keep the old one until they are answered."""
@@ -296,10 +316,6 @@ class Server:
         for map_id in before.keys() - after.keys():
             self._publish("map_retired", map_id=map_id, detail=before[map_id].name)
         self._publish("reloaded", detail=f"from snapshot {old.snapshot}")
-
-    def _reload_failed(self, version: int, message: str) -> None:
-        self._reload_error = f"snapshot {version}: {message}"
-        self._publish("reload_failed", detail=self._reload_error)
 
     def _advertise(self, area: ServedArea) -> None:
         """Liveliness tokens of the server and of each tile it answers for."""

@@ -1,21 +1,11 @@
 """Where a server gets what it answers from: one immutable area at a time, newer ones when they appear."""
 
-import logging
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
-from featuredb.geo.utm import geodetic_from_utm
+from featuredb.export.selection import degrees_around, touches
 from featuredb.store import Database, MapSummary
 from reloc.localiser import Localiser
-from reloc.service.logs import fields
 from reloc.wire.server import BoundingBox, MapInfo
-
-logger = logging.getLogger(__name__)
-
-_MAX_RETRY_S = 60.0  # a broken snapshot is tried again, ever less often up to this
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,89 +63,17 @@ class DatabaseSource:
         return ServedArea(localiser=localiser, maps=tuple(map_info(summary) for summary in active))
 
     def _serves(self, summary: MapSummary) -> bool:
-        if self._bbox is None:
-            return True
-        bounds, (west, south, east, north) = _bounds(summary), self._bbox
-        if bounds is None:
-            return False
-        return bounds.west <= east and bounds.east >= west and bounds.south <= north and bounds.north >= south
+        return self._bbox is None or touches(summary, self._bbox)
 
 
 def map_info(summary: MapSummary) -> MapInfo:
     """A map's summary as the wire says it."""
     same = [name for name in MapInfo.model_fields if name not in ("bounds", "tiles")]
+    around = degrees_around(summary)
     return MapInfo(
         **{name: getattr(summary, name) for name in same},
-        bounds=_bounds(summary),
+        bounds=None
+        if around is None
+        else BoundingBox(**dict(zip(BoundingBox.model_fields, around, strict=True))),
         tiles=tuple(f"{summary.epsg}-{tile}" for tile in summary.tiles),
     )
-
-
-def _bounds(summary: MapSummary) -> BoundingBox | None:
-    """Degrees around the map's box: those of its corners, which grid lines curve off by centimetres."""
-    box = summary.box
-    if box is None:
-        return None
-    corners = [
-        (easting, northing, 0.0)
-        for easting in (box.min_easting, box.max_easting)
-        for northing in (box.min_northing, box.max_northing)
-    ]
-    lat_lon_h = geodetic_from_utm(np.array(corners), summary.epsg)
-    south, west = (float(v) for v in lat_lon_h[:, :2].min(axis=0))
-    north, east = (float(v) for v in lat_lon_h[:, :2].max(axis=0))
-    return BoundingBox(west=west, south=south, east=east, north=north)
-
-
-class AreaWatcher:
-    """Polls a source in a thread; a load that fails leaves everything as it is and is tried again."""
-
-    def __init__(
-        self,
-        source: DatabaseSource,
-        *,
-        served_version: int,
-        poll_interval_s: float,
-        on_area: Callable[[ServedArea], None],
-        on_failure: Callable[[int, str], None],
-    ) -> None:
-        self._source = source
-        self._served = served_version
-        self._interval_s = poll_interval_s
-        self._on_area = on_area
-        self._on_failure = on_failure
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="area-watcher", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def close(self, timeout_s: float) -> None:
-        """Stop; a load in progress is waited for at most `timeout_s`."""
-        self._stop.set()
-        self._thread.join(timeout_s)
-
-    def _run(self) -> None:
-        wait_s = self._interval_s
-        while not self._stop.wait(wait_s):
-            wait_s = self._interval_s if self._poll() else min(2 * wait_s, _MAX_RETRY_S)
-
-    def _poll(self) -> bool:
-        """One look at the source; False when it failed."""
-        version = self._served
-        try:
-            version = self._source.version()
-            if version == self._served:
-                return True
-            area = self._source.load()
-            if self._stop.is_set():
-                return True
-            self._on_area(area)
-            self._served = area.snapshot
-        except Exception as error:
-            # A store may break in many ways; the area in service is whole and stays.
-            told = fields("reload_failed", snapshot=version)
-            logger.exception("reload failed; the running snapshot stays in service", extra=told)
-            self._on_failure(version, f"{type(error).__name__}: {error}")
-            return False
-        return True

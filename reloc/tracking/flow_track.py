@@ -1,9 +1,7 @@
 """A track: known points carried by sparse optical flow through the frames that are kept, and their poses."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -13,10 +11,9 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from reloc.tracking.ground import Keyframe, Unmatched
-from reloc.tracking.lens_walk import LensWalk
+from reloc.tracking.ground import Keyframe
 from reloc.tracking.options import FlowOptions, TrackOptions
-from reloc.tracking.pose_fit import FittedPose, fit_pose
+from reloc.tracking.pose_fit import FittedPose, LensWalk, fit_pose
 
 _HALF_PX = 0.5  # OpenCV's pixel (0, 0) is a centre, ours a corner
 
@@ -267,14 +264,6 @@ class FlowTrack:
     def _spread(self, marks: Landmarks, gray: NDArray[np.uint8]) -> Landmarks:
         options = self._options
         return marks.spread(options.landmarks, options.columns, options.rows, gray.shape[1], gray.shape[0])
-
-
-def carried(track: FlowTrack, frames: Sequence[RecentFrame]) -> FlowTrack | Unmatched:
-    """The track from the first of these frames, which is its last one, to the last of them."""
-    for before, after in pairwise(frames):
-        if track.follow(before, after) is None:
-            return Unmatched(reason="LOST", detail=track.why)
-    return track
 
 
 def _landmarks_of(keyframe: Keyframe, index: int) -> Landmarks:

@@ -54,7 +54,6 @@ class TrackOptions:
     earlier: int = 60
     live: bool = False  # answers are taken as soon as they are there, and no frame waits for one
     live_frames: int = 60  # that are kept meanwhile: two seconds, and 55 MB at 1280x720
-    live_steps: int = 3  # frames by which it is carried on while a client waits; the thread does more
     min_matches: int = 30  # of a keyframe with the map
     max_unconfirmed: int = 3  # keyframes in a row without them; then the track is lost
     # Of a keyframe, whose pose is known to some pixels: as many as a query's take twice the time, and place

@@ -5,21 +5,20 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
 from reloc.localise.result import LocaliseRequest
-from reloc.tracking.flow_track import FlowTrack, RecentFrame, RecentFrames, carried
+from reloc.tracking.flow_track import FlowTrack, RecentFrame, RecentFrames
 from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, Unmatched
-from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.pose_fit import FittedPose
+from reloc.tracking.pose_fit import FittedPose, LensWalk
 from reloc.wire.track import TrackState
 
-Answer = Keyframe | FlowTrack | Unmatched
+Answer = Keyframe | Unmatched
 _FAR = sys.maxsize
 # What would be waited for in one go when it is due is waited for a little at each frame: for a search, and a
 # keyframe of many features, from the first; for another keyframe at the last ones, which it seldom needs.
@@ -31,7 +30,7 @@ class _Sent:
     """What the thread has in hand: its frame, and the frame or the film's time at which it is waited for."""
 
     index: int
-    answer: "Future[Any]"  # Answer
+    answer: "Future[Answer]"
     due: int = _FAR
     due_s: float = float("inf")
     slow: bool = False  # it takes longer than the frames until then
@@ -74,7 +73,6 @@ class Tracker:
         self.late: list[TrackedFrame] = []
         self._sent: _Sent | None = None
         self._catching: _Catching | None = None
-        self._behind = _FAR  # frames through which the thread carries a track that was found, live
         self._next_keyframe, self._next_keyframe_s = 0, float("inf")
         self._unconfirmed = 0  # keyframes in a row of which the ground knew nothing
         self._index = self._posed = -1  # the last frame, and the last that has a pose
@@ -109,14 +107,15 @@ class Tracker:
                 self._lost(f"LOST: {self._track.why}")
         elif self._catching is not None:
             fitted, state = self._caught_up_by(self._options.catch_up), "relocalised"
-        answered, sent = self._answer(now)
+        sent = self._due(now)
+        answered = None if sent is None else sent.answer.result()
         if isinstance(answered, Unmatched):
             self._unconfirmed += 1
             if fitted is None or self._unconfirmed >= self._options.max_unconfirmed:
                 fitted = None
                 self._lost(f"{answered.reason}: {answered.detail}")
-        elif answered is not None and sent is not None:
-            found = self._taken(answered, sent.index, now, self._track)
+        elif sent is not None and answered is not None:
+            found = self._taken(answered, sent.index)
             if found is not None:
                 state = "tracking" if fitted is not None else "relocalised"
                 fitted = found
@@ -157,7 +156,7 @@ class Tracker:
         if sent is not None and last is not None:
             answered = sent.answer.result()
             if not isinstance(answered, Unmatched):
-                fitted = self._taken(answered, sent.index, last, None)
+                fitted = self._taken(answered, sent.index)
         if self._catching is not None:
             fitted = self._caught_up_by(_FAR)
         if fitted is not None and self._track is not None and last is not None:
@@ -195,45 +194,37 @@ class Tracker:
         searched = self._track is None and not self._options.live
         return self._sent.index - (self._options.earlier if searched else 0)
 
-    def _answer(self, now: RecentFrame) -> "tuple[Answer | None, _Sent | None]":
-        """What the thread has found: at the frame at which it is due; live: as soon as it is there."""
+    def _due(self, now: RecentFrame) -> _Sent | None:
+        """What the thread has answered: at the frame at which it is due; live: as soon as it is there."""
         sent = self._sent
         if sent is None:
-            return None, None
+            return None
         due = now.index >= sent.due or now.time_s >= sent.due_s
         ready = sent.answer.done() if self._options.live else due
         if not ready:
             if not self._options.live and (sent.slow or now.index >= sent.due - _LAST_FRAMES):
                 wait([sent.answer], timeout=_PACE_S if sent.slow else _LAST_PACE_S)
-            return None, None
+            return None
         self._sent = None
-        return sent.answer.result(), sent
+        return sent
 
-    def _taken(
-        self, found: Keyframe | FlowTrack, index: int, now: RecentFrame, track: FlowTrack | None
-    ) -> FittedPose | None:
+    def _taken(self, found: Keyframe, index: int) -> FittedPose | None:
         """The pose of the frame at hand by what was found of frame `index`; None: it says nothing of it.
 
-        `track`: as it is at the frame at hand; None: it is lost, and begins again at what was found.
+        A track that is lost begins again at what was found.
         """
-        since = self._frames.since(index)
+        since, track = self._frames.since(index), self._track
         if not since:
             return None
         if track is not None:
-            if isinstance(found, FlowTrack) or found.ground is not track.ground:
-                return None
-            return track.refresh(found, since[0], now)
-        if isinstance(found, FlowTrack):
-            return self._caught_up(found, since)
+            return track.refresh(found, since[0], since[-1]) if found.ground is track.ground else None
         self._found, self._unconfirmed = True, 0
         begun = self._begun(found, since[0])
         fitted = begun.settle()
         if fitted is None:
             self._why = f"LOST: {begun.why}"
             return None
-        if self._options.live:
-            return self._caught_up(begun, since)
-        earlier = self._earlier(found, since[0])
+        earlier = [] if self._options.live else self._earlier(found, since[0])
         self.late.extend(earlier)
         state: TrackState = "tracking" if earlier else "relocalised"
         self._catching = _Catching(track=begun, at=since[0], fitted=fitted, state=state)
@@ -282,34 +273,11 @@ class Tracker:
         self._track, self._catching = catching.track, None
         return catching.fitted
 
-    def _caught_up(self, track: FlowTrack, since: Sequence[RecentFrame]) -> FittedPose | None:
-        """Live: the track from the first of `since` to the frame at hand, soon or in the background.
-
-        The thread carries it through what has come meanwhile, again and again, and each time that is less.
-        Where it does not become less, the thread is too slow for all frames, and some are passed over.
-        """
-        steps, most = len(since) - 1, self._options.live_steps
-        if most < steps < self._behind:
-            self._behind = steps
-            self._sent = _Sent(index=since[-1].index, answer=self._pool.submit(carried, track, since))
-            return None
-        self._behind = _FAR
-        rows = np.linspace(0, steps, min(steps, most) + 1).round().astype(np.int64)
-        chosen = [since[row] for row in rows]
-        fitted = None
-        for before, after in pairwise(chosen):
-            fitted = track.follow(before, after)
-            if fitted is None:
-                self._lost(f"LOST: {track.why}")
-                return None
-        self._track = track
-        return fitted
-
     def _search(self, now: RecentFrame) -> None:
         """Have this frame localised, if the thread is free."""
         if self._sent is not None:
             return
-        self._behind, options = _FAR, self._options
+        options = self._options
         answer = self._pool.submit(self._finder.find, now.gray.copy(), self._request_of(now), options)
         due, due_s = now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s
         self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s, slow=True)

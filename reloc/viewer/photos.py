@@ -23,7 +23,7 @@ from featuredb.store import Database
 from reloc.answered_view import AnsweredView, geopose_of
 from reloc.asking import PhotoAsker
 from reloc.overlay import draw_overlay
-from reloc.viewer.poses import drawn_pose, worded_sigmas
+from reloc.viewer.map_layer import drawn_pose, worded_sigmas
 from reloc.viewer.scene import ViewerScene
 from reloc.wire.query import LocaliseReply
 

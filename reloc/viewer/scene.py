@@ -28,10 +28,10 @@ from reloc.viewer.map_layer import (
     describe_map,
     describe_own_place,
     describe_photos,
+    describe_trajectory,
     picks_command,
 )
 from reloc.viewer.points import DrawnPoints, drawn_points, map_points, sampled, scan_points_in, shares
-from reloc.viewer.poses import describe_trajectory
 
 DEFAULT_POINTS = 1_000_000
 # Over this distance the vertical turns by 0.18 degrees and the ground falls away by 31 m.

@@ -12,7 +12,7 @@ from PIL import Image
 from playwright.sync_api import Browser, sync_playwright
 
 from featuredb.store import Database
-from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.tracking.trajectory.files import read_trajectory_csv
 from reloc.viewer.page import write_static_page
 from reloc.viewer.photos import Pictures
 from reloc.viewer.scene import ViewerSceneOptions, build_scene

@@ -15,8 +15,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.error_modes import LENS_SIZE, ErrorModes
 from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store import Database
-from reloc.gateway.geopose import NotLocalisedError, response_of
-from reloc.gateway.protocol import GeoPoseReq
+from reloc.gateway.geopose import GeoPoseReq, NotLocalisedError, response_of
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
@@ -98,7 +97,7 @@ def test_what_the_map_may_be_off_by_is_in_the_answer(localiser: Localiser) -> No
     for map_id in ("adrift", "bent"):
         found = localiser.localise(photo, LocaliseRequest(camera=CAMERA, map_ids=(map_id,))).in_map
         assert found is not None
-        variance[map_id] = float(np.trace(found.covariance[3:, 3:]))
+        variance[map_id] = float(np.trace(np.array(found.covariance)[3:, 3:]))
     distance = 3.0 * 40.0  # of the camera above the field, in the own frame
     assert variance["bent"] - variance["adrift"] == pytest.approx((5e-3 * distance) ** 2, rel=0.3)
 

@@ -114,7 +114,7 @@ def test_ros_2_hears_the_poses_and_sees_the_node(
 def test_where_nobody_listens_the_command_says_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("reloc.bridge.rmw_zenoh._CONNECT_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("reloc.bridge.ros2._CONNECT_TIMEOUT_S", 0.2)
     with only_command(monkeypatch, "bridge", "reloc.cli.bridge:register"):
         assert main(["bridge", "ros2", "--connect", bind_free_port("tcp/127.0.0.1:0")]) == 2
         assert "rmw_zenohd), such as tcp/127.0.0.1:7447, found nobody" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import pytest
 from cryptography import x509
 
 from featuredb.cli.main import main
-from reloc.authority.folder import Authority
+from reloc.authority import Authority
 from tests.support.strangers import config_of
 
 

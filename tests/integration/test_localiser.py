@@ -136,7 +136,7 @@ def test_a_map_in_quarantine_that_positions_placed_answers_where_it_is_named(
     assert localiser.localise(photo, KNOWN).reason == "NO_COVERAGE"
     named = localiser.localise(photo, replace(KNOWN, map_ids=("field",)))
     assert named.pose is not None
-    assert [entry["map_id"] for entry in named.pose.lineage] == ["field"]
+    assert [entry.map_id for entry in named.pose.lineage] == ["field"]
 
 
 def test_a_map_in_quarantine_that_maps_placed_answers_nobody(

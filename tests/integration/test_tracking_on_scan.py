@@ -23,7 +23,7 @@ from reloc.tracking.ground import Finder, Keyframe, TrackedFrame, Unmatched
 from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import Tracker
-from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.tracking.trajectory.files import read_trajectory_csv
 from reloc.tracking.trajectory.values import point_of
 from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.hill_scan import EPSG, write_hill_scan

@@ -14,8 +14,7 @@ from featuredb.export.selection import Selection
 from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from reloc.listening import listen
-from reloc.tracking.trajectory.files import write_trajectory
-from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.tracking.trajectory.files import read_trajectory_csv, write_trajectory
 from reloc.viewer.page import write_static_page
 from reloc.viewer.photos import Pictures
 from reloc.viewer.scene import ViewerScene, ViewerSceneOptions, build_scene

@@ -22,11 +22,12 @@ from featuredb.store.candidates.states import Contribution
 from reloc.client import Client
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.options import LocaliseOptions
-from reloc.localise.result import Inliers, LocalisedPose, LocaliseRequest, LocaliseResult, RunnerUp
+from reloc.localise.result import Inliers, LocalisedPose, LocaliseRequest, LocaliseResult
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.service.source import ServedArea
+from reloc.wire.query import Lineage, RunnerUpPose
 from reloc.wire.server import BoundingBox, MapInfo
 
 EPSG = 32632
@@ -55,11 +56,11 @@ def localised(snapshot: int, camera: Camera, *, want_inliers: bool = False) -> L
         geopose=geopose_from_camera(cam_from_local, frame),
         height_datum="ellipsoidal",
         map_ids=("map-a",),
-        lineage=({"map_id": "map-a", "method": "gps", "generation": 0, "parents": ()},),
+        lineage=(Lineage(map_id="map-a", method="gps", generation=0, parents=()),),
         residual_rms_px=0.8,
         inliers=inliers if want_inliers else None,
     )
-    runner_up = RunnerUp(inliers=9, distance_m=40.0, angle_deg=170.0, lat=49.0, lon=8.4)
+    runner_up = RunnerUpPose(inliers=9, distance_m=40.0, angle_deg=170.0, lat=49.0, lon=8.4)
     return LocaliseResult(
         reason=None,
         detail="1 map",

@@ -161,7 +161,7 @@ def test_inliers_and_maps_are_named_most_first() -> None:
     rows = np.concatenate([np.flatnonzero(area.point_map == 0)[:5], np.flatnonzero(area.point_map == 1)[:9]])
     answer = answer_of(maps, POSE, rows)
     assert answer.map_ids == ("many", "few")
-    assert [entry["map_id"] for entry in answer.lineage] == ["many", "few"]
+    assert [entry.map_id for entry in answer.lineage] == ["many", "few"]
     assert answer.inliers is not None
     assert answer.inliers.map_rows.tolist() == [1] * 5 + [0] * 9
     point = maps[0].points.utm[area.point_row[rows[:1]][0]]

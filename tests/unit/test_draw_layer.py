@@ -9,8 +9,7 @@ import pytest
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from reloc.pixels.draw import draw_layer
-from reloc.pixels.layer import Shape, laid_on, read_layer
+from reloc.pixels.layer import Shape, draw_layer, laid_on, read_layer
 from tests.support.scanned_map import EPSG, FRAME
 from tests.unit.test_locate_pixels import LENS, POSE, step, true_place, view_of
 

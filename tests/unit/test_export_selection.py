@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -12,6 +14,7 @@ from featuredb.export.selection import (
     licence_is,
     licensed,
     selected_maps,
+    touches,
 )
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.maps.feature_map import FeatureMap
@@ -77,6 +80,20 @@ def test_by_place(database: Database, west: float, east: float, found: bool) -> 
     else:
         with pytest.raises(ExportError, match=r"expected maps in .* found none"):
             ids(database, selection)
+
+
+def test_a_map_across_the_antimeridian_does_not_go_around_the_earth() -> None:
+    box = SimpleNamespace(
+        min_easting=800_000.0, max_easting=840_000.0, min_northing=8_100_000.0, max_northing=8_110_000.0
+    )
+    fiji: Any = SimpleNamespace(box=box, epsg=32760)
+    for west, east, met in (
+        (179.8, 180.0, True),
+        (-180.0, -179.9, True),
+        (179.0, -179.0, True),
+        (8.0, 9.0, False),
+    ):
+        assert touches(fiji, (west, -20.0, east, -10.0)) == met, (west, east)
 
 
 def test_a_box_is_one() -> None:

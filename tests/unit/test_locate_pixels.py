@@ -14,8 +14,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from reloc.answered_view import AnsweredView
-from reloc.pixels.boxes import geojson, read_coco
-from reloc.pixels.locate import locate
+from reloc.pixels.locate import geojson, locate, read_coco
 from reloc.pixels.surfaces import MapSurface, ScanSurface, fit_patch, resampled, window_camera
 from tests.support.scanned_map import EPSG, FRAME
 from tools.worlds.clouds import build_cloud

@@ -23,10 +23,10 @@ from reloc.tracking.trajectory.files import (
     CSV_COLUMNS,
     exit_code,
     format_of,
+    read_trajectory_csv,
     write_outputs,
     write_trajectory,
 )
-from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 from tests.support.maps import random_unplaced_map
 from tests.support.planar_map import view

@@ -8,7 +8,7 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
-from reloc.localise.jacobians import pixel_jacobians
+from reloc.localise.lens_prior import pixel_jacobians
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import (
     PoseHypothesis,

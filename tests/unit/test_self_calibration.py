@@ -10,8 +10,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
-from reloc.localise.jacobians import pixel_jacobians
-from reloc.localise.lens_prior import LensPriors, lens_of, with_lens
+from reloc.localise.lens_prior import LensPriors, lens_of, pixel_jacobians, with_lens
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import PoseHypothesis, pose_uncertainty, refine_pose
 from reloc.localise.self_calibration import (

@@ -30,7 +30,6 @@ class SlowThread:
         self.delays: dict[str, Callable[..., int]] = {
             "find": lambda *_: 9,
             "match": lambda *_: 5,
-            "carried": lambda track, frames: len(frames) // 3,
         }
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Later":
@@ -88,22 +87,18 @@ def test_no_frame_waits_and_a_track_that_was_found_is_carried_to_the_frame_at_ha
 ) -> None:
     with Tracker(MapFinder([field_area()]), CAMERA, _LIVE) as tracker:
         found = followed(tracker, thread, range(60))
-        # Found after nine frames; those take three more, and the last three are followed at once.
-        assert runs(found) == [("lost", 12), ("relocalised", 1), ("tracking", 47)]
-        assert [what for _, what in thread.asked[:3]] == ["find", "carried", "match"]
-        assert thread.asked[1][0] == 9
+        # Found after nine frames, of which five are followed then, and the others with the next frame.
+        assert runs(found) == [("lost", 10), ("relocalised", 1), ("tracking", 49)]
+        assert [what for _, what in thread.asked[:2]] == ["find", "match"]
         assert not tracker.finish()
     check_poses(found)
 
 
-def test_a_thread_that_is_slower_than_the_frames_is_caught_up_with_by_passing_some_over(
-    thread: SlowThread,
-) -> None:
-    thread.delays["carried"] = lambda track, frames: 2 * len(frames)
-    with Tracker(MapFinder([field_area()]), CAMERA, _LIVE) as tracker:
-        found = followed(tracker, thread, range(45))
-    assert [what for _, what in thread.asked].count("carried") == 1
-    assert runs(found)[1:] == [("relocalised", 1), ("tracking", len(found) - 1 - runs(found)[0][1])]
+def test_an_answer_that_comes_late_is_caught_up_with_by_frames_that_are_kept(thread: SlowThread) -> None:
+    thread.delays["find"] = lambda *_: 40
+    with Tracker(MapFinder([field_area()]), CAMERA, replace(_LIVE, live_frames=20)) as tracker:
+        found = followed(tracker, thread, range(60))
+    assert runs(found) == [("lost", 44), ("relocalised", 1), ("tracking", 15)]
     check_poses(found)
 
 
@@ -118,7 +113,7 @@ def test_maps_that_change_end_a_track_in_them_and_leave_others_alone(thread: Slo
         tracker.use(MapFinder([moved]))
         again = followed(tracker, thread, range(30, 60))
         assert again[0].detail == "LOST: the maps have changed"
-        assert runs(again) == [("lost", 12), ("relocalised", 1), ("tracking", 17)]
+        assert runs(again) == [("lost", 10), ("relocalised", 1), ("tracking", 19)]
         grounds = [f.ground for f in again if f.ground is not None]
         assert all(isinstance(g, MapGround) and g.area is moved.area for g in grounds)
         check_poses(again, 30)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from featuredb.errors import InvalidValueError
-from reloc.tracking.trajectory.files import write_trajectory
-from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.tracking.trajectory.files import read_trajectory_csv, write_trajectory
 from reloc.tracking.trajectory.values import Trajectory
 from tests.support.planar_map import planar_map
 from tests.support.viewer import track_over

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
-from reloc.viewer.map_layer import coverage, describe_photos
+from reloc.viewer.map_layer import coverage, describe_photos, drawn_pose, ellipse_95
 from reloc.viewer.page import page, page_in_one
 from reloc.viewer.points import DrawnPoints, map_points, sampled, shares
-from reloc.viewer.poses import drawn_pose, ellipse_95
 from reloc.viewer.scene import Spot, _budget, group, scan_box
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
 from tests.support.planar_map import CAMERA, planar_map, view

@@ -15,7 +15,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
 from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame_registration import SIGMAS, FramePrior
-from reloc.localise.jacobians import pixel_jacobians
+from reloc.localise.lens_prior import pixel_jacobians
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import PoseHypothesis, reprojection_errors
 from reloc.localise.self_calibration import pose_step

@@ -164,20 +164,20 @@ class Inbox:
         mine = counts.waiting_by_owner.get(owner, 0) + sum(place.owner == owner for place in self._places)
         stored = counts.stored_bytes + queued_bytes
         waiting = counts.waiting + queued
-        refusal: tuple[ContributionReason, str]
-        if mine >= options.max_owner_photos:
-            told = f"{mine} photos of this owner wait for growth, which is as many as one owner may have"
-            refusal = "OWNER_LIMIT", told
-        elif waiting >= options.max_photos:
-            refusal = "INBOX_FULL", f"{waiting} photos wait for growth, which is the limit"
-        elif stored + size > options.max_stored_bytes:
-            told = f"the stored photos take {stored} of {options.max_stored_bytes} bytes"
-            refusal = "INBOX_FULL", told
-        else:
-            return None
-        self._limited = True
-        self._changed.notify()
-        return refusal
+        of_owner = f"{mine} photos of this owner wait for growth, which is as many as one owner may have"
+        of_all = f"{waiting} photos wait for growth, which is the limit"
+        of_bytes = f"the stored photos take {stored} of {options.max_stored_bytes} bytes"
+        limits: tuple[tuple[bool, ContributionReason, str], ...] = (
+            (mine >= options.max_owner_photos, "OWNER_LIMIT", of_owner),
+            (waiting >= options.max_photos, "INBOX_FULL", of_all),
+            (stored + size > options.max_stored_bytes, "INBOX_FULL", of_bytes),
+        )
+        for reached, reason, told in limits:
+            if reached:
+                self._limited = True
+                self._changed.notify()
+                return reason, told
+        return None
 
     def _run(self) -> None:
         while (batch := self._next()) is not None:

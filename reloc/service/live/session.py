@@ -107,18 +107,12 @@ class Follower:
         return pose.model_copy(update={"timings_ms": clock.milliseconds()})
 
     def _asked(self, process: WorkerProcess, frame: FrameAsk, data: bytes) -> TrackPose:
-        late = threading.Event()
-
-        def end() -> None:
-            late.set()
-            process.kill()
-
-        watch = threading.Timer(self._frame_s, end)
+        watch = threading.Timer(self._frame_s, process.kill)
         watch.start()
         try:
             return process.ask(frame, data, TrackPose)
         except WorkerEndedError as error:
-            if not late.is_set():
+            if self._stopped or not process.killed:
                 raise
             text = f"the frame was not done within {self._frame_s:g} s; send smaller ones"
             raise RequestError(ErrorCode.DEADLINE, text) from error

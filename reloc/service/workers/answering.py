@@ -40,13 +40,6 @@ class WorkerLimits:
     processor_s: float  # of all threads together
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OpenFiles:
-    """The files of a localiser follow, as descriptors; it answers from now on."""
-
-    keys: tuple[int, ...]
-
-
 @contextmanager
 def capped_process(count: int) -> Iterator[None]:
     """Within the block OpenCV and BLAS use at most `count` threads, in all threads of the process."""
@@ -74,7 +67,10 @@ class _Stop:
 
 
 def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer) -> None:
-    """Until the other end is closed: answers to `OpenFiles` (empty) and what the answerer is asked."""
+    """Until the other end is closed: answers what the answerer is asked.
+
+    And to keys of a localiser's files, a tuple, that follow as descriptors: empty, it answers from now on.
+    """
     stop, areas = _Stop(), MappedAreas()
     localiser: Localiser | None = None
     unlimited = resource.getrlimit(resource.RLIMIT_AS)
@@ -83,7 +79,7 @@ def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer)
             try:
                 message = connection.recv()
                 stop.busy = True
-                if isinstance(message, OpenFiles):
+                if isinstance(message, tuple):
                     resource.setrlimit(resource.RLIMIT_AS, unlimited)
                     localiser = _opened(connection, message, areas)
                     answer = b""
@@ -102,10 +98,10 @@ def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer)
             stop.busy = False
 
 
-def _opened(connection: Connection, message: OpenFiles, areas: MappedAreas) -> Localiser:
+def _opened(connection: Connection, keys: tuple[int, ...], areas: MappedAreas) -> Localiser:
     """Raises SystemExit, and says why, where a file cannot be mapped."""
     try:
-        localiser: Localiser = areas.localiser(message.keys, lambda: recv_handle(connection))
+        localiser: Localiser = areas.localiser(keys, lambda: recv_handle(connection))
     except OSError as error:
         if isinstance(error, ConnectionError):
             raise

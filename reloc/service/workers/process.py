@@ -18,7 +18,6 @@ from reloc.service.workers.answering import (
     OUT_OF_MEMORY,
     REFUSAL,
     Answerer,
-    OpenFiles,
     WorkerLimits,
     answer_all,
 )
@@ -81,7 +80,7 @@ class WorkerProcess:
             raise WorkerEndedError(None) from error
         self._limits = limits
         self._open: LocaliserFiles | None = None
-        self._killed = False
+        self.killed = False  # by `kill`
         self._process = _CONTEXT.Process(
             target=answer_all, args=(theirs, limits, answerer), name="localise", daemon=True
         )
@@ -96,11 +95,11 @@ class WorkerProcess:
 
     def is_alive(self) -> bool:
         """Between queries: then there is nothing to be read but the end. One that was told to end is not."""
-        return not self._killed and not self._connection.poll() and self._process.is_alive()
+        return not self.killed and not self._connection.poll() and self._process.is_alive()
 
     def kill(self) -> None:
         """From any thread: whoever waits for an answer gets WorkerEndedError."""
-        self._killed = True
+        self.killed = True
         self._process.kill()
 
     def close(self) -> None:
@@ -118,7 +117,7 @@ class WorkerProcess:
         if files is self._open:
             return
         try:
-            self._connection.send(OpenFiles(keys=tuple(file.key for file in files)))
+            self._connection.send(tuple(file.key for file in files))
             for file in files:
                 send_handle(self._connection, file.file.fileno(), self._process.pid)
             self._connection.recv_bytes()

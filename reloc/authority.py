@@ -1,4 +1,6 @@
-"""The folder of an authority: its key, the server's configuration, one of each client.
+"""A small authority: X.509 certificates for a server and its clients, and rules of what each may do.
+
+Keys are of the curve P-256. Its folder:
 
 ca.pem, ca.key          the authority; nobody but this folder needs the key
 server.json5            Zenoh configuration of the server, with its key and the rules of all clients
@@ -9,19 +11,110 @@ revoked/NAME.pem        those of clients that they do not name any more
 
 import base64
 import fcntl
+import ipaddress
 import json
 import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
 from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import DecodeLimits
-from reloc.authority.certificates import Identity
 from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, NAME_EXPECTED, Keys, is_name
 from reloc.wire.query import MESSAGE_HEADROOM
+
+# Who may come in is for the access rules to say, not for dates: a phone that is forgotten goes on working.
+_VALID = timedelta(days=3650)
+_CLOCKS_DIFFER = timedelta(days=1)  # a device that was just switched on may be behind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Identity:
+    """A certificate and its private key, both PEM."""
+
+    certificate: bytes
+    key: bytes
+
+    @classmethod
+    def authority(cls) -> "Identity":
+        """An authority, which signs the certificates of others and nothing else."""
+        extensions = (x509.BasicConstraints(ca=True, path_length=0), _usage(signs_certificates=True))
+        return _identity("featuredb authority", None, extensions)
+
+    def server(self, name: str, hosts: tuple[str, ...]) -> "Identity":
+        """A server's, signed by this authority; clients that connect to another host refuse it."""
+        uses = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        names = x509.SubjectAlternativeName([_host(host) for host in hosts])
+        return _identity(name, self, _of_others(), (x509.ExtendedKeyUsage(uses), names))
+
+    def client(self, name: str) -> "Identity":
+        """A client's, signed by this authority; it cannot be a server's."""
+        uses = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH])
+        return _identity(name, self, _of_others(), (uses,))
+
+
+def _identity(
+    name: str,
+    signer: Identity | None,  # None: it signs its own
+    critical: tuple[x509.ExtensionType, ...],
+    others: tuple[x509.ExtensionType, ...] = (),
+) -> Identity:
+    """A new key, and a certificate of it."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    issuer = own = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    signing = key
+    if signer is not None:
+        issuer = x509.load_pem_x509_certificate(signer.certificate).subject
+        loaded = serialization.load_pem_private_key(signer.key, password=None)
+        assert isinstance(loaded, ec.EllipticCurvePrivateKey)
+        signing = loaded
+    now = datetime.now(UTC)
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(own)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _CLOCKS_DIFFER)
+        .not_valid_after(now + _VALID)
+    )
+    for extension in (*critical, *others):
+        builder = builder.add_extension(extension, critical=extension in critical)
+    return Identity(
+        certificate=builder.sign(signing, hashes.SHA256()).public_bytes(serialization.Encoding.PEM),
+        key=key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        ),
+    )
+
+
+def _of_others() -> tuple[x509.ExtensionType, ...]:
+    """Of who signs nobody's certificate."""
+    return x509.BasicConstraints(ca=False, path_length=None), _usage(signs_certificates=False)
+
+
+def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    signs = {"digital_signature": not signs_certificates}
+    signs |= dict.fromkeys(("key_cert_sign", "crl_sign"), signs_certificates)
+    encrypts = ("key_encipherment", "data_encipherment", "key_agreement", "encipher_only", "decipher_only")
+    return x509.KeyUsage(**signs, content_commitment=False, **dict.fromkeys(encrypts, False))
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
 
 DEFAULT_PORT = 7447  # Zenoh's own
 _SERVER = "server"
@@ -271,19 +364,15 @@ def _common(authority: Identity, shown: dict[str, Identity]) -> Section:
     tls: Section = {
         "enable_mtls": True,
         "verify_name_on_connect": True,
-        "root_ca_certificate_base64": _base64(authority.certificate),
+        "root_ca_certificate_base64": base64.b64encode(authority.certificate).decode(),
     }
     for side, identity in shown.items():
-        tls[f"{side}_certificate_base64"] = _base64(identity.certificate)
-        tls[f"{side}_private_key_base64"] = _base64(identity.key)
+        tls[f"{side}_certificate_base64"] = base64.b64encode(identity.certificate).decode()
+        tls[f"{side}_private_key_base64"] = base64.b64encode(identity.key).decode()
     return {
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {"shared_memory": {"enabled": False}, "link": {"tls": tls}},
     }
-
-
-def _base64(pem: bytes) -> str:
-    return base64.b64encode(pem).decode()
 
 
 def _text(config: Section) -> str:
