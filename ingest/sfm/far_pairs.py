@@ -17,9 +17,9 @@ from ingest.photos.photo import Photo, gps_positions
 from ingest.sfm.pairs import Pair
 
 # A photo reaches as far as half of its verified matches; no photo loses more than the other half. Pairs go
-# that are longer than four times the longer reach of their photos, and than what noise of positions adds: 2 of
-# 712 of `brighton`, `lewis` and `seneca` (21 and 28 matches), all 33 wrong ones of that town and none of the
-# others; with a fifth of the positions off by 300 m 21 of the 33, and none of the others.
+# that are longer than four times the longer reach of their photos, and than what noise of positions adds: 2
+# of 712 of `brighton`, `lewis` and `seneca` (21 and 28 matches), all 33 wrong ones of that town and none of
+# the others; with a fifth of the positions off by 300 m 21 of the 33, and none of the others.
 _WITHIN_REACH = 0.5
 _MOST_REACHES, _MOST_SIGMAS = 4.0, 3.0
 
