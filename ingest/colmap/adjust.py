@@ -160,7 +160,8 @@ def _adjusted(
     if options.whole_lens and options.refine_focal:
         _bundle(reconstruction, known, loss_scale_px, options, (_ROUGH,))
         reconstruction = _triangulated_anew(reconstruction, database, folder)
-    _bundle(reconstruction, known, loss_scale_px, options, (_ROUGH, _FINE))
+    settled = (_ROUGH, _FINE) if options.whole_lens else (_ROUGH,)  # a start is adjusted again
+    _bundle(reconstruction, known, loss_scale_px, options, settled)
     return reconstruction
 
 
