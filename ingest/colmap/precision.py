@@ -51,25 +51,49 @@ def linearise(
     Args:
         camera_of: camera of each photo.
     """
-    rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
-    translations = np.array([p.translation for p in poses]).reshape(-1, 3)
-    in_camera = np.einsum("mij,mj->mi", rotations[photo_of], points[point_of]) + translations[photo_of]
-    projected = np.full((len(xy), 2), np.nan)
+    in_camera = _in_camera(poses, points, point_of, photo_of)
     by_camera_point = np.zeros((len(xy), 2, 3))
     for index, camera in enumerate(cameras):
         rows = np.flatnonzero(camera_of[photo_of] == index)
-        projected[rows] = camera.project(in_camera[rows])
         by_camera_point[rows] = camera.projection_jacobian(in_camera[rows])
     by_pose = np.zeros((len(xy), 2, 6))
     by_pose[:, :, :3] = -by_camera_point @ skew(in_camera)
     by_pose[:, :, 3:] = by_camera_point
     return Linearised(
-        residual=xy - projected,
-        by_point=by_camera_point @ rotations[photo_of],
+        residual=residuals_px(cameras, camera_of, poses, points, point_of, photo_of, xy),
+        by_point=by_camera_point @ np.array([p.rotation for p in poses]).reshape(-1, 3, 3)[photo_of],
         by_pose=by_pose,
         point_of=point_of,
         photo_of=photo_of,
     )
+
+
+def residuals_px(
+    cameras: Sequence[Camera],
+    camera_of: NDArray[np.int64],
+    poses: Sequence[Rigid3],
+    points: FloatArray,
+    point_of: NDArray[np.int64],
+    photo_of: NDArray[np.int64],
+    xy: FloatArray,
+) -> FloatArray:
+    """(m, 2) observed minus projected; arguments as of `linearise`."""
+    in_camera = _in_camera(poses, points, point_of, photo_of)
+    projected = np.full((len(xy), 2), np.nan)
+    for index, camera in enumerate(cameras):
+        rows = np.flatnonzero(camera_of[photo_of] == index)
+        projected[rows] = camera.project(in_camera[rows])
+    return np.asarray(xy - projected)
+
+
+def _in_camera(
+    poses: Sequence[Rigid3], points: FloatArray, point_of: NDArray[np.int64], photo_of: NDArray[np.int64]
+) -> FloatArray:
+    """(m, 3): observed points in the axes of their cameras."""
+    rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
+    translations = np.array([p.translation for p in poses]).reshape(-1, 3)
+    turned = np.einsum("mij,mj->mi", rotations[photo_of], points[point_of])
+    return np.asarray(turned + translations[photo_of])
 
 
 def residual_variance(linear: Linearised, photos: int, points: int) -> float:
@@ -98,10 +122,14 @@ def design_effect(
         residuals, pixels: (m, 2). photo_of: (m,) their photos.
         side_px: longer side of the photos, of which a part is a quarter.
     """
+    if len(residuals) == 0:
+        return 1.0
     squared = (residuals**2).sum(axis=1)
     weighted = residuals / (1.0 + squared / max(4.0 * _variance_px2(residuals), 1e-12))[:, None]
     place = np.floor(4.0 * pixels / side_px).astype(np.int64)
-    part = np.unique(np.column_stack([photo_of, place]), axis=0, return_inverse=True)[1].reshape(-1)
+    place -= place.min(axis=0)
+    code = (photo_of * (place[:, 0].max() + 1) + place[:, 0]) * (place[:, 1].max() + 1) + place[:, 1]
+    part = np.unique(code, return_inverse=True)[1]
     sums = np.stack([np.bincount(part, weights=weighted[:, k]) for k in range(2)])
     return max(1.0, float((sums**2).sum() / max((weighted**2).sum(), 1e-12)))
 
