@@ -21,7 +21,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.positions.held import ANGLES_WRONG, Held
 from ingest.positions.one_height import told_once
 from ingest.positions.receivers import places_apart
-from ingest.positions.variance_components import MixedModel, ModelAxis, prior_mean, stated_sigma
+from ingest.positions.variance_components import MixedModel, prior_mean, stated_sigma
 
 _TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
 _ROUNDS = 12  # of weights and components; most settle in five
@@ -254,27 +254,44 @@ def _walk(times_s: FloatArray) -> FloatArray:
     return np.asarray((1.0 - _TREND) * np.minimum(share[:, None], share) + _TREND * np.outer(share, share))
 
 
-def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: FloatArray) -> list[ModelAxis]:
-    """East, north, up.
+def _model(
+    data: _Data,
+    residual: FloatArray,
+    jacobian: FloatArray,
+    weights: FloatArray,
+    known: tuple[FloatArray, FloatArray],
+    least: float = 0.0,
+) -> MixedModel:
+    """Of east, north and up.
 
     Args:
         residual: (n, 3). jacobian: (n, 3, p).
+        known: Jacobian (k, p) and residual (k,), whitened, of what is known beside positions.
+        least: variance, as `MixedModel` has it.
     """
-    result = []
+    groups, residuals, jacobians, walks = [], [], [], []
     for axis, group in enumerate(_GROUP_OF):
-        known = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
-        root = np.sqrt(weights[known, group]) * data.stated[group] / data.sigmas[known, axis]
-        walk = data.walk[np.ix_(known, known)]
-        variance, basis = np.linalg.eigh(root[:, None] * walk * root)
-        whitened = basis.T @ (root * residual[known, axis])
-        by_step = basis.T @ (root[:, None] * jacobian[known, axis])
-        result.append(ModelAxis(group, whitened, by_step, np.maximum(variance, 0.0)))
-    return result
+        there = np.isfinite(data.sigmas[:, axis]) & (weights[:, group] > 0)
+        root = np.sqrt(weights[there, group]) * data.stated[group] / data.sigmas[there, axis]
+        variance, basis = np.linalg.eigh(root[:, None] * data.walk[np.ix_(there, there)] * root)
+        groups.append(np.full(len(root), group))
+        residuals.append(basis.T @ (root * residual[there, axis]))
+        jacobians.append(basis.T @ (root[:, None] * jacobian[there, axis]))
+        walks.append(np.maximum(variance, 0.0))
+    return MixedModel(
+        group=np.concatenate(groups),
+        residual=np.concatenate(residuals),
+        jacobian=np.concatenate(jacobians),
+        walk=np.concatenate(walks),
+        known=known[0],
+        off=known[1],
+        least=least,
+    )
 
 
 def _at(data: _Data, state: _State, weights: FloatArray) -> MixedModel:
-    axes = _axes(data, state.residual(data), state.jacobian(data), weights)
-    return MixedModel(axes, *state.known(data), data.shape_m**2)
+    residual, jacobian = state.residual(data), state.jacobian(data)
+    return _model(data, residual, jacobian, weights, state.known(data), data.shape_m**2)
 
 
 def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: FloatArray) -> FloatArray:
@@ -327,13 +344,13 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
     off = np.where(np.isfinite(data.sigmas), data.positions, 0.0)
     costs, theta, places = [], np.zeros(4), len(data.centers)
     for residual in (state.residual(data), off - np.median(off, axis=0)):
-        problem = MixedModel(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
+        problem = _model(data, residual, shift, weights, (np.eye(3) / _UNKNOWN_M, np.zeros(3)))
         spread = [np.square(residual[known[:, axes[0]]][:, axes]) for axes in _AXES]
         size = np.array([float(np.sqrt(of.mean())) if of.size else 1.0 for of in spread])
         size = np.maximum(size, _LEAST_SHARE * data.stated)  # heights that are all the same are told in steps
         start = np.log(np.concatenate([size, size]))
         theta = problem.most_likely(start, None, np.log(_LEAST_SHARE * data.stated))
-        costs.append(problem.cost(theta, None))
+        costs.append(float(problem.cost(theta, None)))
         if data.many and len(costs) == 1:
             places = places_apart(state.sim.act(data.centers)[known[:, 0]], _ONE_PLACE * np.exp(theta[0]))
     apart = min(places / max(int(known[:, 0].sum()), 1), 1.0)
