@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.rays import pixel_rays
-from featuredb.render.rendering import Rendering
+from featuredb.geometry.camera import pixel_rays
+from featuredb.render.renderer import Rendering
 
 _WIDEST_STEP_PX = 12  # as the largest splat
 

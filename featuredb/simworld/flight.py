@@ -8,7 +8,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.camera.shot import Device, Shot, look_pose
+from featuredb.simworld.camera.photograph import Device, Shot, look_pose
 from featuredb.simworld.town.scene import Scene, Street
 
 GpsError = Literal["realistic", "rtk", "none"]

@@ -5,7 +5,7 @@ import numpy as np
 from featuredb.features.exif.read import is_of_film, shot_model, unnamed_model
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.camera.photograph import look_pose
 from reloc.tracking.lens_walk import STILL_S, LensWalk
 from reloc.tracking.pose_fit import FittedPose, LensSigmas, fit_pose
 

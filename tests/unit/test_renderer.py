@@ -8,16 +8,15 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rays import pixel_rays
+from featuredb.geometry.camera import Camera, pixel_rays
 from featuredb.render import renderer, shading, splats
 from featuredb.render.cloud import PointCloud
 from featuredb.render.loops.draw_loops import project
 from featuredb.render.renderer import RenderOptions, render, visible_nodes
 from featuredb.render.shading import shaded_relief
 from featuredb.render.splats import BlockPlanes, lens_numbers
+from featuredb.simworld.camera.photograph import look_pose
 from featuredb.simworld.camera.raster import render as cast_rays
-from featuredb.simworld.camera.shot import look_pose
 from featuredb.simworld.town.scene import Ellipsoids, Faces
 from featuredb.simworld.town.solids import box, face
 from tools.worlds.clouds import build_cloud
