@@ -322,7 +322,18 @@ def _row(
     notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
     return {
         "scan_id": scan_id,
-        "files": [_file_row(item) for item in inputs],
+        "files": [
+            {
+                "name": item.file.path.name,
+                "sha256": item.file.sha256,
+                "size_bytes": item.file.size_bytes,
+                "points": item.file.points,
+                "crs": item.crs.name,
+                "transformation": item.to_utm.description,
+                "transformation_accuracy_m": item.to_utm.accuracy_m,
+            }
+            for item in inputs
+        ],
         "epsg": inputs[0].to_utm.epsg,
         **staged.totals(),
         "tiles": sorted({block.tile for block in plan.blocks}),
@@ -340,16 +351,4 @@ def _row(
         **{name: getattr(crs, name) for name in _OF_CRS},
         "notes": list(dict.fromkeys(notes)),
         "options": json.dumps(asdict(options), sort_keys=True),
-    }
-
-
-def _file_row(item: ScanInput) -> Row:
-    return {
-        "name": item.file.path.name,
-        "sha256": item.file.sha256,
-        "size_bytes": item.file.size_bytes,
-        "points": item.file.points,
-        "crs": item.crs.name,
-        "transformation": item.to_utm.description,
-        "transformation_accuracy_m": item.to_utm.accuracy_m,
     }

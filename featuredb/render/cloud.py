@@ -107,7 +107,7 @@ class PointCloud:
             not in here.
         nodes: levels of detail and culling.
         spacing_m: (n,) float32, distance between neighbouring points of the whole scan around each point
-            (see featuredb.render.spacing.point_spacing), or None: the nodes' spacings are taken, which are
+            (see featuredb.render.cloud.point_spacing), or None: the nodes' spacings are taken, which are
             those of the dense parts where a node holds dense and sparse surfaces, as roofs and walls.
     """
 

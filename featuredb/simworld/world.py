@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -123,7 +123,19 @@ def true_image(scene: Scene, shot: Shot) -> TrueImage:
 
 def write_truth(folder: Path, truth: Truth) -> None:
     """Write folder/truth.json; floats are written so that they read back exactly."""
-    images = [_image_json(truth.images[name]) for name in sorted(truth.images)]
+    images = [
+        {
+            "name": name,
+            "camera": asdict(image.camera),
+            "cam_from_local": {
+                "quaternion_xyzw": image.cam_from_local.quaternion_xyzw.tolist(),
+                "translation_m": image.cam_from_local.translation.tolist(),
+            },
+            "utm": image.utm.tolist(),
+            "gps_error_m": None if image.gps_error_m is None else image.gps_error_m.tolist(),
+        }
+        for name, image in sorted(truth.images.items())
+    ]
     document = {
         "version": _VERSION,
         "seed": truth.seed,
@@ -146,7 +158,18 @@ def read_truth(folder: Path) -> Truth:
         document = json.loads(path.read_text(encoding="utf-8"))
         if document["version"] != _VERSION:
             raise InvalidValueError(f"{path}: expected version {_VERSION}, found {document['version']}")
-        images = [_image_value(entry) for entry in document["images"]]
+        images = [
+            TrueImage(
+                name=entry["name"],
+                camera=Camera(**{**entry["camera"], "params": tuple(entry["camera"]["params"])}),
+                cam_from_local=Rigid3.from_quaternion(
+                    entry["cam_from_local"]["quaternion_xyzw"], entry["cam_from_local"]["translation_m"]
+                ),
+                utm=np.asarray(entry["utm"]),
+                gps_error_m=None if entry["gps_error_m"] is None else np.asarray(entry["gps_error_m"]),
+            )
+            for entry in document["images"]
+        ]
         return Truth(
             seed=document["seed"],
             epsg=document["epsg"],
@@ -158,30 +181,6 @@ def read_truth(folder: Path) -> Truth:
             f"{path}: expected the truth of a simulated world, found {error!r}; "
             "make one with featuredb simworld"
         ) from error
-
-
-def _image_json(image: TrueImage) -> dict[str, Any]:
-    return {
-        "name": image.name,
-        "camera": asdict(image.camera),
-        "cam_from_local": {
-            "quaternion_xyzw": image.cam_from_local.quaternion_xyzw.tolist(),
-            "translation_m": image.cam_from_local.translation.tolist(),
-        },
-        "utm": image.utm.tolist(),
-        "gps_error_m": None if image.gps_error_m is None else image.gps_error_m.tolist(),
-    }
-
-
-def _image_value(entry: dict[str, Any]) -> TrueImage:
-    camera, pose, error = entry["camera"], entry["cam_from_local"], entry["gps_error_m"]
-    return TrueImage(
-        name=entry["name"],
-        camera=Camera(**{**camera, "params": tuple(camera["params"])}),
-        cam_from_local=Rigid3.from_quaternion(pose["quaternion_xyzw"], pose["translation_m"]),
-        utm=np.asarray(entry["utm"]),
-        gps_error_m=None if error is None else np.asarray(error),
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,10 +22,19 @@ from numpy.typing import NDArray
 
 from featuredb.errors import VideoError
 from featuredb.features.shrink import fitted_size
-from featuredb.video.decoding import Decoder, is_indexed, nominal_rate
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen
 from featuredb.video.folder import open_folder
-from featuredb.video.opening import MAX_CODED_PIXELS, Opening, Source, check_size, open_input, opening_of
+from featuredb.video.opening import (
+    MAX_CODED_PIXELS,
+    Decoder,
+    Opening,
+    Source,
+    check_size,
+    is_indexed,
+    nominal_rate,
+    open_input,
+    opening_of,
+)
 from featuredb.video.pixels import PixelReader, clockwise_from_display_matrix
 
 logger = logging.getLogger(__name__)
@@ -237,6 +246,8 @@ def _info(
     frame_size = fitted_size(*size, options.max_side_px)
     texts = {**container.metadata, **stream.metadata}
     tags = {name.lower(): value for name, value in texts.items()}
+    said = " ".join(tags.get(name, "") for name in _STREAM_NAMES).lower()
+    maker = next((make for word, make in _MAKER_WORDS.items() if word in said), None)
     return VideoInfo(
         name=opening.name,
         width=size[0],
@@ -247,7 +258,7 @@ def _info(
         duration_s=None if opening.live else _duration_s(container, stream),
         frame_count=stream.frames if stream.frames > 0 else None,
         creation_time=_creation_time(tags),
-        make=_first(tags, _MAKE) or _maker(tags),
+        make=_first(tags, _MAKE) or maker,
         model=_first(tags, _MODEL),
         live=opening.live,
     )
@@ -255,11 +266,6 @@ def _info(
 
 def _first(tags: Mapping[str, str], names: tuple[str, ...]) -> str | None:
     return next((value for name in names if (value := tags.get(name, "").strip())), None)
-
-
-def _maker(tags: Mapping[str, str]) -> str | None:
-    said = " ".join(tags.get(name, "") for name in _STREAM_NAMES).lower()
-    return next((make for word, make in _MAKER_WORDS.items() if word in said), None)
 
 
 def _creation_time(tags: Mapping[str, str]) -> datetime | None:

@@ -10,8 +10,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.photograph import look_pose
 from featuredb.simworld.camera.raster import render
 from featuredb.simworld.camera.shading import Look
+from featuredb.simworld.town.blocks import box, face
 from featuredb.simworld.town.scene import SKY_ID, TEXTURES, Ellipsoids, Faces, Scene
-from featuredb.simworld.town.solids import box, face
 from featuredb.simworld.town.texture import Texture
 from featuredb.simworld.town.town import make_town
 

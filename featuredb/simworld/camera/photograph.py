@@ -16,10 +16,10 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.raster import Rendered, render
 from featuredb.simworld.camera.shading import Look
+from featuredb.simworld.town.blocks import car
 from featuredb.simworld.town.ground import paint_ground
 from featuredb.simworld.town.materials import town_textures, water_texture
 from featuredb.simworld.town.scene import TEXTURES, Faces, GroundPlan, Scene
-from featuredb.simworld.town.solids import car
 from featuredb.simworld.town.texture import Image8, Texture, to_image
 
 

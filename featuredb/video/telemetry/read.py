@@ -17,7 +17,6 @@ from av.stream import Discard, Stream
 
 from featuredb.errors import TelemetryError, VideoError
 from featuredb.video.opening import open_input, opening_of
-from featuredb.video.telemetry.assemble import MAX_WARNINGS, check_count
 from featuredb.video.telemetry.formats.csv_table import read_csv
 from featuredb.video.telemetry.formats.gpmf import TimedPacket, has_positions, read_gpmf
 from featuredb.video.telemetry.formats.gpx import read_gpx
@@ -30,7 +29,7 @@ from featuredb.video.telemetry.formats.srt import (
 )
 from featuredb.video.telemetry.formats.srt_fields import looks_like_telemetry
 from featuredb.video.telemetry.formats.text import decode_text, read_bytes
-from featuredb.video.telemetry.values import Telemetry
+from featuredb.video.telemetry.values import MAX_WARNINGS, Telemetry, check_count
 
 # GPMF is some 10 to 30 kB a second: five hours and more.
 MAX_TRACK_BYTES = 512 * 1024 * 1024

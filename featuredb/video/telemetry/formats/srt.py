@@ -15,11 +15,10 @@ import numpy as np
 
 from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import METRES_PER_DEGREE, assemble, check_count
 from featuredb.video.telemetry.axis_order import ThirdValue, decide_order
 from featuredb.video.telemetry.formats.srt_fields import BlockFields, looks_like_telemetry, parse_block
 from featuredb.video.telemetry.formats.text import decode_text, parse_wall_clock
-from featuredb.video.telemetry.values import Telemetry
+from featuredb.video.telemetry.values import METRES_PER_DEGREE, Telemetry, assemble, check_count
 
 _TIMES = re.compile(r"^\s*(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})\s*-->\s*\d{1,3}:\d{2}:\d{2}[,.]\d{1,3}")
 _NUMBER_LINE = re.compile(r"^\s*\d{1,9}\s*$")
