@@ -1,11 +1,23 @@
-"""Files and folders that are there whole or not at all, and where those lie that can be made again."""
+"""Files by their bytes; files and folders that are whole or not there; a place for what can be made again."""
 
+import hashlib
 import os
 import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def file_sha256(path: Path) -> str:
+    """Hex digest of a file's bytes, read piece by piece.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
 
 TEMPORARY = ".tmp-"  # names of files that are being written begin so
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.adjust.block import Block
-from featuredb.adjust.terms import CenterPriors
+from featuredb.adjust.terms import Block, CenterPriors
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from featuredb.adjust.block import Block, whole_camera
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import LensPrior, Marks, Terms
+from featuredb.adjust.terms import Block, LensPrior, Marks, Terms, whole_camera
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import similarity_closed_form
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from tools.commands import anchor, featuredb

@@ -15,8 +15,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
-from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.plain_json import plain
 

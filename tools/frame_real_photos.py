@@ -24,7 +24,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.camera.photograph import look_pose
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameOptions
 from ingest.register.frame_registration import FramePrior, FrameRegistration

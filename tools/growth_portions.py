@@ -25,8 +25,7 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
 from ingest.colmap.bridge import Model

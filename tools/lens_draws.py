@@ -30,8 +30,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
-from featuredb.simworld.camera.shot import look_pose
-from featuredb.simworld.pool import in_order
+from featuredb.simworld.camera.photograph import look_pose
+from featuredb.simworld.world import in_order
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
 from ingest.map_builder import MapIdentity, MapOptions, build_map

@@ -25,7 +25,7 @@ from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.camera.photograph import look_pose
 from ingest.own_frame import held_of
 from ingest.register.gps import GpsPlacement, place_by_gps
 from tools.figures import inside_figures, say, squared, study_parser, write_figures

@@ -24,11 +24,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.camera.photograph import exif_of
-from featuredb.simworld.camera.sensor import jpeg_bytes
-from featuredb.simworld.camera.shot import Device, Shot
-from featuredb.simworld.pool import in_order
-from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.simworld.camera.photograph import Device, Shot, exif_of, jpeg_bytes
+from featuredb.simworld.world import WorldOptions, in_order, town_of
 from featuredb.store import Database
 from tools.commands import featuredb
 from tools.figures import say, squared, study_parser, write_figures

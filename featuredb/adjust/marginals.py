@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-from featuredb.adjust.block import Block
+from featuredb.adjust.terms import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pycolmap import cost_functions
 from scipy import sparse
 
-from featuredb.adjust.block import Block
 from featuredb.adjust.lens_agreement import Weighted, honest, lens_disagreement
 from featuredb.adjust.marginals import (
     Marginals,
@@ -22,7 +21,16 @@ from featuredb.adjust.marginals import (
     marginals,
     target_marginals,
 )
-from featuredb.adjust.terms import CenterPriors, LensPrior, Marks, Orientations, PointPriors, Targets, Terms
+from featuredb.adjust.terms import (
+    Block,
+    CenterPriors,
+    LensPrior,
+    Marks,
+    Orientations,
+    PointPriors,
+    Targets,
+    Terms,
+)
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 
@@ -128,7 +136,9 @@ class Problem:
                 replace(camera, params=tuple(params))
                 for camera, params in zip(self._block.cameras, self._lenses, strict=True)
             ),
-            cam_from_block=tuple(_pose(params) for params in self._poses),
+            cam_from_block=tuple(
+                Rigid3.from_quaternion(p[:4] / np.linalg.norm(p[:4]), p[4:]) for p in self._poses
+            ),
             xyz=xyz,
         )
 
@@ -318,10 +328,6 @@ class Problem:
 def _target_rows(targets: Targets) -> NDArray[np.int64]:
     """The block's points that are marked or surveyed, in order."""
     return np.union1d(targets.point_of, targets.survey.point_of)
-
-
-def _pose(params: FloatArray) -> Rigid3:
-    return Rigid3.from_quaternion(params[:4] / np.linalg.norm(params[:4]), params[4:])
 
 
 def _seen_by_marks_alone(block: Block, terms: Terms) -> list[int]:

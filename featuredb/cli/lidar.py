@@ -112,6 +112,9 @@ def summary(scan: "ScanSummary", outcome: str) -> str:
     """What a surveyor wants to check: counts, CRS, units, datum, bounds, density, classes, losses."""
     row, box = scan.row, scan.box
     area_m2 = scan.points * scan.spacing_m**2
+    intensity = "none"
+    if scan.has_intensity:
+        intensity = f"raw {row['intensity_low']:g} to {row['intensity_high']:g} stretched to 0 to 255"
     lines = [("files", f"{len(row['files'])} with {scan.points_in_files:,} points")]
     for crs, transformation, accuracy in dict.fromkeys(
         (f["crs"], f["transformation"], f["transformation_accuracy_m"]) for f in row["files"]
@@ -136,7 +139,7 @@ def summary(scan: "ScanSummary", outcome: str) -> str:
             ", ".join(f"{c} {_CLASS_NAMES.get(c, 'other')} {n:,}" for c, n in scan.classes.items()),
         ),
         ("colour", {"file": "of the file", "ortho": "from the ortho image"}.get(scan.colour, "none")),
-        ("intensity", _intensity(scan)),
+        ("intensity", intensity),
         (
             "dropped",
             f"{row['dropped_noise']:,} classified as noise, {row['dropped_withheld']:,} withheld, "
@@ -153,12 +156,6 @@ def summary(scan: "ScanSummary", outcome: str) -> str:
 
 
 _SAY_DATUM = "; --height-datum states it: " + ", ".join(d for d in HEIGHT_DATUMS if d != "unknown")
-
-
-def _intensity(scan: "ScanSummary") -> str:
-    if not scan.has_intensity:
-        return "none"
-    return f"raw {scan.row['intensity_low']:g} to {scan.row['intensity_high']:g} stretched to 0 to 255"
 
 
 def _register_add(commands: Any) -> None:

@@ -150,9 +150,8 @@ class ScaleSpace:
         out = np.empty_like(image) if out is None else out
         kernel = cv2.getGaussianKernel(round(8.0 * sigma_px + 1.0) | 1, sigma_px, cv2.CV_32F)
         weights = np.ascontiguousarray(kernel[len(kernel) // 2 :, 0])
-        mapped(
-            lambda rows: _pyramid().blur(image, weights, *rows, out), self._bands(len(image)), self._threads
-        )
+        pyramid = compiled_module("featuredb.features.pyramid_loops")
+        mapped(lambda rows: pyramid.blur(image, weights, *rows, out), self._bands(len(image)), self._threads)
         return out
 
     def keypoints(self, contrast_threshold: float, edge_threshold: float) -> ScaleSpacePoints:
@@ -212,10 +211,6 @@ class ScaleSpace:
             mine = np.flatnonzero(points.rows[:, OCTAVE] == number)
             parts += [(octave, mine[k : k + _AT_ONCE]) for k in range(0, len(mine), _AT_ONCE)]
         return parts
-
-
-def _pyramid() -> ModuleType:
-    return compiled_module("featuredb.features.pyramid_loops")
 
 
 def _loops() -> ModuleType:

@@ -154,7 +154,12 @@ def irregular_series(poses: Sequence[tuple[int, GeoPose]]) -> dict[str, Any]:
             "stopInstant": poses[-1][0],
             "transitionModel": _TRANSITION,
         },
-        "outerFrame": _tangent(outer),
+        "outerFrame": {
+            "authority": _AUTHORITY,
+            "id": "LTP-ENU",
+            "parameters": f"longitude={outer.longitude_deg:.10f}&latitude={outer.latitude_deg:.10f}"
+            f"&height={outer.height_m:.4f}",
+        },
         "innerFrameAndTimeSeries": series,
         "trailer": check,
     }
@@ -164,15 +169,6 @@ def _frame_at(pose: GeoPose) -> LocalFrame:
     return LocalFrame(
         latitude_deg=pose.latitude_deg, longitude_deg=pose.longitude_deg, height_m=pose.height_m
     )
-
-
-def _tangent(frame: LocalFrame) -> dict[str, str]:
-    return {
-        "authority": _AUTHORITY,
-        "id": "LTP-ENU",
-        "parameters": f"longitude={frame.longitude_deg:.10f}&latitude={frame.latitude_deg:.10f}"
-        f"&height={frame.height_m:.4f}",
-    }
 
 
 def _inner(outer: LocalFrame, pose: GeoPose) -> dict[str, str]:

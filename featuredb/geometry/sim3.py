@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import skew, so3_exp, so3_log
+from featuredb.geometry.rotation import nearest_rotation, skew, so3_exp, so3_log
 
 _SMALL_ANGLE = 1e-8  # below this the square of the angle is under float64's resolution
 
@@ -182,3 +182,18 @@ def _translation_factor(sigma: float, omega: FloatArray) -> FloatArray:
 def _phi(z: complex) -> complex:
     """(e^z - 1) / z, 1 at z = 0."""
     return complex(np.expm1(z)) / z if z != 0 else 1.0 + 0.0j
+
+
+def similarity_closed_form(source: FloatArray, target: FloatArray) -> Sim3 | None:
+    """Least-squares similarity target = S source, both (n, 3) (Umeyama 1991); None if points coincide."""
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    a, b = source - source_mean, target - target_mean
+    variance = float((a**2).sum())
+    cross = b.T @ a
+    if variance < 1e-18 or float((b**2).sum()) < 1e-12:
+        return None
+    rotation = nearest_rotation(cross)
+    scale = float(np.trace(rotation.T @ cross)) / variance
+    if scale <= 0:
+        return None
+    return Sim3(scale=scale, rotation=rotation, translation=target_mean - scale * rotation @ source_mean)

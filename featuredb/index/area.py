@@ -18,9 +18,8 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.index.descriptor_index import DescriptorCodes
+from featuredb.index.descriptor_index import DescriptorCodes, Stacked
 from featuredb.index.segment import Segment, segment_of
-from featuredb.index.stacked import Stacked
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import full_covariances

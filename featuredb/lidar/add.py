@@ -17,19 +17,15 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from featuredb.atomic import atomic_file, user_cache
+from featuredb.atomic import atomic_file, file_sha256, user_cache
 from featuredb.errors import ConflictError, GeodesyError, ScanError
-from featuredb.file_digest import file_sha256
 from featuredb.geo.crs.scan import ScanCrs, scan_crs
 from featuredb.geo.crs.utm_transform import UtmTransform, utm_transform
-from featuredb.lidar.clean import OutlierOptions, clean_block
-from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
+from featuredb.lidar.clean import OutlierOptions, clean_block, finest_level
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
-from featuredb.lidar.formats.ortho_image import OrthoImage, open_ortho
-from featuredb.lidar.levels import finest_level
+from featuredb.lidar.formats.ortho_image import OrthoImage, is_raster, open_dsm, open_ortho, read_dsm
 from featuredb.lidar.ortho import LAID
-from featuredb.lidar.spill import Spill
-from featuredb.lidar.staged import BlockPlan, Staged, stretch_of
+from featuredb.lidar.spill import BlockPlan, Spill, Staged, stretch_of
 from featuredb.store import Database
 from featuredb.store.encode import Row
 from featuredb.store.scans import ScanSummary, commit_scan, find_scan, list_scans
@@ -326,7 +322,18 @@ def _row(
     notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
     return {
         "scan_id": scan_id,
-        "files": [_file_row(item) for item in inputs],
+        "files": [
+            {
+                "name": item.file.path.name,
+                "sha256": item.file.sha256,
+                "size_bytes": item.file.size_bytes,
+                "points": item.file.points,
+                "crs": item.crs.name,
+                "transformation": item.to_utm.description,
+                "transformation_accuracy_m": item.to_utm.accuracy_m,
+            }
+            for item in inputs
+        ],
         "epsg": inputs[0].to_utm.epsg,
         **staged.totals(),
         "tiles": sorted({block.tile for block in plan.blocks}),
@@ -344,16 +351,4 @@ def _row(
         **{name: getattr(crs, name) for name in _OF_CRS},
         "notes": list(dict.fromkeys(notes)),
         "options": json.dumps(asdict(options), sort_keys=True),
-    }
-
-
-def _file_row(item: ScanInput) -> Row:
-    return {
-        "name": item.file.path.name,
-        "sha256": item.file.sha256,
-        "size_bytes": item.file.size_bytes,
-        "points": item.file.points,
-        "crs": item.crs.name,
-        "transformation": item.to_utm.description,
-        "transformation_accuracy_m": item.to_utm.accuracy_m,
     }

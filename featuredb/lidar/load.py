@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from featuredb.errors import ScanError, ScanNotFoundError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_from_geodetic
-from featuredb.render.cloud import CloudNodes, PointCloud
-from featuredb.render.spacing import point_spacing
+from featuredb.render.cloud import CloudNodes, PointCloud, point_spacing
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_points
 from featuredb.store.snapshot import full_id

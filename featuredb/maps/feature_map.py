@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from featuredb.errors import InvalidValueError
+from featuredb.features.exif.read import ExifInfo
 from featuredb.geo.checks import check_place
 from featuredb.geo.datum import check_datum
 from featuredb.geo.local_frame import LocalFrame
@@ -342,3 +343,16 @@ def _covariance(name: str, value: ArrayLike, size: int) -> FloatArray:
     if np.linalg.eigvalsh(covariance).min() < -1e-6 * largest:
         raise InvalidValueError(f"{name}: expected no negative eigenvalue, found {covariance.tolist()}")
     return covariance
+
+
+def prior_from_exif(exif: ExifInfo) -> GeoPrior | None:
+    """The position with its deviations, or None where the photo has none."""
+    if exif.latitude_deg is None or exif.longitude_deg is None:
+        return None
+    return GeoPrior(
+        latitude_deg=exif.latitude_deg,
+        longitude_deg=exif.longitude_deg,
+        height_m=exif.altitude_m,
+        sigma_horizontal_m=exif.sigma_horizontal_m,
+        sigma_vertical_m=exif.sigma_vertical_m,
+    )

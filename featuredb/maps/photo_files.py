@@ -3,7 +3,7 @@
 import threading
 from pathlib import Path, PurePosixPath
 
-from featuredb.file_digest import file_sha256
+from featuredb.atomic import file_sha256
 from featuredb.maps.feature_map import MapImage
 
 _SUFFIXES = (".jpg", ".jpeg", ".heic", ".heif", ".avif", ".png", ".tif", ".tiff")

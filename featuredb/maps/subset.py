@@ -38,7 +38,9 @@ def only_images(feature_map: MapKind, image_ids: Collection[int]) -> MapKind:
     cameras = sorted({image.camera_id for image in images})
     seen = feature_map.observations
     stays = np.isin(seen.image_id, np.array(sorted(wanted), dtype=np.int32))
-    views = _views(seen.point_index[stays], seen.image_id[stays], len(feature_map.points))
+    # How many images see each point; one that sees it twice counts once.
+    sights = np.stack([seen.point_index[stays], seen.image_id[stays].astype(np.int64)], axis=1)
+    views = np.bincount(np.unique(sights, axis=0)[:, 0], minlength=len(feature_map.points)).astype(np.int32)
     modes = ErrorModes.of_provenance(feature_map.provenance, len(feature_map.cameras))
     kept = {} if modes is None else modes.of(wanted, cameras).as_provenance()
     part = replace(
@@ -72,9 +74,3 @@ def answering_with(feature_map: MapKind, points: NDArray[np.bool_]) -> MapKind:
     keep = seen.has_descriptor & points[seen.point_index]
     descriptors = np.where(keep[:, None], seen.descriptors, np.uint8(0))
     return replace(feature_map, observations=replace(seen, has_descriptor=keep, descriptors=descriptors))
-
-
-def _views(point_index: NDArray[np.int64], image_id: NDArray[np.int32], points: int) -> NDArray[np.int32]:
-    """How many images see each point (points,); an image that sees one twice counts once."""
-    pairs = np.unique(np.stack([point_index, image_id.astype(np.int64)], axis=1), axis=0)
-    return np.bincount(pairs[:, 0], minlength=points).astype(np.int32)

@@ -8,11 +8,39 @@ from numpy.typing import NDArray
 
 from featuredb.compiled import compiled_module, mapped, over_rows, thread_count
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
+from featuredb.geometry.camera import Camera, pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import CloudNodes, PointCloud
-from featuredb.render.rendering import Rendering
 from featuredb.render.splats import FINEST_PX, NEAR_M, BlockPlanes, Splats, draw_splats, project_points
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rendering:
+    """A point cloud seen by a camera; pixel (row, column) has its centre at (column + 0.5, row + 0.5).
+
+    Attributes:
+        camera: whose width and height the images have, distortion included.
+        cam_from_local: the pose in the frame of the cloud.
+        depth: (h, w) float32, metres along the optical axis; NaN where nothing is seen.
+        index: (h, w) int32, row of the cloud that the pixel shows; -1 where nothing is seen, and where a
+            hole was closed from its surroundings.
+        rgb: (h, w, 3) uint8 or None; zero where depth is NaN.
+        intensity: (h, w) uint8 or None; zero where depth is NaN.
+    """
+
+    camera: Camera
+    cam_from_local: Rigid3
+    depth: NDArray[np.float32]
+    index: NDArray[np.int32]
+    rgb: NDArray[np.uint8] | None
+    intensity: NDArray[np.uint8] | None
+    points_drawn: int
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(h, w) bool: pixels that show the scan, closed holes included."""
+        return np.isfinite(self.depth)
+
 
 # Splats wider than this show which way they lie; then there are few, and drawing them again is cheap.
 _WORTH_REDRAWING_PX = 2.5
@@ -173,7 +201,9 @@ def close_holes(
     """
     loops = compiled_module("featuredb.render.loops.hole_loops")
     s = surfaces
-    radii = _radii(splats, focal_px)
+    # Radii of closings, up to what the widest spacing in the picture asks for.
+    widest_px = _REACH_PER_SPACING * float(apart_px(splats, focal_px).max(initial=0.0))
+    radii = np.array([r for r in _RADII_PX if r == _RADII_PX[0] or r < widest_px + 0.5], np.int32)
     closed = _closings(s.nearness, radii, threads)
     widest = _widest_m(s.apart_m, radii)
     paint = np.empty_like(s.paint)
@@ -220,12 +250,6 @@ def block_planes(splats: Splats, typical_px: float, threads: int) -> BlockPlanes
     return BlockPlanes(planes=planes, side=side)
 
 
-def _radii(splats: Splats, focal_px: float) -> NDArray[np.int32]:
-    """Radii of closings, up to what the widest spacing in the picture asks for."""
-    widest = _REACH_PER_SPACING * float(apart_px(splats, focal_px).max(initial=0.0))
-    return np.array([r for r in _RADII_PX if r == _RADII_PX[0] or r < widest + 0.5], np.int32)
-
-
 def _closings(nearness: NDArray[np.float32], radii: NDArray[np.int32], threads: int) -> NDArray[np.float32]:
     """Grey-scale closings (k, h, w) by squares of 2 radius + 1 pixels."""
     closed = np.empty((len(radii), *nearness.shape), np.float32)
@@ -245,3 +269,70 @@ def _widest_m(apart_m: NDArray[np.float32], radii: NDArray[np.int32]) -> NDArray
     in_tile = np.maximum.reduceat(np.maximum.reduceat(apart_m, rows, axis=0), columns, axis=1)
     reach = [-(-int(r) // tile) for r in radii]
     return np.stack([cv2.dilate(in_tile, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in reach])
+
+
+_WIDEST_STEP_PX = 12  # as the largest splat
+
+
+# Cartography's light: where it comes from, clockwise from north and above the horizon. Photos are taken under
+# all azimuths.
+_LIGHT_AZIMUTH_DEG, _LIGHT_ELEVATION_DEG = 315.0, 45.0
+_AMBIENT = 0.25  # share of the light that falls from everywhere: keeps surfaces apart that are turned away
+# A steeper change of depth counts as an edge: 84 degrees; ground seen at 6 degrees is still ground.
+_STEEPEST_SLOPE = float(np.tan(np.radians(84.0)))
+
+
+def shaded_relief(rendering: Rendering) -> NDArray[np.uint8]:
+    """(h, w) uint8: how brightly the surfaces are lit, zero where nothing is seen.
+
+    Normals come from differences of depth over the distance between neighbouring points in the picture,
+    never across a depth edge.
+    """
+    x, y = pixel_rays(rendering.camera)
+    points = np.stack([x * rendering.depth, y * rendering.depth, rendering.depth], axis=2)
+    step = point_distance_px(rendering)
+    # Down times across points towards the camera (x right, y down, z forward).
+    normal = np.cross(_along_surface(points, x, y, step, 0), _along_surface(points, x, y, 0, step))
+    azimuth, elevation = np.radians([_LIGHT_AZIMUTH_DEG, _LIGHT_ELEVATION_DEG])
+    to_light = np.array(
+        [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
+    length = np.linalg.norm(normal, axis=2)
+    lit = normal @ (rendering.cam_from_local.rotation @ to_light).astype(np.float32)
+    light = _AMBIENT + (1.0 - _AMBIENT) * np.maximum(lit / np.maximum(length, np.float32(1e-30)), 0.0)
+    return np.where(length > 0.0, np.rint(255.0 * light), 0.0).astype(np.uint8)
+
+
+def _along_surface(
+    points: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32], down: int, right: int
+) -> NDArray[np.float32]:
+    """(h, w, 3) the step in space along a surface from before a pixel to behind it; zero without neighbours.
+
+    Of the two halves the one across a depth edge is left out.
+
+    Args:
+        points: (h, w, 3) in camera axes, NaN where nothing is seen. x, y: (h, w) rays of the pixels.
+        down, right: pixels to the neighbour behind.
+    """
+    height, width = x.shape
+    result = np.zeros_like(points)
+    if down >= height or right >= width:
+        return result  # no pixel has a neighbour
+    first, second = np.s_[: height - down, : width - right], np.s_[down:, right:]
+    apart = np.hypot(x[second] - x[first], y[second] - y[first]) * np.float32(_STEEPEST_SLOPE)
+    change = points[second] - points[first]
+    for here in (first, second):
+        same = np.abs(change[..., 2]) < apart * points[here][..., 2]
+        result[here] += np.where(same[..., None], change, np.float32(0.0))
+    return result
+
+
+def point_distance_px(rendering: Rendering) -> int:
+    """How far apart neighbouring points are in the picture, in whole pixels from 1 up."""
+    index = rendering.index
+    both = (index[:, 1:] >= 0) & (index[:, :-1] >= 0)
+    pairs = int(np.count_nonzero(both))
+    changes = int(np.count_nonzero(both & (index[:, 1:] != index[:, :-1])))
+    if changes == 0:
+        return 1
+    return min(max(round(pairs / changes), 1), _WIDEST_STEP_PX)

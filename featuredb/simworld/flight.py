@@ -8,7 +8,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.camera.shot import Device, Shot, look_pose
+from featuredb.simworld.camera.photograph import Device, Shot, look_pose
 from featuredb.simworld.town.scene import Scene, Street
 
 GpsError = Literal["realistic", "rtk", "none"]
@@ -80,7 +80,8 @@ def survey(scene: Scene, options: FlightOptions, seed: int) -> list[Shot]:
     rng = np.random.default_rng((seed, 11))
     device = drone_device(options.width)
     step, between = _spacing_m(options)
-    turn = _town_heading(scene)
+    y_axis = scene.enu_from_town[:, 1]
+    turn = float(np.degrees(np.arctan2(y_axis[0], y_axis[1])))  # compass heading of the town's y axis
     stations: list[tuple[FloatArray, float, float]] = []
     for line in range(options.lines):
         y = (line - 0.5 * (options.lines - 1)) * between
@@ -225,12 +226,6 @@ def received_positions(
         bias = keep * bias + np.sqrt(1 - keep**2) * rng.normal(0, [1.2, 1.2, 1.5])
         believed[i] = position + bias + rng.normal(0, [0.8, 0.8, 1.2]) + [0.0, 0.0, height_bias]
     return believed
-
-
-def _town_heading(scene: Scene) -> float:
-    """Compass heading of the town's y axis, degrees."""
-    y_axis = scene.enu_from_town[:, 1]
-    return float(np.degrees(np.arctan2(y_axis[0], y_axis[1])))
 
 
 def _town_direction(scene: Scene, heading_deg: float) -> FloatArray:

@@ -5,8 +5,7 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
-from featuredb.simworld.town.noise import fractal
-from featuredb.simworld.town.texture import Image8, to_image
+from featuredb.simworld.town.texture import Image8, fractal, to_image
 
 NegativeKind = Literal["other_town", "blank", "noise", "text", "mirrored", "blurred"]
 NEGATIVE_KINDS: tuple[NegativeKind, ...] = get_args(NegativeKind)

@@ -14,8 +14,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.photograph import render_view
-from featuredb.simworld.town.days import DayOptions, another_day
-from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.scene import DayOptions, Scene, another_day
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.town.town import WATER_LEVEL_M
 

@@ -1,12 +1,16 @@
 """Writes a simulated world: folders of photos, and the truth beside them."""
 
 import json
-from collections.abc import Callable
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
+import cv2
 import numpy as np
 
 from featuredb.errors import InvalidValueError
@@ -15,14 +19,44 @@ from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld import negatives
-from featuredb.simworld.camera.photograph import photo_bytes, take_photo
-from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
-from featuredb.simworld.camera.shot import Shot
+from featuredb.simworld.camera.photograph import SensorOptions, Shot, jpeg_bytes, photo_bytes, take_photo
 from featuredb.simworld.flight import FlightOptions, pedestrians, survey, survey_half_extent, visitors
 from featuredb.simworld.negatives import NEGATIVE_KINDS, NegativeKind
-from featuredb.simworld.pool import in_order
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
+
+T = TypeVar("T")
+
+
+def in_order(draw: Callable[[int], T], count: int, workers: int = 0, chunk: int | None = 1) -> Iterator[T]:
+    """`draw(i)` of all i below `count` in their order, from a pool of processes (or here, for one worker).
+
+    Args:
+        workers: processes; 0 takes one per core.
+        chunk: numbers that travel to a process at a time; None: to each process a row of its own.
+    """
+    processes = min(workers or os.cpu_count() or 1, count)
+    if processes <= 1:
+        yield from map(draw, range(count))
+        return
+    size = chunk or -(-count // processes)
+    # Spawned, not forked: the caller may have threads (Zenoh, a progress bar) that a fork would cut off.
+    # OpenCV's own threads would fight over the same cores.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, cv2.setNumThreads, (1,)) as pool:
+        # A few chunks ahead of the writer, so that a slow disk does not fill the memory.
+        chunks = [range(first, min(first + size, count)) for first in range(0, count, size)]
+        ahead = 4 * processes
+        waiting = [pool.submit(_drawn, draw, numbers) for numbers in chunks[:ahead]]
+        for k in range(len(chunks)):
+            yield from waiting.pop(0).result()
+            if k + ahead < len(chunks):
+                waiting.append(pool.submit(_drawn, draw, chunks[k + ahead]))
+
+
+def _drawn(draw: Callable[[int], T], numbers: range) -> list[T]:
+    return [draw(number) for number in numbers]
+
 
 Progress = Callable[[int, int], None]
 
@@ -89,7 +123,19 @@ def true_image(scene: Scene, shot: Shot) -> TrueImage:
 
 def write_truth(folder: Path, truth: Truth) -> None:
     """Write folder/truth.json; floats are written so that they read back exactly."""
-    images = [_image_json(truth.images[name]) for name in sorted(truth.images)]
+    images = [
+        {
+            "name": name,
+            "camera": asdict(image.camera),
+            "cam_from_local": {
+                "quaternion_xyzw": image.cam_from_local.quaternion_xyzw.tolist(),
+                "translation_m": image.cam_from_local.translation.tolist(),
+            },
+            "utm": image.utm.tolist(),
+            "gps_error_m": None if image.gps_error_m is None else image.gps_error_m.tolist(),
+        }
+        for name, image in sorted(truth.images.items())
+    ]
     document = {
         "version": _VERSION,
         "seed": truth.seed,
@@ -112,7 +158,18 @@ def read_truth(folder: Path) -> Truth:
         document = json.loads(path.read_text(encoding="utf-8"))
         if document["version"] != _VERSION:
             raise InvalidValueError(f"{path}: expected version {_VERSION}, found {document['version']}")
-        images = [_image_value(entry) for entry in document["images"]]
+        images = [
+            TrueImage(
+                name=entry["name"],
+                camera=Camera(**{**entry["camera"], "params": tuple(entry["camera"]["params"])}),
+                cam_from_local=Rigid3.from_quaternion(
+                    entry["cam_from_local"]["quaternion_xyzw"], entry["cam_from_local"]["translation_m"]
+                ),
+                utm=np.asarray(entry["utm"]),
+                gps_error_m=None if entry["gps_error_m"] is None else np.asarray(entry["gps_error_m"]),
+            )
+            for entry in document["images"]
+        ]
         return Truth(
             seed=document["seed"],
             epsg=document["epsg"],
@@ -124,30 +181,6 @@ def read_truth(folder: Path) -> Truth:
             f"{path}: expected the truth of a simulated world, found {error!r}; "
             "make one with featuredb simworld"
         ) from error
-
-
-def _image_json(image: TrueImage) -> dict[str, Any]:
-    return {
-        "name": image.name,
-        "camera": asdict(image.camera),
-        "cam_from_local": {
-            "quaternion_xyzw": image.cam_from_local.quaternion_xyzw.tolist(),
-            "translation_m": image.cam_from_local.translation.tolist(),
-        },
-        "utm": image.utm.tolist(),
-        "gps_error_m": None if image.gps_error_m is None else image.gps_error_m.tolist(),
-    }
-
-
-def _image_value(entry: dict[str, Any]) -> TrueImage:
-    camera, pose, error = entry["camera"], entry["cam_from_local"], entry["gps_error_m"]
-    return TrueImage(
-        name=entry["name"],
-        camera=Camera(**{**camera, "params": tuple(camera["params"])}),
-        cam_from_local=Rigid3.from_quaternion(pose["quaternion_xyzw"], pose["translation_m"]),
-        utm=np.asarray(entry["utm"]),
-        gps_error_m=None if error is None else np.asarray(error),
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

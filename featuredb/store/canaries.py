@@ -210,14 +210,12 @@ def _pose_columns(pose: KnownPose | None) -> Row:
 
 def _canary(row: Row) -> Canary:
     try:
-        pose = _pose(row) if row["expected"] == "localised" else None
+        pose = None
+        if row["expected"] == "localised":
+            utm, turn = np.array([row[name] for name in UTM_COORDINATES]), np.array(row["cam_from_utm_xyzw"])
+            pose = of_columns(KnownPose, {**row, "utm": utm, "cam_from_utm_xyzw": turn})
         return of_columns(Canary, {**row, "request": json.loads(row["request"]), "pose": pose})
     except (TypeError, ValueError) as error:
         raise StoreError(
             f"canary {row['name']}: its row is damaged ({error}); run `featuredb verify`"
         ) from error
-
-
-def _pose(row: Row) -> KnownPose:
-    utm, turn = np.array([row[name] for name in UTM_COORDINATES]), np.array(row["cam_from_utm_xyzw"])
-    return of_columns(KnownPose, {**row, "utm": utm, "cam_from_utm_xyzw": turn})

@@ -93,8 +93,14 @@ def add_maps(
         MapNotFoundError: a map to be replaced is not there.
         StoreError: with `moves` false, a new map is not the successor of one at the same place.
     """
-    if not moves:
-        _check_same_place(rows, new_rows)
+    for new in () if moves else new_rows:
+        old = live_row(rows, new["map_id"])
+        differing = [name for name in _PLACE if old is None or old[name] != new[name]]
+        if differing:
+            raise StoreError(
+                f"map {new['map_id']}: expected a state at the same place as the live one, found another "
+                f"{', '.join(differing)}; commit it as one that moves"
+            )
     new_ids = [row["map_id"] for row in new_rows]
     new_rows = [_still_imported(row, live_row(rows, row["map_id"])) for row in new_rows]
     for map_id in replaces:
@@ -109,7 +115,10 @@ def add_maps(
         kept.append(row)
     stale = descendants(kept, [m for m in replaces if live_row(rows, m) is not None]) if moves else {}
     flagged = [row["map_id"] for row in kept if row["map_id"] in stale and row["status"] != QUARANTINED]
-    kept = [_quarantined(row, stale[row["map_id"]]) if row["map_id"] in flagged else row for row in kept]
+    for k, row in enumerate(kept):
+        if row["map_id"] in flagged:
+            reason = f"map {stale[row['map_id']]}, which placed it, was placed anew; place this one anew, too"
+            kept[k] = {**row, "status": QUARANTINED, "status_reason": reason}
     unchanged = len(kept) == len(rows) and all(a is b for a, b in zip(kept, rows, strict=True))
     added = new_rows if unchanged else None
     return Change(rows=[*kept, *new_rows], added=added, flagged=tuple(flagged))
@@ -258,22 +267,6 @@ def _still_imported(row: Row, before: Row | None) -> Row:
         return row
     keeps = not row["status_reason"] and is_imported(row["status"], before["status_reason"])
     return {**row, "status_reason": before["status_reason"]} if keeps else row
-
-
-def _check_same_place(rows: Sequence[Row], new_rows: Sequence[Row]) -> None:
-    for new in new_rows:
-        old = live_row(rows, new["map_id"])
-        differing = [name for name in _PLACE if old is None or old[name] != new[name]]
-        if differing:
-            raise StoreError(
-                f"map {new['map_id']}: expected a state at the same place as the live one, found another "
-                f"{', '.join(differing)}; commit it as one that moves"
-            )
-
-
-def _quarantined(row: Row, ancestor: str) -> Row:
-    reason = f"map {ancestor}, which placed it, was placed anew; place this one anew, too"
-    return {**row, "status": QUARANTINED, "status_reason": reason}
 
 
 def anchored(

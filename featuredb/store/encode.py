@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -39,12 +39,12 @@ def encode_map(feature_map: AnyMap, write_id: str, created_at: datetime) -> Enco
     Raises:
         InvalidValueError: provenance or evidence that JSON cannot hold.
     """
-    where = _where(feature_map)
-    ids = {"write_id": write_id, "map_id": feature_map.map_id, "zone": where.zone}
+    zone, point_tiles, camera_utm, camera_tiles = _where(feature_map)
+    ids = {"write_id": write_id, "map_id": feature_map.map_id, "zone": zone}
     children = {
-        tables.IMAGES: _image_rows(feature_map, ids, where.camera_utm, where.camera_tiles),
-        tables.POINTS: _point_rows(feature_map, ids, where.point_tiles),
-        tables.OBSERVATIONS: _observation_rows(feature_map, ids, where.point_tiles),
+        tables.IMAGES: _image_rows(feature_map, ids, camera_utm, camera_tiles),
+        tables.POINTS: _point_rows(feature_map, ids, point_tiles),
+        tables.OBSERVATIONS: _observation_rows(feature_map, ids, point_tiles),
     }
     found = {tile for table in children.values() for tile in table["tile"].unique().to_pylist()}
     tiles = sorted(found - {tables.NO_TILE})
@@ -77,32 +77,18 @@ def _coordinates(feature_map: AnyMap) -> FloatArray:
     return feature_map.points.xyz if isinstance(feature_map, UnplacedMap) else feature_map.points.utm
 
 
-class _Where(NamedTuple):
-    """Where the rows of a map lie: n points and i cameras, whose UTM is NaN without a place."""
-
-    zone: int
-    point_tiles: NDArray[Any]  # (n,)
-    camera_utm: FloatArray  # (i, 3)
-    camera_tiles: NDArray[Any]  # (i,)
-
-
-def _where(feature_map: AnyMap) -> _Where:
+def _where(feature_map: AnyMap) -> tuple[int, NDArray[Any], FloatArray, NDArray[Any]]:
+    """Zone, tiles of points (n,), UTM of cameras (i, 3), NaN without a place, and their tiles (i,)."""
     images = len(feature_map.images)
     if isinstance(feature_map, UnplacedMap):
-        return _Where(
-            zone=tables.NO_ZONE,
-            point_tiles=np.full(len(feature_map.points), tables.NO_TILE, dtype=object),
-            camera_utm=np.full((images, 3), np.nan),
-            camera_tiles=np.full(images, tables.NO_TILE, dtype=object),
+        tiles, nowhere = (
+            np.full(len(feature_map.points), tables.NO_TILE, object),
+            np.full((images, 3), np.nan),
         )
+        return tables.NO_ZONE, tiles, nowhere, np.full(images, tables.NO_TILE, object)
     centers = np.array([i.cam_from_local.center for i in feature_map.images], dtype=np.float64).reshape(-1, 3)
     utm = feature_map.frame.utm_from_enu(centers, feature_map.epsg)
-    return _Where(
-        zone=feature_map.epsg,
-        point_tiles=np.asarray(tile_of(feature_map.points.utm), dtype=object),
-        camera_utm=utm,
-        camera_tiles=tile_of(utm),
-    )
+    return feature_map.epsg, np.asarray(tile_of(feature_map.points.utm), dtype=object), utm, tile_of(utm)
 
 
 def _place_columns(feature_map: AnyMap) -> Row:

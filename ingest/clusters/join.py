@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, similarity_closed_form
 from ingest.colmap.bridge import Model
 from ingest.register.structure.similarity import ransac_similarity
 from ingest.sfm.links import tied_parts

@@ -16,9 +16,17 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import CenterPriors, LensPrior, LensWidths, Marks, Terms, lens_prior
+from featuredb.adjust.terms import (
+    Block,
+    CenterPriors,
+    LensPrior,
+    LensWidths,
+    Marks,
+    Terms,
+    lens_prior,
+    whole_lens,
+)
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3

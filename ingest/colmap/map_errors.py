@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import CenterPriors, Orientations, Terms
+from featuredb.adjust.terms import Block, CenterPriors, Orientations, Terms, whole_lens
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.maps.error_modes import LENS_SIZE, ErrorModes

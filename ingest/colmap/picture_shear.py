@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from featuredb.adjust.block import Block
+from featuredb.adjust.terms import Block
 from featuredb.geometry.arrays import FloatArray
 from ingest.colmap.adjust import longest_side, residuals_of
 

@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from featuredb.atomic import file_sha256
 from featuredb.errors import IngestError
 from featuredb.export.formats.colmap import DATABASE
 from featuredb.export.georeference import GEOREFERENCE
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.file_digest import file_sha256
 from featuredb.geo.datum import check_datum
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.unplaced_map import AnyMap, MapKind, NoPlace

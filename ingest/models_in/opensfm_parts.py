@@ -1,7 +1,7 @@
 """OpenSfM's files as it writes them, checked: reconstructions and references, lenses, observations.
 
 Reference: OpenSfM, doc/source/geometry.rst. Lengths are over the longer side of the image, the principal
-point counts from its middle; `featuredb.export.formats.opensfm_camera` is the way back.
+point counts from its middle; `featuredb.export.formats.opensfm` is the way back.
 """
 
 import json
@@ -17,7 +17,7 @@ from pyarrow import csv
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from featuredb.errors import IngestError, InvalidValueError
-from featuredb.export.formats.opensfm_camera import LENS_TERMS
+from featuredb.export.formats.opensfm import LENS_TERMS
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 

@@ -12,8 +12,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.projections import geodetic_from_ecef
 from featuredb.geo.utm import geodetic_from_utm, utm_epsg, zone_of
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, similarity_closed_form
 from featuredb.maps.feature_map import MAP_METHODS, MapStatus, Placement
 from featuredb.maps.unplaced_map import NoPlace
 from ingest.colmap.bridge import Model

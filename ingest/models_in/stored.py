@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, IngestError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
-from featuredb.features.describe import describe_at, orientations_at
+from featuredb.features.extractor import describe_at, orientations_at
 from featuredb.features.features import DESCRIPTOR_SIZE, Features
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera

@@ -19,8 +19,7 @@ from featuredb.features.decode import INGEST_LIMITS, DecodeLimits, decode_gray, 
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.features.exif.read import read_exif
 from featuredb.features.image_header import check_signature
-from featuredb.maps.exif_prior import prior_from_exif
-from featuredb.maps.feature_map import GeoPrior
+from featuredb.maps.feature_map import GeoPrior, prior_from_exif
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.photos.duplicates import MAX_BITS, exact_duplicates, near_duplicates, picture_hash

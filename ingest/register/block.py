@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from featuredb.adjust.block import Block
+from featuredb.adjust.terms import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
 from featuredb.maps.error_modes import without_modes

@@ -24,8 +24,7 @@ from scipy.special import ndtri
 
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, similarity_closed_form
 from ingest.positions.held import ANGLES_WRONG, Held
 from ingest.positions.position_noise import NoisyFit, fit_noisy
 from ingest.positions.receivers import receivers

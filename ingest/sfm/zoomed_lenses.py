@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtri
 
-from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import LensWidths, lens_prior
+from featuredb.adjust.terms import Block, LensWidths, lens_prior, whole_lens
 from featuredb.geometry.arrays import FloatArray
 from ingest.colmap.adjust import AdjustOptions
 from ingest.colmap.bridge import Model

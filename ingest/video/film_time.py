@@ -8,9 +8,8 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import CLOCK_RANGE_S
 from featuredb.video.telemetry.formats.text import parse_wall_clock
-from featuredb.video.telemetry.values import Telemetry
+from featuredb.video.telemetry.values import CLOCK_RANGE_S, Telemetry
 
 # Hours that zones are ahead of UTC (IANA's tz database): whole and half ones from -12 to 14, and those of
 # Nepal, Eucla and the Chatham Islands.

@@ -19,7 +19,7 @@ from ingest.video.motion import Motion
 _EARTH_M_PER_DEG = 111_320.0
 # Receivers tell a place once a second or oftener; what repeats for longer stands still.
 _HELD_S = 2.0
-_WILD_M_S = 150.0  # no drone and no car, as in `featuredb.video.telemetry.assemble`
+_WILD_M_S = 150.0  # no drone and no car, as in `featuredb.video.telemetry.values`
 # Slower than this a course is the receiver's noise; turning faster than this it is no flight's.
 _COURSE_M_S, _COURSE_RAD_S = 1.5, 1.5
 _FEWEST = 10  # samples of a curve

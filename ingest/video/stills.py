@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from pydantic import TypeAdapter, ValidationError
 
-from featuredb.atomic import atomic_file
+from featuredb.atomic import atomic_file, file_sha256
 from featuredb.errors import VideoError
 from featuredb.features.exif.angles import DJI_GIMBAL
 from featuredb.features.exif.read import UNNAMED_MAKE, shot_model, unnamed_model
 from featuredb.features.exif.write import gps_directory, with_properties
 from featuredb.features.shrink import shrunk
-from featuredb.file_digest import file_sha256
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
 from featuredb.video.frames import open_video
 from featuredb.video.telemetry.values import Telemetry

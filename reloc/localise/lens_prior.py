@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtri
 
-from featuredb.adjust.block import whole_camera
+from featuredb.adjust.terms import whole_camera
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera

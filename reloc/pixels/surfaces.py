@@ -11,8 +11,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import PlanBox, load_cloud
 from featuredb.maps.lineage import trace
 from featuredb.render.cloud import PointCloud
-from featuredb.render.renderer import RenderOptions, render
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering, RenderOptions, render
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from featuredb.store.tables import LIDAR

@@ -16,7 +16,7 @@ from featuredb.features.decode import DEFAULT_LIMITS, DecodeLimits, decode_gray,
 from featuredb.features.exif.read import read_exif
 from featuredb.features.stored_image import ImageHeader
 from featuredb.geometry.camera import Camera
-from featuredb.maps.exif_prior import prior_from_exif
+from featuredb.maps.feature_map import prior_from_exif
 from featuredb.stage_clock import StageClock
 from reloc.answered_view import camera_of, geo_prior
 from reloc.localise.lens_prior import QueryLensPrior, known_within

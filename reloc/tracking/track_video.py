@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.atomic import file_sha256
 from featuredb.errors import VideoError
 from featuredb.features.exif.read import unnamed_model
-from featuredb.file_digest import file_sha256
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions

@@ -11,8 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from featuredb.errors import ExportError
-from featuredb.export.formats.opensfm import write_opensfm
-from featuredb.export.formats.opensfm_camera import opensfm_camera
+from featuredb.export.formats.opensfm import opensfm_camera, write_opensfm
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.geometry.camera import Camera

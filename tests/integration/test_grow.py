@@ -17,8 +17,7 @@ from featuredb.cli.main import main
 from featuredb.errors import StoreError
 from featuredb.features.features import Features
 from featuredb.store import Database
-from featuredb.store.candidates.owners import read_owners
-from featuredb.store.candidates.photos import contribute
+from featuredb.store.candidates.photos import contribute, read_owners
 from featuredb.store.candidates.states import Contribution
 from featuredb.store.verify import verify
 from ingest.growing import grow_candidates, watch_and_grow

@@ -10,8 +10,7 @@ import pytest
 
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.store import Database
-from featuredb.store.candidates.owners import read_owners
-from featuredb.store.candidates.photos import list_candidates, withdraw
+from featuredb.store.candidates.photos import list_candidates, read_owners, withdraw
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from featuredb.store.changes import IMPORTED
 from featuredb.store.verify import verify

@@ -17,9 +17,8 @@ from PIL import ExifTags, Image
 from featuredb.cli.main import main
 from featuredb.errors import IngestError
 from featuredb.export.formats.colmap import write_map
-from featuredb.features.describe import describe_at
 from featuredb.features.exif.write import gps_directory
-from featuredb.features.extractor import ExtractorOptions, extract
+from featuredb.features.extractor import ExtractorOptions, describe_at, extract
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import UnplacedMap

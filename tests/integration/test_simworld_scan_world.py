@@ -29,9 +29,8 @@ from featuredb.simworld.scan_world import (
     write_lidar,
     write_scan,
 )
-from featuredb.simworld.town.days import DayOptions
 from featuredb.simworld.town.ground import paint_ground
-from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.scene import DayOptions, Scene
 from featuredb.simworld.town.town import make_town
 from featuredb.simworld.world import WorldOptions, town_of
 

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as npst
 from scipy.spatial import cKDTree
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.render.spacing import point_spacing
+from featuredb.render.cloud import point_spacing
 from tools.worlds.clouds import build_cloud
 
 FRAME = LocalFrame(latitude_deg=-33.0, longitude_deg=151.0, height_m=20.0)

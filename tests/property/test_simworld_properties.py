@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags
 
-from featuredb.simworld.camera.photograph import exif_of
-from featuredb.simworld.camera.shot import Shot, look_pose
+from featuredb.simworld.camera.photograph import Shot, exif_of, look_pose
 from featuredb.simworld.flight import drone_device
 
 

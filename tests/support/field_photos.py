@@ -5,7 +5,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from featuredb.file_digest import file_sha256
+from featuredb.atomic import file_sha256
 from featuredb.maps.feature_map import FeatureMap
 from tests.support import planar_map as field
 

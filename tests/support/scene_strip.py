@@ -16,8 +16,7 @@ from featuredb.maps.feature_map import FeatureMap, MapStatus, Placement
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import in_frame, move_map
 from featuredb.store import Database
-from featuredb.store.candidates.owners import Owners
-from featuredb.store.candidates.photos import contribute, mark_confirmed, mark_used
+from featuredb.store.candidates.photos import Owners, contribute, mark_confirmed, mark_used
 from featuredb.store.candidates.states import Contribution
 from ingest.growth.graph.map_graph import place_key
 from ingest.growth.trust.confirmation import Sources

@@ -10,7 +10,7 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import GeoPrior, MapObservations
 from featuredb.maps.unplaced_map import OwnFrame, OwnPoints, UnplacedMap
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.camera.photograph import look_pose
 from ingest.register.anchor.ground import place
 from tests.support.maps import random_unplaced_map
 from tests.support.scanned_map import FRAME

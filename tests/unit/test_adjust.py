@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import (
+    Block,
     CenterPriors,
     LensWidths,
     Marks,
@@ -18,6 +18,7 @@ from featuredb.adjust.terms import (
     Terms,
     lens_prior,
     surface_priors,
+    whole_lens,
 )
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera

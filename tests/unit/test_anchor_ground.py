@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.render.cloud import PointCloud
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.camera.photograph import look_pose
 from ingest.register.anchor.ground.place import place_on_outlines
 from ingest.register.anchor.ground.street_plan import halves, looks_level, weakest_cut
 from tests.support.scanned_map import plain_cloud

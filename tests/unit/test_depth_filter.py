@@ -8,7 +8,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering
 from ingest.register.structure.depth_filter import surface_at
 from tests.support.scanned_map import plain_cloud
 

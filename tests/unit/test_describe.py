@@ -4,8 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from featuredb.features.describe import orientations_at
-from featuredb.features.extractor import extract
+from featuredb.features.extractor import extract, orientations_at
 from tests.support import planar_map as field
 
 

@@ -16,7 +16,7 @@ from PIL.TiffImagePlugin import IFDRational
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.features.exif.read import ExifInfo, parse_exif, read_exif
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
-from featuredb.maps.exif_prior import prior_from_exif
+from featuredb.maps.feature_map import prior_from_exif
 
 WIDTH, HEIGHT = 400, 300
 FULL_FRAME_MM = math.hypot(36.0, 24.0)

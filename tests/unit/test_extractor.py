@@ -11,8 +11,13 @@ import pytest
 
 from featuredb.errors import ImageError, InvalidValueError
 from featuredb.features import scale_space, sift_loops
-from featuredb.features.describe import describe_at, orientations_at
-from featuredb.features.extractor import ExtractorOptions, extract, rootsift_8bit
+from featuredb.features.extractor import (
+    ExtractorOptions,
+    describe_at,
+    extract,
+    orientations_at,
+    rootsift_8bit,
+)
 
 
 def blobs(width: int, height: int, centers: np.ndarray, sigma: float) -> np.ndarray:

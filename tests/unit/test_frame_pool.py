@@ -7,7 +7,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering
 from ingest.register.frame.features.matching import filled, lift, pool_features
 from ingest.register.frame.views import source_image
 

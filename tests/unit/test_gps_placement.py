@@ -11,7 +11,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation, so3_exp
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import similarity_closed_form
 from ingest.own_frame import held_of
 from ingest.positions.held import Held
 from ingest.register.gps import GpsPlacement, place_by_gps

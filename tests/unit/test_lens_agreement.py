@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import featuredb.adjust.problem as adjust
-from featuredb.adjust.block import Block
 from featuredb.adjust.lens_agreement import Weighted, lens_disagreement
 from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import CenterPriors, LensWidths, Terms, lens_prior
+from featuredb.adjust.terms import Block, CenterPriors, LensWidths, Terms, lens_prior
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3

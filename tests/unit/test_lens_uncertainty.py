@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from featuredb.adjust.block import Block
 from featuredb.adjust.marginals import Marginals
+from featuredb.adjust.terms import Block
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3

@@ -5,7 +5,7 @@ import numpy as np
 from featuredb.features.exif.read import is_of_film, shot_model, unnamed_model
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.camera.photograph import look_pose
 from reloc.tracking.pose_fit import STILL_S, FittedPose, LensSigmas, LensWalk, fit_pose
 
 CAMERA = Camera(model="RADIAL", width=1280, height=720, params=(970.0, 641.0, 359.0, -0.03, 0.01))

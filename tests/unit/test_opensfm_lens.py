@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from featuredb.errors import IngestError
-from featuredb.export.formats.opensfm_camera import opensfm_camera
+from featuredb.export.formats.opensfm import opensfm_camera
 from featuredb.geometry.camera import Camera
 from ingest.models_in.opensfm_parts import camera_from_opensfm
 from tests.integration.test_export_opensfm import CAMERAS

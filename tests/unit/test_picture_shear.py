@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from featuredb.adjust.block import Block
+from featuredb.adjust.terms import Block
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.picture_shear import picture_shear

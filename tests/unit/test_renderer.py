@@ -8,18 +8,16 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rays import pixel_rays
-from featuredb.render import renderer, shading, splats
+from featuredb.geometry.camera import Camera, pixel_rays
+from featuredb.render import renderer, splats
 from featuredb.render.cloud import PointCloud
 from featuredb.render.loops.draw_loops import project
-from featuredb.render.renderer import RenderOptions, render, visible_nodes
-from featuredb.render.shading import shaded_relief
+from featuredb.render.renderer import RenderOptions, render, shaded_relief, visible_nodes
 from featuredb.render.splats import BlockPlanes, lens_numbers
+from featuredb.simworld.camera.photograph import look_pose
 from featuredb.simworld.camera.raster import render as cast_rays
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.town.blocks import box, face
 from featuredb.simworld.town.scene import Ellipsoids, Faces
-from featuredb.simworld.town.solids import box, face
 from tools.worlds.clouds import build_cloud
 
 FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=11.0, height_m=500.0)
@@ -271,7 +269,7 @@ def test_relief_follows_lamberts_law(
     points = lattice(0.15, 14.0, 0.0)
     points[:, 2] = east_slope * points[:, 0]
     rendering = render(cloud_of(points), CAMERA, DOWN)
-    monkeypatch.setattr(shading, "_LIGHT_AZIMUTH_DEG", azimuth)
+    monkeypatch.setattr(renderer, "_LIGHT_AZIMUTH_DEG", azimuth)
     picture = shaded_relief(rendering)
     normal = np.array([-east_slope, 0.0, 1.0]) / np.hypot(1.0, east_slope)
     a, e = np.radians(azimuth), np.radians(45.0)
@@ -291,7 +289,7 @@ def test_relief_sees_no_slope_across_a_step() -> None:
 
 
 def test_a_picture_smaller_than_the_distance_of_points_has_no_relief(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shading, "point_distance_px", lambda _: 12)
+    monkeypatch.setattr(renderer, "point_distance_px", lambda _: 12)
     camera = Camera(model="SIMPLE_PINHOLE", width=16, height=10, params=(12, 8, 5))
     rendering = render(cloud_of(lattice(0.5, 14.0, 0.0)), camera, DOWN)
     assert rendering.valid.any()

@@ -3,9 +3,15 @@
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from featuredb.lidar.clean import OutlierOptions, find_outliers, outlier_ratio
-from featuredb.lidar.levels import COARSEST_SPACING_M, finest_level, order_by_level
-from featuredb.lidar.staged import stretch_of
+from featuredb.lidar.clean import (
+    COARSEST_SPACING_M,
+    OutlierOptions,
+    find_outliers,
+    finest_level,
+    order_by_level,
+    outlier_ratio,
+)
+from featuredb.lidar.spill import stretch_of
 from tests.support.las_files import grid_points
 
 

@@ -8,8 +8,7 @@ from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
-from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, similarity_closed_form
 from ingest.register.structure.similarity import (
     Pairs,
     ransac_similarity,

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.laser import airborne as classes
 from featuredb.simworld.laser.airborne import AirborneScan, AirborneScanOptions, scan_town
-from featuredb.simworld.laser.echoes import RANGE_RESOLUTION_M
-from featuredb.simworld.town.days import DayOptions, another_day
-from featuredb.simworld.town.scene import REFLECTANCE, Faces, Scene, texture_index
+from featuredb.simworld.laser.beams import RANGE_RESOLUTION_M
+from featuredb.simworld.town.scene import REFLECTANCE, DayOptions, Faces, Scene, another_day, texture_index
 from featuredb.simworld.town.town import BUILDING_ID, TREE_ID, make_town
 
 OPTIONS = AirborneScanOptions(

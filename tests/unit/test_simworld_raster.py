@@ -5,14 +5,13 @@ import pytest
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rays import pixel_rays
+from featuredb.geometry.camera import Camera, pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.simworld.camera.photograph import look_pose
 from featuredb.simworld.camera.raster import render
 from featuredb.simworld.camera.shading import Look
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.town.blocks import box, face
 from featuredb.simworld.town.scene import SKY_ID, TEXTURES, Ellipsoids, Faces, Scene
-from featuredb.simworld.town.solids import box, face
 from featuredb.simworld.town.texture import Texture
 from featuredb.simworld.town.town import make_town
 

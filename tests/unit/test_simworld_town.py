@@ -9,8 +9,7 @@ from PIL import ExifTags
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.utm import meridian_convergence_deg
-from featuredb.simworld.camera.photograph import exif_of, moving_cars
-from featuredb.simworld.camera.sensor import SensorOptions, expose
+from featuredb.simworld.camera.photograph import SensorOptions, exif_of, expose, moving_cars
 from featuredb.simworld.flight import (
     FlightOptions,
     drone_device,
@@ -20,9 +19,8 @@ from featuredb.simworld.flight import (
     visitors,
 )
 from featuredb.simworld.town.materials import FACADE_LENGTH_M, town_textures, water_texture
-from featuredb.simworld.town.noise import fractal, periodic
 from featuredb.simworld.town.scene import Faces, Scene
-from featuredb.simworld.town.texture import Texture
+from featuredb.simworld.town.texture import Texture, fractal, periodic
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
 
 SIZE = (200.0, 180.0)

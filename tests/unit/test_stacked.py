@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from featuredb.index.stacked import Stacked
+from featuredb.index.descriptor_index import Stacked
 
 
 @dataclass

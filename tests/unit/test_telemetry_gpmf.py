@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from featuredb.errors import TelemetryError
 from featuredb.video.telemetry.formats.gpmf import TimedPacket, has_positions, read_gpmf
 from featuredb.video.telemetry.formats.klv import MAX_DEPTH, numbers, parse_klv
-from featuredb.video.telemetry.read import read_telemetry
-from featuredb.video.telemetry.tracks import read_tracks
+from featuredb.video.telemetry.read import read_telemetry, read_tracks
 from tests.support.telemetry_files import device, gps5, gps9, klv, nest, write_mp4
 
 LAWS = settings(deadline=None, max_examples=150, derandomize=True)

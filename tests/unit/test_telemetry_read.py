@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import MAX_SAMPLES, assemble, check_count
 from featuredb.video.telemetry.formats import text as telemetry_text
 from featuredb.video.telemetry.read import read_telemetry, telemetry_of_video
+from featuredb.video.telemetry.values import MAX_SAMPLES, assemble, check_count
 from tests.support.telemetry_files import device, gps5, mov_text, write_mp4
 
 SRT = "1\n00:00:00,000 --> 00:00:01,000\n2023-04-05 06:07:08.250\n[latitude: 47.500000] [longitude: 8.25]\n"

@@ -8,7 +8,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.camera.photograph import look_pose
 from reloc.tracking.flow_track import Landmarks, follow
 from reloc.tracking.options import FlowOptions, TrackOptions
 from reloc.tracking.pose_fit import fit_pose

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from featuredb.errors import VideoError
-from featuredb.video import container, opening
+from featuredb.video import frames, opening
 from featuredb.video.frames import open_video
 from tests.support.films import (
     HEIGHT,
@@ -205,7 +205,7 @@ def test_pictures_larger_than_their_header_says_are_not_decoded(
     _limit(monkeypatch, 8, 64)
     most = 64 + 2 * 128 * 8
     monkeypatch.setattr(opening, "MAX_CODED_PIXELS", most)
-    monkeypatch.setattr(container, "MAX_CODED_PIXELS", most)
+    monkeypatch.setattr(frames, "MAX_CODED_PIXELS", most)
     assert "no frame of its mjpeg video can be decoded" in _refused(path)
 
 

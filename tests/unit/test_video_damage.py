@@ -19,9 +19,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from featuredb.errors import VideoError
-from featuredb.video.decoding import Decoder
 from featuredb.video.film import VideoOptions, VideoReport
 from featuredb.video.frames import open_video
+from featuredb.video.opening import Decoder
 from tests.support.films import (
     CONTAINER,
     KINDS,

@@ -56,7 +56,7 @@ def test_an_index_that_leads_past_the_start_is_not_trusted(
     """As of films whose key frames are decoded long before they are shown."""
     path = film(tmp_path, "mp4", 50)
     for margins_s in ((-0.8, 1.0), (-0.8, -0.5)):
-        monkeypatch.setattr("featuredb.video.container._SEEK_MARGINS_S", margins_s)
+        monkeypatch.setattr("featuredb.video.frames._SEEK_MARGINS_S", margins_s)
         assert [shown(frame.gray) for frame in read(path, start_s=0.6)] == list(range(15, 50))
 
 

@@ -12,8 +12,7 @@ from featuredb.errors import VideoError
 from featuredb.features.shrink import fitted_size
 from featuredb.video.film import VideoOptions
 from featuredb.video.frames import open_video
-from featuredb.video.pixels import PixelReader
-from featuredb.video.rotation import clockwise_from_display_matrix
+from featuredb.video.pixels import PixelReader, clockwise_from_display_matrix
 from tests.support.films import HEIGHT, WIDTH, film, read, shown, write_film
 
 # ISO 14496-12: the matrix (a b u; c d v; x y w) shows the stored point (p, q) at (a p + c q, b p + d q).

@@ -7,9 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from featuredb.adjust.block import Block
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import Terms
+from featuredb.adjust.terms import Block, Terms
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.adjust import AdjustOptions, lens_prior_of

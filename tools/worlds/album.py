@@ -17,13 +17,10 @@ from typing import Any, Literal, Protocol
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
-from featuredb.simworld.camera.photograph import exif_of, take_photo
-from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
-from featuredb.simworld.camera.shot import Shot
-from featuredb.simworld.pool import in_order
+from featuredb.simworld.camera.photograph import SensorOptions, Shot, exif_of, jpeg_bytes, take_photo
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
-from featuredb.simworld.world import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
+from featuredb.simworld.world import TRUTH_FILE, TrueImage, Truth, in_order, true_image, write_truth
 from tools.worlds.edits import Edit, edited, edited_camera
 from tools.worlds.indoors import indoor_photo, portrait_photo
 

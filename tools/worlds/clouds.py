@@ -4,9 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.lidar.levels import finest_level, order_by_level
-from featuredb.render.cloud import UNCLASSIFIED, CloudNodes, PointCloud
-from featuredb.render.spacing import point_spacing
+from featuredb.lidar.clean import finest_level, order_by_level
+from featuredb.render.cloud import UNCLASSIFIED, CloudNodes, PointCloud, point_spacing
 
 
 def build_cloud(

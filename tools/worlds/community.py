@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.camera.shot import Shot, look_pose
+from featuredb.simworld.camera.photograph import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions, shot_seed
 from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto, Subject, renamed

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.photograph import moving_cars, scene_look
+from featuredb.simworld.camera.photograph import SensorOptions, expose, moving_cars, scene_look
 from featuredb.simworld.camera.raster import render
-from featuredb.simworld.camera.sensor import SensorOptions, expose
-from featuredb.simworld.pool import in_order
 from featuredb.simworld.town.scene import Faces, Scene
 from featuredb.simworld.town.texture import Image8
+from featuredb.simworld.world import in_order
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 
 _GLITTER_HZ = 5.0  # how often the water looks new

@@ -8,7 +8,7 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.shot import Device, Shot
+from featuredb.simworld.camera.photograph import Device, Shot
 from featuredb.simworld.flight import shot_seed
 from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto, renamed

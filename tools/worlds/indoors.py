@@ -5,12 +5,10 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.photograph import scene_look
+from featuredb.simworld.camera.photograph import Device, SensorOptions, expose, look_pose, scene_look
 from featuredb.simworld.camera.raster import render
-from featuredb.simworld.camera.sensor import SensorOptions, expose
-from featuredb.simworld.camera.shot import Device, look_pose
+from featuredb.simworld.town.blocks import box, face
 from featuredb.simworld.town.scene import Ellipsoids, Faces, Scene
-from featuredb.simworld.town.solids import box, face
 from featuredb.simworld.town.texture import Image8
 
 _SKIN = (1.9, 1.25, 1.9)  # factors on the leaf texture's green

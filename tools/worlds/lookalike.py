@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.town.blocks import face
 from featuredb.simworld.town.scene import TEXTURES, Ellipsoids, Faces, GroundPlan, Scene, texture_index
-from featuredb.simworld.town.solids import face
 from featuredb.simworld.town.town import BUILDING_ID
 
 Rect = tuple[float, float, float, float]

@@ -5,8 +5,7 @@ from typing import Any, Literal
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.camera.sensor import SensorOptions
-from featuredb.simworld.camera.shot import Device, Shot
+from featuredb.simworld.camera.photograph import Device, SensorOptions, Shot
 from tools.worlds.album import AlbumFact, ExifPolicy, PlannedPhoto
 from tools.worlds.edits import Edit
 

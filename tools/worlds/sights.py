@@ -7,8 +7,7 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.photograph import render_depth
-from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.camera.photograph import look_pose, render_depth
 from featuredb.simworld.town.scene import Building, Scene
 
 Rect = tuple[float, float, float, float]

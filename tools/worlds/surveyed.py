@@ -7,8 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from featuredb.simworld.flight import FlightOptions, survey
-from featuredb.simworld.town.days import DayOptions, another_day
-from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.scene import DayOptions, Scene, another_day
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
 from tools.worlds.album import AlbumFact, Geotag, PlannedPhoto
 

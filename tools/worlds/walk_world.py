@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.camera.shot import Shot
+from featuredb.simworld.camera.photograph import Shot
 from featuredb.simworld.flight import FlightOptions, shot_seed
 from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from featuredb.atomic import file_sha256
 from featuredb.errors import ExportError
-from featuredb.file_digest import file_sha256
 
 FORMAT, FORMAT_VERSION = "featuredb-dataset", 1
 

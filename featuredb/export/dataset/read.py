@@ -1,7 +1,12 @@
-"""The maps of a dataset, exactly as they were exported."""
+"""The maps of a dataset, exactly as they were exported, and their way back into a database.
 
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+There they are the same maps, in quarantine unless somebody vouches for the dataset.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +19,16 @@ from featuredb.export.dataset import layout
 from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.layout import check_sums
 from featuredb.export.dataset.partitions import COLUMNS
-from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.unplaced_map import MapKind, UnplacedMap
+from featuredb.export.job import Told
+from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
+from featuredb.maps.lineage import reached
+from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap, MapKind, UnplacedMap
 from featuredb.store import tables as store
+from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
+from featuredb.store.database import Database
 from featuredb.store.decode import decode_map
 from featuredb.store.encode import content_digest
+from featuredb.store.snapshot import MapSummary
 
 Row = dict[str, Any]
 
@@ -153,3 +163,160 @@ def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> Un
         },
         UnplacedMap,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Imported:
+    """What an import did, or would do.
+
+    Attributes:
+        created: ids of maps that are visible now and were not before.
+        present: ids of maps that the database had already, with the same content; they are left as they are.
+        quarantined: active maps of the dataset that came in quarantine; with the ids of maps that placed them
+            and are neither in the dataset nor in the database.
+    """
+
+    created: tuple[str, ...]
+    present: tuple[str, ...]
+    quarantined: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    version: int
+    dry_run: bool
+
+
+def import_dataset(
+    database: Database,
+    folder: Path,
+    *,
+    trusted: bool = False,
+    dry_run: bool = False,
+    told: Told = lambda done, total: None,
+) -> Imported:
+    """Commit the maps of a dataset, one after the other, parents before what they have placed.
+
+    All of it is compared with its checksums before the first commit. Importing again changes nothing; an
+    import that was killed goes on where it was. Active maps come in quarantine until they are promoted, and
+    growth does not listen to them. With `trusted` a map keeps its status, with one exception: the store
+    lets a map answer only if a chain of maps leads from it to an anchor. Where the dataset and the database
+    lack the maps that an active one stands on, it comes in quarantine; `featuredb lineage` shows it, and it
+    can be promoted when they are there. Scans of the dataset are left where they are: `featuredb lidar add`
+    takes LAZ.
+
+    Args:
+        trusted: you vouch for the dataset, and its photos count as your own; also for maps of it that an
+            earlier import has left in quarantine.
+        dry_run: read and check everything, write nothing.
+
+    Raises:
+        ExportError: the folder is no sound dataset, or the database has another map of the same id; nothing
+            has been committed. ConflictError, StoreError: the store failed; the import can be run again.
+    """
+    rows, listed = open_dataset(folder)
+    own = own_rows(folder, listed)
+    if own and not dry_run:
+        database.require_newest_format("keep maps without a place")
+    rows = [*rows, *own]
+    own_ids = {row["map_id"] for row in own}
+    snapshot = database.snapshot()
+    there = {m.map_id: m for m in snapshot.any_maps(include_retired=True)}
+    live = {map_id: m for map_id, m in there.items() if m.status != RETIRED}
+    _check_rows(folder, rows, {map_id: m.content_digest for map_id, m in live.items()})
+    missing = _missing_parents(
+        rows, {map_id: m.parents if isinstance(m, MapSummary) else () for map_id, m in live.items()}
+    )
+    held = missing if trusted else {r["map_id"]: () for r in rows if r["status"] == ACTIVE} | missing
+    created: list[str] = []
+    present: list[str] = []
+    for done, row in enumerate(_parents_first(rows)):
+        map_id = row["map_id"]
+        new = map_id not in there or (map_id not in live and row["status"] != RETIRED)
+        (created if new else present).append(map_id)
+        if dry_run or new:
+            found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
+            if not dry_run:
+                _commit(database, found, _vouched_reason(row, missing), map_id in missing, trusted)
+        told(done + 1, len(rows))
+    if trusted and not dry_run:
+        _vouch_for(database, rows, missing)
+    return Imported(
+        created=tuple(created),
+        present=tuple(present),
+        quarantined={map_id: held[map_id] for map_id in created if map_id in held},
+        version=database.poll_version(),
+        dry_run=dry_run,
+    )
+
+
+def _vouch_for(database: Database, rows: Sequence[Row], missing: Mapping[str, Sequence[str]]) -> None:
+    """Lift the mark of the dataset's maps that an earlier import has left in quarantine."""
+    active = {row["map_id"] for row in rows if row["status"] == ACTIVE and row["map_id"] not in missing}
+    reasons = {row["map_id"]: _vouched_reason(row, missing) for row in rows if row["status"] != RETIRED}
+    vouch = partial(vouch_for, active=active, reasons=reasons)
+    database.change_rows("vouch for what was imported", "vouch", VOUCHED, vouch)
+
+
+def _vouched_reason(row: Row, missing: Mapping[str, Sequence[str]]) -> str:
+    """The dataset's, but where it says that nobody has vouched for the map."""
+    if row["map_id"] in missing:
+        return f"what placed it is not here: {', '.join(missing[row['map_id']])}"
+    return VOUCHED if row["status_reason"] == IMPORTED else row["status_reason"] or ""
+
+
+def _commit(database: Database, feature_map: AnyMap, reason: str, missing: bool, trusted: bool) -> None:
+    new = not trusted and feature_map.status != RETIRED
+    if (missing or new) and isinstance(feature_map, FeatureMap):
+        feature_map = feature_map.with_status("quarantined")
+    if new:
+        reason = IMPORTED  # not what the dataset says: reasons decide what growth does with a map
+    if feature_map.status == RETIRED and not reason:
+        reason = "it was retired where the dataset is from"
+    database.commit_maps([feature_map], reasons={feature_map.map_id: reason})
+
+
+def _check_rows(folder: Path, rows: Sequence[Row], digests: Mapping[str, str]) -> None:
+    """Refuse what cannot be imported whole; `digests` are those of the maps that live in the database."""
+    twice = sorted(map_id for map_id, count in Counter(row["map_id"] for row in rows).items() if count > 1)
+    if twice:
+        raise ExportError(f"{folder}: expected different map ids, found {', '.join(twice)} more than once")
+    known = dict.fromkeys((*MAP_STATUSES, *UNPLACED_STATUSES))
+    wrong = sorted({row["status"] for row in rows} - known.keys())
+    if wrong:
+        raise ExportError(f"{folder}: expected a status of {', '.join(known)}, found {', '.join(wrong)}")
+    others = [
+        r["map_id"] for r in rows if digests.get(r["map_id"], r["content_digest"]) != r["content_digest"]
+    ]
+    if others:
+        raise ExportError(
+            f"{folder}: the database has other maps of the ids {', '.join(others)} (placed anew, thinned, or "
+            "exported in part, by licence); nothing was imported; use an empty database, or retire those"
+        )
+
+
+def _missing_parents(rows: Sequence[Row], live: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """Active maps of the dataset without a chain to an anchor, and the maps that they would need for one.
+
+    Args:
+        live: parents of the maps that live in the database, by id.
+    """
+    parents = {**live, **{row["map_id"]: row["parents"] for row in rows}}
+    known = [{"map_id": m, "parents": p, "status": ACTIVE} for m, p in parents.items()]
+    standing = anchored(known)
+    fallen = [r["map_id"] for r in rows if r["status"] == ACTIVE and r["map_id"] not in standing]
+    return {map_id: tuple(sorted(reached([map_id], parents) - parents.keys())) for map_id in fallen}
+
+
+def _parents_first(rows: Sequence[Row]) -> list[Row]:
+    """In the dataset's order, but for maps that come before their parents there."""
+    known = {row["map_id"]: row for row in rows}
+    ordered: dict[str, Row] = {}
+    for row in rows:
+        waiting = [row]
+        seen = set()
+        while waiting:
+            top = waiting[-1]
+            seen.add(top["map_id"])
+            before = [p for p in top["parents"] if p in known and p not in ordered and p not in seen]
+            if before:
+                waiting.append(known[before[0]])
+            else:
+                ordered.setdefault(top["map_id"], waiting.pop())
+    return list(ordered.values())

@@ -42,7 +42,6 @@ from featuredb.export.job import (
 )
 from featuredb.extras import require
 from featuredb.geo.crs.wkt import utm_projjson
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store.encode import encode_map
 
@@ -199,7 +198,11 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
             stands_on = {k: v for k, v in asdict(lineage).items() if k != "map_id"} | {"steps": lineage.steps}
             row["lineage"] = json.dumps(stands_on, sort_keys=True)
             contents.maps.append(entry_of(feature_map, row))
-            cameras += _camera_rows(feature_map)
+            keys = feature_map.camera_keys or (None,) * len(feature_map.cameras)
+            cameras += [
+                {"map_id": feature_map.map_id, "camera_id": number, **asdict(camera), "key": key}
+                for number, (camera, key) in enumerate(zip(feature_map.cameras, keys, strict=True))
+            ]
             del feature_map, encoded  # before the next one is loaded
     write_attribution(folder, credits)
     if not contents.maps:
@@ -227,14 +230,6 @@ def _write_areas(maps: list[MapEntry], folder: Path) -> None:
             rows.append(entry.row | {"geometry": wkb_of(geometry), "bbox": box})
         for start in range(0, len(rows), _ROWS_AT_ONCE):
             file.write(pa.Table.from_pylist(rows[start : start + _ROWS_AT_ONCE], schema=MAPS.schema))
-
-
-def _camera_rows(feature_map: FeatureMap) -> list[dict[str, Any]]:
-    keys = feature_map.camera_keys or (None,) * len(feature_map.cameras)
-    return [
-        {"map_id": feature_map.map_id, "camera_id": number, **asdict(camera), "key": key}
-        for number, (camera, key) in enumerate(zip(feature_map.cameras, keys, strict=True))
-    ]
 
 
 def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
+from featuredb.atomic import file_sha256
 from featuredb.errors import ExportError, FeatureDbError, ImageError
 from featuredb.export.formats.colmap import image_names
 from featuredb.export.job import (
@@ -24,7 +25,6 @@ from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
 from featuredb.features.exif.gps import RADIUS_68
 from featuredb.features.exif.write import gps_directory, with_app1, with_gps, with_properties
 from featuredb.features.image_header import read_header
-from featuredb.file_digest import file_sha256
 
 FILES_TABLE = "files.csv"
 # What the receiver said of its own position no longer belongs to the position that is written.

@@ -166,7 +166,7 @@ def parse_exif(
         jfif: see `ImageHeader`; pictures of films that featuredb saved have it, too, and are unturned.
     """
     main, exif, gps, warnings = _directories(tiff)
-    values = _xmp_values(xmp)
+    values = {m[1].decode().split(":")[1]: float(m[2]) for m in _XMP_VALUE.finditer(xmp)}
     position = finer_position(gps_position(gps, warnings), values)
     orientation = orientation or _orientation(main, warnings)
     sigma_h, sigma_v = gps_sigmas(gps, values, warnings)
@@ -329,8 +329,3 @@ def _with_offset(time: datetime, text: str, warnings: list[str]) -> datetime:
         warnings.append(f"EXIF: {text[:20]!r} is not an offset from UTC")
         return time
     return time.replace(tzinfo=timezone(timedelta(minutes=-minutes if match[1] == "-" else minutes)))
-
-
-def _xmp_values(xmp: bytes) -> dict[str, float]:
-    """Numbers of drones' namespaces, written as attributes or as elements."""
-    return {m[1].decode().split(":")[1]: float(m[2]) for m in _XMP_VALUE.finditer(xmp)}

@@ -161,9 +161,8 @@ def with_properties(xmp: bytes, properties: Mapping[str, str], stale: tuple[str,
         packet = _without(packet, name.encode())
     prefixes = sorted({name.split(":")[0] for name in properties})
     spaces = "".join(f'\n  xmlns:{prefix}="{NAMESPACES[prefix]}"' for prefix in prefixes)
-    values = "".join(
-        f'\n  {name}="{escape(_clean(value), {chr(34): "&quot;"})}"' for name, value in properties.items()
-    )
+    clean = {name: "".join(c for c in value if c >= " ") for name, value in properties.items()}
+    values = "".join(f'\n  {name}="{escape(text, {chr(34): "&quot;"})}"' for name, text in clean.items())
     mine = f'<rdf:Description rdf:about=""{spaces}{values}/>\n'.encode()
     head, end, tail = packet.rpartition(_END)
     return head + mine + end + tail
@@ -175,10 +174,6 @@ def _without(packet: bytes, name: bytes) -> bytes:
     # begin anew at each of them.
     packet = re.sub(rb"\s" + name + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", b"", packet)
     return re.sub(rb"<" + name + rb"(\s[^<>]*)?(/>|>[^<]*</" + name + rb"\s*>)\s*", b"", packet)
-
-
-def _clean(value: str) -> str:
-    return "".join(c for c in value if c >= " ")
 
 
 def with_app1(data: bytes, exif: bytes, xmp: bytes) -> bytes:

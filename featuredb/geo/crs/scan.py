@@ -212,6 +212,11 @@ def height_datum_of(vertical: CRS | None, is_3d: bool) -> HeightDatum:
     return next((datum for name, datum in _DATUM_NAMES if name in names), "unknown")
 
 
+def plane_part(crs: CRS) -> CRS:
+    """The horizontal part of a compound system; any other as it is, without a bound transformation."""
+    return (crs.sub_crs_list[0] if crs.is_compound else crs).to_2d()
+
+
 def _name(crs: CRS) -> str:
     code = crs.to_epsg(min_confidence=100)
     return f"{crs.name} (EPSG:{code})" if code else str(crs.name)

@@ -15,7 +15,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from featuredb.errors import GeodesyError
-from featuredb.geo.crs.scan import height_datum_of, height_unit_of
+from featuredb.geo.crs.scan import height_datum_of, height_unit_of, plane_part
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
 
@@ -59,7 +59,7 @@ def survey_crs(text: str) -> SurveyCrs:
         raise GeodesyError(
             f"expected a coordinate reference system, {_EXAMPLES}; found {text.strip()!r}"
         ) from error
-    plane = _plane_part(crs)
+    plane = plane_part(crs)
     if not (plane.is_projected or plane.is_geographic):
         raise GeodesyError(
             f"expected a plane or geographic reference system, {_EXAMPLES}; found {crs.name!r} "
@@ -102,10 +102,4 @@ def geodetic_from_survey(crs: SurveyCrs, xyz: ArrayLike) -> FloatArray:
 
 @lru_cache(maxsize=16)
 def _to_wgs84(definition: str) -> Transformer:
-    return Transformer.from_crs(_plane_part(CRS.from_user_input(definition)), "EPSG:4326", always_xy=True)
-
-
-def _plane_part(crs: CRS) -> CRS:
-    """The horizontal part of a compound system; any other as it is, without a bound transformation."""
-    part = crs.sub_crs_list[0] if crs.is_compound else crs
-    return part.to_2d()
+    return Transformer.from_crs(plane_part(CRS.from_user_input(definition)), "EPSG:4326", always_xy=True)

@@ -17,7 +17,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from featuredb.errors import GeodesyError
-from featuredb.geo.crs.scan import DEMAND, ScanCrs
+from featuredb.geo.crs.scan import DEMAND, ScanCrs, plane_part
 from featuredb.geo.utm import geodetic_from_utm, utm_epsg, zone_of
 from featuredb.geometry.arrays import FloatArray
 
@@ -131,10 +131,9 @@ def raster_from_utm(wkt: str, epsg: int, place: FloatArray) -> Callable[[FloatAr
     """
     zone_of(epsg)
     try:
-        source = CRS.from_user_input(wkt)
+        source = plane_part(CRS.from_user_input(wkt))
     except CRSError as error:
         raise GeodesyError(f"the image's reference system is not readable: {wkt!r:.200} ({error})") from error
-    source = (source.sub_crs_list[0] if source.is_compound else source).to_2d()
     if not (source.is_projected or source.is_geographic):
         raise GeodesyError(
             f"expected an image in a projected or geographic reference system, found {source.type_name} "

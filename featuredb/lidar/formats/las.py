@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.atomic import file_sha256
 from featuredb.errors import ScanFileError
 from featuredb.extras import require
-from featuredb.file_digest import file_sha256
 from featuredb.geo.crs.geotiff_keys import GeoKeys
 from featuredb.geometry.arrays import FloatArray
 

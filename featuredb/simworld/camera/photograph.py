@@ -1,22 +1,129 @@
-"""Takes one planned photo of a scene: moving things, light, lens, file."""
+"""One photo of a scene, from its plan to the file: who looks from where, what moves, lens, noise, EXIF."""
 
+import io
+from dataclasses import dataclass
+from datetime import datetime
 from functools import lru_cache
 
+import cv2
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from PIL import ExifTags, Image
 
 from featuredb.features.exif.write import gps_directory, rational
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.raster import Rendered, render
-from featuredb.simworld.camera.sensor import SensorOptions, expose, jpeg_bytes
 from featuredb.simworld.camera.shading import Look
-from featuredb.simworld.camera.shot import Shot
+from featuredb.simworld.town.blocks import car
 from featuredb.simworld.town.ground import paint_ground
 from featuredb.simworld.town.materials import town_textures, water_texture
 from featuredb.simworld.town.scene import TEXTURES, Faces, GroundPlan, Scene
-from featuredb.simworld.town.solids import car
-from featuredb.simworld.town.texture import Image8, Texture
+from featuredb.simworld.town.texture import Image8, Texture, to_image
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorOptions:
+    """What a small camera does to the light.
+
+    Attributes:
+        blur_px: standard deviation of lens and motion blur.
+        vignetting: share of light lost in the corner.
+        exposure_sigma_ev: spread of the exposure between photos, stops.
+        white_balance_sigma: spread of the red and blue gains between photos.
+        read_noise: standard deviation in grey levels, independent of the light.
+        shot_noise: standard deviation in grey levels at mid grey (128), growing with the root of the light.
+    """
+
+    blur_px: float = 0.55  # a sharp lens over a Bayer pattern
+    vignetting: float = 0.22
+    exposure_sigma_ev: float = 0.16
+    white_balance_sigma: float = 0.03
+    read_noise: float = 1.0
+    shot_noise: float = 2.2
+
+
+def expose(rgb: Image8, rng: np.random.Generator, options: SensorOptions) -> Image8:
+    """The photo (h, w, 3) uint8 that a sensor makes of the light `rgb` (h, w, 3) uint8."""
+    light = cv2.GaussianBlur(rgb, (0, 0), options.blur_px) if options.blur_px > 0 else rgb
+    exposure = 2.0 ** rng.normal(0.0, options.exposure_sigma_ev)
+    balance = 1.0 + np.array([1.0, 0.0, 1.0]) * rng.normal(0.0, options.white_balance_sigma, 3)
+    gains = (exposure * balance).astype(np.float32)
+    photo: NDArray[np.float32] = np.asarray(light, dtype=np.float32) * gains
+    photo *= _vignette(rgb.shape[0], rgb.shape[1], options.vignetting)[..., None]
+    variance = photo * np.float32(options.shot_noise**2 / 128.0) + np.float32(options.read_noise**2)
+    photo += np.sqrt(variance) * rng.standard_normal(photo.shape, dtype=np.float32)
+    return to_image(photo)
+
+
+@lru_cache(maxsize=8)
+def _vignette(height: int, width: int, loss: float) -> NDArray[np.float32]:
+    """Gain (height, width), 1 in the centre, 1 - loss in the corner, falling with r^2."""
+    y = (np.arange(height, dtype=np.float32) + 0.5 - 0.5 * height)[:, None]
+    x = (np.arange(width, dtype=np.float32) + 0.5 - 0.5 * width)[None]
+    r2 = (x * x + y * y) / (0.25 * (height**2 + width**2))
+    return np.asarray(1.0 - loss * r2, dtype=np.float32)
+
+
+def jpeg_bytes(photo: Image8, exif: Image.Exif | None = None, quality: int = 90) -> bytes:
+    """The photo as JPEG, 4:2:0, with the EXIF block if given."""
+    buffer = io.BytesIO()
+    extra = {"exif": exif} if exif is not None else {}
+    Image.fromarray(photo).save(buffer, format="JPEG", quality=quality, **extra)
+    return buffer.getvalue()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Device:
+    """A camera that people buy.
+
+    Attributes:
+        camera: true intrinsics, for the picture as stored.
+        focal_mm, focal_35mm: as in EXIF; 35 mm equivalents are whole numbers there and so a little wrong.
+    """
+
+    make: str
+    model: str
+    camera: Camera
+    focal_mm: float
+    focal_35mm: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shot:
+    """One photo to be taken.
+
+    Attributes:
+        name: path within the world's folder, with forward slashes.
+        time: timezone-aware.
+        seed: of everything that differs from photo to photo: moving cars, waves, noise, exposure.
+        gps_enu: (3,) metres, what the receiver believes in the local frame, or None without GPS.
+    """
+
+    name: str
+    device: Device
+    cam_from_local: Rigid3
+    time: datetime
+    seed: int
+    gps_enu: FloatArray | None = None
+
+
+def look_pose(center: ArrayLike, heading_deg: float, pitch_deg: float, roll_deg: float = 0.0) -> Rigid3:
+    """Pose of a camera at `center` (3,) in the local frame.
+
+    Args:
+        heading_deg: of the view, clockwise from north; for a view straight down, of the picture's top.
+        pitch_deg: elevation of the view, -90 is straight down.
+        roll_deg: clockwise turn of the camera about its view, 90 for a portrait photo.
+    """
+    h, p, r = np.radians([heading_deg, pitch_deg, roll_deg])
+    view = np.array([np.sin(h) * np.cos(p), np.cos(h) * np.cos(p), np.sin(p)])
+    right = np.array([np.cos(h), -np.sin(h), 0.0])
+    down = np.cross(view, right)
+    rotation = np.stack([np.cos(r) * right + np.sin(r) * down, np.cos(r) * down - np.sin(r) * right, view])
+    return Rigid3(rotation=rotation, translation=-rotation @ np.asarray(center, dtype=np.float64))
+
 
 _SUPERSAMPLE = 2  # rays per pixel and direction; with one, thin things flicker and edges are jagged
 _CAR_SPACING_M = 70.0  # moving cars along a lane, on average

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rays import pixel_rays
+from featuredb.geometry.camera import Camera, pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shading import Float32, Look, ellipsoid_colour, face_colour, sky_colour
 from featuredb.simworld.camera.view import EllipsoidView, view_ellipsoids, view_faces

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rays import pixel_rays
+from featuredb.geometry.camera import Camera, pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.town.scene import Ellipsoids, Faces
 

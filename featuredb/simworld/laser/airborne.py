@@ -9,11 +9,18 @@ from numpy.typing import NDArray
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.photograph import moving_cars
-from featuredb.simworld.laser.beams import NOTHING, Beams, Hits, cross_ellipsoids, hit_faces
-from featuredb.simworld.laser.echoes import Echoes, echoes_of, return_numbers
-from featuredb.simworld.town.days import DayOptions, another_day
-from featuredb.simworld.town.reflectance import Reflectance, scene_reflectance
-from featuredb.simworld.town.scene import REFLECTANCE, Faces, Scene, texture_index
+from featuredb.simworld.laser.beams import (
+    NOTHING,
+    Beams,
+    Echoes,
+    Hits,
+    cross_ellipsoids,
+    echoes_of,
+    hit_faces,
+    return_numbers,
+)
+from featuredb.simworld.town.ground import Reflectance, scene_reflectance
+from featuredb.simworld.town.scene import REFLECTANCE, DayOptions, Faces, Scene, another_day, texture_index
 from featuredb.simworld.town.town import BRIDGE_ID, BUILDING_ID, GROUND_ID, TREE_ID, WATER_ID
 
 _SPEED_M_S = 55.0

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.simworld.town.noise import periodic
-from featuredb.simworld.town.texture import Texture, to_image
+from featuredb.simworld.town.texture import Texture, periodic, to_image
 
 Canvas = NDArray[np.float32]
 

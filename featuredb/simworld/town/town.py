@@ -8,11 +8,10 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.town.blocks import FILLINGS, Layout
+from featuredb.simworld.town.blocks import FILLINGS, Layout, box, face, house
 from featuredb.simworld.town.ground import SIDEWALK_M
 from featuredb.simworld.town.materials import FACADE_LENGTH_M, ROOF_LENGTH_M
 from featuredb.simworld.town.scene import Building, Ellipsoids, Faces, GroundPlan, Scene, Street
-from featuredb.simworld.town.solids import box, face, house
 
 # Upper Bavaria, 2.4 degrees east of zone 32's meridian: convergence 1.8 degrees.
 TOWN_PLACE = (48.1374, 11.4162, 552.0, 32632)

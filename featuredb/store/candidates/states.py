@@ -204,16 +204,6 @@ def contributions_of(events: Iterable["Row"]) -> "list[Row]":
     return list((found or gone).values())
 
 
-def _contributor_of(event: "Row") -> Contributor:
-    return Contributor(
-        owner=owner_of(event),
-        credit=event["owner"],
-        licence=event["licence"],
-        client_id=event["client_id"] or "",
-        at=event["happened_at"],
-    )
-
-
 def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidate:
     """A candidate out of all its events, in order, among them at least one contribution.
 
@@ -226,7 +216,16 @@ def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candida
     return Candidate(
         **asdict(standing_of(events, live_maps)),
         **{name: first[name] for name in _AS_GIVEN},
-        contributors=tuple(map(_contributor_of, given)),
+        contributors=tuple(
+            Contributor(
+                owner=owner_of(event),
+                credit=event["owner"],
+                licence=event["licence"],
+                client_id=event["client_id"] or "",
+                at=event["happened_at"],
+            )
+            for event in given
+        ),
         request=request,
         answer=json.loads(first.get("answer") or "{}"),
     )

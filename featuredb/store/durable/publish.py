@@ -22,8 +22,8 @@ import pyarrow as pa
 from deltalake import DeltaTable
 from deltalake.exceptions import DeltaError
 
+from featuredb.atomic import file_sha256
 from featuredb.errors import StoreError
-from featuredb.file_digest import file_sha256
 from featuredb.store.durable.log import (
     DIGEST,
     LAST_CHECKPOINT,

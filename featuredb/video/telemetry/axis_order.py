@@ -20,7 +20,7 @@ import numpy as np
 
 from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import METRES_PER_DEGREE
+from featuredb.video.telemetry.values import METRES_PER_DEGREE
 
 AxisOrder = Literal["lat_lon", "lon_lat"]
 ThirdValue = Literal["metres", "count", "decimal", "none"]

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from featuredb.adjust.block import Block
 from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import Terms
+from featuredb.adjust.terms import Block, Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian, turns_about
 from ingest.colmap.adjust import longest_side, residuals_of

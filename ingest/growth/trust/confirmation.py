@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage
-from featuredb.store.candidates.owners import Owners
+from featuredb.store.candidates.photos import Owners
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import SIGMAS, Gate
 from ingest.growth.map_places import centers_of, place_sigmas_m

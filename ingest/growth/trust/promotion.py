@@ -11,8 +11,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.subset import answering_with
 from featuredb.store import Database, MapSummary, Snapshot
 from featuredb.store.canaries import list_canaries
-from featuredb.store.candidates.owners import read_owners
-from featuredb.store.candidates.photos import mark_confirmed
+from featuredb.store.candidates.photos import mark_confirmed, read_owners
 from featuredb.store.candidates.states import ANONYMOUS
 from featuredb.store.changes import is_imported
 from ingest.fingerprint import digest

@@ -18,9 +18,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
-from featuredb.render.renderer import render
-from featuredb.render.rendering import Rendering
-from featuredb.render.shading import shaded_relief
+from featuredb.render.renderer import Rendering, render, shaded_relief
 from ingest.html_parts import folded, note, page, picture, pill, table
 from ingest.plot_parts import png_bytes
 from ingest.register.anchor.anchor_map import AnchorResult

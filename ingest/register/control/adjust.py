@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.marginals import Whitened
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import Orientations, PointPriors, Targets, Terms, lens_prior
+from featuredb.adjust.terms import Block, Orientations, PointPriors, Targets, Terms, lens_prior, whole_lens
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian

@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.adjust.block import Block
+from featuredb.adjust.terms import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import rotation_to_up, so3_exp
-from featuredb.geometry.sim3 import Sim3
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, similarity_closed_form
 from ingest.register.control.marks import Control, intersect, on_ground, shown
 
 _MOST_PAIRS = 45  # of one point's marks: all of ten

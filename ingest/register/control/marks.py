@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from featuredb.adjust.block import Block
+from featuredb.adjust.terms import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.control.control_file import ControlFile, Mark

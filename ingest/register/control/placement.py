@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from featuredb.adjust.block import Block
+from featuredb.adjust.terms import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import Placement

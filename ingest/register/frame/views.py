@@ -18,9 +18,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
-from featuredb.render.renderer import RenderOptions, render
-from featuredb.render.rendering import Rendering
-from featuredb.render.shading import shaded_relief
+from featuredb.render.renderer import Rendering, RenderOptions, render, shaded_relief
 from featuredb.stage_clock import StageClock
 from ingest.register.frame_registration import FramePrior, RenderSource
 

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
-from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import LensWidths, Marks, Terms, lens_prior, surface_priors
+from featuredb.adjust.terms import Block, LensWidths, Marks, Terms, lens_prior, surface_priors, whole_lens
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.render.cloud import PointCloud
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering
 
 # Far plane; nothing beyond it is believed. An airborne scan's own accuracy, seen at a shallow angle from
 # further away, is a matter of metres along the ray.

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, point_jacobian, similarity_closed_form
 
 _CHI2_3_95 = 7.815  # 95 % of the squared Mahalanobis length of three normal coordinates
 _CHI2_3_MEDIAN = 2.366

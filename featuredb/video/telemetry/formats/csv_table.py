@@ -16,9 +16,8 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import assemble, check_count
 from featuredb.video.telemetry.formats.text import UNITS, column_name, decode_text, number, parse_wall_clock
-from featuredb.video.telemetry.values import Clock, Telemetry
+from featuredb.video.telemetry.values import Clock, Telemetry, assemble, check_count
 
 # Quantity: its unit's kind, and the names under which it is found, best first. Of heights the one that says
 # above what is better; "altitude" beside "altitude_above_sea_level" is Airdata's height above take-off.
@@ -290,7 +289,9 @@ def _telemetry(
 
 
 def _numbers(texts: list[str], quantity: str, origin: str, warnings: list[str]) -> FloatArray:
-    values = np.array([number(_with_point(text)) for text in texts])
+    # Tables with semicolons may have decimal commas.
+    pointed = (t.replace(",", ".") if re.fullmatch(r"\s*[+-]?\d+,\d+\s*", t) else t for t in texts)
+    values = np.array([number(text) for text in pointed])
     written = [text.strip() for text, value in zip(texts, values, strict=True) if np.isnan(value)]
     words = [text for text in written if text and text.lower() not in _NO_VALUE]
     if len(words) > _MOST * len(texts):
@@ -300,8 +301,3 @@ def _numbers(texts: list[str], quantity: str, origin: str, warnings: list[str]) 
     if words:
         warnings.append(f"{len(words)} values of {quantity} are no numbers and not used")
     return values
-
-
-def _with_point(text: str) -> str:
-    """A number with a decimal comma, as tables with semicolons have, with a point instead."""
-    return text.replace(",", ".") if re.fullmatch(r"\s*[+-]?\d+,\d+\s*", text) else text

@@ -25,9 +25,8 @@ import numpy as np
 from featuredb.errors import TelemetryError
 from featuredb.geo.datum import HeightDatum
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.assemble import assemble, check_count
 from featuredb.video.telemetry.formats.klv import Klv, numbers, parse_klv
-from featuredb.video.telemetry.values import Telemetry
+from featuredb.video.telemetry.values import Telemetry, assemble, check_count
 
 _EPOCH_2000_S = datetime(2000, 1, 1, tzinfo=UTC).timestamp()
 _MIN_FIX = 2  # 0 no fix, 2 in two dimensions, 3 in three

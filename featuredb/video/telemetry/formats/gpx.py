@@ -10,9 +10,8 @@ from xml.parsers import expat
 import numpy as np
 
 from featuredb.errors import TelemetryError
-from featuredb.video.telemetry.assemble import assemble, check_count
 from featuredb.video.telemetry.formats.text import number, parse_wall_clock
-from featuredb.video.telemetry.values import Telemetry
+from featuredb.video.telemetry.values import Telemetry, assemble, check_count
 
 # Elements of a point whose text counts. `fix` is "none", "2d", "3d", "dgps" or "pps".
 _TEXTS = ("ele", "time", "fix")

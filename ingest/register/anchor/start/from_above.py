@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.geometry.sim3 import Sim3, point_jacobian, similarity_closed_form
 from featuredb.index.nearest import nearest
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
-from featuredb.render.renderer import render
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering, render
 from ingest.register.frame.features.matching import joined_pools, pool_features
 from ingest.register.frame.views import FEATURES_SPACING_PX, MIN_COVER, available_sources
 from ingest.register.frame_registration import RenderSource

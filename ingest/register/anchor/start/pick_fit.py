@@ -13,9 +13,8 @@ import numpy as np
 import poselib
 from scipy.stats import chi2
 
-from featuredb.adjust.block import Block
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import LensWidths, PointPriors, Targets, Terms, lens_prior
+from featuredb.adjust.terms import Block, LensWidths, PointPriors, Targets, Terms, lens_prior
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera

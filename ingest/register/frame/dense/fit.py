@@ -11,7 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering
 from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
 from ingest.register.frame.dense.pictures import oriented_gradients
 from ingest.register.frame.dense.score_maps import cut_templates, peaks, search_around

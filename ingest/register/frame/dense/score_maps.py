@@ -17,8 +17,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
-from featuredb.render.renderer import RenderOptions, render
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering, RenderOptions, render
 from ingest.register.frame.dense.pictures import FloatImage, PinholeView, oriented_gradients
 from ingest.register.frame.views import source_image
 from ingest.register.frame_registration import RenderSource

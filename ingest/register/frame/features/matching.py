@@ -11,7 +11,7 @@ from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.nearest import nearest
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering
 from ingest.register.frame.views import source_image
 from ingest.register.frame_registration import RenderSource
 

@@ -19,7 +19,7 @@ from featuredb.compiled import compiled_module
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.render.rendering import Rendering
+from featuredb.render.renderer import Rendering
 from ingest.register.frame.features.matching import (
     NO_MATCHES,
     FrameMatches,
