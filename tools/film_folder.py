@@ -15,7 +15,7 @@ from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import WorldOptions, other_town_of, town_of
 from featuredb.video.writer import VideoWriterOptions
-from tools.worlds.film_frame import Exposure, draw_frame, write_frames
+from tools.worlds.film_world import Exposure, draw_frame, write_frames
 from tools.worlds.flight_path import FlightPath, PathOptions
 
 Kind = Literal["place", "other", "title", "black"]

@@ -29,8 +29,7 @@ from reloc.localise.answer import placement_covariance
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
 from reloc.wire.query import CameraRequest
 from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
-from tools.laser_baseline import colmap_given_the_lens
-from tools.laser_set import FRAME, LaserSet, read_laser_set, with_exif
+from tools.laser_set import FRAME, LaserSet, colmap_given_the_lens, read_laser_set, with_exif
 from tools.made_maps import all_maps, make
 from tools.real_photos import ask_poses
 

@@ -32,7 +32,7 @@ from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored
 from tools.figures import inside, inside_figures, squared, study_parser, write_figures
 from tools.worlds.scan_world import make_scan_world
-from tools.worlds.seen_places import SeenPlaces
+from tools.worlds.sights import SeenPlaces
 
 _SEED = 1
 _PIXELS, _DRAWS = 60, 16  # of each photo: pixels, and draws of a pose and a lens

@@ -32,8 +32,7 @@ from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from tools.commands import featuredb
 from tools.figures import say, squared, study_parser, write_figures
-from tools.worlds.film_frame import Exposure
-from tools.worlds.film_world import FilmOptions, film_frame, wandering_errors
+from tools.worlds.film_world import Exposure, FilmOptions, film_frame, wandering_errors
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
 _PHOTOS, _SEEDS = 24, (1, 2)

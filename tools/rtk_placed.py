@@ -27,7 +27,7 @@ from tools.anchor_simworld import camera_errors
 from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
 from tools.made_maps import copied, position_table
-from tools.worlds.seen_places import SeenPlaces
+from tools.worlds.sights import SeenPlaces
 
 _SEED = 1
 _SIGMA_M, _OTHERWISE_M, _DATUM_M = 0.02, 5.0, 20.0

@@ -25,8 +25,8 @@ from tools.commands import anchor, featuredb, newest_copy
 from tools.figures import kept, median, squared, study_parser, write_figures
 from tools.made_maps import make, once
 from tools.worlds.album import TABLE_FILE
+from tools.worlds.community import StreetOptions, write_street_album
 from tools.worlds.scan_world import make_scan_world
-from tools.worlds.street_people import StreetOptions, write_street_album
 
 _TOWNS = tuple(range(306, 316))
 _LEAST_PHOTOS = 10

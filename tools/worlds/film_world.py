@@ -5,9 +5,11 @@ place that the film shows. Cars drive, water glitters, the light changes; a fram
 moves. Beside `film.mp4` stands `film.srt`, as DJI's drones write it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +19,41 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.camera.photograph import moving_cars, scene_look
+from featuredb.simworld.camera.raster import render
+from featuredb.simworld.camera.sensor import SensorOptions, expose
+from featuredb.simworld.pool import in_order
+from featuredb.simworld.town.scene import Faces, Scene
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import WorldOptions, other_town_of, town_of
-from featuredb.video.writer import VideoWriterOptions
-from tools.worlds.film_frame import Exposure, draw_frame, write_frames
+from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from tools.worlds.flight_path import FlightPath, PathOptions
 
 FILM_FILE, TELEMETRY_FILE = "film.mp4", "film.srt"
 GPS_SIGMA_M = 1.5  # of the telemetry: errors that wander
 TELEMETRY_LATE_S = 0.3  # how much later than the picture the telemetry is
 _START = datetime(2025, 6, 21, 12, 40, 3, tzinfo=UTC)
+_GLITTER_HZ = 5.0  # how often the water looks new
+_SHUTTER_S = 1 / 100
+_SENSOR = SensorOptions(exposure_sigma_ev=0.0, white_balance_sigma=0.0)
+_BANDS = 12  # of rows, where they are not exposed at once
+_CHUNK = 4  # frames that travel to a process at a time
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exposure:
+    """How a frame is exposed.
+
+    Attributes:
+        samples: pictures of its time, in which what moves is blurred, that are averaged; each looks through
+            other parts of the pixels.
+        readout_s: rolling shutter, from the first row to the last; the frame's time is its middle row's.
+        ev: stops brighter than the scene is.
+    """
+
+    samples: int = 4
+    readout_s: float = 0.0
+    ev: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,3 +209,71 @@ def _telemetry(options: FilmOptions) -> str:
 
 def _clock(time_s: float) -> str:
     return f"{datetime.min + timedelta(milliseconds=round(1000 * time_s)):%H:%M:%S,%f}"[:-3]
+
+
+def draw_frame(
+    scene: Scene,
+    camera: Camera,
+    pose_at: Callable[[float], Rigid3],
+    time_s: float,
+    exposure: Exposure,
+    seeds: tuple[int, int],
+) -> Image8:
+    """A frame (h, w, 3) uint8 RGB as the camera's sensor gives it.
+
+    Args:
+        pose_at: cam_from_local at a time, seconds. time_s: of the frame's middle.
+        seeds: of the cars, which is the film's, and the frame's number, which its noise depends on.
+    """
+    look = scene_look(scene, water_seed=int(time_s * _GLITTER_HZ))
+    faces = Faces.concatenate([scene.faces, moving_cars(scene, seeds[0], time_s=time_s)])
+    light: NDArray[np.float32] = np.zeros((camera.height, camera.width, 3), np.float32)
+    n = exposure.samples
+    for k in range(n):
+        moment_s = time_s + _SHUTTER_S * ((k + 0.5) / n - 0.5)
+        # Another part of each pixel: a rank-1 lattice over its square.
+        shift = (float((k + 0.5) / n - 0.5), float((k * 0.618034 + 0.5 / n) % 1.0 - 0.5))
+        for top, bottom, later_s in _bands(camera.height, exposure.readout_s):
+            f, cx, cy, *rest = camera.params
+            params = (f, cx - shift[0], cy - shift[1] - top, *rest)
+            part = replace(camera, height=bottom - top, params=params)
+            pose = pose_at(moment_s + later_s)
+            rendered = render(faces, scene.ellipsoids, part, pose, look=look, supersample=1)
+            assert rendered.rgb is not None
+            light[top:bottom] += rendered.rgb
+    light *= 2.0**exposure.ev / n
+    rng = np.random.default_rng((seeds[0], 72, seeds[1]))
+    return expose(np.clip(light, 0, 255).astype(np.uint8), rng, _SENSOR)
+
+
+def write_frames(
+    file: Path,
+    draw: Callable[[int], Image8],
+    count: int,
+    rate_hz: float,
+    options: VideoWriterOptions,
+    mark: Path,
+    stamp: str,
+    workers: int = 0,
+) -> None:
+    """A film of the pictures `draw(i)`; it is left as it is where the file `mark` has the stamp."""
+    if mark.is_file() and mark.read_text(encoding="utf-8") == stamp:
+        return
+    mark.unlink(missing_ok=True)
+    pictures = in_order(draw, count, workers, _CHUNK)
+    first = next(pictures)
+    height, width = first.shape[:2]
+    with VideoWriter(file, width=width, height=height, fps=rate_hz, options=options) as writer:
+        for picture in chain([first], pictures):
+            writer.write(picture)
+    mark.write_text(stamp, encoding="utf-8")
+
+
+def _bands(height: int, readout_s: float) -> list[tuple[int, int, float]]:
+    """Rows (first, last + 1) that are exposed together, and how much later than the frame's middle."""
+    if readout_s == 0:
+        return [(0, height, 0.0)]
+    edges = np.linspace(0, height, _BANDS + 1).round().astype(int).tolist()
+    return [
+        (top, bottom, readout_s * (0.5 * (top + bottom) / height - 0.5)) for top, bottom in pairwise(edges)
+    ]
