@@ -24,7 +24,7 @@ from featuredb.store import Database
 from reloc.service.options import wire_name_of
 from tools.attacks import ATTACKS, Target, attack
 from tools.figures import say, write_figures
-from tools.serve_process import beside
+from tools.serve_process import beside, watched_memory
 from tools.service_world import (
     ATTACKER,
     DEADLINE_S,
@@ -35,7 +35,6 @@ from tools.service_world import (
     photos_of,
     running_service,
     service_parser,
-    watched_memory,
 )
 
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -69,7 +68,7 @@ def main() -> None:
         for name in ("quiet", *ATTACKS):
             with (
                 _attacked(name, target),
-                watched_memory(service.server) as memory,
+                watched_memory(service.server.process.pid) as memory,
                 honest_clients(service, photos, expected) as heard,
                 _web_client(service, photos) as http,
             ):

@@ -6,10 +6,7 @@ The town has houses that look alike, and positions are a receiver's. Each ingest
 two workers, in the pool or on Dask; processor time and the largest process are those of all that it started.
 """
 
-import resource
 import shutil
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,8 +16,8 @@ import numpy as np
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import TRUTH_FILE, Truth, WorldOptions, read_truth, write_world
+from tools.commands import all_maps, processor_s
 from tools.figures import laid_on, median, say, study_parser, write_figures
-from tools.made_maps import all_maps
 
 _A_LINE, _FIRST_LINES = 40, 5
 _METRES_A_LINE = 22.4
@@ -70,15 +67,9 @@ def _ingested(work: Path, folder: Path, dask: bool) -> dict[str, float]:
     shutil.rmtree(database, ignore_errors=True)
     command = ["-c", _ON_DASK] if dask else ["-m", "featuredb.cli"]
     words = ["ingest", "photos", str(database), str(folder), "--max-features", str(_FEATURES), "--quiet"]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    options = [] if dask else ["--workers", "2"]
-    done = subprocess.run([sys.executable, *command, *words, *options], capture_output=True, text=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    say(done.stdout + done.stderr)
-    if done.returncode:
-        raise SystemExit(f"exit code {done.returncode}")
-    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"a_photo_s": seconds / len(list(folder.iterdir())), "largest_mb": after.ru_maxrss / 1024}
+    seconds, largest_mb, told = processor_s(*command, *words, *([] if dask else ["--workers", "2"]))
+    say(told)
+    return {"a_photo_s": seconds / len(list(folder.iterdir())), "largest_mb": largest_mb}
 
 
 def _against(truth: Truth, maps: Sequence[Any]) -> dict[str, float]:

@@ -26,8 +26,8 @@ from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
+from tools.commands import make, photo_names
 from tools.figures import say, spread, study_parser, write_figures
-from tools.made_maps import make, photo_names
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
 
@@ -49,7 +49,7 @@ def main() -> None:
     args = parser.parse_args()
     names = photo_names(args.photos)
     held_out = args.held_out or names[_EVERY // 2 :: _EVERY]
-    work: Path = args.work
+    work = args.work
     part = ingest(work / "part", args.photos, held_out)
     ingest(work / "whole", args.photos, ())
     rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))

@@ -50,7 +50,7 @@ def main() -> None:
     for style in _STYLES:
         for seed in _SEEDS:
             film = film_options(style, seed)
-            pictures = drawn(film, (args.inputs or args.work) / f"rolling-{style}-{seed}-30")
+            pictures = drawn(film, args.inputs / f"rolling-{style}-{seed}-30")
             for receiver in ("plain", "rtk"):
                 name = f"{style}-{seed}-{receiver}"
                 photos = tagged(film, pictures, receiver == "rtk", args.work / name)

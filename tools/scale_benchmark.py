@@ -40,6 +40,7 @@ from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
+from tools.commands import first_map
 from tools.figures import study_parser, write_figures
 from tools.service_world import cell_order, copied_map
 
@@ -78,7 +79,6 @@ def main() -> None:
     parser.add_argument("sources", nargs="+", metavar="DB:FOLDER")
     parser.add_argument("--points", type=int, default=1_000_000)
     args = parser.parse_args()
-    args.work.mkdir(parents=True, exist_ok=True)
     sources = [source_of(*text.rsplit(":", 1)) for text in args.sources]
     small, large = args.work / "small", args.work / f"large-{args.points}"
     ask = {}
@@ -212,8 +212,7 @@ def measure(path: Path, queries: Sequence[Query]) -> dict[str, float]:
 
 def _commit(database: Database, localiser: Localiser, query: Query) -> float:
     """Seconds from a commit of a small map until a query is answered from a database that has it."""
-    snapshot = database.snapshot()
-    like = snapshot.load_map(snapshot.maps()[0].map_id)
+    like = first_map(database)
     few = np.zeros(len(like.points), dtype=np.bool_)
     few[:_COMMITTED] = True
     small = replace(only_points(like, few), map_id="committed", name="committed")

@@ -107,7 +107,7 @@ REAL: tuple[Row, ...] = (
         name="brighton-located-pixels",
         claim="`brighton` anchored on its scan: pixels of the 4 others, located on the scan and by the map "
         "alone, against the scan's points that they show from poses that the scan alone gives",
-        commands=f"tools.locate_brighton --photos {BRIGHTON} --scan {SCAN} "
+        commands=f"tools.anchor_brighton --pixels --photos {BRIGHTON} --scan {SCAN} "
         f"--poses {POSES} --held-out {HELD_OUT} --work {{work}}/maps {OUT}",
         figures=same("scan_edges scan_edge_95"),
         text="of {asked} pixels {scan_located} on the scan, median {scan_median_m:.3f} m, 95 % off edges "
