@@ -14,9 +14,9 @@
 
 With --pixels, in place of 3 to 5: what is at pixels at random of the held-out photos, located on the scan,
 and on the map's own points. The truth of a pixel: the points of the scan file that it shows from the pose,
-and with the lens, of tools/scan_poses.py. That pose comes of the photo and the scan alone, by code that shares
-nothing with map, anchoring, localisation and renderer. Pixels whose nearest points lie at several depths have
-no truth.
+and with the lens, of tools/scan_poses.py. That pose comes of the photo and the scan alone, by code that
+shares nothing with map, anchoring, localisation and renderer. Pixels whose nearest points lie at several
+depths have no truth.
 """
 
 import argparse

@@ -12,6 +12,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -57,26 +58,19 @@ Message = tuple[bytes, bytes | None]  # payload and attachment
 
 def _ask(target: Target, messages: Iterator[Message], at_once: int = _AT_ONCE) -> None:
     """Ask for ever, so many questions at a time."""
-    with zenoh.open(zenoh.Config.from_file(str(target.config))) as session:
-        lock = threading.Lock()
+    lock, key = threading.Lock(), f"featuredb/*/localise/{target.name}"
+    with (
+        zenoh.open(zenoh.Config.from_file(str(target.config))) as session,
+        ThreadPoolExecutor(at_once) as pool,
+    ):
 
-        def run() -> None:
+        def run(_: int) -> None:
             while True:
                 with lock:
                     payload, attachment = next(messages)
-                for _ in session.get(
-                    f"featuredb/*/localise/{target.name}",
-                    payload=payload,
-                    attachment=attachment,
-                    timeout=10.0,
-                ):
-                    pass
+                list(session.get(key, payload=payload, attachment=attachment, timeout=10.0))
 
-        threads = [threading.Thread(target=run) for _ in range(at_once)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        list(pool.map(run, range(at_once)))
 
 
 def _pngs(target: Target, bits: int, colour: int) -> None:
@@ -222,11 +216,6 @@ ATTACKS: dict[str, Callable[[Target], None]] = {
     "workers killed": _kills,
     "200 connections": _connections,
 }
-
-
-def attack(name: str, target: Target) -> None:
-    """For ever, in a process of its own."""
-    ATTACKS[name](target)
 
 
 def png(width: int, height: int, pixels: bytes, *, bits: int = 8, colour: int = 0) -> bytes:

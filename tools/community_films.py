@@ -26,13 +26,14 @@ from PIL import Image
 
 from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
 from featuredb.simworld.scan_world import write_scan
+from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from ingest.report.page import REPORT_JSON
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb, newest_copy, once
 from tools.figures import inside, median, say, squared, study_parser, write_figures
-from tools.film_folder import HEIGHT, FilmsTruth, FrameTruth, Script, place_scene, six_films, write_films
+from tools.film_folder import HEIGHT, FilmsTruth, FrameTruth, Script, six_films, write_films
 from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import axis_errors
 
@@ -51,8 +52,7 @@ class MapKeyframe(NamedTuple):
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs", "--seed").parse_args()
     inputs = args.inputs / f"community-{args.seed}"
-    scripts = six_films(args.seed)
-    truth = write_films(inputs / "films", scripts)
+    truth = write_films(inputs / "films", args.seed)
     work = args.work / f"run-{args.seed}"
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
@@ -66,10 +66,10 @@ def main() -> None:
         for one in snapshot.unplaced_maps()
     }
     told = json.loads((work / "report" / REPORT_JSON).read_text(encoding="utf-8"))
-    figures = map_figures(maps, told, truth, scripts) | {"placed": 0}
+    figures = map_figures(maps, told, truth, six_films(args.seed)) | {"placed": 0}
     if of_place := {map_id: those for map_id, those in maps.items() if _of_place(those)}:
         database = newest_copy(made, work / "placed")
-        town, options = place_scene(args.seed), AirborneScanOptions()
+        town, options = town_of(WorldOptions.short(args.seed)), AirborneScanOptions()
         scan = once(inputs / "scan.laz", lambda file: write_scan(file, scan_town(town, options)))
         featuredb("lidar", "add", str(database), str(scan), "--quiet")
         biggest, keyframes = max(of_place.items(), key=lambda one: len(one[1]))
@@ -124,12 +124,7 @@ def map_figures(
     Args:
         maps: keyframes by map. told: the report of the ingest.
     """
-    shots = {
-        (f"{s.name}.mp4", n): s.span_s(n)
-        for s in scripts
-        for n, piece in enumerate(s.pieces)
-        if piece.kind == "place"
-    }
+    shots = {(f"{s.name}.mp4", n): span for s in scripts for n, span in s.shots_s().items()}
     mapped = {k.image for keyframes in maps.values() for k in keyframes}
     left = [_keyframe(p["name"], truth, p["reason"]) for p in told["photos"] if p["name"] not in mapped]
     inside_maps = [k for keyframes in maps.values() if _of_place(keyframes) for k in keyframes]
@@ -140,7 +135,7 @@ def map_figures(
         "place_maps": sum(map(_of_place, maps.values())),
         "place_shots": len(shots),
         "shots_in_maps": sum(here[shot] > others[shot] for shot in shots),
-        "foreign_in_maps": sum(k.truth.kind != "place" for k in inside_maps),
+        "foreign_in_maps": sum(k.truth.pose is None for k in inside_maps),
         "lost_without_reason": sum(not k.reason for k in left)
         + sum(not _explained(told["films"], shot[0], shots[shot]) for shot in unseen),
     }
@@ -148,7 +143,7 @@ def map_figures(
 
 def _of_place(keyframes: Sequence[MapKeyframe]) -> bool:
     """Whether most keyframes of a map show the place."""
-    return 2 * sum(k.truth.kind == "place" for k in keyframes) > len(keyframes)
+    return 2 * sum(k.truth.pose is not None for k in keyframes) > len(keyframes)
 
 
 def _explained(films: Sequence[Mapping[str, Any]], name: str, span_s: tuple[float, float]) -> bool:

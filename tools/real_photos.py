@@ -49,16 +49,11 @@ def main() -> None:
     args = parser.parse_args()
     names = photo_names(args.photos)
     held_out = args.held_out or names[_EVERY // 2 :: _EVERY]
-    work = args.work
-    part = ingest(work / "part", args.photos, held_out)
-    ingest(work / "whole", args.photos, ())
-    rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
-    figures = {
-        "usable": len(set(names) - set(held_out)),
-        "registered": part["mapped"],
-        "ingest_s": part["seconds"],
-    }
-    write_figures(args.json, figures | error_figures(rows))
+    part = ingest(args.work / "part", args.photos, held_out)
+    ingest(args.work / "whole", args.photos, ())
+    rows = ask(Database.open(args.work / "part"), args.photos, held_out, reference(args.work / "whole"))
+    figures = {"registered": part["mapped"], "ingest_s": part["seconds"]}
+    write_figures(args.json, figures | {"usable": len(set(names) - set(held_out))} | error_figures(rows))
 
 
 def ingest(database: Path, photos: Path, exclude: Sequence[str], *more: str) -> dict[str, float]:

@@ -63,9 +63,10 @@ class FilmOptions:
     Attributes:
         world: whose town is filmed. path: how the camera flies; its duration is that of the frames.
         frames, rate_hz: of the film. width, height: pixels.
-        exposure: of a frame; what it says of stops is not used.
+        exposure: of a frame, but for what follows.
         ev_range: stops between the darkest and the brightest exposure, which follow each other slowly, and
             leap once where the flight is jerky.
+        focal: of the lens, in widths of the picture. zoom: what it becomes in the middle third of the film.
         cut: frames (first, last + 1) that show another town, or None.
     """
 
@@ -77,12 +78,20 @@ class FilmOptions:
     height: int = 720
     exposure: Exposure = field(default_factory=Exposure)
     ev_range: float = 0.7
+    focal: float = 0.757
+    zoom: float | None = None
     cut: tuple[int, int] | None = None
 
     @property
     def camera(self) -> Camera:
+        """True intrinsics of the first frame."""
+        return self.camera_at(0)
+
+    def camera_at(self, frame: int) -> Camera:
         """True intrinsics: a drone's video mode, a little barrel distortion, the axis off the centre."""
-        f = 0.757 * self.width
+        share = np.clip(3.0 * frame / self.frames - 1.0, 0.0, 1.0)
+        eased = float(share * share * (3.0 - 2.0 * share))  # the lens zooms slowly at first and at last
+        f = self.focal * ((self.zoom or self.focal) / self.focal) ** eased * self.width
         params = (f, 0.5006 * self.width, 0.4991 * self.height, -0.031, 0.012)
         return Camera(model="RADIAL", width=self.width, height=self.height, params=params)
 
@@ -153,11 +162,26 @@ def film_truth(options: FilmOptions) -> FilmTruth:
 
 def film_frame(options: FilmOptions, frame: int) -> Image8:
     """One frame (h, w, 3) uint8 RGB as the camera's sensor gives it."""
-    home, time_s = options.at_home(frame), options.time_s(frame)
-    exposure = replace(options.exposure, ev=_exposure_ev(options, time_s))
-    pose_at = _path(options, home).pose
-    seeds = (options.path.seed, frame)
-    return draw_frame(_scene(options, home), options.camera, pose_at, time_s, exposure, seeds)
+    home, time_s, n = options.at_home(frame), options.time_s(frame), options.exposure.samples
+    scene, path, camera = _scene(options, home), _path(options, home), options.camera_at(frame)
+    look = scene_look(scene, water_seed=int(time_s * _GLITTER_HZ))
+    faces = Faces.concatenate([scene.faces, moving_cars(scene, options.path.seed, time_s=time_s)])
+    light: NDArray[np.float32] = np.zeros((camera.height, camera.width, 3), np.float32)
+    for k in range(n):
+        moment_s = time_s + _SHUTTER_S * ((k + 0.5) / n - 0.5)
+        # Another part of each pixel: a rank-1 lattice over its square.
+        shift = (float((k + 0.5) / n - 0.5), float((k * 0.618034 + 0.5 / n) % 1.0 - 0.5))
+        for top, bottom, later_s in _bands(camera.height, options.exposure.readout_s):
+            f, cx, cy, *rest = camera.params
+            params = (f, cx - shift[0], cy - shift[1] - top, *rest)
+            part = replace(camera, height=bottom - top, params=params)
+            pose = path.pose(moment_s + later_s)
+            rendered = render(faces, scene.ellipsoids, part, pose, look=look, supersample=1)
+            assert rendered.rgb is not None
+            light[top:bottom] += rendered.rgb
+    light *= 2.0 ** _exposure_ev(options, time_s) / n
+    rng = np.random.default_rng((options.path.seed, 72, frame))
+    return expose(np.clip(light, 0, 255).astype(np.uint8), rng, _SENSOR)
 
 
 def wandering_errors(rng: np.random.Generator, sigma_m: float, keep: float, count: int) -> FloatArray:
@@ -172,7 +196,7 @@ def wandering_errors(rng: np.random.Generator, sigma_m: float, keep: float, coun
 def _exposure_ev(options: FilmOptions, time_s: float) -> float:
     slow = 0.5 * options.ev_range * np.sin(2.0 * np.pi * time_s / 17.0)
     leaps = options.path.style == "jerky" and time_s > 0.6 * options.frames / options.rate_hz
-    return float(slow + (0.6 * options.ev_range if leaps else 0.0))
+    return float(options.exposure.ev + slow + (0.6 * options.ev_range if leaps else 0.0))
 
 
 @lru_cache(maxsize=2)
@@ -180,7 +204,7 @@ def _scene(options: FilmOptions, home: bool) -> Scene:
     return (town_of if home else other_town_of)(options.world)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def _path(options: FilmOptions, home: bool) -> FlightPath:
     path = replace(options.path, duration_s=options.frames / options.rate_hz)
     return FlightPath(_scene(options, home), path)
@@ -209,41 +233,6 @@ def _telemetry(options: FilmOptions) -> str:
 
 def _clock(time_s: float) -> str:
     return f"{datetime.min + timedelta(milliseconds=round(1000 * time_s)):%H:%M:%S,%f}"[:-3]
-
-
-def draw_frame(
-    scene: Scene,
-    camera: Camera,
-    pose_at: Callable[[float], Rigid3],
-    time_s: float,
-    exposure: Exposure,
-    seeds: tuple[int, int],
-) -> Image8:
-    """A frame (h, w, 3) uint8 RGB as the camera's sensor gives it.
-
-    Args:
-        pose_at: cam_from_local at a time, seconds. time_s: of the frame's middle.
-        seeds: of the cars, which is the film's, and the frame's number, which its noise depends on.
-    """
-    look = scene_look(scene, water_seed=int(time_s * _GLITTER_HZ))
-    faces = Faces.concatenate([scene.faces, moving_cars(scene, seeds[0], time_s=time_s)])
-    light: NDArray[np.float32] = np.zeros((camera.height, camera.width, 3), np.float32)
-    n = exposure.samples
-    for k in range(n):
-        moment_s = time_s + _SHUTTER_S * ((k + 0.5) / n - 0.5)
-        # Another part of each pixel: a rank-1 lattice over its square.
-        shift = (float((k + 0.5) / n - 0.5), float((k * 0.618034 + 0.5 / n) % 1.0 - 0.5))
-        for top, bottom, later_s in _bands(camera.height, exposure.readout_s):
-            f, cx, cy, *rest = camera.params
-            params = (f, cx - shift[0], cy - shift[1] - top, *rest)
-            part = replace(camera, height=bottom - top, params=params)
-            pose = pose_at(moment_s + later_s)
-            rendered = render(faces, scene.ellipsoids, part, pose, look=look, supersample=1)
-            assert rendered.rgb is not None
-            light[top:bottom] += rendered.rgb
-    light *= 2.0**exposure.ev / n
-    rng = np.random.default_rng((seeds[0], 72, seeds[1]))
-    return expose(np.clip(light, 0, 255).astype(np.uint8), rng, _SENSOR)
 
 
 def write_frames(
