@@ -1,7 +1,7 @@
 """Photos and a scan end to end: a map placed by GPS is anchored on the scan; held-out photos judge it.
 
     python -m tools.anchor_brighton --photos FOLDER --scan SCAN.laz --poses poses.json \\
-        --work FOLDER --held-out A.JPG ...
+        --work FOLDER --held-out A.JPG ... [--pixels]
 
 1. `featuredb ingest photos` makes a map of all photos but the held-out ones.
 2. `featuredb lidar add` adds the scan; `featuredb anchor --auto` places the map by it.
@@ -12,79 +12,136 @@
 5. Of the map as GPS placed it: its focal length beside the scan's, with the standard deviation that the map
    stores, and how far its cameras are from the scan's poses after a similarity (median).
 
+With --pixels, in place of 3 to 5: what is at pixels at random of the held-out photos, located on the scan,
+and on the map's own points. The truth of a pixel: the points of the scan file that it shows from the pose,
+and with the lens, of tools/scan_poses.py. That pose comes of the photo and the scan alone, by code that
+shares nothing with map, anchoring, localisation and renderer. Pixels whose nearest points lie at several
+depths have no truth.
 """
 
+import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from featuredb.geometry.sim3 import similarity_closed_form
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
-from tools.commands import anchor, featuredb
-from tools.figures import write_figures
+from reloc.localiser import Localiser
+from reloc.overlay import map_points_in_view
+from reloc.pixels.locate import locate
+from reloc.pixels.surfaces import MapSurface, scan_surface
+from tools.commands import anchor, featuredb, first_map
+from tools.figures import laid_on, poses_in, write_figures
+from tools.locate_pixels import Miss, miss_figures, misses, view_of
+from tools.picked import Scan, read_scan, visible
 from tools.real_photos import HeldOutRow, ask_poses, error_figures, ingest
 from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
+_SEED, _PIXELS = 1, 300  # of each photo
+_NEAR, _REACH_PX = 12, 12.0  # points of the scan around a pixel, and how far they may be
+_ONE_SURFACE_M = 0.3  # between the depths of nine tenths of them
+
 
 def main() -> None:
-    args = scan_parser(__doc__, "--work", "--held-out").parse_args()
+    parser = scan_parser(__doc__, "--work", "--held-out")
+    parser.add_argument("--pixels", action="store_true", help="locate pixels of the held-out photos")
+    args = parser.parse_args()
     truth = scan_truth(args)
-    work: Path = args.work
-    database = work / "anchored"
-    ingest(database, args.photos, args.held_out)
-    shape = by_gps(Database.open(database), truth)
-    before = ask_poses(Database.open(database), args.photos, args.held_out, truth.frame, truth.poses)
-    anchored = anchored_on(database, args.scan, args.photos, work / "anchor")
-    after = ask_poses(anchored, args.photos, args.held_out, truth.frame, truth.poses)
-    figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
-    write_figures(args.json, figures | stated(after) | shape)
+    ingest(args.work / "db", args.photos, args.held_out)
+    database = Database.open(args.work / "db")
+    figures: dict[str, float] = {}
+    if not args.pixels:
+        before = ask_poses(database, args.photos, args.held_out, truth.frame, truth.poses)
+        figures = by_gps(database, truth) | {f"before_{k}": v for k, v in error_figures(before).items()}
+    featuredb("lidar", "add", database.url, str(args.scan))
+    out = args.work / "anchor"
+    if not anchor(args.work / "db", first_map(database).map_id, args.photos, out):
+        raise SystemExit(f"the map was not placed on its scan; its report is in {out}")
+    if args.pixels:
+        figures = located(args, Database.open(database.url), truth)
+    else:
+        after = ask_poses(Database.open(database.url), args.photos, args.held_out, truth.frame, truth.poses)
+        figures |= error_figures(after) | stated(after)
+    write_figures(args.json, figures)
 
 
 def stated(rows: Sequence[HeldOutRow]) -> dict[str, float]:
     """The radii that answers state (68 %), and over their errors; medians."""
-    answered = [(row, row.error) for row in rows if row.error is not None]
-    if not answered:
-        return {}
-    figures = {
-        "stated_m": [row.position_68_m for row, _ in answered],
-        "stated_deg": [row.orientation_68_deg for row, _ in answered],
-        "stated_over_m": [row.position_68_m / error.position_m for row, error in answered],
-        "stated_over_deg": [row.orientation_68_deg / error.angle_deg for row, error in answered],
-    }
-    return {name: float(np.median(values)) for name, values in figures.items()}
-
-
-def anchored_on(database: Path, scan: Path, photos: Path, out: Path) -> Database:
-    """The database, after its oldest map is placed on the scan, which is added to it; `out`: the report."""
-    featuredb("lidar", "add", str(database), str(scan))
-    map_id = Database.open(database).snapshot().maps()[0].map_id
-    if not anchor(database, map_id, photos, out):
-        raise SystemExit(f"the map was not placed on its scan; its report is in {out}")
-    return Database.open(database)
+    told = [
+        (
+            row.position_68_m,
+            row.orientation_68_deg,
+            row.position_68_m / row.error.position_m,
+            row.orientation_68_deg / row.error.angle_deg,
+        )
+        for row in rows
+        if row.error is not None
+    ]
+    names = ("stated_m", "stated_deg", "stated_over_m", "stated_over_deg")
+    return dict(zip(names, np.median(told, axis=0).tolist(), strict=True)) if told else {}
 
 
 def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
     """What the map's own lens and shape are worth against the scan's, whatever its place."""
-    snapshot = database.snapshot()
-    feature_map = snapshot.load_map(snapshot.maps()[0].map_id)
+    feature_map = first_map(database)
     first = feature_map.images[0]
     focal_px, scan_px = feature_map.cameras[first.camera_id].focal_px, truth.cameras[first.name].focal_px
-    own = np.array([image.cam_from_local.center for image in feature_map.images])
-    wanted = np.array([truth.poses[image.name].center for image in feature_map.images])
-    fit = similarity_closed_form(truth.frame.enu_from(feature_map.frame).act(own), wanted)
+    own = {name: pose.center for name, pose in poses_in(truth.frame, feature_map).items()}
+    fit = laid_on(own, {name: truth.poses[name].center for name in own})
     uncertainty = LensUncertainty.of_provenance(feature_map.provenance)
     if fit is None or uncertainty is None:
         raise SystemExit("the map has no lens uncertainty, or its cameras lie on one point")
-    rest = fit.act(truth.frame.enu_from(feature_map.frame).act(own)) - wanted
+    rest = [np.linalg.norm(fit.act(center) - truth.poses[name].center) for name, center in own.items()]
     return {
         "gps_focal_px": focal_px,
         "scan_focal_px": scan_px,
         "gps_focal_sigma": uncertainty.focal_rel,
         "gps_focal_off": abs(focal_px / scan_px - 1.0) / max(uncertainty.focal_rel, 0.01),
-        "gps_shape_m": float(np.median(np.linalg.norm(rest, axis=1))),
+        "gps_shape_m": float(np.median(rest)),
     }
+
+
+def located(args: argparse.Namespace, database: Database, truth: ScanTruth) -> dict[str, float]:
+    """Places of pixels of the held-out photos, on the scan and by the map, against the scan's points."""
+    scan, rng = read_scan(args.scan, truth.frame, truth.epsg), np.random.default_rng(_SEED)
+    found: dict[str, list[Miss]] = {"scan": [], "map": []}
+    asked = photos = 0
+    localiser = Localiser.open(database)
+    for name in args.held_out:
+        view = view_of(localiser, (args.photos / name).read_bytes())
+        if view is None:
+            continue
+        pixels, places = _truth(scan, truth.cameras[name], truth.poses[name], rng)
+        true = view.frame.enu_from(truth.frame).act(places)
+        asked, photos = asked + len(pixels), photos + 1
+        utm = map_points_in_view(localiser.areas_of(view.map_ids[:1]), view)
+        by_map = MapSurface(points=view.frame.enu_from_utm(utm, view.epsg))
+        for kind, surface in (("scan", scan_surface(database, view)), ("map", by_map)):
+            found[kind] += misses(view, true, locate(view, surface, pixels))
+    figures: dict[str, float] = {"photos": photos, "asked": asked}
+    for kind, those in found.items():
+        figures |= {f"{kind}_located": len(those)} | miss_figures(kind, those)
+    return figures
+
+
+def _truth(
+    scan: Scan, camera: Camera, pose: Rigid3, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) that show one surface of the scan, and their places (n, 3) in the scan's local frame."""
+    rows, shown = visible(scan, camera, pose)
+    depth = pose.act(scan.local[rows])[:, 2]
+    pixels = rng.uniform([0.0, 0.0], [camera.width, camera.height], (_PIXELS, 2))
+    apart, near = cKDTree(shown).query(pixels, k=_NEAR)
+    around = depth[near]
+    low, middle, high = np.quantile(around, [0.05, 0.5, 0.95], axis=1)
+    known: NDArray[np.bool_] = (apart[:, -1] < _REACH_PX) & (high - low < _ONE_SURFACE_M)
+    rays = np.column_stack([camera.unproject(pixels), np.ones(_PIXELS)])
+    return pixels[known], pose.inverse().act(rays * middle[:, None])[known]
 
 
 if __name__ == "__main__":

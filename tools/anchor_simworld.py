@@ -18,17 +18,15 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.world import Truth, World
 from featuredb.store import Database
-from tools.commands import anchor, featuredb, newest_copy
+from tools.commands import anchor, featuredb, first_map, newest_copy, once
 from tools.figures import pose_errors, poses_in, study_parser, write_figures
-from tools.made_maps import once
 from tools.real_photos import ask_poses, error_figures
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
-    work: Path = args.work
-    world = make_scan_world(args.inputs or work)
+    work, world = args.work, make_scan_world(args.inputs)
     refused = anchored(work, world, other=True)[1]
     database, placed = anchored(work, world, other=False)
     figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
@@ -44,15 +42,14 @@ def anchored(work: Path, world: ScanWorld, *, other: bool) -> tuple[Path, bool]:
     mapped = once(work / "mapped", lambda path: featuredb("ingest", "photos", str(path), photos, "--quiet"))
     database = newest_copy(mapped, work / f"anchored-{'other' if other else 'own'}-intensity")
     featuredb("lidar", "add", str(database), str(world.other_scan if other else world.scan))
-    map_id = Database.open(database).snapshot().maps()[0].map_id
+    map_id = first_map(Database.open(database)).map_id
     report = work / f"{database.name}-report"
     return database, anchor(database, map_id, world.world.folder / "drone", report)
 
 
 def judged(database: Database, world: World) -> dict[str, float]:
     """Errors of the map's cameras and of what is answered to queries."""
-    snapshot = database.snapshot()
-    metres, degrees = camera_errors(snapshot.load_map(snapshot.maps()[0].map_id), world.truth)
+    metres, degrees = camera_errors(first_map(database), world.truth)
     poses = {image.name: image.cam_from_local for image in world.truth.group("queries")}
     answers = error_figures(ask_poses(database, world.folder, list(poses), world.truth.frame, poses))
     return {

@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +22,9 @@ import requests
 
 from featuredb.store import Database
 from reloc.service.options import wire_name_of
-from tools.attacks import ATTACKS, Target, attack
+from tools.attacks import ATTACKS, Target
 from tools.figures import say, write_figures
-from tools.serve_process import beside
+from tools.serve_process import beside, watched_memory
 from tools.service_world import (
     ATTACKER,
     DEADLINE_S,
@@ -35,7 +35,6 @@ from tools.service_world import (
     photos_of,
     running_service,
     service_parser,
-    watched_memory,
 )
 
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -68,8 +67,8 @@ def main() -> None:
         )
         for name in ("quiet", *ATTACKS):
             with (
-                _attacked(name, target),
-                watched_memory(service.server) as memory,
+                nullcontext() if name == "quiet" else _attacked(name, target),
+                watched_memory(service.server.process.pid) as memory,
                 honest_clients(service, photos, expected) as heard,
                 _web_client(service, photos) as http,
             ):
@@ -108,10 +107,7 @@ def figures(measured: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
 
 @contextmanager
 def _attacked(name: str, target: Target) -> Iterator[None]:
-    if name == "quiet":
-        yield
-        return
-    process = _CONTEXT.Process(target=attack, args=(name, target), daemon=True)
+    process = _CONTEXT.Process(target=ATTACKS[name], args=(target,), daemon=True)
     process.start()
     time.sleep(_CALM_S)  # it imports, and begins
     try:

@@ -46,15 +46,14 @@ from numpy.typing import NDArray
 from featuredb.features.decode import decode_gray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.lidar.add import add_scan
-from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
-from featuredb.store.database import Database
+from featuredb.store import Database
+from featuredb.store.scans import list_scans
 from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import SURE_CONFIRMATION_LOG_NFA
-from ingest.register.frame_registration import FramePrior
-from tools.figures import off_pose, study_parser, write_figures
+from tools.commands import cloud_of
+from tools.figures import off_pose, prior_off_by, study_parser, write_figures
 from tools.ortho_over_scan import (
     Floats,
     OrthoOverScan,
@@ -112,21 +111,18 @@ class WindowOutcome:
 
 
 def main() -> None:
-    parser = study_parser(__doc__, "--seed")
+    parser = study_parser(__doc__, "--seed", "scan")
     parser.set_defaults(seed=0)
-    parser.add_argument("scan", type=Path)
     parser.add_argument("ortho", type=Path)
     parser.add_argument("--figure", type=Path, help="draw evidence against error")
     parser.add_argument("--photos", type=Path, nargs="*", default=[], help="folders of other places")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
-        database = Database.create(Path(folder) / "db")
-        added = add_scan(database, [args.scan])
-        frame = scan_frame(added.scan)
-        cloud = replace(load_cloud(database, frame), rgb=None)
-    print(f"scan: {len(cloud):,} points, {added.scan.height_datum} heights, EPSG:{added.scan.epsg}")
-    place = place_of(args.ortho, frame, added.scan.epsg, cloud)
+        cloud = replace(cloud_of(args.scan, Path(folder) / "db"), rgb=None)
+        (scan,) = list_scans(Database.open(Path(folder) / "db"))
+    print(f"scan: {len(cloud):,} points, {scan.height_datum} heights, EPSG:{scan.epsg}")
+    place = place_of(args.ortho, scan.epsg, cloud)
     print(f"grid: {place.gray.shape[1]} x {place.gray.shape[0]} pixels of {place.cell:.4f} m")
     halves = halves_of(place)
     offsets = {name: measured_offset(place, part) for name, part in halves.items()}
@@ -204,9 +200,7 @@ def _one(
     place: OrthoOverScan, cloud: PointCloud, trial: _Trial, offset: Floats, rng: np.random.Generator
 ) -> WindowOutcome:
     camera, truth = _nadir_camera(place, trial)
-    # 20 m in space and 5 degrees about any axis, by axis.
-    sigmas = np.array([_PRIOR_M, _PRIOR_DEG]) / np.sqrt(3.0)
-    prior = FramePrior.around(off_pose(truth, rng, _PRIOR_M, _PRIOR_DEG), *sigmas.tolist())
+    prior = prior_off_by(off_pose(truth, rng, _PRIOR_M, _PRIOR_DEG), _PRIOR_M, _PRIOR_DEG)
     found = register_frame(trial.photo, camera, prior, cloud)
     tried = found.evidence.get("pose_tried")
     error = None

@@ -24,63 +24,47 @@ _ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTE
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Run all checks of the repository.")
-    how_much = parser.add_mutually_exclusive_group()
-    how_much.add_argument(
-        "--fast", action="store_true", help="leave out slow tests, also the demo on a small town"
-    )
-    how_much.add_argument(
-        "--all", action="store_true", help="also run the studies and the whole demo (pytest --evaluations)"
-    )
+    much = parser.add_mutually_exclusive_group()
+    much.add_argument("--fast", action="store_true", help="without slow tests, also the demo on a small town")
+    much.add_argument("--all", action="store_true", help="also run the studies and the whole demo")
     args = parser.parse_args()
     python = sys.executable
     # Two at a time, a file on one worker each, since modules share what they have made; in the order of
     # their folders, which leaves the short ones to the end, when one worker may have to wait for the other.
     pytest = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
     pytest += ["--durations", "250"]
-    steps = [
-        ("format", [python, "-m", "ruff", "format", "--check", "."]),
-        ("lint", [python, "-m", "ruff", "check", "."]),
-        ("tests", [*pytest, "-m", "not slow"] if args.fast else pytest),
-    ]
+    steps = {
+        "format": [python, "-m", "ruff", "format", "--check", "."],
+        "lint": [python, "-m", "ruff", "check", "."],
+        "tests": [*pytest, "-m", "not slow"] if args.fast else pytest,
+    }
     if args.all:
-        steps.append(("studies", [*pytest, "--evaluations"]))
+        steps["studies"] = [*pytest, "--evaluations"]
     # These take one core, and tests wait now and then: beside them they take little time of their own.
     beside = {"types": [python, "-m", "mypy"], "import rules": [str(Path(python).with_name("lint-imports"))]}
     with ThreadPoolExecutor(max_workers=1) as runs:
-        said = {name: runs.submit(_said, command) for name, command in beside.items()}
-        failed = [name for name, command in steps if not _passes(name, command)]
+        said = {name: runs.submit(_run, command, subprocess.PIPE) for name, command in beside.items()}
+        failed = []
+        for name, command in steps.items():
+            print(f"== {name}", flush=True)
+            start = time.monotonic()
+            failed += _told(name, _run(command).returncode, f", {time.monotonic() - start:.0f} s")
         for name, done in said.items():
-            code, text = done.result()
-            print(f"== {name}\n{text}== {name}: {_verdict(code)}", flush=True)
-            failed += [name] if code != 0 else []
+            print(f"== {name}\n{done.result().stdout}", end="")
+            failed += _told(name, done.result().returncode)
     print(f"failed: {', '.join(failed)}" if failed else "all checks passed")
     return 1 if failed else 0
 
 
-def _passes(name: str, command: list[str]) -> bool:
-    print(f"== {name}", flush=True)
-    start = time.monotonic()
-    code = subprocess.run(command, cwd=ROOT, env=_ENVIRONMENT, check=False).returncode
-    print(f"== {name}: {_verdict(code)}, {time.monotonic() - start:.0f} s", flush=True)
-    return code == 0
+def _run(command: list[str], out: int | None = None) -> subprocess.CompletedProcess[str]:
+    both = {"stdout": out, "stderr": out and subprocess.STDOUT}
+    return subprocess.run(command, cwd=ROOT, env=_ENVIRONMENT, check=False, text=True, **both)
 
 
-def _said(command: list[str]) -> tuple[int, str]:
-    """Run a command: its exit code, and all that it writes."""
-    done = subprocess.run(
-        command,
-        cwd=ROOT,
-        env=_ENVIRONMENT,
-        check=False,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
-    return done.returncode, done.stdout
-
-
-def _verdict(code: int) -> str:
-    return "ok" if code == 0 else f"exit {code}"
+def _told(name: str, code: int, more: str = "") -> list[str]:
+    """Say how a step ended; its name if it failed."""
+    print(f"== {name}: {'ok' if code == 0 else f'exit {code}'}{more}", flush=True)
+    return [name] if code else []
 
 
 if __name__ == "__main__":

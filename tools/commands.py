@@ -1,12 +1,29 @@
-"""Commands of featuredb, each in a process of its own, as programs that measure something run them."""
+"""Commands of featuredb, each in a process of its own, and what they make of folders of photos."""
 
+import io
+import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from featuredb.features.exif.write import EXIF_PREFIX, with_app1
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.lidar.add import add_scan
+from featuredb.lidar.load import PlanBox, load_cloud, scan_frame
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap
+from featuredb.render.cloud import PointCloud
+from featuredb.store import Database
 
 _ROOT = Path(__file__).resolve().parent.parent
+_SUFFIXES = (".jpg", ".jpeg", ".png")
+_GPS_IFD = 34853
 
 
 def featuredb(*words: str, refusals: Sequence[int] = ()) -> subprocess.CompletedProcess[str]:
@@ -44,3 +61,113 @@ def newest_copy(source: Path, target: Path) -> Path:
     """A copy of a database, made anew."""
     shutil.rmtree(target, ignore_errors=True)
     return Path(shutil.copytree(source, target))
+
+
+def make(database: Path, kind: str, source: Path, more: Sequence[str] = ()) -> dict[str, float]:
+    """Ingest photos or a film, with more arguments, and count what is in maps.
+
+    Photos in the largest map and in any (mapped), maps with a place and without, those placed, seconds of the
+    command, and the root mean square that is left of the first placed map.
+    """
+    start = time.monotonic()
+    featuredb("ingest", kind, str(database), str(source), "--quiet", *more, refusals=(1,))
+    seconds = time.monotonic() - start
+    snapshot = Database.open(database).snapshot()
+    placed = snapshot.maps()
+    sizes = [*(m.images for m in placed), *(m.images for m in snapshot.unplaced_maps())]
+    residual_m = [snapshot.load_map(m.map_id).placement.residual_rms_m for m in placed[:1]]
+    return {
+        "largest": max(sizes, default=0),
+        "mapped": sum(sizes),
+        "maps": len(sizes),
+        "placed": len(placed),
+        "seconds": seconds,
+        "residual_m": residual_m[0] if residual_m else float("nan"),
+    }
+
+
+def once(target: Path, make: Callable[[Path], object]) -> Path:
+    """`target`, which `make` makes once under another name: what is half made is made anew."""
+    if not target.exists():
+        making = target.with_name(f"making{target.suffix}")
+        shutil.rmtree(making, ignore_errors=True)
+        make(making)
+        making.rename(target)
+    return target
+
+
+def with_scan(source: Path, scan: Path, target: Path) -> Path:
+    """A copy of a database with a scan, made once."""
+
+    def add(making: Path) -> None:
+        shutil.copytree(source, making)
+        featuredb("lidar", "add", str(making), str(scan), "--quiet")
+
+    return once(target, add)
+
+
+def all_maps(database: Path) -> list[AnyMap]:
+    """The maps of a database, with a place and without."""
+    snapshot = Database.open(database).snapshot()
+    return [snapshot.load_any(one.map_id) for one in (*snapshot.maps(), *snapshot.unplaced_maps())]
+
+
+def largest_map(database: Path) -> Any:
+    """The one with most images, of those with a place and without."""
+    return max(all_maps(database), key=lambda one: len(one.images))
+
+
+def first_map(database: Database) -> FeatureMap:
+    """The oldest that has a place."""
+    snapshot = database.snapshot()
+    return snapshot.load_map(snapshot.maps()[0].map_id)
+
+
+def processor_s(*argv: str) -> tuple[float, float, str]:
+    """A Python process: processor seconds of it and all that it started, megabytes of the largest of this
+    program's processes so far, and what it printed. Raises SystemExit: it fails."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, *argv], stdout=subprocess.PIPE, text=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        raise SystemExit(f"exit code {done.returncode}: {' '.join(argv[:4])}")
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return seconds, after.ru_maxrss / 1024, done.stdout
+
+
+def cloud_of(
+    scan: Path, database: Path, frame: LocalFrame | None = None, box: PlanBox | None = None
+) -> PointCloud:
+    """A scan, once it is added to a database, in a local frame or one at its centre; a box of it, or all."""
+    made = Database.create(database)
+    return load_cloud(made, frame or scan_frame(add_scan(made, [scan]).scan), box)
+
+
+def photo_names(folder: Path) -> list[str]:
+    """Names of the photos of a folder, sorted."""
+    return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
+
+
+def position_table(folder: Path, rows: Iterable[tuple[object, ...]]) -> Path:
+    """A table beside photos: name, latitude, longitude (degrees), height, and both accuracies (m)."""
+    lines = ["path,lat,lon,height,accuracy,accuracy_height", *(",".join(map(str, row)) for row in rows)]
+    table = folder / "table.csv"
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return table
+
+
+def copied(folder: Path, names: Sequence[str], target: Path, *, strip: bool) -> Path:
+    """Copies of photos, without positions where `strip` says so; the pictures stay bit for bit."""
+    target.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        data = (folder / name).read_bytes()
+        (target / name).write_bytes(without_position(data) if strip else data)
+    return target
+
+
+def without_position(jpeg: bytes) -> bytes:
+    """A JPEG without the GPS directory of its EXIF and with empty XMP; the picture as it was."""
+    with Image.open(io.BytesIO(jpeg)) as image:
+        exif = image.getexif()
+    exif.pop(_GPS_IFD, None)
+    return with_app1(jpeg, exif.tobytes().removeprefix(EXIF_PREFIX), b"")

@@ -13,27 +13,78 @@
    all six together are in the region that the stated covariance gives 95 %.
 """
 
+import json
+import re
 import shutil
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from PIL import Image
 
 from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
 from featuredb.simworld.scan_world import write_scan
-from reloc.tracking.trajectory.files import read_trajectory_csv
+from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.store import Database
+from ingest.report.page import REPORT_JSON
+from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory
-from tools.commands import featuredb, newest_copy
-from tools.figures import median, say, squared, study_parser, write_figures
-from tools.film_folder import FilmsTruth, place_scene, six_films, write_films
-from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
-from tools.made_maps import once
-from tools.picked import place_by_picks, read_scan
+from tools.commands import featuredb, newest_copy, once
+from tools.figures import inside, median, say, squared, study_parser, write_figures
+from tools.film_folder import HEIGHT, FilmsTruth, FrameTruth, Script, six_films, write_films
+from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import axis_errors
 
-_INSIDE = float(chi2.ppf(0.95, 6))
+Shot = tuple[str, int]  # name of a film's file, number of the piece
+
+
+class MapKeyframe(NamedTuple):
+    """An image of a map, or of the report: what it shows by the truth. `reason`: why it is in no map."""
+
+    image: str
+    shot: Shot
+    truth: FrameTruth
+    reason: str = ""
+
+
+def main() -> None:
+    args = study_parser(__doc__, "--work", "--inputs", "--seed").parse_args()
+    inputs = args.inputs / f"community-{args.seed}"
+    truth = write_films(inputs / "films", args.seed)
+    work = args.work / f"run-{args.seed}"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    made = work / "made"
+    featuredb("init", str(made))
+    words = ("ingest", "video", str(made), str(inputs / "films"), "--no-telemetry", "--quiet")
+    featuredb(*words, "--report", str(work / "report"), "--work", str(work / "stages"), refusals=(1,))
+    snapshot = Database.open(made).snapshot()
+    maps = {
+        one.map_id: [_keyframe(image.name, truth) for image in snapshot.load_unplaced(one.map_id).images]
+        for one in snapshot.unplaced_maps()
+    }
+    told = json.loads((work / "report" / REPORT_JSON).read_text(encoding="utf-8"))
+    figures = map_figures(maps, told, truth, six_films(args.seed)) | {"placed": 0}
+    if of_place := {map_id: those for map_id, those in maps.items() if _of_place(those)}:
+        database = newest_copy(made, work / "placed")
+        town, options = town_of(WorldOptions.short(args.seed)), AirborneScanOptions()
+        scan = once(inputs / "scan.laz", lambda file: write_scan(file, scan_town(town, options)))
+        featuredb("lidar", "add", str(database), str(scan), "--quiet")
+        biggest, keyframes = max(of_place.items(), key=lambda one: len(one[1]))
+        photos, seen = keyframe_to_pick_in(keyframes, work / "stages" / "films")
+        cloud = read_scan(scan, truth.frame, truth.epsg)
+        if place_by_picks(database, biggest, photos, seen, cloud, work, args.seed):
+            tracks = {}
+            for film in truth.films:
+                out = work / "tracks" / f"{film}.csv"
+                words = ("track", str(database), str(inputs / "films" / film), "--out", str(out))
+                featuredb(*words, refusals=(1,))
+                tracks[film] = read_trajectory_csv(out)
+                say(f"{film}: {track_figures({film: tracks[film]}, truth)}")
+            figures |= track_figures(tracks, truth) | {"placed": 1}
+    write_figures(args.json, figures)
 
 
 def track_figures(tracks: Mapping[str, Trajectory], truth: FilmsTruth) -> dict[str, float]:
@@ -51,60 +102,89 @@ def track_figures(tracks: Mapping[str, Trajectory], truth: FilmsTruth) -> dict[s
                 squares.append(squared(error, point.pose.covariance))
             elif point.pose is not None:
                 foreign += 1
+    share = len(metres) / max(frames, 1)
     return {
         "place_frames": frames,
-        "tracked_share": len(metres) / max(frames, 1),
-        "inside_share": sum(one <= _INSIDE for one in squares) / max(frames, 1),
+        "tracked_share": share,
+        "inside_share": share * inside(squares, 0.95, 6) if squares else 0.0,
         "foreign_tracked": foreign,
         "median_m": median(metres),
         "largest_m": float(max(metres, default=np.nan)),
     }
 
 
-def main() -> None:
-    args = study_parser(__doc__, "--work", "--inputs", "--seed").parse_args()
-    inputs = (args.inputs or args.work) / f"community-{args.seed}"
-    scripts = six_films(args.seed)
-    truth = write_films(inputs / "films", scripts)
-    work = args.work / f"run-{args.seed}"
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    made = work / "made"
-    featuredb("init", str(made))
-    words = ("ingest", "video", str(made), str(inputs / "films"), "--no-telemetry", "--quiet")
-    featuredb(*words, "--report", str(work / "report"), "--work", str(work / "stages"), refusals=(1,))
-    found = read_film_maps(made, work / "report", truth)
-    figures: dict[str, Any] = found.figures(scripts) | {"placed": 0}
-    if found.of_place:
-        database = newest_copy(made, work / "placed")
-        town = place_scene(args.seed)
-        scan = once(
-            inputs / "scan.laz", lambda file: write_scan(file, scan_town(town, AirborneScanOptions()))
-        )
-        placed = _placed(database, found, truth, scan, work, args.seed)
-        figures["placed"] = int(placed)
-        tracks = _tracked(database, inputs / "films", work, truth) if placed else {}
-        figures |= track_figures(tracks, truth)
-        say("".join(f"\n{film}: {track_figures({film: track}, truth)}" for film, track in tracks.items()))
-    write_figures(args.json, figures)
+def map_figures(
+    maps: Mapping[str, Sequence[MapKeyframe]],
+    told: Mapping[str, Any],
+    truth: FilmsTruth,
+    scripts: Sequence[Script],
+) -> dict[str, int]:
+    """Shots of the place, of which most keyframes are in maps of it; what is in them beside; losses.
+
+    Args:
+        maps: keyframes by map. told: the report of the ingest.
+    """
+    shots = {(f"{s.name}.mp4", n): span for s in scripts for n, span in s.shots_s().items()}
+    mapped = {k.image for keyframes in maps.values() for k in keyframes}
+    left = [_keyframe(p["name"], truth, p["reason"]) for p in told["photos"] if p["name"] not in mapped]
+    inside_maps = [k for keyframes in maps.values() if _of_place(keyframes) for k in keyframes]
+    elsewhere = [k for keyframes in maps.values() if not _of_place(keyframes) for k in keyframes]
+    here, others = (Counter(k.shot for k in those) for those in (inside_maps, [*elsewhere, *left]))
+    unseen = [shot for shot in shots if not here[shot] + others[shot]]
+    return {
+        "place_maps": sum(map(_of_place, maps.values())),
+        "place_shots": len(shots),
+        "shots_in_maps": sum(here[shot] > others[shot] for shot in shots),
+        "foreign_in_maps": sum(k.truth.pose is None for k in inside_maps),
+        "lost_without_reason": sum(not k.reason for k in left)
+        + sum(not _explained(told["films"], shot[0], shots[shot]) for shot in unseen),
+    }
 
 
-def _placed(database: Path, found: FilmMaps, truth: FilmsTruth, scan: Path, work: Path, seed: int) -> bool:
-    """Place the largest map of the place."""
-    featuredb("lidar", "add", str(database), str(scan), "--quiet")
-    biggest, keyframes = max(found.of_place.items(), key=lambda one: len(one[1]))
-    photos, seen = keyframe_to_pick_in(keyframes, work / "stages" / "films")
-    cloud = read_scan(scan, truth.frame, truth.epsg)
-    return place_by_picks(database, biggest, photos, seen, cloud, work, seed)
+def _of_place(keyframes: Sequence[MapKeyframe]) -> bool:
+    """Whether most keyframes of a map show the place."""
+    return 2 * sum(k.truth.pose is not None for k in keyframes) > len(keyframes)
 
 
-def _tracked(database: Path, films: Path, work: Path, truth: FilmsTruth) -> dict[str, Trajectory]:
-    tracks = {}
-    for film in truth.films:
-        out = work / "tracks" / f"{film}.csv"
-        featuredb("track", str(database), str(films / film), "--out", str(out), refusals=(1,))
-        tracks[film] = read_trajectory_csv(out)
-    return tracks
+def _explained(films: Sequence[Mapping[str, Any]], name: str, span_s: tuple[float, float]) -> bool:
+    """Whether the report says why there is no keyframe of a span of a film: of the film, or of a shot."""
+    for film in films:
+        if Path(film["path"]).name == name:
+            if film["status"] == "refused" and film["reason"]:
+                return True
+            for shot in film["shots"]:
+                beside = shot["end_s"] <= span_s[0] or span_s[1] <= shot["start_s"]
+                if not beside and not shot["keyframes"] and shot["dropped"]:
+                    return True
+    return False
+
+
+def keyframe_to_pick_in(keyframes: Sequence[MapKeyframe], stills: Path) -> tuple[Path, Seen]:
+    """Folder of a map's images, below `stills`, and the one to pick in: whole and rich in detail."""
+    found: list[tuple[int, Path, Seen]] = []
+    for keyframe in keyframes:
+        (file,) = stills.rglob(keyframe.image)
+        with Image.open(file) as picture:
+            whole = picture.height == HEIGHT
+        pose, camera = keyframe.truth.pose, keyframe.truth.camera
+        if whole and pose is not None and camera is not None:
+            folder = file.parents[len(Path(keyframe.image).parts) - 1]
+            seen = Seen(image=keyframe.image, camera=camera, cam_from_local=pose)
+            found.append((file.stat().st_size, folder, seen))
+    if not found:
+        raise SystemExit("the map has no keyframe to pick in")
+    return max(found, key=lambda one: one[0])[1:]
+
+
+def _keyframe(image: str, truth: FilmsTruth, reason: str = "") -> MapKeyframe:
+    """The film is a part of the image's path, and the last number of its name the frame."""
+    path = Path(image)
+    named = [film for film in truth.films if Path(film).stem in path.parts[:-1]]
+    numbers = re.findall(r"\d+", path.stem)
+    if len(named) != 1 or not numbers:
+        raise SystemExit(f"{image}: expected FILM/FRAME.jpg of {', '.join(truth.films)}")
+    frame = truth.films[named[0]][int(numbers[-1])]
+    return MapKeyframe(image, (named[0], frame.piece), frame, reason)
 
 
 if __name__ == "__main__":

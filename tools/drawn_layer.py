@@ -17,7 +17,7 @@ from reloc.tracking.trajectory.files import write_trajectory
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb
 from tools.worlds.film_world import FilmTruth
-from tools.worlds.seen_places import SeenPlaces
+from tools.worlds.sights import SeenPlaces
 
 _SEED, _SHOWING, _PLACES = 3, 6, 8  # frames that give places, and places of each
 _REACH_PX = 10  # around a place: a mark is a ring of 4 px radius

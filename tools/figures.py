@@ -18,6 +18,7 @@ from featuredb.geometry.rotation import so3_exp, so3_log
 from featuredb.geometry.sim3 import Sim3, similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.plain_json import plain
+from ingest.register.frame_registration import FramePrior
 
 _SHARED: dict[str, dict[str, Any]] = {
     "--json": {"metavar": "FILE", "help": "write the figures there, too"},
@@ -27,13 +28,29 @@ _SHARED: dict[str, dict[str, Any]] = {
     "--inputs": {"metavar": "FOLDER", "help": "keep worlds and films there"},
     "--held-out": {"type": str, "nargs": "+", "required": True, "metavar": "NAME"},
     "--seed": {"type": int, "default": 1, "help": "of what is drawn; default: 1"},
+    "film": {"metavar": "FILM"},
+    "folder": {"metavar": "FOLDER"},
+    "folders": {"metavar": "FOLDER", "nargs": "+"},
+    "scan": {"metavar": "LAZ"},
 }
 _LEVELS = (0.68, 0.95)
 
 
-def study_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
+class StudyParser(argparse.ArgumentParser):
+    """Makes the folder of --work, which is that of --inputs as well where none is told."""
+
+    def parse_args(self, *args: Any, **more: Any) -> Any:
+        told = super().parse_args(*args, **more)
+        if "work" in told:
+            told.work.mkdir(parents=True, exist_ok=True)
+        if "inputs" in told:
+            told.inputs = told.inputs or told.work
+        return told
+
+
+def study_parser(doc: str | None, *shared: str) -> StudyParser:
     """The parser of a program, with --json and the shared arguments of these names; `doc`: of its module."""
-    parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
+    parser = StudyParser(description=(doc or "").split("\n")[0])
     for name in ("--json", *shared):
         parser.add_argument(name, **{"type": Path, **_SHARED[name]})
     return parser
@@ -50,6 +67,11 @@ def off_pose(pose: Rigid3, rng: np.random.Generator, off_m: float, off_deg: floa
     way, axis = (value / np.linalg.norm(value) for value in rng.normal(size=(2, 3)))
     rotation = so3_exp(np.radians(off_deg) * axis) @ pose.rotation
     return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + off_m * way))
+
+
+def prior_off_by(pose: Rigid3, off_m: float, off_deg: float) -> FramePrior:
+    """What a pose is worth that may be so far off in space, and about any axis."""
+    return FramePrior.around(pose, off_m / float(np.sqrt(3.0)), off_deg / float(np.sqrt(3.0)))
 
 
 def laid_on(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) -> Sim3 | None:

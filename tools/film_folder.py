@@ -1,9 +1,9 @@
 """Films as strangers make them: shots, titles, black, a zoom, a logo, bars, bad codecs; and their truth."""
 
-from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,51 +11,23 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
-from featuredb.simworld.world import WorldOptions, other_town_of, town_of
+from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.writer import VideoWriterOptions
-from tools.worlds.film_frame import Exposure, draw_frame, write_frames
-from tools.worlds.flight_path import FlightPath, PathOptions
+from tools.worlds.film_world import Exposure, FilmOptions, film_frame, film_truth, write_frames
+from tools.worlds.flight_path import PathOptions
 
-Kind = Literal["place", "other", "title", "black"]
 WIDTH, HEIGHT, RATE_HZ = 960, 540, 25.0
 _GOOD_CRF, _BAD_CRF, _WORSE_CRF = 20, 34, 37
 _EXTENT_M = (32.0, 26.0)  # of flights over the small town
-_SAMPLES = 1
 _CARD = (38, 30, 26)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Piece:
-    """What stands between two cuts.
+class Card(NamedTuple):
+    """What no camera saw: a title, or black where there is no text."""
 
-    Attributes:
-        kind: a flight over the place or the other town, or what no camera saw.
-        seconds: how long.
-        path: of the camera.
-        focal: of the lens, in widths of the picture. zoom: what it becomes in the middle third of the piece.
-        text: of a title card.
-    """
-
-    kind: Kind
-    seconds: float
-    path: PathOptions = field(default_factory=PathOptions)
-    focal: float = 0.757
-    zoom: float | None = None
+    frames: int
     text: str = ""
-
-    @property
-    def frames(self) -> int:
-        return round(self.seconds * RATE_HZ)
-
-    def camera(self, frame: int) -> Camera:
-        """True intrinsics at a frame of the piece; the lens zooms slowly at first and at last."""
-        share = np.clip(3.0 * frame / self.frames - 1.0, 0.0, 1.0)
-        eased = float(share * share * (3.0 - 2.0 * share))
-        focal = self.focal * ((self.zoom or self.focal) / self.focal) ** eased
-        params = (focal * WIDTH, 0.5006 * WIDTH, 0.4991 * HEIGHT, -0.031, 0.012)
-        return Camera(model="RADIAL", width=WIDTH, height=HEIGHT, params=params)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,14 +35,15 @@ class Script:
     """A film.
 
     Attributes:
-        name: of its file, without suffix. pieces: in their order. town: seed of the place.
+        name: of its file, without suffix. town: seed of the place.
+        pieces: what stands between cuts, in its order; a flight that is cut away from end to end shows
+            another town.
         logo: burnt into a corner. bars: share of the height that is black above, and below.
         crf: x264's constant rate factor. ev: stops brighter than others.
     """
 
     name: str
-    pieces: tuple[Piece, ...]
-    town: int
+    pieces: tuple[FilmOptions | Card, ...]
     logo: bool = False
     bars: float = 0.0
     crf: int = _GOOD_CRF
@@ -88,10 +61,11 @@ class Script:
             frame -= piece.frames
         raise IndexError(f"{self.name}: the film has {self.frames} frames")
 
-    def span_s(self, number: int) -> tuple[float, float]:
-        """Seconds at which a piece begins and ends."""
-        first = sum(piece.frames for piece in self.pieces[:number])
-        return first / RATE_HZ, (first + self.pieces[number].frames) / RATE_HZ
+    def shots_s(self) -> dict[int, tuple[float, float]]:
+        """Seconds at which pieces that show the place begin and end, by their numbers."""
+        ends = np.cumsum([0, *(piece.frames for piece in self.pieces)]) / RATE_HZ
+        shown = [n for n, p in enumerate(self.pieces) if isinstance(p, FilmOptions) and p.cut is None]
+        return {number: (float(ends[number]), float(ends[number + 1])) for number in shown}
 
 
 def six_films(seed: int) -> tuple[Script, ...]:
@@ -99,61 +73,63 @@ def six_films(seed: int) -> tuple[Script, ...]:
     rng = np.random.default_rng((seed, 81))
 
     def flight(
-        low: float, high: float, seconds: float, focal: float, *, speed: float = 6.0, **more: float
-    ) -> Piece:
+        low: float, high: float, seconds: float, focal: float, speed: float = 6.0, zoom: float | None = None
+    ) -> FilmOptions:
         path = PathOptions(
             seed=int(rng.integers(1 << 30)),
-            duration_s=seconds,
             half_extent_m=_EXTENT_M,
             heights_m=(low, high),
             speed_m_s=speed,
             down_deg=(45.0, 75.0),
             river=False,
         )
-        return Piece(kind="place", seconds=seconds, path=path, focal=focal, zoom=more.get("zoom"))
+        return FilmOptions(
+            world=WorldOptions.short(seed),
+            path=path,
+            frames=round(seconds * RATE_HZ),
+            rate_hz=RATE_HZ,
+            width=WIDTH,
+            height=HEIGHT,
+            exposure=Exposure(samples=1),
+            ev_range=0.0,
+            focal=focal,
+            zoom=zoom,
+        )
 
-    def elsewhere(seconds: float, focal: float) -> Piece:
-        path = flight(42.0, 60.0, seconds, focal).path
-        return Piece(kind="other", seconds=seconds, path=path, focal=focal)
+    def elsewhere(seconds: float, focal: float) -> FilmOptions:
+        film = flight(42.0, 60.0, seconds, focal)
+        return replace(film, cut=(0, film.frames))
 
-    black = Piece(kind="black", seconds=0.6)
+    black = Card(15)
     tour = (
-        Piece(kind="title", seconds=1.2, text="THE OLD TOWN"),
+        Card(30, "THE OLD TOWN"),
         *(flight(42.0, 50.0, 5.6, 0.757), black, flight(48.0, 60.0, 5.6, 0.757)),
     )
     low = (flight(32.0, 40.0, 6.4, 0.62, speed=5.0), flight(38.0, 46.0, 5.0, 0.62, speed=5.0))
-    abroad = (Piece(kind="title", seconds=1.2, text="FAR AWAY"), elsewhere(8.8, 0.7))
+    abroad = (Card(30, "FAR AWAY"), elsewhere(8.8, 0.7))
     best = (flight(44.0, 54.0, 5.6, 0.9), elsewhere(4.0, 0.9), flight(50.0, 60.0, 5.6, 0.9))
+    zoom = (flight(60.0, 72.0, 10.0, 0.8, zoom=1.25),)
     return (
-        Script(name="tour", town=seed, pieces=tour),
-        Script(
-            name="zoom",
-            town=seed,
-            pieces=(flight(60.0, 72.0, 10.0, 0.8, zoom=1.25),),
-            logo=True,
-            bars=0.11,
-            ev=0.15,
-        ),
-        Script(name="low", town=seed, pieces=low, ev=-0.2),
-        Script(name="abroad", town=seed, pieces=abroad),
-        Script(name="old", town=seed, pieces=(flight(48.0, 58.0, 10.0, 0.757),), crf=_BAD_CRF),
-        Script(name="best-of", town=seed, pieces=best, logo=True, crf=_WORSE_CRF),
+        Script(name="tour", pieces=tour),
+        Script(name="zoom", pieces=zoom, logo=True, bars=0.11, ev=0.15),
+        Script(name="low", pieces=low, ev=-0.2),
+        Script(name="abroad", pieces=abroad),
+        Script(name="old", pieces=(flight(48.0, 58.0, 10.0, 0.757),), crf=_BAD_CRF),
+        Script(name="best-of", pieces=best, logo=True, crf=_WORSE_CRF),
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameTruth:
+class FrameTruth(NamedTuple):
     """A frame of a film.
 
     Attributes:
-        piece, kind: what it belongs to. camera: true intrinsics; None where no camera saw it.
+        piece: what it belongs to. camera: true intrinsics; None where no camera saw it.
         pose: cam_from_local; None where it does not show the place.
     """
 
     piece: int
-    kind: Kind
-    camera: Camera | None
-    pose: Rigid3 | None
+    camera: Camera | None = None
+    pose: Rigid3 | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,18 +138,25 @@ class FilmsTruth:
 
     frame: LocalFrame
     epsg: int
-    films: dict[str, tuple[FrameTruth, ...]]
+    films: dict[str, list[FrameTruth]]
 
 
-def write_films(folder: Path, scripts: tuple[Script, ...]) -> FilmsTruth:
-    """Draw what is not there yet; a film whose script is the same is left as it is."""
+def write_films(folder: Path, seed: int) -> FilmsTruth:
+    """Draw what is not there yet of `six_films`; a film whose script is the same is left as it is."""
     folder.mkdir(parents=True, exist_ok=True)
-    for script in scripts:
+    films: dict[str, list[FrameTruth]] = {}
+    for script in six_films(seed):
         quality = VideoWriterOptions(crf=script.crf, preset="veryfast")
         file, mark = folder / f"{script.name}.mp4", folder.with_name(f"{script.name}.stamp")
         write_frames(file, partial(film_picture, script), script.frames, RATE_HZ, quality, mark, repr(script))
-    town = place_scene(scripts[0].town)
-    films = {f"{s.name}.mp4": tuple(_truth(s, i) for i in range(s.frames)) for s in scripts}
+        films[file.name] = []
+        for number, piece in enumerate(script.pieces):
+            if isinstance(piece, Card):
+                films[file.name] += [FrameTruth(number)] * piece.frames
+            else:
+                poses = enumerate(film_truth(piece).cam_from_local)
+                films[file.name] += [FrameTruth(number, piece.camera_at(k), pose) for k, pose in poses]
+    town = town_of(WorldOptions.short(seed))
     return FilmsTruth(frame=town.frame, epsg=town.epsg, films=films)
 
 
@@ -181,46 +164,19 @@ def film_picture(script: Script, frame: int) -> Image8:
     """A frame (h, w, 3) uint8 RGB as it is given to the encoder."""
     number, at = script.at(frame)
     piece = script.pieces[number]
-    if piece.kind == "black":
-        return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    if piece.kind == "title":
+    if isinstance(piece, Card):
         return _card(piece.text)
-    exposure = Exposure(samples=_SAMPLES, ev=script.ev)
-    pose_at = _path(script.town, piece).pose
-    time_s = at / RATE_HZ
-    scene = _scene(script.town, piece.kind)
-    picture = draw_frame(scene, piece.camera(at), pose_at, time_s, exposure, (piece.path.seed, at))
+    picture = film_frame(replace(piece, exposure=replace(piece.exposure, ev=script.ev)), at)
     bar = round(script.bars * HEIGHT)
     if bar:
         picture[:bar] = picture[-bar:] = 0
     return _with_logo(picture, bar) if script.logo else picture
 
 
-def _truth(script: Script, frame: int) -> FrameTruth:
-    number, at = script.at(frame)
-    piece = script.pieces[number]
-    camera = piece.camera(at) if piece.kind in ("place", "other") else None
-    pose = _path(script.town, piece).pose(at / RATE_HZ) if piece.kind == "place" else None
-    return FrameTruth(piece=number, kind=piece.kind, camera=camera, pose=pose)
-
-
-def place_scene(seed: int) -> Scene:
-    """The place of the scripts of a seed."""
-    return _scene(seed, "place")
-
-
-@lru_cache(maxsize=2)
-def _scene(seed: int, kind: Kind) -> Scene:
-    return (town_of if kind == "place" else other_town_of)(WorldOptions.short(seed))
-
-
-@lru_cache(maxsize=8)
-def _path(town: int, piece: Piece) -> FlightPath:
-    return FlightPath(_scene(town, piece.kind), piece.path)
-
-
 def _card(text: str) -> Image8:
-    """A title card."""
+    """A title card; black without text."""
+    if not text:
+        return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     card: Image8 = np.full((HEIGHT, WIDTH, 3), _CARD, np.uint8)
     font, size, thick = cv2.FONT_HERSHEY_TRIPLEX, 1.8, 3
     (wide, high), _ = cv2.getTextSize(text, font, size, thick)

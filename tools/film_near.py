@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.store import Database
-from tools.commands import anchor, newest_copy
+from tools.commands import anchor, newest_copy, once, with_scan
 from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
-from tools.made_maps import once, with_scan
 from tools.paper import frame_of, stills_of, unplaced_film
 from tools.track_evaluation import smooth_film
 from tools.unplaced_brighton import all_drawn, near_words
@@ -28,7 +27,7 @@ _DRAWS, _WRONG_M = 10, 1.0
 
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
-    inputs, work = args.inputs or args.work, args.work
+    inputs, work = args.inputs, args.work
     world = make_scan_world(inputs)
     film, truth = smooth_film(inputs)
     made = once(work / "db", partial(unplaced_film, film))

@@ -11,16 +11,15 @@ Two registrations of each photo:
 Both have to end at one pose: figures are how far apart they are, in metres and degrees.
 """
 
+import tempfile
 import time
 from pathlib import Path
 
-import cv2
-import laspy
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.features.decode import decode_gray
 from featuredb.features.exif.read import read_exif
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
@@ -28,32 +27,24 @@ from featuredb.simworld.camera.photograph import look_pose
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameOptions
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from tools.figures import median, off_pose, say, study_parser, write_figures
-from tools.worlds.clouds import build_cloud
+from tools.commands import cloud_of, photo_names
+from tools.figures import median, off_pose, prior_off_by, say, study_parser, write_figures
 
-_EPSG = 32615  # UTM zone of the scan of `brighton`
 _OFF_M, _OFF_DEG = 15.0, 10.0
-_AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
 
 
 def main() -> None:
-    parser = study_parser(__doc__)
-    parser.add_argument("scan", type=Path)
-    parser.add_argument("folder", type=Path)
+    parser = study_parser(__doc__, "scan", "folder")
     parser.add_argument("--lens", required=True, metavar="MODEL:PARAMS", help="COLMAP's model and parameters")
     parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
     args = parser.parse_args()
-    cloud = read_cloud(args.scan, _EPSG)
-    names = args.photos or sorted(p.name for p in args.folder.iterdir() if p.suffix.lower() == ".jpg")
+    with tempfile.TemporaryDirectory() as scratch:
+        cloud = cloud_of(args.scan, Path(scratch) / "db")
+    names = args.photos or photo_names(args.folder)
     accepted, apart, seconds = 0, [], []
     for number, name in enumerate(names):
         data = (args.folder / name).read_bytes()
-        image = cv2.imdecode(
-            np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        )
-        if image is None:
-            raise SystemExit(f"{name}: not an image that can be read")
-        image = np.asarray(image, dtype=np.uint8)
+        image = decode_gray(data)
         camera = lens(args.lens, image.shape[1], image.shape[0])
         first, _ = _timed(name, image, camera, exif_prior(data, cloud), cloud)
         if first.cam_from_local is None:
@@ -85,17 +76,6 @@ def _timed(
     return found, cpu_s
 
 
-def read_cloud(path: Path, epsg: int) -> PointCloud:
-    """A coloured scan in UTM metres, whole, with 8-bit colours in 16-bit fields or full ones."""
-    scan = laspy.read(path)
-    utm = np.stack([scan.x, scan.y, scan.z], axis=1)
-    middle = (utm.min(axis=0) + utm.max(axis=0)) / 2.0
-    frame = LocalFrame.from_utm(middle[0], middle[1], 0.0, epsg)
-    rgb = np.stack([scan.red, scan.green, scan.blue], axis=1)
-    rgb = rgb >> 8 if rgb.max() > 255 else rgb
-    return build_cloud(frame, "unknown", frame.enu_from_utm(utm, epsg), rgb=rgb.astype(np.uint8))
-
-
 def lens(text: str, width: int, height: int) -> Camera:
     """A camera of a model and its parameters, MODEL:p1,p2,..."""
     model, _, params = text.partition(":")
@@ -108,7 +88,7 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
     if exif.latitude_deg is None or exif.longitude_deg is None or exif.altitude_m is None:
         raise SystemExit("a photo without GPS cannot be registered from EXIF alone")
     center = cloud.frame.enu_from_geodetic([exif.latitude_deg, exif.longitude_deg, 0.0])
-    center[2] = exif.altitude_m
+    center[2] = exif.altitude_m - cloud.frame.height_m
     pitch = -90.0 if exif.angles is None or exif.angles.pitch_deg is None else exif.angles.pitch_deg
     return FramePrior(
         cam_from_local=look_pose(center, 0.0, pitch),
@@ -121,7 +101,7 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
 
 def wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
     """15 m and 10 degrees off."""
-    return FramePrior.around(off_pose(truth, rng, _OFF_M, _OFF_DEG), _OFF_M * _AXIS, _OFF_DEG * _AXIS)
+    return prior_off_by(off_pose(truth, rng, _OFF_M, _OFF_DEG), _OFF_M, _OFF_DEG)
 
 
 if __name__ == "__main__":

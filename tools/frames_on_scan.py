@@ -13,7 +13,6 @@ Of each town, on which nothing was chosen:
 What is found of a town is kept in DIR.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,29 +22,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
-from featuredb.lidar.add import add_scan
-from featuredb.lidar.load import PlanBox, load_cloud, scan_frame
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.move import move_map
 from featuredb.render.cloud import PointCloud
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import TrueImage, WorldOptions, open_world, write_world
-from featuredb.store import Database
-from featuredb.store.scans import list_scans
 from ingest.register.anchor.anchor_map import place_map
 from ingest.register.anchor.frames import FRAMES, try_frames
 from ingest.register.anchor.start.first_place import plan_box
 from ingest.register.anchor.together import register_together
 from ingest.register.frame.register import register_frame
-from ingest.register.frame_registration import FramePrior, FrameRegistration
+from ingest.register.frame_registration import FrameRegistration
 from tools.anchor_simworld import camera_errors
-from tools.figures import kept, median, study_parser, write_figures
-from tools.made_maps import all_maps, make, once
+from tools.commands import cloud_of, largest_map, make, once
+from tools.figures import kept, median, prior_off_by, study_parser, write_figures
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 _TOWNS = tuple(range(301, 311))
@@ -60,9 +54,11 @@ _AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
     cv2.setNumThreads(1)
-    inputs = args.inputs or args.work
     towns, accepted = (
-        [kept(args.work / f"{name}-{seed}.json", partial(of, seed, inputs, args.work)) for seed in _TOWNS]
+        [
+            kept(args.work / f"{name}-{seed}.json", partial(of, seed, args.inputs, args.work))
+            for seed in _TOWNS
+        ]
         for name, of in (("town", _found), ("elsewhere", _registered_elsewhere))
     )
     singles = [np.array(one) for town in towns for one in town["singles"]]
@@ -92,44 +88,31 @@ def main() -> None:
 def _found(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
     """What is found of one town."""
     world = make_scan_world(inputs, seed)
-    scans = _scans(world, seed, work)
-    own = _whole(scans[0])
+    own = _cloud(world.scan, work)
     singles = []
     for number, image in enumerate(_singles(world)):
         true, found = _single(world, image, own, (seed, number))
         if found.cam_from_local is not None:
             off = float(np.linalg.norm(found.cam_from_local.center - true.center))
             singles.append((off, found.cam_from_local.angle_to_deg(true)))
-    return {"singles": singles} | _together(work / f"low-{seed}", scans, seed)
+    return {"singles": singles} | _together(work / f"low-{seed}", world, work, seed)
 
 
 def _registered_elsewhere(seed: int, inputs: Path, work: Path) -> int:
     """How many of a town's photos, each from several priors, are registered on another town's scan."""
     world = make_scan_world(inputs, seed)
-    other, images = _whole(_scans(world, seed, work)[1]), _singles(world)
-    found = [
-        _single(world, images[k % len(images)], other, (seed, 1000, k))[1].accepted for k in range(_NEGATIVES)
-    ]
-    return sum(found)
-
-
-def _scans(world: ScanWorld, seed: int, work: Path) -> list[Database]:
-    databases = [Database.create(work / f"scan-{seed}-{k}") for k in range(2)]
-    for database, scan in zip(databases, (world.scan, world.other_scan), strict=True):
-        add_scan(database, [scan])
-    return databases
-
-
-def _cloud(database: Database, frame: LocalFrame, box: PlanBox | None = None) -> PointCloud:
-    return replace(load_cloud(database, frame, box), rgb=None)
+    other, images = _cloud(world.other_scan, work), _singles(world)
+    drawn = (_single(world, images[k % len(images)], other, (seed, 1000, k)) for k in range(_NEGATIVES))
+    return sum(found.accepted for _, found in drawn)
 
 
 def _gray(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
-def _whole(database: Database) -> PointCloud:
-    return _cloud(database, scan_frame(list_scans(database)[0]))
+def _cloud(scan: Path, work: Path, *part: Any) -> PointCloud:
+    """A town's scan without colours; `part`: as `cloud_of` has it."""
+    return replace(cloud_of(scan, work / f"{scan.parent.name}-{scan.stem}", *part), rgb=None)
 
 
 def _singles(world: ScanWorld) -> list[TrueImage]:
@@ -142,11 +125,12 @@ def _single(
 ) -> tuple[Rigid3, FrameRegistration]:
     """The pose of a photo in a cloud, and its registration from a prior that is off."""
     true = image.cam_from_local @ cloud.frame.enu_from(world.world.truth.frame).inverse()
-    prior = _prior(_moved(true.center, np.random.default_rng(seed)).act_on_pose(true))
+    start = _moved(true.center, np.random.default_rng(seed)).act_on_pose(true)
+    prior = prior_off_by(start, _OFF_M, _OFF_DEG)
     return true, register_frame(_gray(world.world.folder / image.name), image.camera, prior, cloud)
 
 
-def _together(folder: Path, scanned: Sequence[Database], seed: int) -> dict[str, Any]:
+def _together(folder: Path, world: ScanWorld, work: Path, seed: int) -> dict[str, Any]:
     """How far off the low map's cameras are, metres, median, None without a place; what else is placed."""
 
     def make_map(making: Path) -> None:
@@ -159,7 +143,7 @@ def _together(folder: Path, scanned: Sequence[Database], seed: int) -> dict[str,
 
     once(folder / "db", make_map)
     truth = open_world(folder).truth
-    made = max(all_maps(folder / "db"), key=lambda one: len(one.images))
+    made = largest_map(folder / "db")
     assert isinstance(made, FeatureMap)
 
     def read(image: MapImage) -> NDArray[np.uint8]:
@@ -169,21 +153,22 @@ def _together(folder: Path, scanned: Sequence[Database], seed: int) -> dict[str,
         return np.ascontiguousarray(read(image)[:, ::-1])
 
     start = _misplaced(made, np.random.default_rng((seed, 99)))
-    scans = [_cloud(database, start.frame, plan_box(start)) for database in scanned]
+    part = start.frame, plan_box(start)
+    scans = [_cloud(scan, work, *part) for scan in (world.scan, world.other_scan)]
     alone = [
         register_frame(
-            read(image), start.cameras[image.camera_id], _prior(image.cam_from_local), scans[0]
+            read(image),
+            start.cameras[image.camera_id],
+            prior_off_by(image.cam_from_local, _OFF_M, _OFF_DEG),
+            scans[0],
         ).accepted
         for image in start.images[:_ALONE]
     ]
     tried = try_frames(start, scans[0], read, FRAMES)
     placed = place_map(start, scans[0], tried, read, FRAMES).feature_map
-    own_m = None
-    if placed is not None:
-        own_m = float(np.median(camera_errors(placed, truth)[0]))
     return {
         "alone": sum(alone),
-        "own_m": own_m,
+        "own_m": None if placed is None else float(np.median(camera_errors(placed, truth)[0])),
         "other": register_together(start, start.images, scans[1], read, 1) is not None,
         "mirrored": register_together(start, start.images, scans[0], mirrored, 1) is not None,
     }
@@ -194,10 +179,6 @@ def _moved(middle: FloatArray, rng: np.random.Generator) -> Sim3:
     axis, way = (value / np.linalg.norm(value) for value in rng.normal(size=(2, 3)))
     turn = so3_exp(np.radians(_OFF_DEG) * axis)
     return Sim3(scale=1.0, rotation=turn, translation=middle + _OFF_M * way - turn @ middle)
-
-
-def _prior(pose: Rigid3) -> FramePrior:
-    return FramePrior.around(pose, _OFF_M * _AXIS, _OFF_DEG * _AXIS)
 
 
 def _misplaced(feature_map: FeatureMap, rng: np.random.Generator) -> FeatureMap:

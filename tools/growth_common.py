@@ -112,7 +112,6 @@ def world_told(
     parser = study_parser(doc, "--work", "--seed")
     parser.set_defaults(seed=seed)
     args = parser.parse_args(argv)
-    args.work.mkdir(parents=True, exist_ok=True)
     return args, world(seed=args.seed)
 
 

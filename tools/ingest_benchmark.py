@@ -8,16 +8,13 @@ commit. Each is a process of its own, the one after the other.
 """
 
 import json
-import resource
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from featuredb.maps.feature_map import FeatureMap
+from tools.commands import all_maps, processor_s
 from tools.figures import study_parser, write_figures
-from tools.made_maps import all_maps
 
 _NEIGHBOURS = 15
 _SIDE_PX = 1600
@@ -47,9 +44,7 @@ print(json.dumps(max(([m.image(i).name for i in m.reg_image_ids()] for m in mode
 
 
 def main() -> None:
-    parser = study_parser(__doc__)
-    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
-    args = parser.parse_args()
+    args = study_parser(__doc__, "folders").parse_args()
     figures: dict[str, Any] = {folder.parent.name: measured(folder) for folder in args.folders}
     costs = list(figures.values())
     figures["worst_ratio"] = max(cost["ratio"] for cost in costs)
@@ -61,11 +56,10 @@ def measured(folder: Path) -> dict[str, float]:
     """Both programs over the photos of a folder: processor seconds, photos in the largest model or map and in
     both, maps with a place."""
     with tempfile.TemporaryDirectory() as scratch:
-        colmap_s, told = _processor_s("-c", _THEIRS, str(folder), scratch)
+        colmap_s, _, told = processor_s("-c", _THEIRS, str(folder), scratch)
         database = Path(scratch) / "db"
-        ours_s, _ = _processor_s(
-            *("-m", "featuredb.cli", "ingest", "photos", str(database), str(folder), "--quiet")
-        )
+        words = ("-m", "featuredb.cli", "ingest", "photos", str(database), str(folder), "--quiet")
+        ours_s, *_ = processor_s(*words)
         maps = all_maps(database)
     theirs = set(json.loads(told.splitlines()[-1]))
     ours = {image.name for image in max(maps, key=lambda one: len(one.images)).images}
@@ -79,16 +73,6 @@ def measured(folder: Path) -> dict[str, float]:
         "share": len(theirs & ours) / max(1, len(theirs)),
         "placed": sum(isinstance(one, FeatureMap) for one in maps),
     }
-
-
-def _processor_s(*argv: str) -> tuple[float, str]:
-    """Of a Python process and all that it started; and what it printed."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, *argv], stdout=subprocess.PIPE, text=True, check=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if done.returncode:
-        raise SystemExit(f"exit code {done.returncode}: {' '.join(argv[:4])}")
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done.stdout
 
 
 if __name__ == "__main__":

@@ -26,9 +26,8 @@ from featuredb.store import Database
 from ingest.own_frame import held_of
 from ingest.photos.photo import Photo, whose_cameras
 from ingest.register.gps import place_by_gps
-from tools.commands import featuredb
+from tools.commands import copied, featuredb, largest_map, make, photo_names, position_table
 from tools.figures import inside_figures, laid_on, median, poses_in, say, squared, study_parser, write_figures
-from tools.made_maps import all_maps, copied, make, photo_names, position_table
 
 _EXTENT_M, _OFF_M, _STATED_M = 120.0, 8.0, 30.0
 _FRAME = LocalFrame(latitude_deg=52.5186, longitude_deg=13.3750, height_m=75.0)
@@ -69,7 +68,7 @@ def main() -> None:
 
 def true_landmark(database: Path) -> Landmark:
     """The largest map, which has no place, in metres."""
-    largest = max(all_maps(database), key=lambda one: len(one.images))
+    largest = largest_map(database)
     poses = [image.cam_from_local for image in largest.images]
     extent = np.linalg.norm(np.ptp([pose.center for pose in poses], axis=0)[:2])
     scale = _EXTENT_M / float(extent)

@@ -28,10 +28,9 @@ from featuredb.store import Database
 from reloc.localise.answer import placement_covariance
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
 from reloc.wire.query import CameraRequest
+from tools.commands import all_maps, make
 from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
-from tools.laser_baseline import colmap_given_the_lens
-from tools.laser_set import FRAME, LaserSet, read_laser_set, with_exif
-from tools.made_maps import all_maps, make
+from tools.laser_set import FRAME, LaserSet, colmap_given_the_lens, read_laser_set, with_exif
 from tools.real_photos import ask_poses
 
 
@@ -47,9 +46,7 @@ class Errors:
 
 
 def main() -> None:
-    parser = study_parser(__doc__)
-    parser.add_argument("folder", type=Path, metavar="FOLDER")
-    args = parser.parse_args()
+    args = study_parser(__doc__, "folder").parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         figures = judged(read_laser_set(args.folder), Path(scratch) / args.folder.name)
     write_figures(args.json, figures)

@@ -33,8 +33,8 @@ from ingest.colmap.picture_shear import picture_shear
 from ingest.photos.photo import Photo
 from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
+from tools.commands import all_maps, largest_map, make, once
 from tools.figures import say, study_parser, write_figures
-from tools.made_maps import all_maps, make, once
 
 WIDTHS = tuple(field.name for field in fields(LensWidths))
 _DROP = float(chi2.ppf(0.95, 1)) / 2.0
@@ -96,7 +96,7 @@ def main() -> None:
 
 def write_shears(databases: Sequence[Path]) -> None:
     """How much the pictures of each largest map are sheared, and what few maps exceed (log-normal)."""
-    largest = [max(all_maps(path), key=lambda one: len(one.images)) for path in databases]
+    largest = [largest_map(path) for path in databases]
     shears = np.log([picture_shear(block_of_map(one)).size for one in largest])
     for path, shear in zip(databases, np.exp(shears), strict=True):
         say(f"{path.name}: pictures sheared by {shear:.1e}")

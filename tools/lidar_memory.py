@@ -4,15 +4,13 @@
 
 The scan is an airborne one of a rolling land with houses and trees, written strip by strip as LAS 1.4, so
 that making it needs little memory, too. The command runs in a process of its own; the memory of that process
-and all its children (resident set) is sampled ten times a second.
+and all its children (what they share counts once) is sampled ten times a second.
 """
 
 import os
 import shutil
 import subprocess
 import sys
-import threading
-from contextlib import suppress
 from pathlib import Path
 
 import laspy
@@ -20,9 +18,9 @@ import numpy as np
 from laspy.vlrs.known import WktCoordinateSystemVlr
 from pyproj import CRS
 
+from tools.commands import once
 from tools.figures import study_parser, write_figures
-from tools.made_maps import once
-from tools.serve_process import beside, process_tree
+from tools.serve_process import watched_memory
 
 CHUNK = 500_000
 EPSG = 32632
@@ -73,31 +71,14 @@ def _surface(
     return height, label, value.astype(np.uint16)
 
 
-def tree_rss_bytes(root: int) -> int:
-    """Resident memory of a process and all its descendants."""
-    total = 0
-    for process in process_tree(root):
-        with suppress(OSError):  # it has ended meanwhile
-            total += int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return total * os.sysconf("SC_PAGE_SIZE")
-
-
 def measure(command: list[str]) -> dict[str, float]:
     """Run a command; CPU seconds, and peak memory of its processes."""
-    peak = 0
     process = subprocess.Popen(command, stdout=sys.stderr)
-    done = threading.Event()
-
-    def watch() -> None:
-        nonlocal peak
-        while not done.wait(SAMPLE_S):
-            peak = max(peak, tree_rss_bytes(process.pid))
-
-    with beside([threading.Thread(target=watch)], done):
+    with watched_memory(process.pid, SAMPLE_S) as seen:
         _, status, usage = os.wait4(process.pid, 0)
     if os.waitstatus_to_exitcode(status) != 0:
         raise SystemExit(f"{' '.join(command)} failed with status {os.waitstatus_to_exitcode(status)}")
-    return {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_tree_mib": peak / 2**20}
+    return {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_tree_mib": max(seen)}
 
 
 def main() -> None:

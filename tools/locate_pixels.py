@@ -11,7 +11,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -20,19 +19,18 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.simworld.laser.airborne import AirborneScanOptions
-from featuredb.simworld.town.scene import Scene
-from featuredb.simworld.world import TrueImage, Truth, WorldOptions, town_of
+from featuredb.simworld.world import TrueImage, WorldOptions, town_of
 from featuredb.store import Database
 from reloc.answered_view import AnsweredView
 from reloc.localiser import Localiser
 from reloc.pixels.locate import PixelPlace, locate
-from reloc.pixels.surfaces import RaySurface, scan_surface
+from reloc.pixels.surfaces import scan_surface
 from reloc.service.handler import answer_query
 from reloc.wire.query import LocaliseWireRequest
 from tools.anchor_simworld import anchored
 from tools.figures import inside, inside_figures, squared, study_parser, write_figures
 from tools.worlds.scan_world import make_scan_world
-from tools.worlds.seen_places import SeenPlaces
+from tools.worlds.sights import SeenPlaces
 
 _SEED = 1
 _PIXELS, _DRAWS = 60, 16  # of each photo: pixels, and draws of a pose and a lens
@@ -51,15 +49,14 @@ class Miss:
 
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
-    work: Path = args.work
-    world = make_scan_world(args.inputs or work, _SEED)
-    database = Database.open(anchored(work, world, other=False)[0])
+    world = make_scan_world(args.inputs, _SEED)
+    database = Database.open(anchored(args.work, world, other=False)[0])
     scene, truth = town_of(WorldOptions.short(_SEED)), world.world.truth
     rng = np.random.default_rng(_SEED)
     localiser = Localiser.open(database)
     answered: list[Miss] = []
     drawn: list[Miss] = []
-    refused = 0
+    asked = 0
     for photo in truth.group("queries"):
         data = (world.world.folder / photo.name).read_bytes()
         view = view_of(localiser, data)
@@ -67,43 +64,33 @@ def main() -> None:
             continue
         surface = scan_surface(database, view)
         surface.common_m = _STRIPS_M
-        target = _Target(scene, truth, photo, view)
-        found = target.looked_at(rng, surface, _PIXELS)
-        answered += found
-        refused += _PIXELS - len(found)
-        for _ in range(_DRAWS):
-            drawn += target.drawn(rng, surface, _PIXELS // 5)
+        here = view.frame.enu_from(truth.frame)
+        seen = SeenPlaces(scene, photo.camera, photo.cam_from_local)
+        for draw in range(_DRAWS + 1):  # the first by the answer itself
+            one = _drawn(rng, view, photo, here) if draw else view
+            pixels = seen.pixels(rng, _PIXELS // 5 if draw else _PIXELS)  # of what stands still
+            found = misses(view, here.act(seen.places(pixels)), locate(one, surface, pixels))
+            (drawn if draw else answered).extend(found)
+        asked += _PIXELS
     figures = miss_figures("answered", answered) | miss_figures("drawn", drawn)
-    write_figures(args.json, figures | {"refused": refused, "located": len(answered)})
+    write_figures(args.json, figures | {"refused": asked - len(answered), "located": len(answered)})
 
 
-class _Target:
-    """A photo whose every pixel has a true place, in the frame of its answer."""
+def _drawn(rng: np.random.Generator, view: AnsweredView, photo: TrueImage, here: Rigid3) -> AnsweredView:
+    """A pose and a lens that are off from the true ones as the answer's covariance says.
 
-    def __init__(self, scene: Scene, truth: Truth, photo: TrueImage, view: AnsweredView) -> None:
-        self._here = view.frame.enu_from(truth.frame)
-        self._photo, self._view = photo, view
-        self._seen = SeenPlaces(scene, photo.camera, photo.cam_from_local)
-
-    def looked_at(
-        self, rng: np.random.Generator, surface: RaySurface, count: int, view: AnsweredView | None = None
-    ) -> list[Miss]:
-        """Misses of pixels at random, of what stands in both, photo and scan; `view`: or the answer's."""
-        pixels = self._seen.pixels(rng, count)
-        found = locate(view or self._view, surface, pixels)
-        return misses(self._view, self._here.act(self._seen.places(pixels)), found)
-
-    def drawn(self, rng: np.random.Generator, surface: RaySurface, count: int) -> list[Miss]:
-        """Misses from a pose and a lens that are off as the answer's covariance says."""
-        error = rng.multivariate_normal(np.zeros(len(self._view.covariance)), self._view.covariance)
-        local_from_cam = (self._photo.cam_from_local @ self._here.inverse()).inverse()
-        turned = so3_exp(error[:3]).T @ local_from_cam.rotation
-        pose = Rigid3(rotation=turned, translation=local_from_cam.translation - error[3:6]).inverse()
-        camera = self._view.camera
-        if len(error) > 6:
-            camera = whole_camera(self._photo.camera)
-            camera = replace(camera, params=tuple(np.array(camera.params) - error[6:]))
-        return self.looked_at(rng, surface, count, replace(self._view, camera=camera, cam_from_local=pose))
+    Args:
+        here: the frame of the answer from that of the truth.
+    """
+    error = rng.multivariate_normal(np.zeros(len(view.covariance)), view.covariance)
+    local_from_cam = (photo.cam_from_local @ here.inverse()).inverse()
+    turned = so3_exp(error[:3]).T @ local_from_cam.rotation
+    pose = Rigid3(rotation=turned, translation=local_from_cam.translation - error[3:6]).inverse()
+    camera = view.camera
+    if len(error) > 6:
+        camera = whole_camera(photo.camera)
+        camera = replace(camera, params=tuple(np.array(camera.params) - error[6:]))
+    return replace(view, camera=camera, cam_from_local=pose)
 
 
 def misses(view: AnsweredView, places: FloatArray, found: Sequence[PixelPlace]) -> list[Miss]:

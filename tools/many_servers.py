@@ -8,10 +8,9 @@ pause: one server, two, four; then two of which one is killed (SIGKILL) in the m
 
 import io
 import multiprocessing
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
@@ -66,16 +65,15 @@ class _Source:
         return _Slow.snapshot
 
     def load(self) -> ServedArea:
-        return ServedArea(localiser=_Slow(), maps=())  # type: ignore[arg-type]
+        return ServedArea(localiser=_Slow(), maps=())
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args = study_parser(__doc__).parse_args(argv)
+def main() -> None:
+    args = study_parser(__doc__).parse_args()
     rates = {}
     for count in (1, 2, 4):
         with servers(count) as (router, _):
-            asked = ask(router, _SECONDS)
-            rates[count] = asked["answered"] / _SECONDS
+            rates[count] = ask(router, _SECONDS)["answered"] / _SECONDS
     with servers(2) as (router, processes):
         killed = ask(router, _SECONDS, lambda: processes[0].kill())
     figures: dict[str, Any] = {
@@ -86,7 +84,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "killed_lost": killed["lost"],
     }
     write_figures(args.json, figures)
-    return 0
 
 
 @contextmanager
@@ -124,35 +121,30 @@ def _wait_for(router: str, count: int) -> None:
             time.sleep(0.1)
 
 
-def ask(router: str, seconds: float, in_the_middle: Callable[[], None] | None = None) -> dict[str, int]:
+def ask(router: str, seconds: float, in_the_middle: Callable[[], None] = lambda: None) -> Counter[str]:
     """Queries that were answered, and that were not, of clients that ask without pause for so long."""
     picture = io.BytesIO()
     Image.fromarray(np.zeros((64, 64), np.uint8)).save(picture, "png")
-    asked = {"answered": 0, "lost": 0}
-    lock = threading.Lock()
     with Client(router, _DATABASE) as client, ThreadPoolExecutor(_ASKING) as pool:
         end = time.monotonic() + seconds
 
-        def ask_on() -> None:
+        def ask_on() -> Counter[str]:
+            asked: Counter[str] = Counter()
             while time.monotonic() < end:
                 try:
                     client.localise(picture.getvalue())
-                    outcome = "answered"
+                    asked["answered"] += 1
                 except ServiceError:
-                    outcome = "lost"
-                with lock:
-                    asked[outcome] += 1
+                    asked["lost"] += 1
+            return asked
 
         asking = [pool.submit(ask_on) for _ in range(_ASKING)]
-        if in_the_middle is not None:
-            time.sleep(0.5 * seconds)
-            in_the_middle()
-        for one in asking:
-            one.result()
-    return asked
+        time.sleep(0.5 * seconds)
+        in_the_middle()
+        return sum((one.result() for one in asking), Counter())
 
 
 if __name__ == "__main__":
     from tools import many_servers  # workers look for its classes there, and not in a program
 
-    sys.exit(many_servers.main())
+    many_servers.main()

@@ -9,8 +9,8 @@ with photos of two places is wrong. Prints how many photos each map has and of w
 from collections import Counter
 from pathlib import Path
 
+from tools.commands import all_maps, make, photo_names
 from tools.figures import say, study_parser, write_figures
-from tools.made_maps import all_maps, make, photo_names
 
 
 def main() -> None:

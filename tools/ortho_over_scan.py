@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geo.crs.utm_transform import raster_from_utm
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.lidar.formats.ortho_image import open_ortho, sample_ortho
 from featuredb.render.cloud import PointCloud
 from ingest.register.frame.dense.pictures import oriented_gradients, plan_spacing_m
@@ -75,9 +74,9 @@ class Offset:
         return f"{east} m east, {north} m north, by {self.patches} patches"
 
 
-def place_of(path: Path, frame: LocalFrame, epsg: int, cloud: PointCloud) -> OrthoOverScan:
+def place_of(path: Path, epsg: int, cloud: PointCloud) -> OrthoOverScan:
     """The ortho image at `path` and a cloud on one grid."""
-    ortho = open_ortho(path)
+    ortho, frame = open_ortho(path), cloud.frame
     low, high = (of.astype(np.float64) for of in (cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)))
     to_raster = raster_from_utm(ortho.wkt, epsg, frame.utm_from_enu(0.5 * (low + high), epsg))
     a, b, c, d, e, f = ortho.pixel_from_xy

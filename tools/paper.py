@@ -20,9 +20,8 @@ from ingest.workspace import default_root
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
-from tools.commands import featuredb
+from tools.commands import featuredb, make
 from tools.figures import kept, say, study_parser, write_figures
-from tools.made_maps import make
 from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import judge_film, smooth_film
 from tools.worlds.film_world import FilmTruth
@@ -33,7 +32,7 @@ _SEED = 1
 
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
-    write_figures(args.json, film_figures(args.work / "film", args.inputs or args.work))
+    write_figures(args.json, film_figures(args.work / "film", args.inputs))
 
 
 def film_figures(work: Path, inputs: Path) -> dict[str, Any]:

@@ -28,8 +28,8 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.simworld.camera.photograph import look_pose
 from ingest.own_frame import held_of
 from ingest.register.gps import GpsPlacement, place_by_gps
+from tools.commands import largest_map, make, once
 from tools.figures import inside_figures, say, squared, study_parser, write_figures
-from tools.made_maps import all_maps, make, once
 
 SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
@@ -200,7 +200,7 @@ def unrelated(flights: Sequence[Flight], chance: int) -> dict[str, float]:
 def real_flight(folder: Path, work: Path) -> Flight:
     """The cameras of the largest map of a folder of photos, by its own positions."""
     database = once(work / folder.parent.name, lambda path: make(path, "photos", folder))
-    largest = max(all_maps(database), key=lambda one: len(one.images))
+    largest = largest_map(database)
     images = sorted(
         largest.images, key=lambda image: (image.capture_time is None, image.capture_time, image.name)
     )

@@ -26,8 +26,8 @@ from reloc.localise.result import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
+from tools.commands import make, photo_names
 from tools.figures import say, spread, study_parser, write_figures
-from tools.made_maps import make, photo_names
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
 
@@ -49,16 +49,11 @@ def main() -> None:
     args = parser.parse_args()
     names = photo_names(args.photos)
     held_out = args.held_out or names[_EVERY // 2 :: _EVERY]
-    work: Path = args.work
-    part = ingest(work / "part", args.photos, held_out)
-    ingest(work / "whole", args.photos, ())
-    rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
-    figures = {
-        "usable": len(set(names) - set(held_out)),
-        "registered": part["mapped"],
-        "ingest_s": part["seconds"],
-    }
-    write_figures(args.json, figures | error_figures(rows))
+    part = ingest(args.work / "part", args.photos, held_out)
+    ingest(args.work / "whole", args.photos, ())
+    rows = ask(Database.open(args.work / "part"), args.photos, held_out, reference(args.work / "whole"))
+    figures = {"registered": part["mapped"], "ingest_s": part["seconds"]}
+    write_figures(args.json, figures | {"usable": len(set(names) - set(held_out))} | error_figures(rows))
 
 
 def ingest(database: Path, photos: Path, exclude: Sequence[str], *more: str) -> dict[str, float]:

@@ -20,15 +20,15 @@ from featuredb.video.folder import natural_key
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
+from tools.commands import photo_names
 from tools.figures import laid_on, poses_in, say, spread, study_parser, write_figures
-from tools.made_maps import photo_names
 from tools.real_photos import ingest, reference
 
 
 def main() -> None:
     args = study_parser(__doc__, "--photos", "--work").parse_args()
     names = sorted(photo_names(args.photos), key=natural_key)
-    work: Path = args.work
+    work = args.work
     for name, left_out in (("part", names[1::2]), ("whole", [])):
         if not (work / name).exists():
             ingest(work / name, args.photos, left_out, "--work", str(work / "cache"))

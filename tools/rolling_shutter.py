@@ -29,8 +29,7 @@ from featuredb.simworld.world import WorldOptions, in_order, town_of
 from featuredb.store import Database
 from tools.commands import featuredb
 from tools.figures import say, squared, study_parser, write_figures
-from tools.worlds.film_frame import Exposure
-from tools.worlds.film_world import FilmOptions, film_frame, wandering_errors
+from tools.worlds.film_world import Exposure, FilmOptions, film_frame, wandering_errors
 from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
 
 _PHOTOS, _SEEDS = 24, (1, 2)
@@ -48,7 +47,7 @@ def main() -> None:
     for style in _STYLES:
         for seed in _SEEDS:
             film = film_options(style, seed)
-            pictures = drawn(film, (args.inputs or args.work) / f"rolling-{style}-{seed}-30")
+            pictures = drawn(film, args.inputs / f"rolling-{style}-{seed}-30")
             for receiver in ("plain", "rtk"):
                 name = f"{style}-{seed}-{receiver}"
                 photos = tagged(film, pictures, receiver == "rtk", args.work / name)

@@ -24,10 +24,9 @@ from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import TrueImage, Truth, World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database
 from tools.anchor_simworld import camera_errors
-from tools.commands import featuredb
+from tools.commands import copied, featuredb, first_map, position_table
 from tools.figures import study_parser, write_figures
-from tools.made_maps import copied, position_table
-from tools.worlds.seen_places import SeenPlaces
+from tools.worlds.sights import SeenPlaces
 
 _SEED = 1
 _SIGMA_M, _OTHERWISE_M, _DATUM_M = 0.02, 5.0, 20.0
@@ -49,7 +48,7 @@ def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
     flight = FlightOptions(lines=3, per_line=5, oblique=3, width=1024)
     options = replace(WorldOptions.short(_SEED), flight=flight, queries=0, street=0, negatives_per_kind=0)
-    inputs = (args.inputs or args.work) / f"rtk-flight-{_SEED}"
+    inputs = args.inputs / f"rtk-flight-{_SEED}"
     whole = (inputs / "truth.json").is_file()
     world = open_world(inputs) if whole else write_world(inputs, options)
     rng = np.random.default_rng((_SEED, 11))
@@ -123,14 +122,13 @@ def with_control(
     """What is told of the heights' offset: with a datum that is 20 m off, and of right positions."""
     gcp = work / "gcp_list.txt"
     gcp.write_text(control_text(world, options, rng), encoding="utf-8")
-    right = Database.open(work / "dji.db")
-    featuredb("register", str(work / "dji.db"), right.snapshot().maps()[0].map_id, "--gcp", str(gcp))
+    right = first_map(Database.open(work / "dji.db"))
+    featuredb("register", str(work / "dji.db"), right.map_id, "--gcp", str(gcp))
     high = said(world, places + np.array([0.0, 0.0, _DATUM_M]), "dji", work / "high")
     featuredb("ingest", "photos", str(work / "high.db"), str(high), "--gcp", str(gcp), *_MOST)
     notes = {}
     for name in ("dji", "high"):
-        snapshot = Database.open(work / f"{name}.db").snapshot()
-        evidence = snapshot.load_map(snapshot.maps()[0].map_id).placement.evidence
+        evidence = first_map(Database.open(work / f"{name}.db")).placement.evidence
         notes[name] = [note for note in evidence["notes"] if "GPS" in note]
     told = [re.search(r"heights are ([0-9.]+) m above", note) for note in notes["high"]]
     metres = [float(one[1]) for one in told if one is not None]

@@ -19,10 +19,10 @@ import shutil
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,6 +40,7 @@ from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
+from tools.commands import first_map
 from tools.figures import study_parser, write_figures
 from tools.service_world import cell_order, copied_map
 
@@ -53,18 +54,14 @@ _AT_ONCE = 16  # maps of a commit
 _SMALL = 10_000  # points
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CopiedMap:
+class Source(NamedTuple):
     """A map; photos that are not in it: features, lenses, and centres (3,) in its frame, metres."""
 
     feature_map: FeatureMap
-    photos: list[Features]
-    cameras: list[Camera]
-    places: list[FloatArray]
+    photos: list[tuple[Features, Camera, FloatArray]]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Query:
+class Query(NamedTuple):
     """Features, a lens, a prior, and the true place: latitude, longitude, height."""
 
     features: Features
@@ -78,23 +75,17 @@ def main() -> None:
     parser.add_argument("sources", nargs="+", metavar="DB:FOLDER")
     parser.add_argument("--points", type=int, default=1_000_000)
     args = parser.parse_args()
-    args.work.mkdir(parents=True, exist_ok=True)
     sources = [source_of(*text.rsplit(":", 1)) for text in args.sources]
     small, large = args.work / "small", args.work / f"large-{args.points}"
-    ask = {}
-    for path, points in ((small, _SMALL), (large, args.points)):
-        ask[path] = city(path, sources, points)
+    databases = {"small": (small, city(small, sources, _SMALL))}
+    databases["large"] = (large, city(large, sources, args.points))
     context = multiprocessing.get_context("spawn")
-    measured: dict[Path, dict[str, float]] = {}
-    for path, queries in ask.items():
+    figures: dict[str, Any] = {}
+    for size, (path, queries) in databases.items():
         with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
-            first_start_s = pool.submit(first_start, path, queries[0]).result()
-            measured[path] = pool.submit(measure, path, queries).result() | {"first_start_s": first_start_s}
-    figures: dict[str, Any] = {
-        f"{size}_{name}": value
-        for size, path in (("small", small), ("large", large))
-        for name, value in measured[path].items()
-    }
+            figures[f"{size}_first_start_s"] = pool.submit(first_start, path, queries[0]).result()
+            measured = pool.submit(measure, path, queries).result()
+        figures |= {f"{size}_{name}": value for name, value in measured.items()}
     for name in ("first_start_s", "start_s", "commit_s", "with_prior_ms", "without_ms"):
         figures[f"times_{name.rsplit('_', 1)[0]}"] = figures[f"large_{name}"] / figures[f"small_{name}"]
     more = figures["large_points"] - figures["small_points"]
@@ -103,7 +94,7 @@ def main() -> None:
     write_figures(args.json, figures)
 
 
-def source_of(database: str, folder: str) -> CopiedMap:
+def source_of(database: str, folder: str) -> Source:
     """The largest placed map of a database without some of its photos, which are spread over it."""
     snapshot = Database.open(database).snapshot()
     whole = snapshot.load_map(max(snapshot.maps(), key=lambda m: m.images).map_id)
@@ -113,13 +104,14 @@ def source_of(database: str, folder: str) -> CopiedMap:
     rest = only_images(whole, {i.image_id for i in whole.images} - {i.image_id for i in asked})
     rest = replace(rest, images=tuple(replace(image, gps=None) for image in rest.images))
     options = LocaliseOptions()
-    photos = [extract(decode_gray(Path(folder) / image.name), options.extractor) for image in asked]
-    places = [image.cam_from_local.center for image in asked]
-    cameras = [whole.cameras[image.camera_id] for image in asked]
-    return CopiedMap(feature_map=rest, photos=photos, cameras=cameras, places=places)
+    photos = []
+    for image in asked:
+        features = extract(decode_gray(Path(folder) / image.name), options.extractor)
+        photos.append((features, whole.cameras[image.camera_id], image.cam_from_local.center))
+    return Source(rest, photos)
 
 
-def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
+def city(path: Path, sources: Sequence[Source], points: int) -> list[Query]:
     """A database of at least so many described points, and what to ask it."""
     for folder in (path, Path(f"{path}-cache")):
         shutil.rmtree(folder, ignore_errors=True)
@@ -138,13 +130,12 @@ def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
             height_m=source.feature_map.frame.height_m,
         )
         seen = source.feature_map.observations
-        described = len(np.unique(seen.point_index[seen.has_descriptor]))
         waiting.append(copied_map(source.feature_map, frame, copies, f"copy-{copies}"))
-        total += described
+        total += len(np.unique(seen.point_index[seen.has_descriptor]))
         if len(waiting) == _AT_ONCE or total >= points:
             database.commit_maps(waiting)
             waiting.clear()
-        for photo, camera, place in zip(source.photos, source.cameras, source.places, strict=True):
+        for photo, camera, place in source.photos:
             geodetic = frame.geodetic_from_enu(place)
             prior = GeoPrior(
                 latitude_deg=float(geodetic[0]),
@@ -154,7 +145,7 @@ def city(path: Path, sources: Sequence[CopiedMap], points: int) -> list[Query]:
                 sigma_vertical_m=_PRIOR_M,
             )
             features = replace(photo, descriptors=photo.descriptors[:, cell_order(copies)])
-            queries.append(Query(features=features, camera=camera, prior=prior, place=geodetic))
+            queries.append(Query(features, camera, prior, geodetic))
         copies += 1
     every = max(1, len(queries) // _ASKED)
     return queries[::every][:_ASKED]
@@ -212,11 +203,10 @@ def measure(path: Path, queries: Sequence[Query]) -> dict[str, float]:
 
 def _commit(database: Database, localiser: Localiser, query: Query) -> float:
     """Seconds from a commit of a small map until a query is answered from a database that has it."""
-    snapshot = database.snapshot()
-    like = snapshot.load_map(snapshot.maps()[0].map_id)
-    few = np.zeros(len(like.points), dtype=np.bool_)
-    few[:_COMMITTED] = True
-    small = replace(only_points(like, few), map_id="committed", name="committed")
+    like = first_map(database)
+    small = replace(
+        only_points(like, np.arange(len(like.points)) < _COMMITTED), map_id="committed", name="committed"
+    )
     began = time.perf_counter()
     database.commit_map(small)
     opened = Localiser.open(database, previous=localiser)

@@ -8,9 +8,10 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import contextmanager, suppress
 from typing import Any
+
+import psutil
 
 
 class CommandProcess:
@@ -62,8 +63,7 @@ class CommandProcess:
         return [json.loads(line) for line in self.errors if line.startswith("{")]
 
     def memory_mib(self) -> float:
-        """Of the process and all that it has started; what they share counts once."""
-        return sum(map(_pss_kib, process_tree(self.process.pid))) / 1024
+        return memory_mib(self.process.pid)
 
 
 class ServeProcess(CommandProcess):
@@ -74,32 +74,20 @@ class ServeProcess(CommandProcess):
         super().__init__("serve", *argv, *where)
 
 
-def _pss_kib(pid: int) -> int:
-    try:
-        text = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii")
-    except OSError:  # it has ended meanwhile
-        return 0
-    return next((int(line.split()[1]) for line in text.splitlines() if line.startswith("Pss:")), 0)
-
-
-def process_tree(pid: int) -> Iterator[int]:
-    """A process and all that it has started."""
-    yield pid
-    for child in children(pid):
-        yield from process_tree(child)
+def memory_mib(pid: int) -> float:
+    """Of a process and all that it has started; what they share counts once."""
+    total = 0
+    for process in (psutil.Process(pid), *psutil.Process(pid).children(recursive=True)):
+        with suppress(psutil.Error):  # it has ended meanwhile
+            total += process.memory_full_info().pss
+    return total / 2**20
 
 
 def children(pid: int) -> list[int]:
-    """Process ids of a process's children, of whichever of its threads."""
-    found = []
-    for status in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, parent = status.read_text().rpartition(")")[2].split()[:2]
-        except OSError:  # it has ended meanwhile
-            continue
-        if int(parent) == pid and state != "Z":
-            found.append(int(status.parent.name))
-    return found
+    """Process ids of a process's children."""
+    with suppress(psutil.NoSuchProcess):
+        return [one.pid for one in psutil.Process(pid).children() if one.status() != psutil.STATUS_ZOMBIE]
+    return []
 
 
 def grandchildren(pid: int) -> list[int]:
@@ -118,3 +106,17 @@ def beside(threads: Sequence[threading.Thread], stop: threading.Event) -> Iterat
         stop.set()
         for thread in threads:
             thread.join()
+
+
+@contextmanager
+def watched_memory(pid: int, every_s: float = 1.0) -> Iterator[list[float]]:
+    """Looks at the memory of a process and its own again and again within the block: MiB, in order."""
+    seen, stop = [memory_mib(pid)], threading.Event()
+
+    def run() -> None:
+        while not stop.wait(every_s):
+            with suppress(psutil.Error):  # it has ended
+                seen.append(memory_mib(pid))
+
+    with beside([threading.Thread(target=run)], stop):
+        yield seen

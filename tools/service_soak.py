@@ -23,7 +23,9 @@ from featuredb.errors import ServiceError
 from featuredb.store import Database
 from reloc.client import Client
 from reloc.client.connection import NO_SERVER, TIMEOUT
+from tools.commands import first_map
 from tools.figures import say, write_figures
+from tools.serve_process import watched_memory
 from tools.service_world import (
     ATTACKER,
     Service,
@@ -33,7 +35,6 @@ from tools.service_world import (
     photos_of,
     running_service,
     service_parser,
-    watched_memory,
 )
 
 _EVENT_S = 5.0  # between two of what happens beside the queries
@@ -46,8 +47,7 @@ class Events:
         self.counts: Counter[str] = Counter()
         self._database, self._service, self._photo = database, service, photo
         self._rng = random.Random(seed)
-        snapshot = database.snapshot()
-        self._original = snapshot.load_map(snapshot.maps()[0].map_id)
+        self._original = first_map(database)
         self._turns = cycle((self._commit, self._kill, self._send_broken, self._retire, self._kill))
 
     def next(self) -> None:
@@ -87,7 +87,7 @@ def main() -> None:
             events = Events(database, service, photos[0], seed=1)
             end = time.monotonic() + 60 * args.minutes
             with (
-                watched_memory(service.server, every_s=5.0) as memory,
+                watched_memory(service.server.process.pid, every_s=5.0) as memory,
                 honest_clients(service, photos, expected) as heard,
             ):
                 while time.monotonic() < end:

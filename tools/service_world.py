@@ -275,16 +275,3 @@ def honest_clients(
     threads = [threading.Thread(target=run, args=(name, 3 * k)) for k, name in enumerate(HONEST)]
     with beside(threads, stop):
         yield heard
-
-
-@contextmanager
-def watched_memory(process: CommandProcess, every_s: float = 1.0) -> Iterator[list[float]]:
-    """Looks at a process's memory again and again within the block: what it sees (MiB), in order."""
-    seen, stop = [process.memory_mib()], threading.Event()
-
-    def run() -> None:
-        while not stop.wait(every_s):
-            seen.append(process.memory_mib())
-
-    with beside([threading.Thread(target=run)], stop):
-        yield seen

@@ -9,7 +9,6 @@ those of a fundamental matrix to one pixel of the shrunk photos. Times are of on
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -38,9 +37,7 @@ class TimedFeatures:
 
 
 def main() -> None:
-    parser = study_parser(__doc__)
-    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
-    args = parser.parse_args()
+    args = study_parser(__doc__, "folders").parse_args()
     options = ExtractorOptions(first_octave_px=2 * _SIDE_PX, max_features=_FEATURES, oversample=1.25)
     cv2.setNumThreads(1)
     counts = {"ours": 0, "opencv": 0, "across": 0}

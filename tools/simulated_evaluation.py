@@ -51,7 +51,6 @@ class Asked(NamedTuple):
 
 def main() -> None:
     args = study_parser(__doc__, "--work", "--seed").parse_args()
-    args.work.mkdir(parents=True, exist_ok=True)
     world = make_world(args.work / "world", size="full", seed=args.seed)
     database = Database.create(args.work / "db")
     if not database.snapshot().maps():

@@ -21,12 +21,11 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.world import Truth, read_truth
 from featuredb.store import Database
-from tools.commands import anchor, featuredb, newest_copy
+from tools.commands import anchor, featuredb, make, newest_copy, once
 from tools.figures import kept, median, squared, study_parser, write_figures
-from tools.made_maps import make, once
 from tools.worlds.album import TABLE_FILE
+from tools.worlds.community import StreetOptions, write_street_album
 from tools.worlds.scan_world import make_scan_world
-from tools.worlds.street_people import StreetOptions, write_street_album
 
 _TOWNS = tuple(range(306, 316))
 _LEAST_PHOTOS = 10
@@ -38,7 +37,7 @@ _RADIUS_M = 200.0
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
     cv2.setNumThreads(1)
-    inputs, work = args.inputs or args.work, args.work
+    inputs, work = args.inputs, args.work
     towns = [kept(work / f"town-{seed}.json", partial(_town, seed, inputs, work)) for seed in _TOWNS]
     here = [one for town in towns for one in town["here"]]
     placed = [one for one in here if one["off"]]

@@ -55,15 +55,13 @@ def main() -> None:
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
     args = parser.parse_args()
-    args.work.mkdir(parents=True, exist_ok=True)
-    inputs = args.inputs or args.work
-    database, placed = anchored(args.work, make_scan_world(inputs), other=False)
+    database, placed = anchored(args.work, make_scan_world(args.inputs), other=False)
     if not placed:
         raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
     results: dict[str, dict[str, float]] = {}
     for name in args.films:
         options = film_options(name, args.frames)
-        film = write_film(inputs / f"film-{name}-{args.frames}-{_SEED}", options) / FILM_FILE
+        film = write_film(args.inputs / f"film-{name}-{args.frames}-{_SEED}", options) / FILM_FILE
         truth = film_truth(options)
         finder = finder_on(args.on, database, truth)
         tracked = track_video(film, finder, camera=truth.camera)

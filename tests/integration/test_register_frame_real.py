@@ -8,7 +8,8 @@ import pytest
 
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameOptions
-from tools.frame_real_photos import exif_prior, lens, read_cloud, wrong_prior
+from tools.commands import cloud_of
+from tools.frame_real_photos import exif_prior, lens, wrong_prior
 
 # Of all 18 photos, by bundle adjustment.
 LENS = "SIMPLE_RADIAL:2916.2,2011.0,1153.6,0.02"
@@ -16,9 +17,9 @@ LENS = "SIMPLE_RADIAL:2916.2,2011.0,1153.6,0.02"
 
 @pytest.mark.real_data
 @pytest.mark.evaluation
-def test_two_priors_end_at_one_pose(shared_data: Path) -> None:
+def test_two_priors_end_at_one_pose(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "brighton"
-    cloud = read_cloud(folder / "model.laz", 32615)
+    cloud = cloud_of(folder / "model.laz", tmp_path / "db")
     data = (folder / "images" / "DJI_0026.JPG").read_bytes()
     image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
     camera = lens(LENS, image.shape[1], image.shape[0])

@@ -18,7 +18,7 @@ from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from tests.support.live import wait_until
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
-from tools.bombs import png, progressive_jpeg, zeros
+from tools.attacks import png, progressive_jpeg, zeros
 from tools.serve_process import ServeProcess
 
 SIDE = 10_944  # 120 million pixels, the most that are taken

@@ -12,7 +12,7 @@ from PIL import Image
 from featuredb.errors import ServiceError
 from reloc.wire.query import ErrorCode, LocaliseReply
 from tests.support.service import ScriptedLocaliser, client_of, photo, running_server
-from tools.bombs import png
+from tools.attacks import png
 
 QUERIES = 300
 

@@ -20,7 +20,7 @@ from schemas import load_schema
 from tests.support.live import LENS, SOON_S, jpeg, localiser, wait_until
 from tests.support.live_sessions import LIVE, end_of, exchange, live_status, serving, until_tracking
 from tests.support.service import MemorySource, ScriptedLocaliser, area_of, client_of, photo, running_server
-from tools.bombs import png, zeros
+from tools.attacks import png, zeros
 
 
 class Raw:

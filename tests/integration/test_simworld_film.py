@@ -13,12 +13,12 @@ from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.frames import VideoOptions, open_video
 from featuredb.video.telemetry.read import read_telemetry
-from tools.worlds.film_frame import Exposure
 from tools.worlds.film_world import (
     FILM_FILE,
     GPS_SIGMA_M,
     TELEMETRY_FILE,
     TELEMETRY_LATE_S,
+    Exposure,
     FilmOptions,
     film_frame,
     film_truth,

@@ -31,8 +31,7 @@ from featuredb.simworld.scan_world import write_scan
 from featuredb.simworld.world import Truth, World, WorldOptions, town_of, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
-from tools.worlds.film_frame import Exposure
-from tools.worlds.film_world import FilmOptions, write_film
+from tools.worlds.film_world import Exposure, FilmOptions, write_film
 from tools.worlds.flight_path import PathOptions
 
 _LICENCE = "CC-BY-4.0"

@@ -9,8 +9,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from tools.figures import pose_errors
-from tools.laser_baseline import robust_similarity
-from tools.laser_set import camera_file, centers, true_camera, true_pose, upright
+from tools.laser_set import camera_file, centers, robust_similarity, true_camera, true_pose, upright
 from tools.laser_truth import Errors, figures_of
 
 

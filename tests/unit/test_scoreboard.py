@@ -27,7 +27,7 @@ def row(text: str = "{m:.2f} m in {seconds:.0f} s", limit: float = 0.3, code: st
         form="quick",
         claim="a claim",
         commands=shlex.join(("timeit", "-n1", "-r1", f"import sys; sys.argv = {_ARGV}; {code}")),
-        figures={"m": "a.m"},
+        figures="m=a_m",
         text=text,
         limits=f"m <= {limit}",
     )

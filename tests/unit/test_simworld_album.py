@@ -16,9 +16,16 @@ from featuredb.simworld.town.scene import Ellipsoids, Scene
 from featuredb.simworld.town.town import make_town
 from tools.worlds.community import CommunityOptions, plan_community
 from tools.worlds.edits import Edit, edited, edited_camera
-from tools.worlds.geotags import GeotagOptions, Tagging, geotag_at, give_geotags
-from tools.worlds.lookalike import Rect, blocks_of, forged, with_copied_block
-from tools.worlds.people import community, stored_upright, zoomed
+from tools.worlds.people import (
+    GeotagOptions,
+    Tagging,
+    community,
+    geotag_at,
+    give_geotags,
+    stored_upright,
+    zoomed,
+)
+from tools.worlds.poison_world import Rect, blocks_of, forged, with_copied_block
 from tools.worlds.sights import Surroundings, find_sights, look_at
 from tools.worlds.surveyed import day_key, day_scene
 

@@ -5,7 +5,7 @@ from functools import partial
 from tools.scoreboard.real_rows import REAL
 from tools.scoreboard.row import Row
 from tools.scoreboard.simulated_rows import SIMULATED
-from tools.scoreboard.words import BRIGHTON, OUT, same
+from tools.scoreboard.words import BRIGHTON, OUT
 
 _row = partial(Row, group="speed")
 # Points for each image that a thinned map keeps.
@@ -23,7 +23,7 @@ SPEED: tuple[Row, ...] = (
         "alone and its decoding",
         commands=f"{_MADE}tools.query_benchmark {{work}}/db {BRIGHTON}/DJI_0020.JPG "
         f"{BRIGHTON}/DJI_0033.JPG {OUT}",
-        figures=same("in_process_ms asked localised sift_ms"),
+        figures="in_process_ms asked localised sift_ms",
         text="{wall_ms:.0f} ms, of which transport {transport_ms:.1f} ms; without decoding {over_sift:.2f} "
         "times SIFT alone, decoding {over_decode:.2f} times OpenCV's",
         limits="wall_ms <= 1000, transport_ms <= 10, over_sift <= 0.5, over_decode <= 1",
@@ -37,7 +37,7 @@ SPEED: tuple[Row, ...] = (
         commands="tools.sift_against_opencv "
         + " ".join(f"{{data}}/{name}/images" for name in ("brighton", "seneca", "lewis", "copr", "reichstag"))
         + f" {OUT}",
-        figures=same("photos ours_ms opencv_inliers"),
+        figures="photos ours_ms opencv_inliers",
         text="{time_ratio:.2f} times OpenCV's time; {inliers_ratio:.3f} times its {opencv_inliers:.0f} "
         "inliers, across {across_ratio:.3f} times; {photos} photos",
         limits="time_ratio <= 0.7, 0.98 <= inliers_ratio, 0.95 <= across_ratio",
@@ -50,11 +50,7 @@ SPEED: tuple[Row, ...] = (
         commands=f"tools.ingest_benchmark {BRIGHTON} "
         + " ".join(f"{{data}}/{name}/images" for name in _INGESTED[1:])
         + f" {OUT}",
-        figures={
-            f"{photos}_{name}": f"{photos}.{name}"
-            for photos in _INGESTED
-            for name in ("ratio", "ours_photos", "colmap_photos", "ours_s", "colmap_s")
-        },
+        figures=" ".join(f"{photos}_ours_s {photos}_colmap_s" for photos in _INGESTED),
         text="times COLMAP's time, photos in a map, COLMAP's photos: "
         + ", ".join(
             f"{{{name}_ratio:.2f}} {{{name}_ours_photos:.0f}} {{{name}_colmap_photos:.0f}}"
@@ -69,7 +65,7 @@ SPEED: tuple[Row, ...] = (
         "positions, beside the first 200 of them: processor time a photo, the largest of its processes, its "
         "maps against the truth",
         commands=f"tools.bulk_ingest --work {{work}}/bulk --seed 5 {OUT}",
-        figures=same("photos maps placed share wrong median_m largest_m a_photo_s first_s ratio largest_mb"),
+        figures="photos maps placed share wrong median_m largest_m a_photo_s first_s ratio largest_mb",
         text="{placed:.0f} of {photos:.0f} photos in {maps:.0f} maps, {wrong:.0f} wrong, {median_m:.2f} m, "
         "largest {largest_m:.2f} m; {a_photo_s:.2f} s a photo, {ratio:.2f} times that of the first; "
         "{largest_mb:.0f} MB",
@@ -81,19 +77,7 @@ SPEED: tuple[Row, ...] = (
         claim="`seneca`'s map of all photos but every fifth, thinned to so many points for each image; the "
         "others over Zenoh, against a map of all",
         commands=f"tools.memory_curve --photos {{data}}/seneca/images --work {{work}}/maps {OUT}",
-        figures={
-            f"cover_{cover}_{name}": f"cover_{cover}.{name}"
-            for cover in _COVERS
-            for name in (
-                "megabytes_a_km2",
-                "size_ratio",
-                "answered",
-                "asked",
-                "kept",
-                "median_m",
-                "largest_m",
-            )
-        },
+        figures=" ".join(f"cover_{k}_size_ratio cover_{k}_kept cover_{k}_largest_m" for k in _COVERS),
         text="points an image, megabytes a km2, answered, median error: "
         + "; ".join(
             f"{cover} {{cover_{cover}_megabytes_a_km2:.0f}} {{cover_{cover}_answered:.0f}} of "
@@ -111,7 +95,7 @@ SPEED: tuple[Row, ...] = (
         commands=f"{_MADE}featuredb.cli ingest photos {{work}}/seneca {{data}}/seneca/images --quiet\n"
         f"tools.scale_benchmark {{work}}/db:{BRIGHTON} {{work}}/seneca:{{data}}/seneca/images "
         f"--work {{work}}/scale {OUT}",
-        figures=same(
+        figures=(
             "large_points large_first_start_s large_start_s large_commit_s large_with_prior_ms "
             "large_without_ms anonymous_bytes_a_point"
         ),
@@ -129,7 +113,7 @@ SPEED: tuple[Row, ...] = (
         claim="servers of one database behind a router, each of whose workers takes 100 ms for a photo: "
         "queries a second of two and four, in those of one; and queries lost when one of two is killed",
         commands=f"tools.many_servers {OUT}",
-        figures=same("one_per_s killed_answered"),
+        figures="one_per_s killed_answered",
         text="{two_times:.2f} and {four_times:.2f} times the queries of one; {killed_lost:.0f} of "
         "{killed_answered:.0f} lost",
         limits="1.8 <= two_times, 3.4 <= four_times, killed_lost <= 0",
@@ -140,7 +124,7 @@ SPEED: tuple[Row, ...] = (
         claim="a real map of `brighton` with copies of it to 200,000 points, served with keys: honest "
         "clients' answer times and the server's memory under eleven attacks (tools/attacks.py)",
         commands=f"{_MADE}tools.attacks_benchmark {{work}}/db {BRIGHTON} {OUT}",
-        figures=same("points asked quiet_mib after_mib worst_http_p99_s failures_by_kills"),
+        figures="points asked quiet_mib after_mib worst_http_p99_s failures_by_kills",
         text="99 % within {quiet_p99_s:.2f} s quiet, {worst_p99_s:.2f} s under the worst attack, {failures} "
         "failed, {wrong} wrong; {peak_mib:.0f} MiB at the peak",
         # A failed question counts as the deadline, 8 s.
@@ -152,7 +136,7 @@ SPEED: tuple[Row, ...] = (
         claim="a server for an hour: queries with and without priors, commits, reloads, killed workers, "
         "broken messages",
         commands=f"{_MADE}tools.service_soak {{work}}/db {BRIGHTON} --minutes 60 {OUT}",
-        figures=same("failed p99_s late_mib exit_code"),
+        figures="failed p99_s late_mib exit_code",
         text="{asked} questions, {wrong} wrong, {missing} without a reply, {kills} workers killed, {reloads} "
         "reloads; {grown_mib:+.0f} MiB",
         limits="wrong <= 0, missing <= 0, grown_mib <= 100, exit_code = 0",
@@ -162,7 +146,7 @@ SPEED: tuple[Row, ...] = (
         name="service-stops",
         claim="a server told to stop in the middle of its load, 200 times",
         commands=f"{_MADE}tools.service_stops {{work}}/db {BRIGHTON} {OUT}",
-        figures=same("stops slowest_s"),
+        figures="stops slowest_s",
         text="{clean} of {stops} clean, the slowest in {slowest_s:.1f} s",
         limits="200 <= clean",
         minutes=25,
@@ -171,7 +155,7 @@ SPEED: tuple[Row, ...] = (
         name="scan-memory",
         claim="100 million points added by `lidar add`",
         commands=f"tools.lidar_memory --points 100000000 --folder {{work}}/scan {OUT}",
-        figures=same("points_per_cpu_second"),
+        figures="points_per_cpu_second",
         text="{peak_tree_mib:.0f} MiB at the peak, {cpu_seconds:.0f} s of a core",
         limits="peak_tree_mib <= 2048",
         minutes=15,

@@ -4,7 +4,7 @@ from functools import partial
 from itertools import product
 
 from tools.scoreboard.row import Form, Row
-from tools.scoreboard.words import ANSWERS, BRIGHTON, BRIGHTON_LENS, ERRORS, HELD_OUT, OUT, POSES, SCAN, same
+from tools.scoreboard.words import ANSWERS, BRIGHTON, BRIGHTON_LENS, ERRORS, HELD_OUT, ON_SCAN, OUT, SCAN
 
 _row = partial(Row, group="real")
 
@@ -26,7 +26,7 @@ def _sequence(photos: str, median_m: float, minutes: float) -> Row:
         name=f"{name}-as-film",
         claim=f"`{name}`: every second photo is a map, all are played as a film and tracked",
         commands=f"tools.real_sequence --photos {{data}}/{photos} --work {{work}}/maps {OUT}",
-        figures=same("unknown"),
+        figures="unknown",
         text="{lost} of {frames} lost, median {median_m:.3f} m, largest {largest_m:.3f} m",
         limits=f"median_m <= {median_m:g}, largest_m <= 1",
         minutes=minutes,
@@ -40,7 +40,7 @@ def _laser(name: str, photos: int, form: Form, limits: str = "") -> Row:
         claim=f"`strecha/{name}`: {photos} photos with exact positions become a map, others are asked, their "
         "camera told and unknown; against a laser scan, beside COLMAP given the true lens",
         commands=f"tools.laser_truth {{data}}/strecha/{name} {OUT}",
-        figures=same("map_reported_deg told_reported_m"),
+        figures="map_reported_deg told_reported_m",
         text="{map_found} photos; map {map_m:.4f} m and {map_deg:.3f} degrees (COLMAP {map_colmap_m:.4f} m), "
         "told {told_m:.4f} m and {told_deg:.3f}, unknown {unknown_m:.4f} m and {unknown_deg:.3f} "
         "(COLMAP {told_colmap_m:.4f} m); worst ratio {worst:.1f}; lens off by {lens_off:.1f} of its sigmas",
@@ -67,7 +67,7 @@ REAL: tuple[Row, ...] = (
         )
         + " sacre_coeur={data}/sacre_coeur/mapping courtyard={data}/strecha/fountain-P11/images "
         f"courtyard={{data}}/strecha/entry-P10/images --work {{work}}/maps {OUT}",
-        figures=same("photos maps placed seconds"),
+        figures="photos maps placed seconds",
         text="{mapped} of {photos} photos in {maps} maps, {in_largest} in the largest of each place; {mixed} "
         "maps mix places; {placed} have a place",
         limits="mixed <= 0, 7 <= places, 0.8 <= least_share",
@@ -88,8 +88,7 @@ REAL: tuple[Row, ...] = (
         form="quick",
         claim="`brighton` anchored on its scan without a person; the 4 others over Zenoh, against poses that "
         "the scan alone gives",
-        commands=f"tools.anchor_brighton --photos {BRIGHTON} --scan {SCAN} "
-        f"--poses {POSES} --held-out {HELD_OUT} --work {{work}}/maps {OUT}",
+        commands=f"tools.anchor_brighton {ON_SCAN} --held-out {HELD_OUT} --work {{work}}/maps {OUT}",
         figures=ERRORS,
         text=ANSWERS
         + ", stated {stated_m:.2f} m and {stated_deg:.2f} (by GPS {before_median_m:.1f} m; its focal "
@@ -107,9 +106,8 @@ REAL: tuple[Row, ...] = (
         name="brighton-located-pixels",
         claim="`brighton` anchored on its scan: pixels of the 4 others, located on the scan and by the map "
         "alone, against the scan's points that they show from poses that the scan alone gives",
-        commands=f"tools.locate_brighton --photos {BRIGHTON} --scan {SCAN} "
-        f"--poses {POSES} --held-out {HELD_OUT} --work {{work}}/maps {OUT}",
-        figures=same("scan_edges scan_edge_95"),
+        commands=f"tools.anchor_brighton --pixels {ON_SCAN} --held-out {HELD_OUT} --work {{work}}/maps {OUT}",
+        figures="scan_edges scan_edge_95",
         text="of {asked} pixels {scan_located} on the scan, median {scan_median_m:.3f} m, 95 % off edges "
         "within {scan_clear_95_m:.3f} m, {scan_68:.0%} and {scan_95:.1%} inside 68 and 95 % bounds; "
         "{map_located} by the map, median {map_median_m:.3f} m, 95 % within {map_clear_95_m:.3f} m, "
@@ -146,9 +144,8 @@ REAL: tuple[Row, ...] = (
         name="brighton-by-picks",
         claim="`brighton` without GPS: a map of 14 photos, placed on the scan by six picks (3 px) in one; "
         "20 draws, the 4 others asked of each",
-        commands=f"tools.unplaced_brighton --photos {BRIGHTON} --scan {SCAN} "
-        f"--poses {POSES} --work {{work}}/draws {OUT}",
-        figures=same("worst_deg"),
+        commands=f"tools.unplaced_brighton {ON_SCAN} --work {{work}}/draws {OUT}",
+        figures="worst_deg",
         text="{placed} of {draws} placed, {wrong} wrong; median {median_m:.2f} m and "
         "{median_deg:.2f} degrees, worst draw {worst_m:.2f} m",
         limits="maps = 1, 14 <= largest, refused <= 2, wrong <= 0, median_m <= 0.25, median_deg <= 0.25",
@@ -159,8 +156,7 @@ REAL: tuple[Row, ...] = (
         name="brighton-near",
         claim="`brighton` without GPS: a map of 14 photos, looked for within 250 m of a point 100 m off; ten "
         "points each with the scan's colours, with grey values as intensities, and on a mirrored scan",
-        commands=f"tools.unplaced_brighton --near --photos {BRIGHTON} --scan {SCAN} "
-        f"--poses {POSES} --work {{work}}/near {OUT}",
+        commands=f"tools.unplaced_brighton --near {ON_SCAN} --work {{work}}/near {OUT}",
         text="{colour_placed} and {intensity_placed} of {draws} placed, {colour_wrong} and {intensity_wrong} "
         "wrong; the 4 others median {colour_median_m:.2f} and {intensity_median_m:.2f} m, "
         "{colour_median_deg:.2f} and {intensity_median_deg:.2f} degrees; mirrored: {mirrored_placed}",
@@ -175,7 +171,7 @@ REAL: tuple[Row, ...] = (
         "photos of `lewis` not; against a map of all by GPS, laid on the first",
         commands=f"tools.unplaced_grown --photos {BRIGHTON} --strange {{data}}/lewis/images "
         f"--work {{work}}/maps {OUT}",
-        figures=same("bound_m"),
+        figures="bound_m",
         text="{grown} of {photos} placed, median {loose_median_m:.2f} m and {loose_median_deg:.2f} degrees, "
         "largest {loose_largest_m:.2f} m; the map by GPS {placed_median_m:.2f} m",
         limits="9 <= grown, strange_placed <= 0, loose_median_m <= 0.3",
@@ -218,13 +214,7 @@ REAL: tuple[Row, ...] = (
         claim="`reichstag`: 74 photos of one landmark by many people; of those in COLMAP's largest model "
         "(exhaustive, incremental), how many are in our largest map (paper: 7 and 22 % of collections)",
         commands=f"tools.ingest_benchmark {{data}}/reichstag/images {OUT}",
-        figures={
-            "ours_of_colmap_largest": "reichstag.both",
-            "colmap_largest": "reichstag.colmap_photos",
-            "share": "reichstag.share",
-            "times": "reichstag.ratio",
-            "placed": "reichstag.placed",
-        },
+        figures="ours_of_colmap_largest=both colmap_largest=colmap_photos times=ratio placed",
         text="{ours_of_colmap_largest} of {colmap_largest} ({share:.0%}), in {times:.1f} times COLMAP's time",
         limits="0.9 <= share, placed <= 0",
         minutes=15,
@@ -276,7 +266,7 @@ REAL: tuple[Row, ...] = (
         name="strip-draws",
         claim="single strips of photos, nine of `brighton` and simulated ones, placed by positions with the "
         "cameras' angles and without",
-        commands=f"tools.strip_draws --photos {BRIGHTON} --scan {SCAN} --poses {POSES} --draws 300 {OUT}",
+        commands=f"tools.strip_draws {ON_SCAN} --draws 300 {OUT}",
         text="; ".join(_STRIPS.replace("KIND", kind) for kind in ("real", "simulated")),
         limits="1 <= real_answer, real_without_answer <= 0, 0.85 <= simulated_answer, "
         "simulated_without_answer <= 0.05, "
@@ -303,7 +293,7 @@ REAL: tuple[Row, ...] = (
         "and again from 15 m and 10 degrees off",
         commands=f"tools.frame_real_photos {SCAN} {BRIGHTON} --lens {BRIGHTON_LENS} "
         f"--photos {HELD_OUT} {OUT}",
-        figures=same("cpu_s"),
+        figures="cpu_s",
         text="{accepted} of {photos}, both at one pose to {largest_apart_m:.2f} m and "
         "{largest_apart_deg:.2f} degrees",
         limits="4 <= accepted, largest_apart_m <= 0.3, largest_apart_deg <= 0.25",

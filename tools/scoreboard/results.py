@@ -5,7 +5,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -16,7 +16,7 @@ _CODE = ("featuredb", "ingest", "reloc", "schemas", "tools", "pyproject.toml", "
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """A row as it was measured.
+    """A row as it was measured; by default on this machine, today.
 
     Attributes:
         row: its name. commit: short hash of the last one that changed the program; `+` follows where the
@@ -27,33 +27,17 @@ class Result:
 
     row: str
     commit: str
-    date: str
+    date: str = field(default_factory=lambda: f"{datetime.now(UTC):%Y-%m-%d}")
     figures: Mapping[str, float | int | str | None]
     seconds: float
-    cores: int
-    python: str
+    cores: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
+    python: str = field(default_factory=platform.python_version)
     failure: str = ""
 
     @property
     def clean(self) -> bool:
         """Whether the commit has exactly what was run."""
         return not self.commit.endswith("+")
-
-
-def result_now(
-    row: str, commit: str, figures: Mapping[str, float | int | str | None], seconds: float, failure: str = ""
-) -> Result:
-    """A result of this machine, today."""
-    return Result(
-        row=row,
-        commit=commit,
-        date=f"{datetime.now(UTC):%Y-%m-%d}",
-        figures=figures,
-        seconds=round(seconds, 1),
-        cores=len(os.sched_getaffinity(0)),
-        python=platform.python_version(),
-        failure=failure,
-    )
 
 
 def code_commit() -> str:

@@ -5,7 +5,7 @@ import re
 import shlex
 import string
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from featuredb.errors import InvalidValueError
@@ -60,8 +60,9 @@ class Row:
             (`tools.x`, `featuredb.cli`).
         text: the figures in words, a format string.
         limits: all must hold; between commas, each as `Limit` reads it.
-        figures: name -> where it is in the file, keys joined by dots: of those that are kept beside what
-            `text` and `limits` name, and of what does not stand there under its own name.
+        figures: names of those that are kept beside what `text` and `limits` name. What does not stand in the
+            file under its own name stands there in a part: `smooth_lost` is `lost` of `smooth`; where there
+            is but one part, in that. `times=ratio` is called otherwise there.
         resumes: whether the command goes on with what it finds in `{work}` of the same commit.
         readme: whether README shows it. minutes: about how long it takes on two cores.
     """
@@ -73,7 +74,7 @@ class Row:
     commands: str
     text: str
     limits: str
-    figures: Mapping[str, str] = field(default_factory=dict)
+    figures: str = ""
     resumes: bool = False
     readme: bool = False
     minutes: float = 1.0
@@ -98,9 +99,11 @@ class Row:
     def read(self, document: Mapping[str, Any]) -> dict[str, float | int | str | None]:
         """The row's figures of what the command has written; None for what is not there."""
         words = (name for _, name, _, _ in string.Formatter().parse(self.text) if name is not None)
-        named = {*words, *(limit.figure for limit in self.each_limit())} - {"seconds"}
-        paths = {name: name for name in sorted(named)} | dict(self.figures)
-        return {name: _at(document, path) for name, path in paths.items()}
+        named = {name: name for name in (*words, *(limit.figure for limit in self.each_limit()))}
+        for text in self.figures.split():
+            name, _, there = text.partition("=")
+            named[name] = there or name
+        return {name: _at(document, named[name]) for name in sorted(named) if name != "seconds"}
 
     def holds(self, figures: Figures) -> bool:
         """Whether all limits hold."""
@@ -132,9 +135,12 @@ class _Dashes(dict[str, Any]):
         return _Dash() if value is None else value
 
 
-def _at(document: Any, path: str) -> float | int | str | None:
-    for key in path.split("."):
-        if not isinstance(document, Mapping) or key not in document:
-            return None
-        document = document[key]
-    return document if isinstance(document, float | int | str) else None
+def _at(document: Mapping[str, Any], name: str) -> float | int | str | None:
+    found = document.get(name)
+    if isinstance(found, float | int | str):
+        return found
+    parts = {key: part for key, part in document.items() if isinstance(part, Mapping)}
+    key = max((key for key in parts if name.startswith(f"{key}_")), key=len, default=None)
+    if key is not None:
+        return _at(parts[key], name.removeprefix(f"{key}_"))
+    return _at(*parts.values(), name) if len(parts) == 1 else None

@@ -10,9 +10,9 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
-from tools.scoreboard.results import ROOT, Result, result_now
+from tools.scoreboard.results import ROOT, Result
 from tools.scoreboard.row import Row
 
 _LAST_LINES = 3  # of a command that failed, in its result
@@ -54,15 +54,17 @@ def run(row: Row, places: Folders, commit: str) -> Result:
                 break
         log.seek(0)
         tail = " / ".join(log.read().strip().splitlines()[-_LAST_LINES:])
-    seconds = time.monotonic() - start
+    seconds = round(time.monotonic() - start, 1)
     if not failure and not figures_file.is_file():
         failure = f"no figures were written, exit code {code}"
+    figures: dict[str, Any] = {}
     if failure:
-        return result_now(row.name, commit, {}, seconds, f"{failure}: {tail[-300:]}")
-    figures = row.read(json.loads(figures_file.read_text(encoding="utf-8")))
-    if row.resumes:  # the next run begins anew
-        shutil.rmtree(work)
-    return result_now(row.name, commit, figures | {"seconds": round(seconds, 1)}, seconds)
+        failure = f"{failure}: {tail[-300:]}"
+    else:
+        figures = row.read(json.loads(figures_file.read_text(encoding="utf-8"))) | {"seconds": seconds}
+        if row.resumes:  # the next run begins anew
+            shutil.rmtree(work)
+    return Result(row=row.name, commit=commit, figures=figures, seconds=seconds, failure=failure)
 
 
 def _call(command: Sequence[str], log: TextIO) -> int:

@@ -3,14 +3,10 @@
 from functools import partial
 
 from tools.scoreboard.row import Row
-from tools.scoreboard.words import OUT, same
+from tools.scoreboard.words import OUT
 
 _row = partial(Row, group="simulated")
 _SIGMAS = ("2cm", "50cm", "300cm")
-_TRACKED = (
-    "frames lost invented mean_m largest_m first_m last_m rate_hz position_95 orientation_95 squared "
-    "few_position_95 few_orientation_95 few_squared"
-)
 
 
 def _track(film: str, on: str, mean_m: float) -> Row:
@@ -19,7 +15,7 @@ def _track(film: str, on: str, mean_m: float) -> Row:
         claim=f"a {film} film of 600 frames over the town, tracked on its {on} alone",
         commands=f"tools.track_evaluation --work {{work}} --inputs {{cache}} --frames 600 --films {film} "
         f"--on {on} {OUT}",
-        figures={name: f"{film}.{name}" for name in _TRACKED.split()},
+        figures="first_m last_m squared",
         text="{lost} of {frames} lost, {invented} invented, mean {mean_m:.3f} m, largest {largest_m:.2f} m; "
         "{rate_hz:.0f} frames/s; inside 95 %: {position_95:.0%} and {orientation_95:.0%}, with fewest "
         "landmarks {few_position_95:.0%} and {few_orientation_95:.0%} (squared error {few_squared:.1f}; 3 is "
@@ -37,7 +33,7 @@ def _films(seed: int) -> Row:
         "compression): maps of the place, placed by six picks in one frame, every film tracked; "
         f"draw {seed}",
         commands=f"tools.community_films --work {{work}}/films --inputs {{cache}} --seed {seed} {OUT}",
-        figures=same("placed largest_m"),
+        figures="placed largest_m",
         text="{shots_in_maps} of {place_shots} shots in {place_maps} maps of the place, {foreign_in_maps} "
         "keyframes of elsewhere in them; {tracked_share:.1%} of {place_frames} frames tracked, "
         "{inside_share:.1%} inside their bounds, median {median_m:.3f} m",
@@ -65,7 +61,7 @@ SIMULATED: tuple[Row, ...] = (
         claim="24 photos with a drone's GPS, placed by an airborne scan with intensity only; another town's "
         "scan is refused",
         commands=f"tools.anchor_simworld --work {{work}}/town --inputs {{cache}} {OUT}",
-        figures=same("scan_cameras_deg"),
+        figures="scan_cameras_deg",
         text="cameras {gps_cameras_m:.1f} m off by GPS, {scan_cameras_m:.3f} m by the scan (medians); "
         "{scan_answered} of {scan_queries} queries, median {scan_queries_m:.3f} m, "
         "largest {scan_queries_largest_m:.2f} m",
@@ -77,7 +73,7 @@ SIMULATED: tuple[Row, ...] = (
         claim="places of pixels that show what stands still, on an airborne scan: from answers to held-out "
         "photos, and from poses and lenses drawn as the answers' covariances say, which test the bounds",
         commands=f"tools.locate_pixels --work {{work}}/town --inputs {{cache}} {OUT}",
-        figures=same("answered_95 drawn_edges drawn_edge_95"),
+        figures="answered_95 drawn_edges drawn_edge_95",
         text="answers: median {answered_median_m:.3f} m, 95 % off edges within {answered_clear_95_m:.3f} m; "
         "drawn: {drawn_68:.0%} and {drawn_95:.1%} inside 68 and 95 % bounds, {drawn_edge_95:.0%} of the "
         "{drawn_edges:.0%} that say that they are at an edge; {refused} refused beside {located}",
@@ -126,7 +122,7 @@ SIMULATED: tuple[Row, ...] = (
         name="town-held-out",
         claim="60 held-out drone photos of the town, survey-grade tags; photos that show no mapped place",
         commands=f"tools.simulated_evaluation --work {{work}}/town --seed 3 {OUT}",
-        figures=same("median_deg"),
+        figures="median_deg",
         text="{answered} of {asked}, {within:.1%} within 0.25 m and 0.3 degrees, median {median_m:.3f} m; "
         "{negatives_answered} of {negatives} others answered, {street_answered} of {street} from the street",
         # Inside: 68 % within two standard deviations of the count of 60.
@@ -142,16 +138,7 @@ SIMULATED: tuple[Row, ...] = (
         "the marks of a GeoJSON layer that `draw` lays over them, against where they belong",
         commands="tools.track_evaluation --work {work} --inputs {cache} --frames 150 --films smooth cut "
         f"--on map --draw {OUT}",
-        figures={
-            f"{film}_{name}": f"{film}.{name}"
-            for film in ("smooth", "cut")
-            for name in ("frames", "lost", "invented", "mean_m", "largest_m", "rate_hz", "found_s")
-        }
-        | {
-            f"{film}_layer_{name}": f"{film}_layer.{name}"
-            for film in ("smooth", "cut")
-            for name in ("frames", "marks", "stray", "median_px", "largest_px")
-        },
+        figures="smooth_frames smooth_invented smooth_largest_m smooth_found_s cut_frames cut_rate_hz",
         text="smooth: {smooth_lost} lost, mean {smooth_mean_m:.3f} m, {smooth_rate_hz:.0f} frames/s; "
         "cut: {cut_lost} lost, mean {cut_mean_m:.3f} m, {cut_invented} invented; {smooth_layer_marks} marks "
         "in {smooth_layer_frames} smooth frames: median {smooth_layer_median_px:.1f} px, largest "
@@ -207,7 +194,7 @@ SIMULATED: tuple[Row, ...] = (
         "one frame, tracked from end to end (paper: 0.4 m, 29.7 frames/s with a GPU; a frame 15 to 30 s, "
         "structure projection 1 s)",
         commands=f"tools.paper --work {{work}} --inputs {{cache}} {OUT}",
-        figures=same("largest_m made_s"),
+        figures="largest_m made_s",
         text="mean {mean_m:.3f} m (first quarter {first_m:.3f}, last {last_m:.3f}; from the map's adjusted "
         "keyframes {adjusted_m:.3f}), {lost} lost, {rate_hz:.0f} frames/s; a frame {frame_s:.0f} s, "
         "structure projection {projection_s:.1f} s",

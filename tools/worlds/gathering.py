@@ -13,8 +13,7 @@ from featuredb.simworld.flight import shot_seed
 from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto, renamed
 from tools.worlds.edits import Edit
-from tools.worlds.geotags import GeotagOptions, Tagging, give_geotags
-from tools.worlds.people import Person, planned, stored_upright, zoomed
+from tools.worlds.people import GeotagOptions, Person, Tagging, give_geotags, planned, stored_upright, zoomed
 from tools.worlds.sights import Sight, Surroundings, look_at
 from tools.worlds.surveyed import DAYS, day_key, moment, photo_ids
 

@@ -15,8 +15,7 @@ from featuredb.simworld.camera.photograph import Shot
 from featuredb.simworld.flight import FlightOptions, shot_seed
 from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto
-from tools.worlds.geotags import geotag_at
-from tools.worlds.people import community, planned
+from tools.worlds.people import community, geotag_at, planned
 from tools.worlds.sights import Surroundings, look_at
 from tools.worlds.surveyed import TownOptions, day_key, moment, photo_ids, survey_photos, town_of
 
