@@ -54,7 +54,7 @@ _AT_ONCE = 16  # maps of a commit
 _SMALL = 10_000  # points
 
 
-class Source(NamedTuple):
+class MapSource(NamedTuple):
     """A map; photos that are not in it: features, lenses, and centres (3,) in its frame, metres."""
 
     feature_map: FeatureMap
@@ -94,7 +94,7 @@ def main() -> None:
     write_figures(args.json, figures)
 
 
-def source_of(database: str, folder: str) -> Source:
+def source_of(database: str, folder: str) -> MapSource:
     """The largest placed map of a database without some of its photos, which are spread over it."""
     snapshot = Database.open(database).snapshot()
     whole = snapshot.load_map(max(snapshot.maps(), key=lambda m: m.images).map_id)
@@ -108,10 +108,10 @@ def source_of(database: str, folder: str) -> Source:
     for image in asked:
         features = extract(decode_gray(Path(folder) / image.name), options.extractor)
         photos.append((features, whole.cameras[image.camera_id], image.cam_from_local.center))
-    return Source(rest, photos)
+    return MapSource(rest, photos)
 
 
-def city(path: Path, sources: Sequence[Source], points: int) -> list[Query]:
+def city(path: Path, sources: Sequence[MapSource], points: int) -> list[Query]:
     """A database of at least so many described points, and what to ask it."""
     for folder in (path, Path(f"{path}-cache")):
         shutil.rmtree(folder, ignore_errors=True)
