@@ -35,9 +35,9 @@ from reloc.localiser import Localiser
 from reloc.overlay import map_points_in_view
 from reloc.pixels.locate import locate
 from reloc.pixels.surfaces import MapSurface, scan_surface
+from tools.anchor_simworld import Miss, miss_figures, misses, view_of
 from tools.commands import anchor, featuredb, first_map
-from tools.figures import laid_on, poses_in, write_figures
-from tools.locate_pixels import Miss, miss_figures, misses, view_of
+from tools.figures import laid_apart, median, poses_in, write_figures
 from tools.picked import Scan, read_scan, visible
 from tools.real_photos import HeldOutRow, ask_poses, error_figures, ingest
 from tools.scan_poses import ScanTruth, scan_parser, scan_truth
@@ -92,17 +92,16 @@ def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
     first = feature_map.images[0]
     focal_px, scan_px = feature_map.cameras[first.camera_id].focal_px, truth.cameras[first.name].focal_px
     own = {name: pose.center for name, pose in poses_in(truth.frame, feature_map).items()}
-    fit = laid_on(own, {name: truth.poses[name].center for name in own})
+    shape = laid_apart(own, {name: truth.poses[name].center for name in own})
     uncertainty = LensUncertainty.of_provenance(feature_map.provenance)
-    if fit is None or uncertainty is None:
-        raise SystemExit("the map has no lens uncertainty, or its cameras lie on one point")
-    rest = [np.linalg.norm(fit.act(center) - truth.poses[name].center) for name, center in own.items()]
+    if uncertainty is None:
+        raise SystemExit("the map has no lens uncertainty")
     return {
         "gps_focal_px": focal_px,
         "scan_focal_px": scan_px,
         "gps_focal_sigma": uncertainty.focal_rel,
         "gps_focal_off": abs(focal_px / scan_px - 1.0) / max(uncertainty.focal_rel, 0.01),
-        "gps_shape_m": float(np.median(rest)),
+        "gps_shape_m": median(shape),
     }
 
 

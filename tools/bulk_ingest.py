@@ -17,7 +17,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import Truth, WorldOptions, read_truth, write_world
 from tools.commands import all_maps, copied, once, processor_s
-from tools.figures import laid_on, median, say, study_parser, write_figures
+from tools.figures import laid_apart, median, say, study_parser, write_figures
 
 _LINES, _A_LINE, _FIRST_LINES = 25, 40, 5
 _METRES_A_LINE = 22.4
@@ -59,8 +59,7 @@ def _against(truth: Truth, maps: Sequence[Any]) -> dict[str, float]:
     errors: list[float] = []
     for one in placed:
         centers = {Path(image.name).name: image.cam_from_local.center for image in one.images}
-        onto = laid_on(centers, true)
-        errors += [float(np.linalg.norm(onto.act(c) - true[n])) for n, c in centers.items()] if onto else []
+        errors += [error for error in laid_apart(centers, true) if np.isfinite(error)]
     return {
         "maps": len(maps),
         "placed": len(errors),

@@ -12,8 +12,10 @@ from typing import Any
 
 from PIL import Image
 
-from featuredb.features.exif.write import EXIF_PREFIX, with_app1
+from featuredb.features.exif.write import EXIF_PREFIX, gps_directory, with_app1, with_gps
+from featuredb.features.image_header import read_header
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import PlanBox, load_cloud, scan_frame
 from featuredb.maps.feature_map import FeatureMap
@@ -163,6 +165,25 @@ def copied(folder: Path, names: Sequence[str], target: Path, *, strip: bool) -> 
         data = (folder / name).read_bytes()
         (target / name).write_bytes(without_position(data) if strip else data)
     return target
+
+
+def with_place(
+    jpeg: bytes,
+    frame: LocalFrame,
+    place: FloatArray,
+    error_m: float | None,
+    xmp: bytes = b"",
+    *datum: str,
+    **more: float,
+) -> bytes:
+    """A JPEG with another position (3,) in its EXIF, and other XMP; the picture as it was.
+
+    Args:
+        datum, more: as `gps_directory` has them.
+    """
+    latitude, longitude, height = (float(v) for v in frame.geodetic_from_enu(place))
+    gps = gps_directory((latitude, longitude, height), *datum, error_m=error_m, **more)
+    return with_app1(jpeg, with_gps(jpeg[slice(*read_header(jpeg).exif)], gps), xmp)
 
 
 def without_position(jpeg: bytes) -> bytes:

@@ -82,6 +82,12 @@ def laid_on(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) ->
     return similarity_closed_form(*(np.array([of[name] for name in both]) for of in (mine, theirs)))
 
 
+def laid_apart(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) -> list[float]:
+    """Metres (n,) between places of the same names, once laid on each other; NaN where these are too few."""
+    sim, both = laid_on(mine, theirs), sorted(mine.keys() & theirs.keys())
+    return [float(np.linalg.norm(sim.act(mine[n]) - theirs[n])) if sim else float("nan") for n in both]
+
+
 def median(values: Sequence[float] | FloatArray) -> float:
     """NaN of none."""
     return float(np.median(values)) if len(values) else float("nan")

@@ -14,8 +14,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.writer import VideoWriterOptions
-from tools.worlds.film_world import Exposure, FilmOptions, film_frame, film_truth, write_frames
-from tools.worlds.flight_path import PathOptions
+from tools.worlds.film_world import Exposure, FilmOptions, PathOptions, film_frame, film_truth, write_frames
 
 WIDTH, HEIGHT, RATE_HZ = 960, 540, 25.0
 _GOOD_CRF, _BAD_CRF, _WORSE_CRF = 20, 34, 37

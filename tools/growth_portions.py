@@ -41,7 +41,7 @@ from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from tools.figures import laid_on, median, poses_in, say, study_parser, write_figures
+from tools.figures import laid_apart, median, poses_in, say, study_parser, write_figures
 from tools.growth_gates import recorded
 
 _PORTIONS = 3
@@ -63,7 +63,7 @@ class State:
         poses: of registered photos in the first map's frame, by name.
         frame: of the first map.
         growth: without a drift budget where the first map's metre is made up.
-        joint: poses of the joint reconstruction, in its own frame, by name. reach: of its cameras, median.
+        joint: the joint reconstruction.
         gates: where what the gates say is recorded, beside the joint reconstruction's places.
     """
 
@@ -74,9 +74,14 @@ class State:
     poses: dict[str, Rigid3] = field(default_factory=dict)
     frame: LocalFrame | None = None
     growth: GrowthOptions = field(default_factory=GrowthOptions)
-    joint: dict[str, Rigid3]
-    reach: float
+    joint: Component
     gates: Path | None = None
+
+    @property
+    def joint_poses(self) -> dict[str, Rigid3]:
+        """In the joint reconstruction's own frame, by name."""
+        names = (photo.name for photo in self.joint.photos)
+        return dict(zip(names, self.joint.model.cam_from_sfm, strict=True))
 
 
 def main() -> None:
@@ -88,18 +93,12 @@ def main() -> None:
     photos = [replace(photo, owner=_OWNER) for photo in found]
     joint = _reconstruct(photos, list(range(len(photos))), args.work)[0]
     with tempfile.TemporaryDirectory() as scratch:
-        state = State(
-            photos=photos,
-            work=args.work,
-            database=Database.create(Path(scratch) / "portions"),
-            joint={p.name: pose for p, pose in zip(joint.photos, joint.model.cam_from_sfm, strict=True)},
-            reach=_reach(joint.model),
-            gates=args.gates,
-        )
+        database = Database.create(Path(scratch) / "portions")
+        state = State(photos=photos, work=args.work, database=database, joint=joint, gates=args.gates)
         for rows in [*portions(len(photos), args.cut), []]:
             state.waiting = sorted([*state.waiting, *rows])
             _take_in(state)
-    write_figures(args.json, _judged(state, joint))
+    write_figures(args.json, _judged(state))
 
 
 def portions(count: int, cut: str) -> list[list[int]]:
@@ -115,21 +114,19 @@ def _take_in(state: State) -> None:
     """Make the first map, or grow."""
     if state.frame is None:
         _first_map(state)
-    if state.frame is None or not state.waiting:
-        return
-    made = _reconstructed(state.photos, state.waiting, state.work)
-    with nullcontext() if state.gates is None else _recording(state, state.gates):
-        report = grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
-    say(f"{report.as_text()}")
-    _find_poses(state)
+    if state.frame is not None and state.waiting:
+        made = _reconstructed(state.photos, state.waiting, state.work)
+        with _recording(state, state.frame):
+            report = grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
+        say(f"{report.as_text()}")
+        _find_poses(state)
 
 
 def _first_map(state: State) -> None:
     for component in _reconstruct(state.photos, state.waiting, state.work):
         if len(component.photos) < _LEAST_FIRST:
             break
-        first = component.feature_map or _made_up(state, component)
-        if first is not None:
+        if first := component.feature_map or _made_up(state, component):
             if component.feature_map is None:
                 state.growth = GrowthOptions(drift_budget_m=_NO_BUDGET_M)
             state.database.commit_maps([first])
@@ -150,9 +147,8 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
         residual_rms_m=0.0,
         evidence={"made_up": True},
     )
-    key = features_key(_MAKING.extractor)
-    read = Workspace(root=state.work).features
-    features = [read_features(read(key, photo.sha256)) for photo in component.photos]
+    key, kept = features_key(_MAKING.extractor), Workspace(root=state.work)
+    features = [read_features(kept.features(key, photo.sha256)) for photo in component.photos]
     rows = [state.photos.index(photo) for photo in component.photos]
     return build_map(
         model, placement, _MADE_UP_FRAME, component.photos, features, _identity(rows), _MAKING.maps
@@ -165,29 +161,29 @@ def _reach(model: Model) -> float:
     return float(np.median(np.linalg.norm(offsets, axis=1)))
 
 
-def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
+def _recording(state: State, frame: LocalFrame) -> AbstractContextManager[None]:
     """The joint reconstruction's places, carried to the first map's frame by the photos that are in both.
 
     By what they look at as well: centres on a line leave the turn about it open.
     """
-    both = sorted(state.joint.keys() & state.poses.keys())
-    if len(both) < 3 or state.frame is None:
+    joint = state.joint_poses
+    both = sorted(joint.keys() & state.poses.keys())
+    if len(both) < 3 or state.gates is None:
         return nullcontext()
-    mine, theirs = ([of[name] for name in both] for of in (state.joint, state.poses))
-    extents = [np.linalg.norm(np.ptp([pose.center for pose in of], axis=0)) for of in (mine, theirs)]
-    reaches = state.reach, state.reach * float(extents[1] / extents[0])
-    seen = [
-        np.concatenate([pose.center + reach * np.vstack([np.zeros(3), pose.rotation]) for pose in of])
-        for of, reach in zip((mine, theirs), reaches, strict=True)
-    ]
+    pairs = [[of[name] for name in both] for of in (joint, state.poses)]
+    extents = [np.linalg.norm(np.ptp([pose.center for pose in of], axis=0)) for of in pairs]
+    seen = []
+    for of, extent in zip(pairs, extents, strict=True):
+        looks = _reach(state.joint.model) * float(extent / extents[0]) * np.eye(4, 3, -1)
+        seen.append(np.concatenate([pose.center + looks @ pose.rotation for pose in of]))
     carried = similarity_closed_form(*seen)
     if carried is None:
         return nullcontext()
 
     def place(name: str) -> FloatArray | None:
-        return carried.act(state.joint[name].center) if name in state.joint else None
+        return carried.act(joint[name].center) if name in joint else None
 
-    return recorded(gates, state.frame, place)
+    return recorded(state.gates, frame, place)
 
 
 def _find_poses(state: State) -> None:
@@ -219,25 +215,20 @@ def _identity(rows: Sequence[int]) -> MapIdentity:
     return MapIdentity(map_id=name, name=name, source="photos", licence="", provenance={})
 
 
-def _judged(state: State, joint: Component) -> dict[str, float]:
+def _judged(state: State) -> dict[str, float]:
     """Where growth has the photos against the joint reconstruction."""
-    metric = joint.placement.local_from_sfm is not None and joint.placement.reason is None
-    sim = joint.placement.local_from_sfm if metric else None
-    scale = _EXTENT_M / float(np.linalg.norm(np.ptp(joint.model.centers(), axis=0)))
+    placed = state.joint.placement
+    sim = placed.local_from_sfm if placed.reason is None else None
+    scale = _EXTENT_M / float(np.linalg.norm(np.ptp(state.joint.model.centers(), axis=0)))
     sim = sim or Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3))
-    reference = {name: sim.act(pose.center) for name, pose in state.joint.items()}
-    centers = {name: pose.center for name, pose in state.poses.items()}
-    both = sorted(reference.keys() & centers.keys())
-    aligned = laid_on(centers, reference)
-    apart = np.full(len(both), np.nan)
-    if aligned is not None:
-        apart = np.array([np.linalg.norm(aligned.act(centers[n]) - reference[n]) for n in both])
+    reference = {name: sim.act(pose.center) for name, pose in state.joint_poses.items()}
+    apart = laid_apart({name: pose.center for name, pose in state.poses.items()}, reference)
     return {
         "joint": len(reference),
-        "grown": len(both),
-        "missing": len(reference.keys() - centers.keys()),
+        "grown": len(apart),
+        "missing": len(reference.keys() - state.poses.keys()),
         "median_m": median(apart),
-        "largest_m": float(apart.max(initial=0)),
+        "largest_m": float(np.max(apart, initial=0)),
     }
 
 

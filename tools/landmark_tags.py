@@ -27,7 +27,16 @@ from ingest.own_frame import held_of
 from ingest.photos.photo import Photo, whose_cameras
 from ingest.register.gps import place_by_gps
 from tools.commands import copied, featuredb, largest_map, make, photo_names, position_table
-from tools.figures import inside_figures, laid_on, median, poses_in, say, squared, study_parser, write_figures
+from tools.figures import (
+    inside_figures,
+    laid_apart,
+    median,
+    poses_in,
+    say,
+    squared,
+    study_parser,
+    write_figures,
+)
 
 _EXTENT_M, _OFF_M, _STATED_M = 120.0, 8.0, 30.0
 _FRAME = LocalFrame(latitude_deg=52.5186, longitude_deg=13.3750, height_m=75.0)
@@ -102,16 +111,13 @@ def ingested(landmark: Landmark, photos: Path, work: Path) -> dict[str, float]:
             poses = poses_in(_FRAME, snapshot.load_map(summary.map_id))
             places |= {Path(name).name: pose.center for name, pose in poses.items()}
     true = dict(zip(landmark.names, landmark.xyz, strict=True))
-    both = sorted(true.keys() & places.keys())
-    aligned = laid_on(places, true)
-    off = [np.linalg.norm((places[n] - true[n])[:2]) for n in both]
-    shape = [] if aligned is None else [np.linalg.norm(aligned.act(places[n]) - true[n]) for n in both]
+    off = [np.linalg.norm((places[name] - true[name])[:2]) for name in true.keys() & places.keys()]
     return {
         "photos": len(landmark.names),
-        "active": len(both),
-        "share": len(both) / len(landmark.names),
+        "active": len(off),
+        "share": len(off) / len(landmark.names),
         "off_m": median(off),
-        "shape_m": median(shape),
+        "shape_m": median(laid_apart(places, true)),
     }
 
 

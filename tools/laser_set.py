@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import poselib
@@ -15,13 +16,14 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from featuredb.features.exif.write import EXIF_PREFIX, gps_directory, with_app1
+from featuredb.features.exif.write import EXIF_PREFIX, with_app1
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3
+from tools.commands import with_place
 
 FRAME = LocalFrame(latitude_deg=49.0, longitude_deg=8.4, height_m=150.0)  # somewhere on Earth
 SIGMA_M = 0.02  # that positions claim
@@ -93,16 +95,13 @@ def with_exif(truth: LaserSet, names: Sequence[str], folder: Path, *, positions:
     folder.mkdir(parents=True, exist_ok=True)
     focal_35_mm = round(36.0 * truth.camera.focal_px / max(truth.camera.width, truth.camera.height))
     for name in names:
-        exif = Image.Exif()
+        exif, picture = Image.Exif(), (truth.photos / name).read_bytes()
         exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Strecha", "laser truth"
         exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35_mm
+        told = with_app1(picture, exif.tobytes().removeprefix(EXIF_PREFIX), b"")
         if positions:
-            lat, lon, height = FRAME.geodetic_from_enu(truth.poses[name].center)
-            gps = gps_directory((float(lat), float(lon), float(height)))
-            exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
-            exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSHPositioningError] = SIGMA_M
-        content = exif.tobytes().removeprefix(EXIF_PREFIX)
-        (folder / name).write_bytes(with_app1((truth.photos / name).read_bytes(), content, b""))
+            told = with_place(told, FRAME, truth.poses[name].center, SIGMA_M)
+        (folder / name).write_bytes(told)
     return folder
 
 
@@ -139,16 +138,14 @@ def _rows(path: Path) -> list[list[float]]:
     return [[float(word) for word in line.split()] for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Baseline:
-    """Poses cam_from_local in the set's frame: of the model's photos and of those that were asked."""
+def colmap_given_the_lens(truth: LaserSet) -> tuple[dict[str, Rigid3], dict[str, Rigid3]]:
+    """What maps and answers are compared with: poses cam_from_local in the set's frame of the model's photos,
+    and of those that were asked.
 
-    mapped: dict[str, Rigid3]
-    asked: dict[str, Rigid3]
-
-
-def colmap_given_the_lens(truth: LaserSet) -> Baseline:
-    """See the module."""
+    SIFT, exhaustive matching and incremental mapping with the lens held; the model is moved onto the true
+    centres by a robust similarity. Asked photos: nearest RootSIFT descriptor of the model by brute force,
+    ratio test, poselib's absolute pose.
+    """
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     pycolmap.set_random_seed(0)
     with tempfile.TemporaryDirectory() as scratch:
@@ -158,9 +155,7 @@ def colmap_given_the_lens(truth: LaserSet) -> Baseline:
         settings = pycolmap.IncrementalPipelineOptions()
         settings.ba_refine_focal_length = settings.ba_refine_extra_params = False
         settings.ba_refine_principal_point = False
-        output = work / "models"
-        output.mkdir()
-        found = pycolmap.incremental_mapping(str(database), str(truth.photos), str(output), settings)
+        found = pycolmap.incremental_mapping(str(database), str(truth.photos), str(work), settings)
         if not found:
             raise SystemExit("COLMAP makes no model of the photos, even with the true lens")
         model = max(found.values(), key=lambda one: one.num_reg_images())
@@ -181,7 +176,7 @@ def colmap_given_the_lens(truth: LaserSet) -> Baseline:
                 )
                 if pose is not None:
                     asked[image.name] = move.act_on_pose(pose)
-    return Baseline(mapped={name: move.act_on_pose(pose) for name, pose in poses.items()}, asked=asked)
+    return {name: move.act_on_pose(pose) for name, pose in poses.items()}, asked
 
 
 def robust_similarity(source: FloatArray, target: FloatArray) -> Sim3:
@@ -214,8 +209,7 @@ def _extracted(truth: LaserSet, names: Sequence[str], database: Path) -> Path:
     return database
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Known:
+class _Known(NamedTuple):
     """Every observation of a model: its point's place (m, 3) and id (m,), its RootSIFT (m, 128) float32."""
 
     xyz: FloatArray

@@ -7,7 +7,7 @@ database, with exact positions and the EXIF of one camera whose focal length is 
 millimetre of 35 mm film. The other photos are asked of a server twice: with their true camera, and with EXIF
 alone. Prints, for the map's cameras and for both kinds of answers: the median error of position
 and orientation, the median of the 68 % radius that was reported, and the baseline's median
-(`tools.laser_baseline`); and how far the map's lens is from the true one, over the standard deviations that
+(`tools.laser_set`); and how far the map's lens is from the true one, over the standard deviations that
 the map stores of it (root mean square of its parameters: 1 is right). Worst is the largest ratio
 of a median to the baseline's, or to the reported radius.
 """
@@ -47,30 +47,26 @@ class Errors:
 
 def main() -> None:
     args = study_parser(__doc__, "folder").parse_args()
-    with tempfile.TemporaryDirectory() as scratch:
-        figures = judged(read_laser_set(args.folder), Path(scratch) / args.folder.name)
-    write_figures(args.json, figures)
-
-
-def judged(truth: LaserSet, work: Path) -> dict[str, float]:
-    """The figures of one set."""
-    photos = with_exif(truth, truth.mapped, work / "photos", positions=True)
-    asked = with_exif(truth, truth.asked, work / "asked", positions=False)
-    make(work / "db", "photos", photos)
-    maps = [one for one in all_maps(work / "db") if isinstance(one, FeatureMap)]
-    if not maps:
-        raise SystemExit(f"{truth.photos}: no map was placed")
-    baseline = colmap_given_the_lens(truth)
+    truth = read_laser_set(args.folder)
     lens = truth.camera
-    told = CameraRequest(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
-    database = Database.open(work / "db")
-    kinds = {
-        "map": map_errors(maps, truth),
-        "told": answer_errors(database, asked, truth, told),
-        "unknown": answer_errors(database, asked, truth, None),
-    }
-    theirs = {"map": errors_of(baseline.mapped, truth), "asked": errors_of(baseline.asked, truth)}
-    return figures_of(kinds, theirs) | {"lens_off": lens_error(maps, truth)}
+    with tempfile.TemporaryDirectory() as scratch:
+        work = Path(scratch) / args.folder.name
+        photos = with_exif(truth, truth.mapped, work / "photos", positions=True)
+        asked = with_exif(truth, truth.asked, work / "asked", positions=False)
+        make(work / "db", "photos", photos)
+        maps = [one for one in all_maps(work / "db") if isinstance(one, FeatureMap)]
+        if not maps:
+            raise SystemExit(f"{truth.photos}: no map was placed")
+        told = CameraRequest(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+        database = Database.open(work / "db")
+        kinds = {
+            "map": map_errors(maps, truth),
+            "told": answer_errors(database, asked, truth, told),
+            "unknown": answer_errors(database, asked, truth, None),
+        }
+    theirs = dict(zip(("map", "asked"), colmap_given_the_lens(truth), strict=True))
+    baseline = {kind: errors_of(poses, truth) for kind, poses in theirs.items()}
+    write_figures(args.json, figures_of(kinds, baseline) | {"lens_off": lens_error(maps, truth)})
 
 
 def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dict[str, float]:

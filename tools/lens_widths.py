@@ -8,9 +8,8 @@ eliminated, less the prior. The widths are those under which the lenses of all c
 likely (type II maximum likelihood): a lens of which the photos say little says little of the widths.
 
 For each width: what `AdjustOptions` has, what is measured, and between which limits it lies with 95 %
-probability (likelihood ratio, the other widths where they are most likely). Also how far photos of a camera
-disagree about its lens (`featuredb.adjust.lens_agreement`), and by how much single pictures are sheared
-(`ingest.colmap.picture_shear`).
+probability (likelihood ratio, the other widths where they are most likely). Also by how much single pictures
+are sheared (`ingest.colmap.picture_shear`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,9 +21,9 @@ import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.stats import chi2, norm
 
-from featuredb.adjust.lens_agreement import lens_squares
+from featuredb.adjust.block import whole_lens
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import LensWidths, Terms, lens_prior, whole_lens
+from featuredb.adjust.terms import LensWidths, Terms, lens_prior
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from ingest.colmap.adjust import AdjustOptions
@@ -68,28 +67,24 @@ def main() -> None:
     parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
     args = parser.parse_args()
     options = AdjustOptions()
-    told: list[Told] = []
-    disagreement: list[float] = []
-    for folder in args.photos:
-        found, factors = lenses_of(_database(folder, args.work), folder, options)
-        disagreement += factors
-        say(f"{folder}: {len(found)} lenses")
-        told += found
-    write_shears([_database(folder, args.work) for folder in args.photos])
+    databases = [_database(folder, args.work) for folder in args.photos]
+    told = [
+        one
+        for database, folder in zip(databases, args.photos, strict=True)
+        for one in lenses_of(database, folder, options)
+    ]
+    write_shears(databases)
     if not told:
         raise SystemExit("no lens of any map")
     assumed = assumed_widths(options)
     measured = measured_widths(told, assumed, options)
     limits = {name: limits_of(told, measured, k, options) for k, name in enumerate(WIDTHS)}
-    inside = {name: limits[name][0] <= assumed[k] <= limits[name][1] for k, name in enumerate(WIDTHS)}
     figures = {
         "lenses": len(told),
-        **{name: measured[k] for k, name in enumerate(WIDTHS)},
-        "inside": sum(inside.values()),
+        **dict(zip(WIDTHS, measured, strict=True)),
+        "inside": sum(limits[name][0] <= assumed[k] <= limits[name][1] for k, name in enumerate(WIDTHS)),
         "assumed": dict(zip(WIDTHS, assumed, strict=True)),
         "limits": limits,
-        "with_exif": sum(one.has_exif for one in told),
-        "disagreement": float(np.exp(np.mean(np.log(disagreement)))) if disagreement else float("nan"),
     }
     write_figures(args.json, figures)
 
@@ -105,24 +100,19 @@ def write_shears(databases: Sequence[Path]) -> None:
         say(f"one map in twenty is above {few:.1e}, one in a thousand above {hardly:.1e}")
 
 
-def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[list[Told], list[float]]:
-    """What the photos of each lens of a database's maps say of it, and how far they disagree about it."""
+def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> list[Told]:
+    """What the photos of each lens of a database's maps say of it."""
     photos = {photo.name: photo for photo in scan_folder(folder).photos}
     told: list[Told] = []
-    disagreement: list[float] = []
     for feature_map in all_maps(database):
         block = whole_lens(block_of_map(feature_map))
         focal_px = _focals(block.names, block.camera_of.tolist(), photos)
         terms = terms_of_map(block, focal_px, None, options)
         problem = Problem(block, terms, options.threads)
         problem.solve(options.max_iterations, 1e-6)
-        squares, freedom = lens_squares(problem.weighted())
-        for one, free in zip(squares.tolist(), freedom.tolist(), strict=True):
-            if np.isfinite(one):
-                say(f"{folder}: photos disagree {one / free:.2f} times ({free:.0f} degrees)")
-                disagreement.append(one / free)
         told += _told(problem, terms, focal_px, options)
-    return told, disagreement
+    say(f"{folder}: {len(told)} lenses")
+    return told
 
 
 def _told(

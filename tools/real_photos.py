@@ -1,6 +1,7 @@
 """Real photos end to end: some are held out, localised over Zenoh, and compared with a map of all photos.
 
     python -m tools.real_photos --photos FOLDER --work FOLDER --held-out DJI_0020.JPG DJI_0025.JPG
+    python -m tools.real_photos --photos FOLDER --work FOLDER --as-film
 
 1. `featuredb ingest photos` takes all photos but the held-out ones, in a process and a database of its own.
 2. The same takes all photos, into another database: what its map says of the held-out ones is the reference.
@@ -8,6 +9,11 @@
 3. A server answers from the first database; each held-out photo is asked for as `featuredb query` does, with
    nothing but the file: no camera, no prior.
 
+With --as-film the first map is of every second photo. All photos in the order of their names are the frames
+of a film, a second apart, which is tracked by that map as `featuredb track` does: no lens, no positions.
+Consecutive photos overlap little, so that most frames are looked for anew. Each frame's pose is compared with
+that of the map of all photos, laid on the first one by the cameras of both: a similarity, so that what GPS
+says of either does not count.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,13 +27,17 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import PoseError, pose_difference
 from featuredb.store import Database
+from featuredb.video.folder import natural_key
 from reloc.client import Client, LocaliseReply
 from reloc.localise.result import error_radius
+from reloc.localiser import Localiser
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
+from reloc.tracking.map_ground import MapFinder
+from reloc.tracking.track_video import track_video
 from reloc.wire.query import CameraRequest
-from tools.commands import make, photo_names
-from tools.figures import say, spread, study_parser, write_figures
+from tools.commands import copied, make, photo_names
+from tools.figures import laid_on, poses_in, say, spread, study_parser, write_figures
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
 
@@ -46,14 +56,44 @@ class HeldOutRow:
 def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--held-out", nargs="+", metavar="NAME", help=f"default: every {_EVERY}th photo")
+    parser.add_argument("--as-film", action="store_true", help="track all photos by every second one")
     args = parser.parse_args()
-    names = photo_names(args.photos)
-    held_out = args.held_out or names[_EVERY // 2 :: _EVERY]
-    part = ingest(args.work / "part", args.photos, held_out)
-    ingest(args.work / "whole", args.photos, ())
-    rows = ask(Database.open(args.work / "part"), args.photos, held_out, reference(args.work / "whole"))
-    figures = {"registered": part["mapped"], "ingest_s": part["seconds"]}
+    names = sorted(photo_names(args.photos), key=natural_key if args.as_film else None)
+    held_out = names[1::2] if args.as_film else args.held_out or names[_EVERY // 2 :: _EVERY]
+    more = ("--work", str(args.work / "cache"))
+    made = ingest(args.work / "part", args.photos, held_out, *more)
+    ingest(args.work / "whole", args.photos, (), *more)
+    truth = reference(args.work / "whole")
+    if args.as_film:
+        write_figures(args.json, as_film(args.photos, names, args.work, truth))
+        return
+    rows = ask(Database.open(args.work / "part"), args.photos, held_out, truth)
+    figures = {"registered": made["mapped"], "ingest_s": made["seconds"]}
     write_figures(args.json, figures | {"usable": len(set(names) - set(held_out))} | error_figures(rows))
+
+
+def as_film(photos: Path, names: Sequence[str], work: Path, whole: FeatureMap) -> dict[str, float]:
+    """All photos tracked by the map in `work`/part, against the map of all."""
+    part = reference(work / "part")
+    theirs, mine = poses_in(part.frame, whole), poses_in(part.frame, part)
+    sim = laid_on(*({name: pose.center for name, pose in of.items()} for of in (theirs, mine)))
+    moved = {name: sim.act_on_pose(pose) for name, pose in theirs.items()}
+    frames = copied(photos, names, work / "frames", strip=False)
+    lines = ["file,time_s", *(f"{name},{i}" for i, name in enumerate(names))]
+    (frames / "timestamps.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
+    poses = {name: p.pose for name, p in zip(names, tracked.trajectory.points, strict=True) if p.pose}
+    off = []
+    for name, pose in poses.items():
+        if name in moved:
+            off.append(pose_difference(part.frame, moved[name], pose.epsg, pose.utm, pose.cam_from_utm_xyzw))
+            say(f"{name}: {off[-1]}")
+    counts = {
+        "frames": len(names),
+        "lost": len(names) - len(poses),
+        "unknown": len(poses.keys() - moved.keys()),
+    }
+    return counts | spread([e.position_m for e in off], [e.angle_deg for e in off])
 
 
 def ingest(database: Path, photos: Path, exclude: Sequence[str], *more: str) -> dict[str, float]:

@@ -10,27 +10,30 @@
 
 """
 
-from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image
 from scipy.stats import chi2
 
-from featuredb.features.exif.write import rational
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.camera.photograph import Device, Shot, exif_of, jpeg_bytes
 from featuredb.simworld.world import WorldOptions, in_order, town_of
 from featuredb.store import Database
-from tools.commands import featuredb
-from tools.figures import say, squared, study_parser, write_figures
-from tools.worlds.film_world import Exposure, FilmOptions, film_frame, wandering_errors
-from tools.worlds.flight_path import FlightPath, FlightStyle, PathOptions
+from tools.commands import featuredb, once, with_place
+from tools.figures import pose_offset, say, squared, study_parser, write_figures
+from tools.worlds.film_world import (
+    Exposure,
+    FilmOptions,
+    FlightPath,
+    FlightStyle,
+    PathOptions,
+    film_frame,
+    wandering_errors,
+)
 
 _PHOTOS, _SEEDS = 24, (1, 2)
 _READOUT_S = 0.03  # from the first row to the last
@@ -47,7 +50,7 @@ def main() -> None:
     for style in _STYLES:
         for seed in _SEEDS:
             film = film_options(style, seed)
-            pictures = drawn(film, args.inputs / f"rolling-{style}-{seed}-30")
+            pictures = drawn(film, args.inputs / f"rolling-{style}-{seed}-{_PHOTOS}")
             for receiver in ("plain", "rtk"):
                 name = f"{style}-{seed}-{receiver}"
                 photos = tagged(film, pictures, receiver == "rtk", args.work / name)
@@ -80,18 +83,28 @@ def film_options(style: FlightStyle, seed: int) -> FilmOptions:
     )
 
 
-def drawn(film: FilmOptions, folder: Path) -> list[Path]:
-    """The film's frames as JPEG; what is there is taken as it is."""
-    folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / f"{k:04d}.jpg" for k in range(film.frames)]
-    if not all(file.is_file() for file in files):
-        for file, data in zip(files, in_order(partial(_jpeg, film), film.frames), strict=True):
-            file.write_bytes(data)
-    return files
+def drawn(film: FilmOptions, folder: Path) -> Path:
+    """The film's frames as JPEG with EXIF of a camera and times; what is there is taken as it is."""
+
+    def draw(making: Path) -> None:
+        making.mkdir(parents=True)
+        for k, data in enumerate(in_order(partial(_jpeg, film), film.frames)):
+            (making / f"{k:04d}.jpg").write_bytes(data)
+
+    return once(folder, draw)
 
 
 def _jpeg(film: FilmOptions, frame: int) -> bytes:
-    return jpeg_bytes(film_frame(film, frame), quality=92)
+    device = Device(make="Maker", model="Film", camera=film.camera, focal_mm=4.5, focal_35mm=26)
+    time_s = film.time_s(frame)
+    shot = Shot(
+        name=f"{frame:04d}.jpg",
+        device=device,
+        cam_from_local=pose_at(film, time_s),
+        time=_START + timedelta(seconds=time_s),
+        seed=frame,
+    )
+    return jpeg_bytes(film_frame(film, frame), exif_of(shot, None), 92)
 
 
 def pose_at(film: FilmOptions, time_s: float) -> Rigid3:
@@ -99,32 +112,16 @@ def pose_at(film: FilmOptions, time_s: float) -> Rigid3:
     return FlightPath(town_of(film.world), film.path).pose(time_s)
 
 
-def tagged(film: FilmOptions, pictures: Sequence[Path], rtk: bool, folder: Path) -> Path:
-    """The pictures with EXIF: camera, time, and the position that a receiver gives."""
+def tagged(film: FilmOptions, pictures: Path, rtk: bool, folder: Path) -> Path:
+    """The pictures with positions as a receiver gives them."""
     folder.mkdir(parents=True, exist_ok=True)
-    scene = town_of(film.world)
-    device = Device(make="Maker", model="Film", camera=film.camera, focal_mm=4.5, focal_35mm=26)
-    rng = np.random.default_rng((film.path.seed, 74))
+    frame, rng = town_of(film.world).frame, np.random.default_rng((film.path.seed, 74))
     sigma, late_s, keep = (_RTK_M, 0.0, 0.0) if rtk else (_RECEIVER_M, _LATE_S, np.exp(-1.0 / 20.0))
-    errors = wandering_errors(rng, sigma, keep, len(pictures))
-    for k, (picture, error) in enumerate(zip(pictures, errors, strict=True)):
-        time_s = film.time_s(k)
-        place = pose_at(film, time_s - late_s).center + error
-        shot = Shot(
-            name=picture.name,
-            device=device,
-            cam_from_local=pose_at(film, time_s),
-            time=_START + timedelta(seconds=time_s),
-            seed=k,
-            gps_enu=place,
-        )
-        latitude, longitude, height = (float(v) for v in scene.frame.geodetic_from_enu(place))
-        exif = exif_of(shot, (latitude, longitude, height))
-        if rtk:
-            gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
-            gps[ExifTags.GPS.GPSHPositioningError.value] = rational(1.51 * _RTK_M, 10_000)
-        with Image.open(picture) as image:
-            (folder / picture.name).write_bytes(jpeg_bytes(np.asarray(image), exif, 92))
+    for k, error in enumerate(wandering_errors(rng, sigma, keep, film.frames)):
+        place = pose_at(film, film.time_s(k) - late_s).center + error
+        picture = pictures / f"{k:04d}.jpg"
+        told = with_place(picture.read_bytes(), frame, place, 1.51 * _RTK_M if rtk else None)
+        (folder / picture.name).write_bytes(told)
     return folder
 
 
@@ -137,13 +134,11 @@ def normalised(film: FilmOptions, feature_map: FeatureMap) -> tuple[float, float
         pose = image.cam_from_local
         true = pose_at(film, film.time_s(int(Path(image.name).stem))) @ scene_from_map
         own = image.covariance if image.covariance is not None else np.zeros((6, 6))
-        turn = pose.rotation.T
-        at = point_jacobian(pose.center)
+        turn, at = pose.rotation.T, point_jacobian(pose.center)
         center = at @ placement @ at.T + turn @ own[3:, 3:] @ turn.T
         angle = placement[1:4, 1:4] + turn @ own[:3, :3] @ turn.T
-        off = pose.center - true.center
-        turned = so3_log(pose.rotation.T @ true.rotation)
-        squares.append((squared(off, center), squared(turned, angle)))
+        off = pose_offset(true, pose)
+        squares.append((squared(off[3:], center), squared(off[:3], angle)))
     position, orientation = np.median(squares, axis=0)
     return float(position), float(orientation)
 

@@ -17,14 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.features.exif.write import gps_directory, with_app1, with_gps
-from featuredb.features.image_header import read_header
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import TrueImage, Truth, World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database
 from tools.anchor_simworld import camera_errors
-from tools.commands import copied, featuredb, first_map, position_table
+from tools.commands import copied, featuredb, first_map, once, position_table, with_place
 from tools.figures import study_parser, write_figures
 from tools.worlds.sights import SeenPlaces
 
@@ -49,8 +47,7 @@ def main() -> None:
     flight = FlightOptions(lines=3, per_line=5, oblique=3, width=1024)
     options = replace(WorldOptions.short(_SEED), flight=flight, queries=0, street=0, negatives_per_kind=0)
     inputs = args.inputs / f"rtk-flight-{_SEED}"
-    whole = (inputs / "truth.json").is_file()
-    world = open_world(inputs) if whole else write_world(inputs, options)
+    world = open_world(once(inputs, lambda making: write_world(making, options)))
     rng = np.random.default_rng((_SEED, 11))
     images = world.truth.group("drone")
     places = np.array([image.cam_from_local.center for image in images])
@@ -75,7 +72,9 @@ def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
         for name, place in zip(names, places, strict=True):
             error_m = _SIGMA_M * _RADIUS_68 if way == "exif" else _OTHERWISE_M
             data = (world.folder / "drone" / name).read_bytes()
-            (folder / name).write_bytes(tagged(data, world.truth, place, error_m, _TAGS[way]))
+            xmp = _XMP.format(words=_TAGS[way]).encode()
+            told = with_place(data, world.truth.frame, place, error_m, xmp, "ellipsoid", heading_deg=0.0)
+            (folder / name).write_bytes(told)
         return folder
     copied(world.folder / "drone", names, folder, strip=True)
     geodetic = np.array([world.truth.frame.geodetic_from_enu(place) for place in places])
@@ -89,14 +88,6 @@ def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
     file = folder / "geo.txt"
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return file
-
-
-def tagged(data: bytes, truth: Truth, place: FloatArray, error_m: float, words: str) -> bytes:
-    """A photo with another position (3,) and XMP; the picture stays bit for bit."""
-    header = read_header(data)
-    latitude, longitude, height = (float(v) for v in truth.frame.geodetic_from_enu(place))
-    gps = gps_directory((latitude, longitude, height), "ellipsoid", heading_deg=0.0, error_m=error_m)
-    return with_app1(data, with_gps(data[slice(*header.exif)], gps), _XMP.format(words=words).encode())
 
 
 def ingested(database: Path, source: Path, truth: Truth, way: str) -> dict[str, float]:

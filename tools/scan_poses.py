@@ -4,17 +4,13 @@
 
 Registers every photo of the folder (tools/scan_to_photo.py, which shares no code with the map, with
 anchoring or with localisation), estimates one lens over the photos of each camera, which EXIF tells apart
-as in a map (`ExifInfo.camera_key`), and measures its own accuracy:
-
-- halves of the correspondences: each photo's pose from two disjoint sets of picture blocks;
-- halves of the photos: poses from two disjoint sets of photos, each with a lens of its own. This is the
-  larger one, for it shows how far focal length, principal point and height trade.
+as in a map (`ExifInfo.camera_key`), and measures its own accuracy: how far poses with the lenses of two
+disjoint halves of the photos differ, which shows how far focal length, principal point and height trade.
 """
 
 import argparse
 import json
-import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +22,7 @@ from featuredb.features.exif.read import read_exif
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from tools.figures import study_parser
+from tools.figures import say, study_parser
 from tools.scan_to_photo import (
     Lens,
     PosedPicture,
@@ -38,17 +34,14 @@ from tools.scan_to_photo import (
     read_scan,
 )
 
-_BLOCK_PX = 200  # correspondences of one block, in the full photo, stay in one half
 _ROUNDS = ((0, 3), (0, 1, 2, 3, 4), tuple(range(7)))  # lens parameters that are free, coarse to fine
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("scan", type=Path, metavar="SCAN", help="LAS or LAZ with colour, and its CRS")
-    parser.add_argument("photos", type=Path, metavar="FOLDER", help="its photos")
+    parser = study_parser(__doc__, "scan", "folder")
     parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="write there")
     args = parser.parse_args()
-    write_poses(args.scan, args.photos, args.poses)
+    write_poses(args.scan, args.folder, args.poses)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -108,7 +101,7 @@ def register(scan_path: Path, folder: Path) -> dict[str, Any]:
     for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png")):
         gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         pose = first_pose(gray, _start(gray), raster, features)
-        _say(f"{path.name}: {'no pose' if pose is None else 'first pose'}")
+        say(f"{path.name}: {'no pose' if pose is None else 'first pose'}")
         if pose is not None:
             key = read_exif(path.read_bytes()).camera_key
             of_camera.setdefault(key, []).append(PosedPicture(path.name, gray, pose))
@@ -122,7 +115,7 @@ def register(scan_path: Path, folder: Path) -> dict[str, Any]:
         for free in _ROUNDS:
             photos = [correspond(photo, lens, scan) for photo in photos]
             photos, lens = adjust(photos, lens, free)
-            _say(f"{sum(len(p.world) for p in photos)} correspondences, focal length {lens.f:.1f} px")
+            say(f"{sum(len(p.world) for p in photos)} correspondences, focal length {lens.f:.1f} px")
         cameras[key] = _camera(photos, lens)
         poses |= {photo.name: _pose(photo, key) for photo in photos}
     return {"crs": scan.crs, "origin": list(scan.origin), "cameras": cameras, "poses": poses}
@@ -141,7 +134,6 @@ def _camera(photos: list[PosedPicture], lens: Lens) -> dict[str, Any]:
         "height": lens.height,
         # COLMAP's pixels: centre of the top-left pixel at (0.5, 0.5).
         "params": [lens.f, lens.f, lens.cx + 0.5, lens.cy + 0.5, lens.k1, lens.k2, lens.p1, lens.p2],
-        "halves_of_correspondences": halves_of_correspondences(photos, lens),
         "halves_of_photos": halves_of_photos(photos, lens),
     }
 
@@ -154,44 +146,20 @@ def _pose(photo: PosedPicture, key: str) -> dict[str, Any]:
     }
 
 
-def halves_of_correspondences(photos: list[PosedPicture], lens: Lens) -> dict[str, float]:
-    """How far poses from two disjoint halves of each photo's blocks differ, with the same lens."""
-    halves = []
-    for parity in (0, 1):
-        chosen = []
-        for photo in photos:
-            rows = ((photo.pixels // _BLOCK_PX).astype(int).sum(axis=1) % 2) == parity
-            chosen.append(replace(photo, world=photo.world[rows], pixels=photo.pixels[rows]))
-        halves.append(adjust(chosen, lens, ())[0])
-    return _difference(halves[0], halves[1])
-
-
 def halves_of_photos(photos: list[PosedPicture], lens: Lens) -> dict[str, float]:
     """How far poses with the camera of the even photos are from those with the camera of the odd ones."""
-    full = tuple(range(7))
-    lenses = [adjust(photos[parity::2], lens, full)[1] for parity in (0, 1)]
-    fixed = [adjust(photos, half, ())[0] for half in lenses]
-    return _difference(fixed[0], fixed[1]) | {"focal_px": abs(lenses[0].f - lenses[1].f)}
-
-
-def _difference(first: list[PosedPicture], second: list[PosedPicture]) -> dict[str, float]:
+    lenses = [adjust(photos[parity::2], lens, _ROUNDS[-1])[1] for parity in (0, 1)]
     shifts, turns = [], []
-    for a, b in zip(first, second, strict=True):
+    for a, b in zip(*(adjust(photos, half, ())[0] for half in lenses), strict=True):
         ra, rb = cv2.Rodrigues(a.pose[:3])[0], cv2.Rodrigues(b.pose[:3])[0]
         shifts.append(ra.T @ a.pose[3:] - rb.T @ b.pose[3:])
         turns.append(np.degrees(np.linalg.norm(cv2.Rodrigues(ra @ rb.T)[0])))
-    east, north, up = np.median(np.abs(shifts), axis=0).tolist()
     return {
-        "east_m": east,
-        "north_m": north,
-        "up_m": up,
+        **dict(zip(("east_m", "north_m", "up_m"), np.median(np.abs(shifts), axis=0).tolist(), strict=True)),
         "position_m": float(np.median(np.linalg.norm(shifts, axis=1))),
         "rotation_deg": float(np.median(turns)),
+        "focal_px": abs(lenses[0].f - lenses[1].f),
     }
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(text + "\n")
 
 
 if __name__ == "__main__":

@@ -37,8 +37,15 @@ from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored
 from tools.drawn_layer import drawn_marks
 from tools.figures import inside, off_pose, say, squared, study_parser, write_figures
-from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, film_truth, write_film
-from tools.worlds.flight_path import FlightStyle, PathOptions
+from tools.worlds.film_world import (
+    FILM_FILE,
+    FilmOptions,
+    FilmTruth,
+    FlightStyle,
+    PathOptions,
+    film_truth,
+    write_film,
+)
 from tools.worlds.scan_world import make_scan_world
 
 _FILMS = ("smooth", "jerky", "cut")

@@ -20,11 +20,12 @@ from tools.worlds.film_world import (
     TELEMETRY_LATE_S,
     Exposure,
     FilmOptions,
+    FlightPath,
+    PathOptions,
     film_frame,
     film_truth,
     write_film,
 )
-from tools.worlds.flight_path import FlightPath, PathOptions
 
 _WORLD = replace(WorldOptions.short(1), town_size_m=(180.0, 160.0))
 _OPTIONS = FilmOptions(

@@ -31,8 +31,7 @@ from featuredb.simworld.scan_world import write_scan
 from featuredb.simworld.world import Truth, World, WorldOptions, town_of, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
-from tools.worlds.film_world import Exposure, FilmOptions, write_film
-from tools.worlds.flight_path import PathOptions
+from tools.worlds.film_world import Exposure, FilmOptions, PathOptions, write_film
 
 _LICENCE = "CC-BY-4.0"
 _TOWN = WorldOptions(

@@ -14,6 +14,7 @@ from featuredb.simworld.camera.raster import render
 from featuredb.simworld.flight import FlightOptions, received_positions, survey
 from featuredb.simworld.town.scene import Ellipsoids, Scene
 from featuredb.simworld.town.town import make_town
+from tools.worlds.album import day_key, day_scene
 from tools.worlds.community import CommunityOptions, plan_community
 from tools.worlds.edits import Edit, edited, edited_camera
 from tools.worlds.people import (
@@ -27,7 +28,6 @@ from tools.worlds.people import (
 )
 from tools.worlds.poison_world import Rect, blocks_of, forged, with_copied_block
 from tools.worlds.sights import Surroundings, find_sights, look_at
-from tools.worlds.surveyed import day_key, day_scene
 
 SIZE = (200.0, 180.0)
 TINY = CommunityOptions(

@@ -25,7 +25,7 @@ def _sequence(photos: str, median_m: float, minutes: float) -> Row:
     return _row(
         name=f"{name}-as-film",
         claim=f"`{name}`: every second photo is a map, all are played as a film and tracked",
-        commands=f"tools.real_sequence --photos {{data}}/{photos} --work {{work}}/maps {OUT}",
+        commands=f"tools.real_photos --as-film --photos {{data}}/{photos} --work {{work}}/maps {OUT}",
         figures="unknown",
         text="{lost} of {frames} lost, median {median_m:.3f} m, largest {largest_m:.3f} m",
         limits=f"median_m <= {median_m:g}, largest_m <= 1",

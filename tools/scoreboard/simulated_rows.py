@@ -72,7 +72,7 @@ SIMULATED: tuple[Row, ...] = (
         name="town-located-pixels",
         claim="places of pixels that show what stands still, on an airborne scan: from answers to held-out "
         "photos, and from poses and lenses drawn as the answers' covariances say, which test the bounds",
-        commands=f"tools.locate_pixels --work {{work}}/town --inputs {{cache}} {OUT}",
+        commands=f"tools.anchor_simworld --pixels --work {{work}}/town --inputs {{cache}} {OUT}",
         figures="answered_95 drawn_edges drawn_edge_95",
         text="answers: median {answered_median_m:.3f} m, 95 % off edges within {answered_clear_95_m:.3f} m; "
         "drawn: {drawn_68:.0%} and {drawn_95:.1%} inside 68 and 95 % bounds, {drawn_edge_95:.0%} of the "

@@ -1,5 +1,7 @@
 """Albums: photos of many people as planned, taken, edited, tagged, and written with a table and the truth.
 
+They show a town on many days, of a part of which there is an anchored survey.
+
 An album's photos lie in a folder per owner under names that give nothing away. Beside them stand
 `table.jsonl` as a photo site's programming interface would give it, `truth.json` with every true pose, and
 `facts.jsonl` with what each photo really is.
@@ -9,43 +11,36 @@ import json
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
-import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.photograph import (
-    Device,
-    SensorOptions,
-    Shot,
-    exif_of,
-    expose,
-    jpeg_bytes,
-    look_pose,
-    scene_look,
-    take_photo,
-)
-from featuredb.simworld.camera.raster import render
-from featuredb.simworld.town.blocks import box, face
-from featuredb.simworld.town.scene import Ellipsoids, Faces, Scene
+from featuredb.simworld.camera.photograph import SensorOptions, Shot, exif_of, jpeg_bytes, take_photo
+from featuredb.simworld.flight import FlightOptions, survey
+from featuredb.simworld.town.scene import DayOptions, Scene, another_day
 from featuredb.simworld.town.texture import Image8
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
 from featuredb.simworld.world import TRUTH_FILE, TrueImage, Truth, in_order, true_image, write_truth
-from tools.worlds.edits import Edit, edited, edited_camera
+from tools.worlds.edits import Edit, edited, edited_camera, indoor_photo, portrait_photo
 
 FACTS_FILE = "facts.jsonl"
 TABLE_FILE = "table.jsonl"
 
+# Suns by the hour, town axes; index 0 is the scene's own.
+_SUNS = (None, (0.62, -0.42, 0.62), (0.10, -0.55, 0.83), (-0.66, -0.30, 0.55))
+_SEASONS = ((1.0, 1.0, 1.0), (1.05, 1.08, 0.9), (1.35, 0.95, 0.6), (0.9, 0.95, 0.9))
+_FIRST = datetime(2024, 3, 2, 0, 0, tzinfo=UTC)
+DAYS = 730
+_OTHER_SEED = 1000
+
 Progress = Callable[[int, int], None]
 Subject = Literal["town", "indoor", "portrait"]
 ExifPolicy = Literal["full", "no_gps", "none"]
-_SKIN = (1.9, 1.25, 1.9)  # factors on the leaf texture's green
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,14 +85,62 @@ class AlbumFact:
     batch: int = 0
 
 
-class SceneSource(Protocol):
-    """Options of a world: hashable, picklable, and able to build its scenes."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TownOptions:
+    """What to write. The same options give the same bytes.
 
-    def __hash__(self) -> int: ...
+    Attributes:
+        seed: of everything. town_size_m: width and height of the town.
+        flight: the anchored survey. width: of people's widest camera, pixels.
+        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
+    """
+
+    seed: int
+    town_size_m: tuple[float, float]
+    flight: FlightOptions
+    width: int = 1200
+    texel_m: float = 0.06
+    pieces: int = 4
 
     def scene(self, key: str) -> Scene:
-        """The scene of that name."""
-        ...
+        """Scenes "home/light/week" and, of another town, "away/light/week"."""
+        return day_scene(town_of(self, away=key.startswith("away/")), key)
+
+
+@lru_cache(maxsize=4)
+def town_of(options: TownOptions, *, away: bool = False) -> Scene:
+    """The town as it was built, or another one elsewhere on Earth."""
+    return make_town(
+        options.seed + (_OTHER_SEED if away else 0),
+        size_m=options.town_size_m,
+        place=OTHER_TOWN_PLACE if away else TOWN_PLACE,
+        texel_m=options.texel_m,
+        pieces=options.pieces,
+    )
+
+
+def day_key(town: str, day: int, hour: float) -> str:
+    """Key of the scene of a town on a day (0 to 729) at an hour; sorts by what is dear to paint.
+
+    Days of a week share their parked cars.
+    """
+    light = 1 if hour < 11 else 2 if hour < 15 else 3
+    return f"{town}/{light}/{day // 7:03d}"
+
+
+def day_scene(base: Scene, key: str) -> Scene:
+    """The scene of a key made by `day_key`; "town/0/000" is the base itself."""
+    _, light, week = key.split("/")
+    sun = _SUNS[int(light)]
+    if sun is None:
+        return base
+    season = _SEASONS[(int(week) // 13) % 4]
+    return another_day(base, DayOptions(seed=int(week) + 1, to_sun=sun, leaf_tint=season))
+
+
+def moment(day: int, hour: float) -> datetime:
+    """Time of a day of the two years."""
+    return _FIRST + timedelta(days=day, hours=hour)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -137,7 +180,7 @@ def renamed(photo: PlannedPhoto, name: str, **fact: Any) -> PlannedPhoto:
 
 def write_album(
     folder: Path,
-    world: SceneSource,
+    world: TownOptions,
     plan: Callable[[], list[PlannedPhoto]],
     workers: int = 0,
     progress: Progress | None = None,
@@ -222,11 +265,11 @@ def _exif(photo: PlannedPhoto, image: Image8) -> Image.Exif | None:
 
 
 @lru_cache(maxsize=4)
-def _scene(world: SceneSource, key: str) -> Scene:
+def _scene(world: TownOptions, key: str) -> Scene:
     return world.scene(key)
 
 
-def _write(folder: Path, world: SceneSource, photos: Sequence[PlannedPhoto], number: int) -> None:
+def _write(folder: Path, world: TownOptions, photos: Sequence[PlannedPhoto], number: int) -> None:
     """Write one file under its name by renaming, so that a file that is there is whole."""
     photo = photos[number]
     target = folder / photo.shot.name
@@ -262,107 +305,30 @@ def _table_row(fact: AlbumFact, tag: Geotag | None) -> dict[str, Any]:
     }
 
 
-def indoor_photo(scene: Scene, device: Device, seed: int, sensor: SensorOptions) -> Image8:
-    """A room (h, w, 3) uint8 that nobody else has; `scene` lends its textures only."""
-    rng = np.random.default_rng((seed, 95))
-    size = rng.uniform(4.0, 7.0, 2)
-    faces = _room(rng, size)
-    plants = _balls(rng.uniform([-0.4, -0.4, 0.5], [0.4, 0.4, 1.3], (3, 3)) * [*size, 1.0], 0.25, rng)
-    centre = np.array([*(rng.uniform(-0.25, 0.25, 2) * size), rng.uniform(1.4, 1.7)])
-    pose = look_pose(centre, float(rng.uniform(0, 360)), float(rng.normal(-8, 6)), float(rng.normal(0, 2)))
-    return expose(_draw(scene, faces, plants, device, pose), rng, sensor)
-
-
-def portrait_photo(scene: Scene, device: Device, seed: int, sensor: SensorOptions) -> Image8:
-    """A person who fills the frame, in a room out of focus."""
-    rng = np.random.default_rng((seed, 96))
-    size = rng.uniform(4.0, 7.0, 2)
-    pose = look_pose((0.0, -0.3 * size[1], 1.55), float(rng.normal(0, 8)), float(rng.normal(-3, 2)))
-    wall = _draw(scene, _room(rng, size), _balls(np.zeros((0, 3)), 0.2, rng), device, pose)
-    wall = np.asarray(cv2.GaussianBlur(wall, (0, 0), 0.012 * device.camera.width), dtype=np.uint8)
-    ahead = pose.inverse().rotation[:, 2]
-    at = pose.center + ahead * float(rng.uniform(0.9, 1.4)) + rng.normal(0, [0.12, 0.0, 0.0])
-    body = at + np.array([[0, 0, 0.02], [0, 0, -0.45], [0, 0.03, 0.10]])
-    radii = np.array([[0.105, 0.12, 0.145], [0.26, 0.16, 0.36], [0.115, 0.125, 0.11]])
-    cloth, hair = rng.uniform(0.2, 2.2, 3), rng.uniform(0.3, 1.2, 3)
-    person = Ellipsoids(
-        center=body,
-        radii=radii,
-        tint=np.array([_SKIN, cloth, hair]),
-        texture_uv=rng.uniform(0, 500, (3, 2)),
-        object_id=np.arange(1, 4, dtype=np.int32),
-    )
-    rendered = render(
-        Faces.concatenate([]), person, device.camera, pose, look=scene_look(scene), supersample=2
-    )
-    assert rendered.rgb is not None
-    skin = cv2.GaussianBlur(rendered.rgb, (0, 0), 2.0)
-    seen = np.isfinite(rendered.depth)[..., None]
-    return expose(np.where(seen, skin, wall).astype(np.uint8), rng, sensor)
-
-
-def _draw(scene: Scene, faces: Faces, balls: Ellipsoids, device: Device, pose: Rigid3) -> Image8:
-    rendered = render(faces, balls, device.camera, pose, look=scene_look(scene), supersample=2)
-    assert rendered.rgb is not None
-    return rendered.rgb
-
-
-def _room(rng: np.random.Generator, size: FloatArray) -> Faces:
-    """Walls, floor, ceiling, pictures, furniture; the floor's middle at the origin."""
-    x, y, z = 0.5 * size[0], 0.5 * size[1], float(rng.uniform(2.4, 3.0))
-    wall = tuple(float(c) for c in rng.uniform(0.75, 1.2, 3))
-    corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]])
-    parts = [
-        face(
-            corners[0], corners[3] - corners[0], corners[1] - corners[0], "wood", 1, detail=_start(rng)
-        ),  # floor
-        face((-x, -y, z), (0, 2 * y, 0), (2 * x, 0, 0), "plain", 2, tint=(1.15,) * 3),  # ceiling
-    ]
-    for i in range(4):
-        start, edge = corners[i], corners[(i + 1) % 4] - corners[i]
-        parts.append(face(start, edge, (0, 0, z), "plain", 3 + i, detail=_start(rng), tint=wall))
-        inward = np.cross(edge, [0, 0, 1]) / np.linalg.norm(edge)
-        for _ in range(int(rng.integers(1, 4))):  # pictures on the wall
-            w, h = rng.uniform(0.3, 1.0, 2)
-            along = rng.uniform(0.1, 0.9 - w / np.linalg.norm(edge)) * edge
-            origin = start + along + inward * 0.02 + [0, 0, rng.uniform(1.0, z - h - 0.1)]
-            tint = tuple(float(c) for c in rng.uniform(0.3, 1.3, 3))
-            texture = str(rng.choice(["leaves", "fields", "wood", "car"]))
-            unit = edge / np.linalg.norm(edge)
-            parts.append(face(origin, w * unit, (0, 0, h), texture, 20, detail=_start(rng), tint=tint))
-    for i in range(int(rng.integers(4, 9))):
-        w, d, h = rng.uniform([0.4, 0.4, 0.4], [1.8, 1.0, 1.9])
-        at = rng.uniform(-0.45, 0.45, 2) * size
-        away = float(np.linalg.norm(at))
-        if away < 1.5:
-            at *= 1.5 / max(away, 0.3)
-        tint = tuple(float(c) for c in rng.uniform(0.4, 1.2, 3))
-        parts.append(
-            box(
-                float(at[0]),
-                float(at[1]),
-                0.0,
-                (float(w), float(d), float(h)),
-                30 + i,
-                yaw_deg=float(rng.choice([0, 90])),
-                texture=str(rng.choice(["wood", "plain"])),
-                detail=_start(rng),
-                tint=tint,
-            )
+def survey_photos(
+    scene: Scene, flight: FlightOptions, seed: int, *, folder: str = "survey"
+) -> list[PlannedPhoto]:
+    """An anchored survey as planned photos: full EXIF, positions as its receiver believes them."""
+    photos = []
+    for i, shot in enumerate(survey(scene, flight, seed)):
+        shot = replace(shot, name=f"{folder}/SW_{i + 1:04d}.jpg")
+        assert shot.gps_enu is not None
+        latitude, longitude, height = scene.frame.geodetic_from_enu(shot.gps_enu)
+        fact = AlbumFact(
+            name=shot.name,
+            photo_id=f"{folder}-{i + 1}",
+            kind="survey",
+            owner="survey office",
+            licence="CC-BY-4.0",
+            time=shot.time,
         )
-    return Faces.concatenate(parts)
+        tag = Geotag(latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=float(height))
+        photos.append(PlannedPhoto(shot=shot, scene="home/0/000", fact=fact, geotag=tag))
+    return photos
 
 
-def _start(rng: np.random.Generator) -> tuple[float, float]:
-    return float(rng.uniform(0, 500)), float(rng.uniform(0, 500))
-
-
-def _balls(centers: FloatArray, radius: float, rng: np.random.Generator) -> Ellipsoids:
-    n = len(centers)
-    return Ellipsoids(
-        center=np.reshape(centers, (n, 3)),
-        radii=radius * rng.uniform(0.7, 1.3, (n, 3)),
-        tint=rng.uniform(0.8, 1.2, (n, 3)),
-        texture_uv=rng.uniform(0, 500, (n, 2)),
-        object_id=np.arange(100, 100 + n, dtype=np.int32),
-    )
+@lru_cache(maxsize=64)
+def photo_ids(seed: int, count: int) -> tuple[str, ...]:
+    """Numbers as a photo site gives them, all different."""
+    rng = np.random.default_rng((seed, 57))
+    return tuple(str(n) for n in rng.choice(900_000_000, count, replace=False) + 100_000_000)

@@ -12,15 +12,23 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.camera.photograph import Shot, look_pose
+from featuredb.simworld.camera.photograph import look_pose
 from featuredb.simworld.flight import FlightOptions, shot_seed
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import PlannedPhoto, Subject, renamed, write_album
+from tools.worlds.album import (
+    DAYS,
+    PlannedPhoto,
+    Subject,
+    TownOptions,
+    moment,
+    renamed,
+    survey_photos,
+    write_album,
+)
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.people import ACCURACY_SHARE, GeotagOptions, Person, community, geotag_at, planned
 from tools.worlds.sights import find_sights
-from tools.worlds.surveyed import DAYS, TownOptions, moment, survey_photos
 
 # Of another town's visits: claimed here, or at their own place; the rest not at all.
 _TAGGED_HERE, _TAGGED_THERE = 0.6, 0.8
@@ -147,28 +155,24 @@ def _plan_nowhere(options: CommunityOptions, people: tuple[Person, ...], home: S
     for i, subject in enumerate(subjects):
         person = walkers[int(rng.integers(len(walkers)))]
         assert person.ground is not None
-        name, half = f"nowhere-{i}", 0.4 * np.asarray(home.plan.size)
+        half = 0.4 * np.asarray(home.plan.size)
         spot = home.enu_from_town @ np.array([*rng.uniform(-half, half), 2.0])
         has_tag = rng.random() < person.tags
-        shot = Shot(
-            name=name,
+        photo = planned(
+            person,
+            subject,
+            name=f"nowhere-{i}",
             device=person.ground,
             cam_from_local=look_pose(spot, 0.0, 0.0),
             time=moment(int(rng.integers(DAYS)), float(rng.uniform(8, 22))),
             seed=shot_seed(options.seed, 5, i),
+            scene="home/0/000",
+            exif=person.exif,
+            home=False,
+            geotag=geotag_at(home, spot, 0.0, None) if has_tag else None,
+            subject=subject,
         )
-        photos.append(
-            planned(
-                person,
-                shot,
-                "home/0/000",
-                subject,
-                exif=person.exif,
-                home=False,
-                geotag=geotag_at(home, spot, 0.0, None) if has_tag else None,
-                subject=subject,
-            )
-        )
+        photos.append(photo)
     return photos
 
 

@@ -8,14 +8,13 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.camera.photograph import Device, Shot
+from featuredb.simworld.camera.photograph import Device
 from featuredb.simworld.flight import shot_seed
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import PlannedPhoto, renamed
+from tools.worlds.album import DAYS, PlannedPhoto, day_key, moment, photo_ids, renamed
 from tools.worlds.edits import Edit
 from tools.worlds.people import GeotagOptions, Person, Tagging, give_geotags, planned, stored_upright, zoomed
 from tools.worlds.sights import Sight, Surroundings, look_at
-from tools.worlds.surveyed import DAYS, day_key, moment, photo_ids
 
 _AHEAD = 15  # photos that somebody may be ahead of his share: two visits
 _VISIT_TRIES = 4  # visits per wanted photo: then the sights cannot be photographed by these people
@@ -24,13 +23,7 @@ _NEAREST_DRONE_M, _NEAREST_GROUND_M = 4.0, 2.5
 _TRIES = 6  # a photographer who sees nothing but a wall takes a step and tries again
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
-    """One photo of a visit: with what, from where, how the phone was held."""
-
-    device: Device
-    cam_from_local: Rigid3
-    orientation: int
+View = tuple[Device, Rigid3, int]  # of one photo of a visit: with what, from where, EXIF orientation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,7 +54,9 @@ def ground_visit(
             factor = float(rng.choice([1.0, person.zoom], p=[0.7, 0.3]))
             device = person.ground if factor == 1.0 else zoomed(person.ground, factor)
             upright = person.upright != "never" and rng.random() < 0.5
-            device, roll, orientation = _held(device, person, upright)
+            by_exif = upright and person.upright == "tagged"
+            device = stored_upright(device) if upright and not by_exif else device
+            roll, orientation = (90.0, 6) if by_exif else (0.0, 1)
             wobble = rng.normal(0, [3.0, 2.0, 0.8 + 3.0 * careless])
             look = Viewpoint(eye=eye, target=aim, turn_deg=(wobble[0], wobble[1], wobble[2] + roll))
             view = _view(around, look, device, orientation, _NEAREST_GROUND_M)
@@ -69,15 +64,6 @@ def ground_visit(
                 views.append(view)
                 break
     return views
-
-
-def _held(device: Device, person: Person, upright: bool) -> tuple[Device, float, int]:
-    """Device, roll in degrees and EXIF orientation of a photo held level or upright."""
-    if not upright:
-        return device, 0.0, 1
-    if person.upright == "stored":
-        return stored_upright(device), 0.0, 1
-    return device, 90.0, 6
 
 
 def drone_visit(
@@ -92,8 +78,7 @@ def drone_visit(
     views = []
     for look in getattr(_Flight(person, sight, around, count, rng), mode)():
         wobble = rng.normal(0, [1.5, 1.2, 0.6 + 1.5 * (1 - person.skill)])
-        heading, pitch, roll = (float(turn) for turn in np.add(look.turn_deg, wobble))
-        turned = replace(look, turn_deg=(heading, pitch, roll))
+        turned = replace(look, turn_deg=tuple(np.add(look.turn_deg, wobble).tolist()))
         view = _view(around, turned, person.drone, 1, _NEAREST_DRONE_M)
         if view is not None:
             views.append(view)
@@ -110,7 +95,7 @@ def _view(
     pose = look_at(around.scene, look.eye, look.target, look.turn_deg)
     if not around.worth_taking(device.camera, pose, nearest_m):
         return None
-    return View(device=device, cam_from_local=pose, orientation=orientation)
+    return device, pose, orientation
 
 
 class _Flight:
@@ -265,28 +250,24 @@ def _visit(
     views = (drone_visit if by_drone else ground_visit)(person, sight, around, count, rng)
     day, hour = int(rng.integers(DAYS)), float(rng.uniform(8.0, 19.0))
     photos = []
-    for i, view in enumerate(views):
-        shot = Shot(
+    for i, (device, pose, orientation) in enumerate(views):
+        crop = Edit(kind="cropped", amount=float(rng.uniform(0.08, 0.25)))
+        photo = planned(
+            person,
+            kind or ("drone" if by_drone else "street"),
             name=f"{town}-{visit}-{i}",
-            device=view.device,
-            cam_from_local=view.cam_from_local,
+            device=device,
+            cam_from_local=pose,
             time=moment(day, hour + 0.01 * i),
             seed=shot_seed(seed, 4, visit, i),
+            scene=day_key(town, day, hour),
+            exif=person.exif,
+            home=town == "home",
+            visit=visit,
+            edits=(*([crop] if rng.random() < person.crop_share else []), *person.edits),
+            orientation=orientation,
         )
-        crop = Edit(kind="cropped", amount=float(rng.uniform(0.08, 0.25)))
-        photos.append(
-            planned(
-                person,
-                shot,
-                day_key(town, day, hour),
-                kind or ("drone" if by_drone else "street"),
-                exif=person.exif,
-                home=town == "home",
-                visit=visit,
-                edits=(*([crop] if rng.random() < person.crop_share else []), *person.edits),
-                orientation=view.orientation,
-            )
-        )
+        photos.append(photo)
     return photos
 
 

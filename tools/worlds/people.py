@@ -60,17 +60,17 @@ class Person:
     sensor: SensorOptions = field(default_factory=SensorOptions)
 
 
-def planned(
-    person: Person, shot: Shot, scene: str, kind: str, *, exif: ExifPolicy = "full", **more: Any
-) -> PlannedPhoto:
-    """A photo by a person; `more`: fields of `PlannedPhoto`, and of its fact."""
-    told = {field.name: more.pop(field.name) for field in fields(AlbumFact) if field.name in more}
-    fact = {"owner": person.name, "photo_id": "", "licence": person.licence} | told
+def planned(person: Person, kind: str, **more: Any) -> PlannedPhoto:
+    """A photo by a person; `more`: fields of `PlannedPhoto`, of its shot, and of its fact."""
+
+    def told(of: type) -> dict[str, Any]:
+        return {field.name: more.pop(field.name) for field in fields(of) if field.name in more}
+
+    shot = Shot(**told(Shot))
+    fact = {"owner": person.name, "photo_id": "", "licence": person.licence} | told(AlbumFact)
     return PlannedPhoto(
         shot=shot,
-        scene=scene,
         fact=AlbumFact(name=shot.name, kind=kind, time=shot.time, **fact),
-        exif=exif,
         quality=person.quality,
         sensor=person.sensor,
         **more,
@@ -79,7 +79,7 @@ def planned(
 
 def make_device(
     make: str,
-    model: str,
+    name: str,
     size: tuple[int, int],
     focal_35mm: float,
     lens: tuple[float, ...],
@@ -92,13 +92,11 @@ def make_device(
     """
     w, h = size
     f = focal_35mm / 36.0 * w
-    cx, cy = (0.5 + 0.001) * w, 0.5 * h - 0.0007 * w
-    if len(lens) == 4:
-        camera = Camera(model="OPENCV", width=w, height=h, params=(f, 1.0005 * f, cx, cy, *lens))
-    else:
-        name = "SIMPLE_RADIAL" if len(lens) == 1 else "RADIAL"
-        camera = Camera(model=name, width=w, height=h, params=(f, cx, cy, *lens))
-    return Device(make=make, model=model, camera=camera, focal_mm=focal_mm, focal_35mm=round(focal_35mm))
+    model = {1: "SIMPLE_RADIAL", 2: "RADIAL", 4: "OPENCV"}[len(lens)]
+    focals = (f, 1.0005 * f) if model == "OPENCV" else (f,)
+    params = (*focals, (0.5 + 0.001) * w, 0.5 * h - 0.0007 * w, *lens)
+    camera = Camera(model=model, width=w, height=h, params=params)
+    return Device(make=make, model=name, camera=camera, focal_mm=focal_mm, focal_35mm=round(focal_35mm))
 
 
 def zoomed(device: Device, factor: float) -> Device:

@@ -29,12 +29,11 @@ from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.blocks import face
 from featuredb.simworld.town.scene import TEXTURES, Ellipsoids, Faces, GroundPlan, Scene, texture_index
 from featuredb.simworld.town.town import BUILDING_ID
-from tools.worlds.album import Geotag, PlannedPhoto, renamed
+from tools.worlds.album import Geotag, PlannedPhoto, TownOptions, day_scene, renamed, survey_photos, town_of
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.people import GeotagOptions, Person, community, geotag_at
 from tools.worlds.sights import Sight, find_sights
-from tools.worlds.surveyed import TownOptions, day_scene, survey_photos, town_of
 
 POISONS = ("lookalike", "mirrored", "mirror_block", "liar", "liar_other", "altered", "forged")
 _LIE_M = (130.0, 75.0)  # shift of the liar's positions, east and north: another block

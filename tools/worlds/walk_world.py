@@ -6,18 +6,15 @@ survey_far/. Kinds: survey, survey_far, walk, probe.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.camera.photograph import Shot
 from featuredb.simworld.flight import FlightOptions, shot_seed
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import PlannedPhoto
+from tools.worlds.album import PlannedPhoto, TownOptions, day_key, moment, photo_ids, survey_photos, town_of
 from tools.worlds.people import community, geotag_at, planned
 from tools.worlds.sights import Surroundings, look_at
-from tools.worlds.surveyed import TownOptions, day_key, moment, photo_ids, survey_photos, town_of
 
 _PROBE = "probe"
 _TRIES = 8
@@ -142,24 +139,24 @@ class _Walk:
         for i, (eye, target) in enumerate(aims):
             photo_id = next(self._ids)
             wobble = rng.normal(0, [1.5, 1.0, 0.8])
-            shot = Shot(
+            place = home.enu_from_town @ eye + np.append(rng.normal(0, walker.gps_sigma_m, 2), 0.0)
+            tag = None
+            if walker.gps_sigma_m > 0:
+                tag = geotag_at(home, place, float(rng.normal(0, _VERTICAL_M)), walker.gps_sigma_m)
+            photo = planned(
+                person,
+                kind,
                 name=f"{'photos/' + person.name if kind == 'walk' else 'probes'}/{photo_id}.jpg",
                 device=person.drone,
                 cam_from_local=look_at(home, eye, target, (wobble[0], wobble[1], wobble[2])),
                 time=moment(day, hour + 0.005 * i),
                 seed=shot_seed(seed, 7, step, who, i),
+                scene=day_key("home", day, hour),
+                geotag=tag,
+                photo_id=photo_id,
+                owner=person.name if kind == "walk" else _PROBE,
+                visit=10 * step + who,
+                batch=step,
             )
-            place = home.enu_from_town @ eye + np.append(rng.normal(0, walker.gps_sigma_m, 2), 0.0)
-            tag = None
-            if walker.gps_sigma_m > 0:
-                tag = geotag_at(home, place, float(rng.normal(0, _VERTICAL_M)), walker.gps_sigma_m)
-            owner = person.name if kind == "walk" else _PROBE
-            told: dict[str, Any] = {
-                "photo_id": photo_id,
-                "owner": owner,
-                "visit": 10 * step + who,
-                "batch": step,
-            }
-            scene = day_key("home", day, hour)
-            photos.append(planned(person, shot, scene, kind, geotag=tag, **told))
+            photos.append(photo)
         return photos
