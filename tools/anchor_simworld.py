@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.adjust.block import whole_camera
+from featuredb.adjust.terms import whole_camera
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp

@@ -21,9 +21,8 @@ import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.stats import chi2, norm
 
-from featuredb.adjust.block import whole_lens
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import LensWidths, Terms, lens_prior
+from featuredb.adjust.terms import LensWidths, Terms, lens_prior, whole_lens
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from ingest.colmap.adjust import AdjustOptions
