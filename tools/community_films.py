@@ -29,7 +29,7 @@ from featuredb.simworld.scan_world import write_scan
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from ingest.report.page import REPORT_JSON
-from reloc.tracking.trajectory.read import read_trajectory_csv
+from reloc.tracking.trajectory.files import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory
 from tools.commands import featuredb, newest_copy, once
 from tools.figures import inside, median, say, squared, study_parser, write_figures
