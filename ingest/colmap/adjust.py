@@ -32,7 +32,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap.bridge import SfmPhoto, quiet, triangulation_settings, whole_model_of
-from ingest.colmap.precision import residuals_px, shared_variance_px2
+from ingest.colmap.precision import in_cameras, projected, shared_variance_px2
 from ingest.positions.center_priors import center_priors
 
 # COLMAP's own gates of mapping: 4 px at keypoints good to half a pixel, 1.5 degrees, 15 observations.
@@ -235,9 +235,8 @@ def residuals_of(
         point_of = np.concatenate([point_of, len(xyz) + np.arange(len(marks.xyz))])
         xyz, photo_of = np.concatenate([xyz, marks.xyz]), np.concatenate([photo_of, marks.photo_of])
         xy = np.concatenate([xy, marks.xy])
-    residuals = residuals_px(
-        block.cameras, block.camera_of, block.cam_from_block, xyz, point_of, photo_of, xy
-    )
+    in_camera = in_cameras(block.cam_from_block, xyz, point_of, photo_of)
+    residuals = xy - projected(block.cameras, block.camera_of[photo_of], in_camera)
     seen = np.isfinite(residuals).all(axis=1)
     return residuals[seen], xy[seen], photo_of[seen]
 

@@ -51,16 +51,17 @@ def linearise(
     Args:
         camera_of: camera of each photo.
     """
-    in_camera = _in_camera(poses, points, point_of, photo_of)
+    in_camera = in_cameras(poses, points, point_of, photo_of)
+    camera_seen = camera_of[photo_of]
     by_camera_point = np.zeros((len(xy), 2, 3))
     for index, camera in enumerate(cameras):
-        rows = np.flatnonzero(camera_of[photo_of] == index)
+        rows = np.flatnonzero(camera_seen == index)
         by_camera_point[rows] = camera.projection_jacobian(in_camera[rows])
     by_pose = np.zeros((len(xy), 2, 6))
     by_pose[:, :, :3] = -by_camera_point @ skew(in_camera)
     by_pose[:, :, 3:] = by_camera_point
     return Linearised(
-        residual=residuals_px(cameras, camera_of, poses, points, point_of, photo_of, xy),
+        residual=xy - projected(cameras, camera_seen, in_camera),
         by_point=by_camera_point @ np.array([p.rotation for p in poses]).reshape(-1, 3, 3)[photo_of],
         by_pose=by_pose,
         point_of=point_of,
@@ -68,32 +69,23 @@ def linearise(
     )
 
 
-def residuals_px(
-    cameras: Sequence[Camera],
-    camera_of: NDArray[np.int64],
-    poses: Sequence[Rigid3],
-    points: FloatArray,
-    point_of: NDArray[np.int64],
-    photo_of: NDArray[np.int64],
-    xy: FloatArray,
-) -> FloatArray:
-    """(m, 2) observed minus projected; arguments as of `linearise`."""
-    in_camera = _in_camera(poses, points, point_of, photo_of)
-    projected = np.full((len(xy), 2), np.nan)
-    for index, camera in enumerate(cameras):
-        rows = np.flatnonzero(camera_of[photo_of] == index)
-        projected[rows] = camera.project(in_camera[rows])
-    return np.asarray(xy - projected)
-
-
-def _in_camera(
+def in_cameras(
     poses: Sequence[Rigid3], points: FloatArray, point_of: NDArray[np.int64], photo_of: NDArray[np.int64]
 ) -> FloatArray:
-    """(m, 3): observed points in the axes of their cameras."""
+    """(m, 3) observed points (n, 3) in the axes of their cameras; poses are cam_from_local."""
     rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
     translations = np.array([p.translation for p in poses]).reshape(-1, 3)
     turned = np.einsum("mij,mj->mi", rotations[photo_of], points[point_of])
     return np.asarray(turned + translations[photo_of])
+
+
+def projected(cameras: Sequence[Camera], camera_seen: NDArray[np.int64], in_camera: FloatArray) -> FloatArray:
+    """Pixels (m, 2) of points (m, 3) in the axes of the cameras (m,) that see them."""
+    pixels = np.full((len(in_camera), 2), np.nan)
+    for index, camera in enumerate(cameras):
+        rows = np.flatnonzero(camera_seen == index)
+        pixels[rows] = camera.project(in_camera[rows])
+    return pixels
 
 
 def residual_variance(linear: Linearised, photos: int, points: int) -> float:

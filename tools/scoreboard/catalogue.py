@@ -65,12 +65,27 @@ SPEED: tuple[Row, ...] = (
         "positions, beside the first 200 of them: processor time a photo, the largest of its processes, its "
         "maps against the truth",
         commands=f"tools.bulk_ingest --work {{work}}/bulk --seed 5 {OUT}",
-        figures="photos maps placed share wrong median_m largest_m a_photo_s first_s ratio largest_mb",
+        figures="photos share first_s off_5_wrong_left_out off_5_right_left_out off_20_right_left_out "
+        "off_30_wrong_left_out off_30_right_left_out",
         text="{placed:.0f} of {photos:.0f} photos in {maps:.0f} maps, {wrong:.0f} wrong, {median_m:.2f} m, "
         "largest {largest_m:.2f} m; {a_photo_s:.2f} s a photo, {ratio:.2f} times that of the first; "
-        "{largest_mb:.0f} MB",
+        "{largest_mb:.0f} MB; {off_0_wrong_left_out:.0f} of {wrong_pairs:.0f} wrong pairs left out "
+        "({off_20_wrong_left_out:.0f} with a fifth of the positions off by 300 m) and "
+        "{off_0_right_left_out:.0f} "
+        "right ones of {pairs:.0f}",
         limits="0.99 <= share, wrong <= 0, maps <= 2, ratio <= 1.15, largest_mb <= 2048",
         minutes=60,
+    ),
+    _row(
+        name="far-pairs",
+        claim="verified pairs of real flights that are left out, since their photos are too far apart by "
+        "their positions",
+        commands=f"tools.far_pairs {BRIGHTON} {{data}}/lewis/images {{data}}/seneca/images "
+        f"--work {{work}}/pairs {OUT}",
+        figures="brighton_left_out lewis_left_out seneca_left_out",
+        text="{left_out:.0f} of {pairs:.0f}, the strongest with {lewis_most_matches:.0f} matches",
+        limits="left_out_share <= 0.01",
+        minutes=10,
     ),
     _row(
         name="memory-curve",
