@@ -18,9 +18,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import WorldOptions, read_truth, write_world
-from tools.commands import all_maps, copied, once, processor_s
+from tools.commands import all_maps, once, processor_s
 from tools.far_pairs import FEATURES, against_truth, verified_pairs
 from tools.figures import laid_apart, median, say, study_parser, write_figures
+from tools.photo_files import copied
 
 _A_LINE, _FIRST_LINES = 40, 5
 _METRES_A_LINE = 22.4

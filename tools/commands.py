@@ -1,21 +1,15 @@
-"""Commands of featuredb, each in a process of its own, and what they make of folders of photos."""
+"""Commands of featuredb, each in a process of its own, and what they make."""
 
-import io
 import resource
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
-from featuredb.features.exif.write import EXIF_PREFIX, gps_directory, with_app1, with_gps
-from featuredb.features.image_header import read_header
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import PlanBox, load_cloud, scan_frame
 from featuredb.maps.feature_map import FeatureMap
@@ -24,8 +18,6 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 
 _ROOT = Path(__file__).resolve().parent.parent
-_SUFFIXES = (".jpg", ".jpeg", ".png")
-_GPS_IFD = 34853
 
 
 def featuredb(*words: str, refusals: Sequence[int] = ()) -> subprocess.CompletedProcess[str]:
@@ -143,52 +135,3 @@ def cloud_of(
     """A scan, once it is added to a database, in a local frame or one at its centre; a box of it, or all."""
     made = Database.create(database)
     return load_cloud(made, frame or scan_frame(add_scan(made, [scan]).scan), box)
-
-
-def photo_names(folder: Path) -> list[str]:
-    """Names of the photos of a folder, sorted."""
-    return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
-
-
-def position_table(folder: Path, rows: Iterable[tuple[object, ...]]) -> Path:
-    """A table beside photos: name, latitude, longitude (degrees), height, and both accuracies (m)."""
-    lines = ["path,lat,lon,height,accuracy,accuracy_height", *(",".join(map(str, row)) for row in rows)]
-    table = folder / "table.csv"
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return table
-
-
-def copied(folder: Path, names: Sequence[str], target: Path, *, strip: bool) -> Path:
-    """Copies of photos, without positions where `strip` says so; the pictures stay bit for bit."""
-    target.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        data = (folder / name).read_bytes()
-        (target / name).write_bytes(without_position(data) if strip else data)
-    return target
-
-
-def with_place(
-    jpeg: bytes,
-    frame: LocalFrame,
-    place: FloatArray,
-    error_m: float | None,
-    xmp: bytes = b"",
-    *datum: str,
-    **more: float,
-) -> bytes:
-    """A JPEG with another position (3,) in its EXIF, and other XMP; the picture as it was.
-
-    Args:
-        datum, more: as `gps_directory` has them.
-    """
-    latitude, longitude, height = (float(v) for v in frame.geodetic_from_enu(place))
-    gps = gps_directory((latitude, longitude, height), *datum, error_m=error_m, **more)
-    return with_app1(jpeg, with_gps(jpeg[slice(*read_header(jpeg).exif)], gps), xmp)
-
-
-def without_position(jpeg: bytes) -> bytes:
-    """A JPEG without the GPS directory of its EXIF and with empty XMP; the picture as it was."""
-    with Image.open(io.BytesIO(jpeg)) as image:
-        exif = image.getexif()
-    exif.pop(_GPS_IFD, None)
-    return with_app1(jpeg, exif.tobytes().removeprefix(EXIF_PREFIX), b"")

@@ -27,8 +27,9 @@ from featuredb.simworld.camera.photograph import look_pose
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameOptions
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from tools.commands import cloud_of, photo_names
+from tools.commands import cloud_of
 from tools.figures import median, off_pose, prior_off_by, say, study_parser, write_figures
+from tools.photo_files import photo_names
 
 _OFF_M, _OFF_DEG = 15.0, 10.0
 

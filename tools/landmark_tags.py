@@ -26,7 +26,7 @@ from featuredb.store import Database
 from ingest.own_frame import held_of
 from ingest.photos.photo import Photo, whose_cameras
 from ingest.register.gps import place_by_gps
-from tools.commands import copied, featuredb, largest_map, make, photo_names, position_table
+from tools.commands import featuredb, largest_map, make
 from tools.figures import (
     inside_figures,
     laid_apart,
@@ -37,6 +37,7 @@ from tools.figures import (
     study_parser,
     write_figures,
 )
+from tools.photo_files import copied, photo_names, position_table
 
 _EXTENT_M, _OFF_M, _STATED_M = 120.0, 8.0, 30.0
 _FRAME = LocalFrame(latitude_deg=52.5186, longitude_deg=13.3750, height_m=75.0)

@@ -23,7 +23,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3
-from tools.commands import with_place
+from tools.photo_files import with_place
 
 FRAME = LocalFrame(latitude_deg=49.0, longitude_deg=8.4, height_m=150.0)  # somewhere on Earth
 SIGMA_M = 0.02  # that positions claim

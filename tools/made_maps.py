@@ -10,8 +10,9 @@ which no other position is known).
 
 from pathlib import Path
 
-from tools.commands import make, photo_names
+from tools.commands import make
 from tools.figures import study_parser, write_figures
+from tools.photo_files import photo_names
 
 
 def main() -> None:

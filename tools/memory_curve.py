@@ -17,8 +17,9 @@ from scipy.spatial import ConvexHull
 
 from featuredb.index.segment import Segment, segment_of
 from featuredb.store import Database
-from tools.commands import featuredb, photo_names
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
+from tools.photo_files import photo_names
 from tools.real_photos import ask, error_figures, ingest, reference
 
 _EVERY = 5  # one photo in so many is held out

@@ -9,8 +9,9 @@ with photos of two places is wrong. Prints how many photos each map has and of w
 from collections import Counter
 from pathlib import Path
 
-from tools.commands import all_maps, make, photo_names
+from tools.commands import all_maps, make
 from tools.figures import say, study_parser, write_figures
+from tools.photo_files import photo_names
 
 
 def main() -> None:

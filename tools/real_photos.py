@@ -36,8 +36,9 @@ from reloc.service.serve import start_server
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
 from reloc.wire.query import CameraRequest
-from tools.commands import copied, make, photo_names
+from tools.commands import make
 from tools.figures import laid_on, poses_in, say, spread, study_parser, write_figures
+from tools.photo_files import copied, photo_names
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
 

@@ -23,8 +23,9 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.camera.photograph import Device, Shot, exif_of, jpeg_bytes
 from featuredb.simworld.world import WorldOptions, in_order, town_of
 from featuredb.store import Database
-from tools.commands import featuredb, once, with_place
+from tools.commands import featuredb, once
 from tools.figures import pose_offset, say, squared, study_parser, write_figures
+from tools.photo_files import with_place
 from tools.worlds.film_world import (
     Exposure,
     FilmOptions,

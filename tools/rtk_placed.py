@@ -22,8 +22,9 @@ from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import TrueImage, Truth, World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database
 from tools.anchor_simworld import camera_errors
-from tools.commands import copied, featuredb, first_map, once, position_table, with_place
+from tools.commands import featuredb, first_map, once
 from tools.figures import study_parser, write_figures
+from tools.photo_files import copied, position_table, with_place
 from tools.worlds.sights import SeenPlaces
 
 _SEED = 1

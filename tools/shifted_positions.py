@@ -20,8 +20,9 @@ from featuredb.geo.utm import geodetic_from_utm, utm_epsg, utm_from_geodetic
 from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution
-from tools.commands import copied, featuredb, photo_names, position_table
+from tools.commands import featuredb
 from tools.figures import study_parser, write_figures
+from tools.photo_files import copied, photo_names, position_table
 
 _SHIFT_M = 50_000.0
 

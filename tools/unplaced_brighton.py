@@ -28,8 +28,9 @@ import numpy as np
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
-from tools.commands import anchor, copied, make, newest_copy, photo_names, with_scan
+from tools.commands import anchor, make, newest_copy, with_scan
 from tools.figures import kept, write_figures
+from tools.photo_files import copied, photo_names
 from tools.picked import picks, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
 from tools.scan_poses import ScanTruth, scan_parser, scan_truth

@@ -21,8 +21,9 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from tools.commands import copied, featuredb, photo_names
+from tools.commands import featuredb
 from tools.figures import pose_errors, poses_in, spread, study_parser, write_figures
+from tools.photo_files import copied, photo_names
 from tools.real_photos import ingest, reference
 
 _STRANGE = 10

@@ -1,4 +1,4 @@
-"""Promotion, canaries and re-placement on databases of small maps whose truth is known."""
+"""Promotion and canaries on databases of small maps whose truth is known."""
 
 import hashlib
 import tempfile
@@ -9,28 +9,22 @@ import numpy as np
 import pytest
 
 from featuredb.errors import StoreError
-from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.move import in_frame, move_map
 from featuredb.store import Database
-from featuredb.store.changes import IMPORTED
-from ingest.growth.graph.map_graph import placed_maps
-from ingest.growth.graph.replacing import replace_descendants
-from ingest.growth.place.map_images import features_and_points, measure_overlap
+from ingest.growth.place.map_images import features_and_points
 from ingest.growth.trust.canaries import CanaryRun, own_canaries, run_canaries
 from ingest.growth.trust.confirmation import NewPhotos
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
-from ingest.growth.values import Edge, GrowthOptions, GrowthPhotos
+from ingest.growth.values import GrowthOptions, GrowthPhotos
 from reloc.localise.localise import localise_features
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from tests.support.scene_strip import (
+    ANCHOR,
     DESCRIPTORS,
-    FRAME,
     POINTS,
+    add,
+    database_of,
     east,
-    error_m,
-    note_contributed,
     put_on_record,
     strip_map,
 )
@@ -45,21 +39,6 @@ from tests.support.scenes import (
     scene_map,
 )
 
-_BUDGET_M = 0.5
-
-
-def _database(folder: Path, *maps: FeatureMap) -> Database:
-    database = Database.create(folder / "db")
-    for feature_map in maps:  # one after the other, as they came
-        _add(database, feature_map)
-    return database
-
-
-def _add(database: Database, feature_map: FeatureMap) -> None:
-    """As growth does; photos of "survey" are the operator's, others contributed by that identity."""
-    note_contributed(database, feature_map)
-    database.commit_map(feature_map)
-
 
 def _promoted(database: Database, trusted: tuple[str, ...] = ()) -> dict[str, Promotion]:
     work = Path(tempfile.mkdtemp(dir=database.url))
@@ -71,13 +50,12 @@ def _status(database: Database, map_id: str) -> str:
     return database.snapshot().get(map_id).status
 
 
-_ANCHOR = strip_map("A", 20.0, owners=["survey"])
 _NONE = NewPhotos(given=GrowthPhotos(), rows=(), localised={})
 
 
 def test_a_map_of_two_owners_is_promoted(tmp_path: Path) -> None:
-    database = _database(
-        tmp_path, _ANCHOR, strip_map("m", 50.0, owners=["anna", "ben"], parents=[_ANCHOR], seed=1)
+    database = database_of(
+        tmp_path, ANCHOR, strip_map("m", 50.0, owners=["anna", "ben"], parents=[ANCHOR], seed=1)
     )
     outcome = _promoted(database)["m"]
     assert outcome.promoted
@@ -89,22 +67,22 @@ def test_a_map_of_two_owners_is_promoted(tmp_path: Path) -> None:
 
 def test_a_map_of_one_owner_waits_until_another_one_sees_it(tmp_path: Path) -> None:
     """Anna's map reaches beyond the anchor; Ben's map, quarantined too, shows the same from elsewhere."""
-    mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
-    database = _database(tmp_path, _ANCHOR, mine)
+    mine = strip_map("m", 85.0, owners=["anna"], parents=[ANCHOR], seed=1)
+    database = database_of(tmp_path, ANCHOR, mine)
     put_on_record(database, "anna", "ben")
     outcome = _promoted(database)["m"]
     assert not outcome.promoted
     assert outcome.reason_code == "ONE_SOURCE"
     assert _status(database, "m") == "quarantined"
-    _add(database, strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
+    add(database, strip_map("n", 88.0, owners=["ben"], parents=[ANCHOR], seed=2))
     outcomes = _promoted(database)
     assert outcomes["m"].promoted
     assert outcomes["n"].promoted
 
 
 def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
-    database, work = _database(tmp_path, _ANCHOR, mine), tmp_path / "work"
+    mine = strip_map("m", 85.0, owners=["anna"], parents=[ANCHOR], seed=1)
+    database, work = database_of(tmp_path, ANCHOR, mine), tmp_path / "work"
     put_on_record(database, "anna")
 
     def ask() -> Promotion:
@@ -114,21 +92,21 @@ def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytes
     with monkeypatch.context() as patch:
         patch.setattr("ingest.growth.trust.promotion.corroborate", None)
         assert ask() == first
-    _add(database, strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
+    add(database, strip_map("n", 88.0, owners=["ben"], parents=[ANCHOR], seed=2))
     assert not ask().promoted  # something new has come, of somebody whose word does not count yet
     put_on_record(database, "ben")
     assert ask().promoted
 
 
 def test_photos_of_the_anchor_bear_witness_to_a_map_that_lies_on_it(tmp_path: Path) -> None:
-    mine = strip_map("m", 22.0, owners=["anna"], parents=[_ANCHOR], seed=1)
-    assert _promoted(_database(tmp_path, _ANCHOR, mine))["m"].promoted
+    mine = strip_map("m", 22.0, owners=["anna"], parents=[ANCHOR], seed=1)
+    assert _promoted(database_of(tmp_path, ANCHOR, mine))["m"].promoted
 
 
 def test_a_map_that_has_known_photos_elsewhere_is_contradicted(tmp_path: Path) -> None:
     """Two owners agree on it, and it lies five metres from where the anchor's photos are."""
-    wrong = strip_map("m", 30.0, owners=["anna", "eve"], parents=[_ANCHOR], move=east(5.0), seed=1)
-    database = _database(tmp_path, _ANCHOR, wrong)
+    wrong = strip_map("m", 30.0, owners=["anna", "eve"], parents=[ANCHOR], move=east(5.0), seed=1)
+    database = database_of(tmp_path, ANCHOR, wrong)
     put_on_record(database, "anna", "eve")
     outcome = _promoted(database)["m"]
     assert not outcome.promoted
@@ -138,8 +116,8 @@ def test_a_map_that_has_known_photos_elsewhere_is_contradicted(tmp_path: Path) -
 
 def test_a_copy_of_a_block_elsewhere_is_refused_by_canaries(tmp_path: Path) -> None:
     """The anchor's block is claimed 500 m away, by two owners who agree."""
-    copy = strip_map("m", 20.0, owners=["anna", "eve"], parents=[_ANCHOR], move=east(500.0), seed=1)
-    database = _database(tmp_path, _ANCHOR, copy)
+    copy = strip_map("m", 20.0, owners=["anna", "eve"], parents=[ANCHOR], move=east(500.0), seed=1)
+    database = database_of(tmp_path, ANCHOR, copy)
     put_on_record(database, "anna", "eve")
     before = _answer(database, 20.0)
     outcome = _promoted(database)["m"]
@@ -177,8 +155,8 @@ def _answer(database: Database, at_east_m: float) -> tuple[object, ...]:
 
 @pytest.mark.parametrize("more", [None, "m"])
 def test_own_canaries_are_right_while_nothing_is_wrong(tmp_path: Path, more: str | None) -> None:
-    database = _database(
-        tmp_path, _ANCHOR, strip_map("m", 45.0, owners=["anna", "ben"], parents=[_ANCHOR], seed=1)
+    database = database_of(
+        tmp_path, ANCHOR, strip_map("m", 45.0, owners=["anna", "ben"], parents=[ANCHOR], seed=1)
     )
     before = Localiser.open(database)
     after = Localiser.open(database, previous=before, also=[more] if more else [])
@@ -201,11 +179,11 @@ def test_an_image_need_not_show_what_a_new_map_adds_around_its_points(tmp_path: 
             descriptors=random_descriptors(rng, len(points)),
             poses=ring(6),
             map_id=map_id,
-            fingerprint=_ANCHOR.extractor_fingerprint,
+            fingerprint=ANCHOR.extractor_fingerprint,
         )
         for map_id, points in (("A", corner), ("m", everything))
     )
-    database = _database(tmp_path, anchor, replace(more, status="quarantined"))
+    database = database_of(tmp_path, anchor, replace(more, status="quarantined"))
     before = Localiser.open(database)
     after = Localiser.open(database, previous=before, also=["m"])
     run = run_canaries(database, before, after, [more])
@@ -216,7 +194,7 @@ def test_an_image_need_not_show_what_a_new_map_adds_around_its_points(tmp_path: 
 def test_images_of_maps_by_another_extractor_are_not_asked(tmp_path: Path) -> None:
     """No query finds anything in such a map, and to ask there is an error."""
     older = replace(strip_map("B", 150.0, owners=["survey"], seed=3), extractor_fingerprint="older")
-    database = _database(tmp_path, _ANCHOR, older)
+    database = database_of(tmp_path, ANCHOR, older)
     localiser = Localiser.open(database)
     run = run_canaries(database, localiser, localiser, [])
     assert {check.name.rpartition(" ")[2] for check in run.checks} == {"A"}
@@ -224,7 +202,7 @@ def test_images_of_maps_by_another_extractor_are_not_asked(tmp_path: Path) -> No
 
 
 def test_canaries_are_the_same_in_every_run(tmp_path: Path) -> None:
-    database = _database(tmp_path, _ANCHOR, strip_map("B", 150.0, owners=["survey"], seed=3))
+    database = database_of(tmp_path, ANCHOR, strip_map("B", 150.0, owners=["survey"], seed=3))
     localiser = Localiser.open(database)
     chosen = own_canaries(database, localiser, [strip_map("m", 25.0, seed=1)])
     again = own_canaries(database, Localiser.open(database), [strip_map("m", 25.0, seed=1)])
@@ -237,12 +215,12 @@ def test_canaries_are_the_same_in_every_run(tmp_path: Path) -> None:
 
 def test_maps_that_are_held_back_are_not_examined(tmp_path: Path) -> None:
     owners = ["anna", "ben"]
-    quarantined = strip_map("q", 60.0, owners=["anna"], parents=[_ANCHOR], seed=1)
-    database = _database(
+    quarantined = strip_map("q", 60.0, owners=["anna"], parents=[ANCHOR], seed=1)
+    database = database_of(
         tmp_path,
-        _ANCHOR,
+        ANCHOR,
         quarantined,
-        strip_map("far", 40.0, owners=owners, parents=[_ANCHOR], seed=2, drift_m=0.9),
+        strip_map("far", 40.0, owners=owners, parents=[ANCHOR], seed=2, drift_m=0.9),
         strip_map("orphan", 85.0, owners=owners, parents=[quarantined], seed=3),
     )
     outcomes = _promoted(database)
@@ -251,151 +229,20 @@ def test_maps_that_are_held_back_are_not_examined(tmp_path: Path) -> None:
 
 
 def test_by_hand_a_good_map_needs_no_confirmation(tmp_path: Path) -> None:
-    database = _database(tmp_path, _ANCHOR, strip_map("m", 45.0, owners=["anna"], parents=[_ANCHOR], seed=1))
+    database = database_of(tmp_path, ANCHOR, strip_map("m", 45.0, owners=["anna"], parents=[ANCHOR], seed=1))
     outcome = promote_by_hand(database, "m", "I know Anna", force=False)
     assert outcome.promoted
     assert "I know Anna" in database.snapshot().get("m").status_reason
     assert promote_by_hand(database, "m", "again", force=False).promoted
 
 
-def test_an_overlap_is_measured(tmp_path: Path) -> None:
-    """A map displaced by a known similarity, against one that is right."""
-    move = Sim3.exp([0.002, 0.001, -0.002, 0.003, 0.4, -0.3, 0.2])
-    crooked = strip_map("m", 40.0, move=move, seed=1)
-    found = measure_overlap(crooked, strip_map("n", 55.0, seed=2))
-    assert isinstance(found, Edge), found
-    places = POINTS[np.abs(POINTS[:, 0] - 45.0) < 20.0]
-    miss = found.other_from_map.act(move.act(places)) - places
-    assert np.linalg.norm(miss, axis=1).max() < 0.03
-    error = (found.other_from_map @ move).log()
-    assert error @ np.linalg.solve(found.covariance, error) < 24.0  # 0.1 % of a chi-square of 7
-
-
-def test_maps_that_do_not_overlap_have_none(tmp_path: Path) -> None:
-    found = measure_overlap(strip_map("m", 20.0, seed=1), strip_map("n", 150.0, seed=2))
-    assert isinstance(found, str)
-    assert "images are found" in found
-
-
-def _chain(drift_each_m: float, far: Sim3 | None) -> list[FeatureMap]:
-    """An anchor, four maps that drift away from it, and an anchor at the far end that came later."""
-    maps = [_ANCHOR]
-    for k in range(1, 5):
-        maps.append(
-            strip_map(
-                f"m{k}", 20.0 + 32.0 * k, owners=["anna", "ben"], parents=[maps[-1]], status="active",
-                move=east(drift_each_m * k), seed=k,
-            )
-        )  # fmt: skip
-    if far is not None:
-        maps.append(strip_map("B", 165.0, owners=["survey"], move=far, seed=9))
-    return maps
-
-
-def test_an_anchor_at_the_far_end_re_places_what_drifted_in_one_commit(tmp_path: Path) -> None:
-    database = _database(tmp_path, *_chain(0.06, Sim3.identity()))
-    before = database.poll_version()
-    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
-    assert done is not None
-    assert done.reason is None
-    assert database.poll_version() == before + 1
-    snapshot = database.snapshot()
-    for k in range(1, 5):
-        drifted, placed = 0.06 * k, error_m(snapshot.load_map(f"m{k}"), 20.0 + 32.0 * k)
-        assert placed < max(0.5 * drifted, 0.05)
-        assert snapshot.get(f"m{k}").status == "active"
-    assert error_m(snapshot.load_map("A"), 20.0) < 0.03
-    assert {m.map_id for m in done.moved} >= {"m1", "m2", "m3", "m4"}
-    # m4 overlaps the new anchor and says so; drift is a quarter of a chain of four, at most.
-    assert "B" in snapshot.get("m4").parents
-    drift = {m.map_id: m.drift_m for m in done.moved}
-    assert drift["m4"] < drift["m2"] < 0.5
-    # Everything has been said: a second look finds nothing to do, and measures nothing.
-    assert replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M) is None
-    assert database.poll_version() == before + 1
-
-
-def test_an_anchor_that_contradicts_by_far_moves_nothing(tmp_path: Path) -> None:
-    """The far anchor lies eight metres off: neither side is believed, and the report names the overlaps."""
-    database = _database(tmp_path, *_chain(0.0, east(8.0)))
-    before = database.poll_version()
-    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
-    assert done is not None
-    assert done.reason == "CONTRADICTION"
-    assert "m4 - B" in done.message
-    assert database.poll_version() == before
-
-
-def test_what_was_imported_moves_nothing(tmp_path: Path) -> None:
-    """A dataset's anchor and edge, forged to be surer than all else, would pull at the database's anchor."""
-    database = _database(tmp_path, _ANCHOR)
-    sure = np.diag(np.repeat([1e-9, 1e-5], [4, 3]))
-    forger = strip_map("X", 20.0, owners=["survey"], move=east(1.0), covariance=sure, seed=5)
-    forger = replace(forger, status="quarantined")
-    forged = strip_map("y", 30.0, owners=["eve"], parents=[_ANCHOR, forger], seed=6)
-    database.commit_maps([forger, forged], reasons={"X": IMPORTED, "y": IMPORTED})
-    assert set(placed_maps(database.snapshot())) == {"A"}
-    for feature_map in _chain(0.06, Sim3.identity())[1:]:
-        _add(database, feature_map)
-    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
-    assert done is not None
-    assert done.reason is None
-    assert not {"X", "y"} & {m.map_id for m in done.moved}
-    assert error_m(database.snapshot().load_map("A"), 20.0) < 0.03
-
-
-def test_a_map_that_only_an_import_holds_stays_where_it_is(tmp_path: Path) -> None:
-    """Its other parent is placed anew, and hangs on the same import."""
-    imported = replace(strip_map("X", 20.0, owners=["survey"]), status="quarantined")
-    first = strip_map("m1", 45.0, owners=["anna"], parents=[imported], seed=1)
-    second = strip_map("m2", 60.0, owners=["ben"], parents=[first], seed=2)
-    database = _database(tmp_path)
-    database.commit_maps([imported], reasons={"X": IMPORTED})
-    for feature_map in (first, second):
-        _add(database, feature_map)
-    database.commit_map(
-        move_map(first, in_frame(east(0.1), FRAME, first.frame), covariance=first.placement.covariance),
-        replaces="m1",
-    )
-    before = database.poll_version()
-    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
-    assert done is not None
-    assert done.reason == "NO_ANCHOR"
-    assert database.poll_version() == before
-
-
-def test_a_parent_that_is_placed_anew_takes_its_children_along(tmp_path: Path) -> None:
-    """A survey with GPS of metres is anchored by LiDAR two metres west: its children follow."""
-    loose = np.diag(np.repeat([1e-4, 3.0], [4, 3]) ** 2)
-    first = strip_map("A", 20.0, owners=["survey"], move=east(2.0), covariance=loose)
-    child = strip_map(
-        "m1", 52.0, owners=["anna", "ben"], parents=[first], status="active", move=east(2.0), seed=1
-    )
-    database = _database(tmp_path, first, child)
-    right = replace(
-        move_map(first, in_frame(east(-2.0), FRAME, first.frame), covariance=_ANCHOR.placement.covariance),
-        status="active",
-    )
-    result = database.commit_map(right, replaces="A")
-    assert result.flagged == ("m1",)
-    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
-    assert done is not None
-    assert done.reason is None
-    snapshot = database.snapshot()
-    assert snapshot.get("m1").status == "active"
-    assert error_m(snapshot.load_map("m1"), 52.0) < 0.1
-    assert error_m(snapshot.load_map("A"), 20.0) < 0.02
-    placed = placed_maps(snapshot)
-    assert placed["m1"].edges[0].place == placed["A"].place
-
-
 def test_a_trusted_owner_is_promoted_alone(tmp_path: Path) -> None:
-    mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
-    assert _promoted(_database(tmp_path, _ANCHOR, mine), trusted=("anna",))["m"].promoted
+    mine = strip_map("m", 85.0, owners=["anna"], parents=[ANCHOR], seed=1)
+    assert _promoted(database_of(tmp_path, ANCHOR, mine), trusted=("anna",))["m"].promoted
 
 
 def test_what_is_retired_cannot_be_promoted(tmp_path: Path) -> None:
-    database = _database(tmp_path, _ANCHOR, strip_map("m", 45.0, owners=["anna"], parents=[_ANCHOR], seed=1))
+    database = database_of(tmp_path, ANCHOR, strip_map("m", 45.0, owners=["anna"], parents=[ANCHOR], seed=1))
     database.retire("m", "wrong")
     assert _promoted(database) == {}
     with pytest.raises(StoreError, match="retired"):

@@ -38,7 +38,7 @@ BROKEN: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "header only in part": (lambda data: data[:100], "header of at least 227 bytes"),
     "half": (lambda data: data[: len(data) // 2], "truncated"),
     "last bytes gone": (lambda data: data[:-40], "truncated"),
-    "version 2.7": (lambda data: corrupt(data, 24, b"\x02\x07"), "truncated or broken|1.2 to 1.4"),
+    "version 2.7": (lambda data: corrupt(data, 24, b"\x02\x07"), "truncated or broken|1.0 to 1.4"),
     "scale zero": (lambda data: corrupt(data, 131, b"\x00" * 8), "positive scales"),
     "offset NaN": (lambda data: corrupt(data, 155, np.float64(np.nan).tobytes()), "finite offsets"),
     "a million records": (lambda data: corrupt(data, 100, b"\x40\x42\x0f\x00"), "1000000 records"),

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -187,3 +188,20 @@ def _contribution(image: bytes, owner: str) -> Contribution:
         image=image, width=1, height=1, owner=owner, credit="A. Person", licence="CC0-1.0",
         received_at=datetime(2026, 6, 1, tzinfo=UTC),
     )  # fmt: skip
+
+
+ANCHOR = strip_map("A", 20.0, owners=["survey"])
+
+
+def database_of(folder: Path, *maps: FeatureMap) -> Database:
+    """A new one with these maps, one after the other, as they came."""
+    database = Database.create(folder / "db")
+    for feature_map in maps:
+        add(database, feature_map)
+    return database
+
+
+def add(database: Database, feature_map: FeatureMap) -> None:
+    """As growth does; photos of "survey" are the operator's, others contributed by that identity."""
+    note_contributed(database, feature_map)
+    database.commit_map(feature_map)

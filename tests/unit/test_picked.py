@@ -8,7 +8,7 @@ from PIL import ExifTags, Image
 
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from tools.commands import without_position
+from tools.photo_files import without_position
 from tools.picked import Scan, picks, visible
 from tools.unplaced_brighton import summed
 

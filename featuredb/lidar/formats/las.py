@@ -1,4 +1,4 @@
-"""LAS 1.2 to 1.4, LAZ and COPC files: what the header says, and the points by chunks. The home of laspy.
+"""LAS 1.0 to 1.4, LAZ and COPC files: what the header says, and the points by chunks. The home of laspy.
 
 A file is read as a stream, so its size does not matter. Whatever is wrong with it becomes a `ScanFileError`
 that names the file: what was expected, what was found, what to do.
@@ -214,7 +214,7 @@ def _check_record_counts(path: Path, start: bytes, size: int) -> None:
 def _check_header(path: Path, header: Any, size: int) -> None:
     version = (header.version.major, header.version.minor)
     if not (1, 0) <= version <= (1, 4):
-        raise ScanFileError(f"{path}: expected LAS 1.2 to 1.4, found {header.version}; convert it")
+        raise ScanFileError(f"{path}: expected LAS 1.0 to 1.4, found {header.version}; convert it")
     scales, offsets = np.array(header.scales), np.array(header.offsets)
     if not (np.isfinite([scales, offsets]).all() and (scales > 0).all()):
         raise ScanFileError(
