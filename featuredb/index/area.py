@@ -18,8 +18,9 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.index.descriptor_index import DescriptorCodes, Stacked
+from featuredb.index.descriptor_index import DescriptorCodes
 from featuredb.index.segment import Segment, segment_of
+from featuredb.index.stacked import Moved, Stacked
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import full_covariances
@@ -46,14 +47,15 @@ class Area:
         maps: the maps without images, points and observations, which the
             segments have (`FeatureMap.bare`); `point_map` and `image_map` index into it.
         segments: (m,) of the maps, whose arrays stay where they are, in mapped files for example.
-        turns: (m, 3, 3) rotations from the maps' frames to `frame`.
+        points, view_direction: those of the segments, row by row, in `frame`.
         point_map: (p,) int32, ascending.
+        point_start, image_start: (m + 1,) int64, rows where the points and images of each map begin.
         image_map: (i,) int32, ascending.
+        image_sights: (i,) int64, of how many points each image has an observation, twice if it has two.
         covisible: (i, i) sparse, numbers of shared points; between maps, of neighbouring places.
-        points, image_start, see_point, image_center, image_scene, image_reach: those of the segments, one
-            after the other, in `frame`, with the area's rows of points in `see_point`.
-        point_row, covariance, own_direction, view_spread_cos, view_distance, descriptors, lists, code: those
-            of the segments, row by row; covariances and directions in the maps' own frames.
+        image_center, image_scene, image_reach: those of the segments, one after the other, in `frame`.
+        point_row, covariance, view_spread_cos, view_distance, descriptors, lists, code: those of the
+            segments, row by row; covariances in the maps' own frames.
         lenses: by camera key the maps' cameras that have it: row of the map, camera, images that it took.
         extractor_fingerprint: of all descriptors.
         modes: (m,) joint errors of each map, None of those that keep none.
@@ -63,20 +65,20 @@ class Area:
     frame: LocalFrame
     maps: tuple[FeatureMap, ...]
     segments: tuple[Segment, ...]
-    turns: FloatArray
-    points: FloatArray
+    points: Moved
     point_map: NDArray[np.int32]
+    point_start: NDArray[np.int64]
     point_row: Stacked[np.int32]
     covariance: Stacked[np.float32]
-    own_direction: Stacked[np.float32]
+    view_direction: Moved
     view_spread_cos: Stacked[np.float32]
     view_distance: Stacked[np.float32]
     descriptors: Stacked[np.uint8]
     lists: Stacked[np.int16]
     code: Stacked[np.uint8]
-    see_point: NDArray[np.int32]
     image_start: NDArray[np.int64]
     image_map: NDArray[np.int32]
+    image_sights: NDArray[np.int64]
     image_center: FloatArray
     image_scene: FloatArray
     image_reach: FloatArray
@@ -100,14 +102,9 @@ class Area:
 
     def point_covariance(self, rows: NDArray[np.integer]) -> FloatArray:
         """(k, 3, 3) of points (k,), square metres in `frame`, relative to the map's gauge."""
-        turn = self.turns[self.point_map[rows]]
+        turn = self.points.turns[self.point_map[rows]]
         own = full_covariances(self.covariance[rows])
         return np.asarray(turn @ own @ np.swapaxes(turn, 1, 2), dtype=np.float64)
-
-    def view_direction(self, rows: NDArray[np.integer]) -> FloatArray:
-        """(k, 3) mean unit vectors, in `frame`, from points (k,) to the cameras that saw them."""
-        turn = self.turns[self.point_map[rows]]
-        return np.asarray(np.einsum("kij,kj->ki", turn, self.own_direction[rows]), dtype=np.float64)
 
     def codes(self, rows: NDArray[np.integer] | None = None) -> DescriptorCodes:
         """Of the descriptors of these points (k,), or of all."""
@@ -117,19 +114,24 @@ class Area:
 
     def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:
         """Rows of the points that any of these images sees, ascending, without repetition."""
-        seen = self.see_point[self.sights_of_images(images)]
-        if not len(seen):
-            return np.zeros(0, np.int32)
-        first = int(seen.min())  # points of a map, and maps of a neighbourhood, lie together
-        marked = np.zeros(int(seen.max()) - first + 1, dtype=np.bool_)
-        marked[seen - first] = True
-        return (np.flatnonzero(marked) + first).astype(np.int32)
+        found = [np.zeros(0, np.int32)]
+        for number in np.unique(self.image_map[images]):
+            segment = self.segments[number]
+            marked = np.zeros(len(segment), dtype=np.bool_)
+            for image in images[self.image_map[images] == number] - self.image_start[number]:
+                marked[segment.see_point[slice(*segment.image_start[image : image + 2])]] = True
+            found.append((np.flatnonzero(marked) + self.point_start[number]).astype(np.int32))
+        return np.concatenate(found)
 
-    def sights_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Rows of `see_point` of these images, image by image."""
-        start, count = self.image_start[images], np.diff(self.image_start)[images]
-        before = np.cumsum(count) - count
-        return np.repeat(start - before, count) + np.arange(int(count.sum()))
+    def sums_over_sights(self, of_point: FloatArray) -> FloatArray:
+        """(i,) sums, over the points that each image sees, of what they have (p,)."""
+        sums = np.zeros(len(self.image_map))
+        for number in np.unique(self.point_map[np.flatnonzero(of_point)]):
+            segment = self.segments[number]
+            own = of_point[slice(*self.point_start[number : number + 2])]
+            until = np.concatenate([[0.0], np.cumsum(own[segment.see_point])])
+            sums[slice(*self.image_start[number : number + 2])] = np.diff(until[segment.image_start])
+        return sums
 
     def images_that_see(self, rows: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Which images see some points, in pairs: rows of images, ascending, and positions in `rows`.
@@ -137,25 +139,21 @@ class Area:
         Args:
             rows: (k,) of points, ascending, without repetition.
         """
-        pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
+        pairs = [(np.zeros(0, np.intp), np.zeros(0, np.intp))]
         for number in np.unique(self.point_map[rows]):
-            first, last = np.searchsorted(self.image_map, [number, number + 1])
-            start, end = self.image_start[first], self.image_start[last]
-            seen = self.see_point[start:end]
+            segment = self.segments[number]
+            seen = segment.see_point + self.point_start[number]
             position = np.minimum(np.searchsorted(rows, seen), len(rows) - 1)
             hit = np.flatnonzero(rows[position] == seen)
-            image = np.searchsorted(self.image_start[first : last + 1], start + hit, side="right") - 1 + first
+            image = np.searchsorted(segment.image_start, hit, side="right") - 1 + self.image_start[number]
             pairs.append((image, position[hit]))
-        return (
-            np.concatenate([image for image, _ in pairs] or [np.zeros(0, np.intp)]),
-            np.concatenate([position for _, position in pairs] or [np.zeros(0, np.intp)]),
-        )
+        return np.concatenate([image for image, _ in pairs]), np.concatenate([at for _, at in pairs])
 
     def image(self, row: int) -> "AreaImage":
         """One of the images, as its map has it."""
         number = int(self.image_map[row])
         segment = self.segments[number]
-        own = row - int(np.searchsorted(self.image_map, number))
+        own = row - int(self.image_start[number])
         pose, covariance = segment.image_pose[own], segment.image_covariance[own]
         return AreaImage(
             image_id=int(segment.image_id[own]),
@@ -214,30 +212,32 @@ def join_segments(
     frame = frame or maps[int(np.argmax([len(segment) for segment in segments]))].frame
     area_from_maps = [frame.enu_from(m.frame) for m in maps]
     parts = list(zip(area_from_maps, segments, strict=True))
+    turns = np.array([move.rotation for move in area_from_maps])
+    shifts = np.array([move.translation for move in area_from_maps])
     points = np.array([len(segment) for segment in segments])
     images = np.array([len(segment.image_center) for segment in segments])
-    sights = np.array([len(segment.see_point) for segment in segments])
     scene = np.concatenate([move.act(s.image_scene) for move, s in parts])
     reach = np.concatenate([s.image_reach for s in segments])
     image_map = np.repeat(np.arange(len(maps), dtype=np.int32), images)
+    point_map = np.repeat(np.arange(len(maps), dtype=np.int32), points)
     return Area(
         frame=frame,
         maps=tuple(maps),
         segments=tuple(segments),
-        turns=np.array([move.rotation for move in area_from_maps]),
-        points=np.concatenate([move.act(s.points) for move, s in parts]),
-        point_map=np.repeat(np.arange(len(maps), dtype=np.int32), points),
+        points=Moved(segments, "points", turns, shifts),
+        point_map=point_map,
+        point_start=np.cumsum([0, *points]),
         point_row=Stacked(segments, "point_row"),
         covariance=Stacked(segments, "covariance"),
-        own_direction=Stacked(segments, "view_direction"),
+        view_direction=Moved(segments, "view_direction", turns),
         view_spread_cos=Stacked(segments, "view_spread_cos"),
         view_distance=Stacked(segments, "view_distance"),
         descriptors=Stacked(segments, "descriptors"),
         lists=Stacked(segments, "lists"),
         code=Stacked(segments, "codes"),
-        image_start=_joined_starts([s.image_start for s in segments], sights),
-        see_point=_raised([s.see_point for s in segments], points),
+        image_start=np.cumsum([0, *images]),
         image_map=image_map,
+        image_sights=np.concatenate([np.diff(s.image_start) for s in segments]),
         image_center=np.concatenate([move.act(s.image_center) for move, s in parts]),
         image_scene=scene,
         image_reach=reach,

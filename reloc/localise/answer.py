@@ -109,7 +109,7 @@ def map_covariance(area: Area, center: FloatArray, rows: NDArray[np.int64]) -> F
     image = area.image(best)
     if image.covariance is None:
         return np.zeros((6, 6))
-    turn = area.turns[area.image_map[best]] @ image.cam_from_local.rotation.T
+    turn = area.points.turns[area.image_map[best]] @ image.cam_from_local.rotation.T
     arm = np.eye(6)
     arm[3:, :3] = -skew(center - area.image_center[best])
     by_pose = arm @ np.kron(np.eye(2), -turn)

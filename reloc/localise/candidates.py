@@ -279,13 +279,9 @@ def _image_scores(reach: _Reach, votes_of_point: FloatArray, share: float) -> Fl
             chance: p points get p times this, with about that variance.
     """
     area, images = reach.area, reach.images
-    whole = len(images) == len(area.image_map)
-    votes = votes_of_point[area.see_point if whole else area.see_point[area.sights_of_images(images)]]
-    seen = np.diff(area.image_start)[images]
-    ends = np.concatenate([[0.0], np.cumsum(votes)])[np.concatenate([[0], np.cumsum(seen)])]
-    total = np.diff(ends)
     scores = np.full(len(area.image_map), -np.inf)
-    scores[images] = _above_chance(total, share * seen)
+    votes = area.sums_over_sights(votes_of_point)[images]
+    scores[images] = _above_chance(votes, share * area.image_sights[images])
     return scores
 
 

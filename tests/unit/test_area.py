@@ -35,10 +35,10 @@ def test_points_views_and_reach_against_loops() -> None:
     seen = feature_map.observations
     point_row = area.point_row.whole()
     np.testing.assert_array_equal(point_row, np.unique(seen.point_index))
-    np.testing.assert_allclose(area.points, local[point_row], atol=1e-6)
+    np.testing.assert_allclose(area.points.whole(), local[point_row], atol=1e-6)
     centers = np.array([i.cam_from_local.center for i in feature_map.images])
     np.testing.assert_allclose(area.image_center, centers, atol=1e-9)
-    directions = area.view_direction(np.arange(len(point_row)))
+    directions = area.view_direction[np.arange(len(point_row))]
     for row, index in enumerate(point_row):
         viewers = seen.image_id[seen.point_index == index]
         toward = centers[viewers] - local[index]
@@ -69,8 +69,9 @@ def test_what_images_see_and_share_against_sets(seed: int) -> None:
     sees = {i: set(o.point_index[(o.image_id == i) & o.has_descriptor].tolist()) for i in range(7)}
     covisible = area.covisible.toarray()
     for i in range(7):
-        rows = area.see_point[area.image_start[i] : area.image_start[i + 1]]
+        rows = area.points_of_images(np.array([i]))
         assert set(area.point_row[rows].tolist()) == sees[i]
+        assert area.image_sights[i] == ((o.image_id == i) & o.has_descriptor).sum()
         for j in range(7):
             assert covisible[i, j] == len(sees[i] & sees[j])
     both = area.points_of_images(np.array([2, 5]))
@@ -100,9 +101,13 @@ def test_two_maps_of_two_frames_and_zones_lie_in_one_frame() -> None:
     assert [len(m.observations) for m in area.maps] == [0, 0]
     first, second = (area.point_map == i for i in (0, 1))
     assert first.sum() == second.sum() > 30
-    np.testing.assert_allclose(area.points[first], area.points[second], atol=2e-4)
-    np.testing.assert_allclose(area.points[first], points[area.point_row[np.flatnonzero(first)]], atol=2e-4)
-    here_seen, there_seen = (area.view_direction(np.flatnonzero(part)) for part in (first, second))
+    np.testing.assert_allclose(
+        area.points[np.flatnonzero(first)], area.points[np.flatnonzero(second)], atol=2e-4
+    )
+    np.testing.assert_allclose(
+        area.points[np.flatnonzero(first)], points[area.point_row[np.flatnonzero(first)]], atol=2e-4
+    )
+    here_seen, there_seen = (area.view_direction[np.flatnonzero(part)] for part in (first, second))
     np.testing.assert_allclose(here_seen, there_seen, atol=1e-5)
     np.testing.assert_allclose(area.image_center[:4], area.image_center[4:], atol=1e-6)
     # Covariances turn with the axes: the east-north one of the far map is not that of this frame's axes.
@@ -126,9 +131,11 @@ def test_which_images_see_points_of_several_maps() -> None:
     images, position = area.images_that_see(rows)
     pairs = set(zip(images.tolist(), position.tolist(), strict=True))
     for image in range(len(area.image_map)):
-        sees = area.see_point[area.image_start[image] : area.image_start[image + 1]]
+        sees = area.points_of_images(np.array([image]))
         assert {p for i, p in pairs if i == image} == set(np.flatnonzero(np.isin(rows, sees)).tolist())
     assert len(pairs) == len(images)
+    counted = area.sums_over_sights(np.isin(np.arange(len(area.points)), rows).astype(float))
+    np.testing.assert_array_equal(counted, np.bincount(images, minlength=len(area.image_map)))
     assert [len(part) for part in area.images_that_see(rows[:0])] == [0, 0]
 
 
@@ -146,7 +153,7 @@ def test_no_maps_and_mixed_extractors_are_refused() -> None:
 
 def test_a_map_without_descriptors_gives_an_empty_area() -> None:
     area = build_area([random_map(0, observations=0)])
-    assert area.points.shape == (0, 3)
+    assert area.points.whole().shape == (0, 3)
     assert area.descriptors.whole().shape == (0, 128)
     assert area.covisible.nnz == 0
     assert (area.image_reach == 0).all()

@@ -64,7 +64,7 @@ def test_a_pose_is_off_as_the_map_is(lens_of_photo: str) -> None:
         scene_map(points=points, descriptors=random_descriptors(rng, 80), poses=poses), cameras=(_LENS,)
     )
     area = build_area([feature_map])
-    rows = np.unique(area.see_point)
+    rows = area.points_of_images(np.arange(6))
     truth = looking_at(np.array([20.0, -30.0, 28.0]), np.array([0.0, 2.0, 4.0]))
     step = 1e-4
     mode = rng.normal(size=(6, 6)) * np.repeat([1e-3, 5e-4], 3) * step
@@ -75,7 +75,7 @@ def test_a_pose_is_off_as_the_map_is(lens_of_photo: str) -> None:
         right, wrong = right.scaled_to(500, 400), wrong.scaled_to(500, 400)
     elif lens_of_photo == "its own":
         right = wrong = replace(_LENS, params=(850.0, 850.0, *_LENS.params[2:]))
-    seen = right.project(truth.act(area.points))
+    seen = right.project(truth.act(area.points.whole()))
     reach = area.image_reach
     moved = [
         Rigid3.exp(np.concatenate([m[:3], m[3:] * far])) @ pose
@@ -113,7 +113,7 @@ def _triangulated(
     area: Area, row: int, poses: Sequence[Rigid3], moved: Sequence[Rigid3], lens: Camera
 ) -> FloatArray:
     """Where a point comes to lie whose pixels are those of the true poses and lens."""
-    start = area.points[row]
+    start = area.points[np.array(row)]
     images = area.images_that_see(np.array([row]))[0]
     xy = [_LENS.project(poses[i].act(start[None]))[0] for i in images]
 

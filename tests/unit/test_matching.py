@@ -180,11 +180,11 @@ def test_visible_points_against_a_loop() -> None:
     rows = np.arange(len(area.points))
     for pose in (POSE, looking_at(np.array([-40.0, -15.0, 30.0]), np.zeros(3)), ring(6)[0]):
         found = set(visible_points(area, rows, CAMERA, pose).tolist())
-        _, inside = pixels_inside(CAMERA, pose, area.points)
+        _, inside = pixels_inside(CAMERA, pose, area.points.whole())
         for row in rows:
-            toward = pose.center - area.points[row]
+            toward = pose.center - area.points[np.array(row)]
             toward /= np.linalg.norm(toward)
-            off_deg = np.degrees(np.arccos(np.clip(toward @ area.view_direction(np.array([row]))[0], -1, 1)))
+            off_deg = np.degrees(np.arccos(np.clip(toward @ area.view_direction[np.array([row])][0], -1, 1)))
             cone_deg = np.degrees(np.arccos(np.clip(area.view_spread_cos[np.array(row)], -1, 1))) + 30.0
             assert (row in found) == bool(inside[row] and off_deg <= cone_deg)
     # The two cameras of the map look from the east: from the west nothing is known, nor from below.
@@ -192,7 +192,7 @@ def test_visible_points_against_a_loop() -> None:
     west = looking_at(np.array([-45.0, -10.0, 20.0]), np.zeros(3))
     below = looking_at(np.array([5.0, 0.0, -40.0]), np.zeros(3))
     for pose in (west, below):
-        assert pixels_inside(CAMERA, pose, area.points)[1].sum() > 100
+        assert pixels_inside(CAMERA, pose, area.points.whole())[1].sum() > 100
         assert len(visible_points(area, rows, CAMERA, pose)) == 0
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from featuredb.index.descriptor_index import Stacked
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.stacked import Moved, Stacked
 
 
 @dataclass
@@ -44,3 +45,18 @@ def test_rows_of_nothing() -> None:
     none = Stacked[np.float32]([Owner(np.zeros((0, 3), np.float32))], "values")
     assert len(none) == 0
     assert none[np.zeros(0, np.int64)].shape == (0, 3)
+
+
+def test_points_are_moved_and_directions_turned() -> None:
+    rng = np.random.default_rng(1)
+    owners = [Owner(rng.random((count, 3)).astype(np.float32)) for count in (4, 6)]
+    moves = [Rigid3.exp(rng.normal(size=6)) for _ in owners]
+    turns, shifts = (np.array([getattr(m, name) for m in moves]) for name in ("rotation", "translation"))
+    moved = Moved(owners, "values", turns, shifts)
+    expected = np.concatenate([m.act(o.values) for m, o in zip(moves, owners, strict=True)])
+    np.testing.assert_allclose(pickle.loads(pickle.dumps(moved)).whole(), expected, atol=1e-12)
+    for rows in (np.array([9, 0, 4]), np.array([[1, 2], [8, 3]]), np.array([5]), np.array(5)):
+        assert moved[rows].dtype == np.float64
+        np.testing.assert_allclose(moved[rows], expected[rows], atol=1e-12)
+    turned = Moved(owners, "values", turns)[np.array([0, 9])]
+    np.testing.assert_allclose(turned, [turns[0] @ owners[0].values[0], turns[1] @ owners[1].values[5]])

@@ -183,7 +183,7 @@ def own_canaries(
             continue
         own = snapshot.images_of([m.map_id for m in indexed.area.maps])
         images = [(m, image) for m in indexed.area.maps for image in own[m.map_id]]
-        for (feature_map, image), described in zip(images, np.diff(indexed.area.image_start), strict=True):
+        for (feature_map, image), described in zip(images, indexed.area.image_sights, strict=True):
             if described < LEAST_FEATURES:
                 continue
             key = hashlib.sha256(f"{feature_map.map_id} {image.name}".encode()).hexdigest()
