@@ -24,6 +24,8 @@ _SMALLEST_HALF_PX = 16
 _SPACINGS = 4.0  # around a place from which its plane is taken: some fifty points
 _NEAREST_POINTS = 12  # of a map
 _TOLERANCE_SPACINGS = 0.25  # flatter than this is flat at a scan's resolution
+# Scans keep coordinates in steps of a centimetre or less, and all points of a level place are rounded alike.
+_ROUNDING_M = 0.01 / 12**0.5
 _UNKNOWN_HEIGHTS = (
     "the heights of the map and of the scan are both of an unknown datum, and may be tens of metres apart"
 )
@@ -199,7 +201,7 @@ class ScanSurface:
         if patch is None:
             return f"the {len(near)} points of the scan around lie on no surface"
         common = 0.5 * patch.scatter_m if self.common_m is None else self.common_m
-        sigma = float(np.hypot(patch.fitted_m, common))
+        sigma = float(np.linalg.norm([patch.fitted_m, common, _ROUNDING_M]))
         return Met(patch=patch, sigma_m=sigma, spacing_m=spacing, tolerance_m=tolerance, around=around)
 
     def _depth(self, view: AnsweredView, pixel: FloatArray) -> tuple[float, float] | None:

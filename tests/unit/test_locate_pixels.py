@@ -75,6 +75,14 @@ def test_a_pixel_is_where_its_ray_meets_the_scan() -> None:
         assert 0.002 < place.vertical_68_m < NOISE_M
 
 
+def test_a_level_place_is_known_as_well_as_its_scan_is_rounded() -> None:
+    """All its points have one height: what they are off by together does not show in how they scatter."""
+    (place,) = locate(view_of(POSE), ScanSurface(cloud=step(noise_m=0.0)), [(200.0, 350.5)])
+    assert place.covariance is not None
+    assert place.covariance[2, 2] >= (0.01**2) / 12.0
+    assert np.linalg.cond(place.covariance) < 1e12
+
+
 def test_bounds_hold_when_pose_and_lens_are_off_as_their_covariance_says() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(14, 14)) * 0.3 + np.eye(14)
