@@ -171,7 +171,7 @@ def _recording(state: State, frame: LocalFrame) -> AbstractContextManager[None]:
     if len(both) < 3 or state.gates is None:
         return nullcontext()
     pairs = [[of[name] for name in both] for of in (joint, state.poses)]
-    extents = [np.linalg.norm(np.ptp([pose.center for pose in of], axis=0)) for of in pairs]
+    extents = [np.linalg.norm(np.std([pose.center for pose in of], axis=0)) for of in pairs]  # however turned
     seen = []
     for of, extent in zip(pairs, extents, strict=True):
         looks = _reach(state.joint.model) * float(extent / extents[0]) * np.eye(4, 3, -1)
