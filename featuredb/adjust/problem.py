@@ -123,6 +123,8 @@ class Problem:
             pyceres.logging.minloglevel = told
         if not summary.IsSolutionUsable():
             _LOG.warning("the adjustment failed, everything stays as it was: %s", summary.BriefReport())
+        elif summary.termination_type == pyceres.TerminationType.NO_CONVERGENCE:
+            _LOG.info("the adjustment was stopped on its way after %d steps", max_iterations)
         return summary
 
     def block(self) -> Block:

@@ -60,7 +60,8 @@ class AdjustOptions:
             (`ingest.colmap.precision.shared_variance_px2`) count as one against these priors and positions: a
             lens model's faults are common to whole photos too. On `brighton`, from above, EXIF's focal length
             of 2311 px comes to 2482 with 1, 2319 with 10, 2304 with 50, where its scan says 2303.
-        max_iterations: of Ceres.
+        max_iterations: of Ceres; only a net. Six photos of a strip whose mapping gave twice EXIF's focal
+            length are 31 % off after 60, and 0.2 % after 200.
         threads: one gives the same numbers in every run.
     """
 
@@ -73,7 +74,7 @@ class AdjustOptions:
         )
     )
     dilution: float = 50.0
-    max_iterations: int = 60
+    max_iterations: int = 500
     threads: int = 1
 
 

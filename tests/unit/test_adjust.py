@@ -154,6 +154,18 @@ def test_the_whole_lens_is_found_through_a_plain_prior() -> None:
     assert np.abs(off[:4]).max() < 3.0
 
 
+def test_an_adjustment_that_was_stopped_on_its_way_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    block = _block(points=200, noise_px=0.2)
+    wrong = replace(block, cameras=(replace(TRUE, params=(1500.0, 1500.0, *TRUE.params[2:])),))
+    problem = Problem(wrong, _terms(block, TRUE))
+    with caplog.at_level("INFO"):
+        problem.solve(2, 1e-12)
+        assert "stopped on its way after 2 steps" in caplog.text
+        caplog.clear()
+        problem.solve(500, 1e-6)
+        assert not caplog.text
+
+
 def test_a_focal_length_that_is_far_off_loses_to_photos_that_know() -> None:
     """EXIF of a cropped photo: 30 % off, 15 of its sigmas."""
     block = _block(points=200, noise_px=0.2)
