@@ -28,7 +28,6 @@ _RATE = 1e-3  # of lenses that do not zoom and are found to
 _LEAST_PHOTOS = 3
 _OBSERVATIONS = 200  # of a photo, at most about so many take part: all of them would say it no clearer
 _OTHERS = 50  # photos by other lenses that take part, those that share most points
-_ITERATIONS = 60
 # The same lens but for its focal length, which is anywhere.
 _ZOOMS = LensWidths(focal_rel=0.3, aspect_rel=0.0005, center_rel=0.001, radial=0.0005, tangential=0.0005)
 
@@ -145,7 +144,7 @@ def _focal_lengths(
     if len(held) >= 2:
         terms = replace(terms, held_photos=held, centers=None, orientations=None)
     problem = Problem(part, terms, options.threads)
-    problem.solve(_ITERATIONS, 1e-6)
+    problem.solve(options.max_iterations, 1e-6)
     found = problem.marginals()
     starts = found.lens_start[own]
     if (starts < 0).any():
