@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def _ingested(work: Path, folder: Path, dask: bool) -> dict[str, float]:
-    """Processor seconds a photo, and megabytes of the largest process so far."""
+    """Processor seconds a photo, and megabytes of the largest process."""
     database = work / f"{folder.name}.db"
     shutil.rmtree(database, ignore_errors=True)
     command, where = (("-c", _ON_DASK), ()) if dask else (("-m", "featuredb.cli"), ("--workers", "2"))

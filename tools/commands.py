@@ -1,6 +1,6 @@
 """Commands of featuredb, each in a process of its own, and what they make."""
 
-import resource
+import os
 import shutil
 import subprocess
 import sys
@@ -118,15 +118,16 @@ def first_map(database: Database) -> FeatureMap:
 
 
 def processor_s(*argv: str) -> tuple[float, float, str]:
-    """A Python process: processor seconds of it and all that it started, megabytes of the largest of this
-    program's processes so far, and what it printed. Raises SystemExit: it fails."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, *argv], stdout=subprocess.PIPE, text=True, check=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if done.returncode:
-        raise SystemExit(f"exit code {done.returncode}: {' '.join(argv[:4])}")
-    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return seconds, after.ru_maxrss / 1024, done.stdout
+    """A Python process: processor seconds of it and all that it started, megabytes of the largest of them, what
+    it printed. Raises SystemExit: it fails."""
+    process = subprocess.Popen([sys.executable, *argv], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    told = process.stdout.read()
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"exit code {process.returncode}: {' '.join(argv[:4])}")
+    return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, told
 
 
 def cloud_of(
