@@ -118,8 +118,10 @@ def first_map(database: Database) -> FeatureMap:
 
 
 def processor_s(*argv: str) -> tuple[float, float, str]:
-    """A Python process: processor seconds of it and all that it started, megabytes of the largest of them, what
-    it printed. Raises SystemExit: it fails."""
+    """Processor seconds of a Python process and all that it started, megabytes of the largest, its output.
+
+    Raises SystemExit: it fails.
+    """
     process = subprocess.Popen([sys.executable, *argv], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     told = process.stdout.read()
