@@ -129,7 +129,7 @@ def test_a_map_that_only_an_import_holds_stays_where_it_is(tmp_path: Path) -> No
     before = database.poll_version()
     done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
     assert done is not None
-    assert done.reason == "NOANCHOR"
+    assert done.reason == "NO_ANCHOR"
     assert database.poll_version() == before
 
 

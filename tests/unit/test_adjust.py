@@ -158,7 +158,7 @@ def test_an_adjustment_that_was_stopped_on_its_way_says_so(caplog: pytest.LogCap
     block = _block(points=200, noise_px=0.2)
     wrong = replace(block, cameras=(replace(TRUE, params=(1500.0, 1500.0, *TRUE.params[2:])),))
     problem = Problem(wrong, _terms(block, TRUE))
-    with caplog.at_level("INFO"):
+    with caplog.at_level("INFO", logger="featuredb.adjust"):
         problem.solve(2, 1e-12)
         assert "stopped on its way after 2 steps" in caplog.text
         caplog.clear()
