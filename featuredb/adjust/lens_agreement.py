@@ -28,17 +28,18 @@ class Weighted:
     """A linearised adjustment.
 
     Attributes:
-        jacobian: (r, 3 n + q) sparse, of whitened residuals by points, poses and lenses.
+        by_point, by_shared: (r, 3 n) and (r, q) CSR, Jacobian of whitened residuals by points, and by poses
+            and lenses.
         residual: (r,) whitened.
-        points: n. inverse: (q, q) of the normal matrix, without them.
+        inverse: (q, q) of the normal matrix, without points.
         lenses: columns of each free lens among q; poses come before all of them.
         of_priors: (d, q) dense, rows of priors that count `dilution` times, by poses and lenses.
         dilution: at least 1.
     """
 
-    jacobian: Any
+    by_point: Any
+    by_shared: Any
     residual: FloatArray
-    points: int
     inverse: FloatArray
     lenses: Sequence[slice]
     of_priors: FloatArray
@@ -70,16 +71,13 @@ def lens_squares(problem: Weighted) -> tuple[FloatArray, FloatArray]:
         Sums of squares, NaN for lenses of fewer than three photos, and their degrees of freedom: what
         independent residuals give.
     """
-    start = 3 * problem.points
-    by_point = problem.jacobian[:, :start].tocsc()
-    by_shared = problem.jacobian[:, start:].tocsr()
-    by_column = by_shared.tocsc()
-    inverse = inverse_blocks((by_point.T @ by_point).tocoo(), problem.points)
+    by_point, by_shared = problem.by_point, problem.by_shared
+    inverse = inverse_blocks((by_point.T @ by_point.tocsc()).tocoo(), by_point.shape[1] // 3)
     photo_of = _photo_of(by_shared[:, : _first_lens(problem)])
-    seen = np.diff(by_point.tocsr().indptr) > 0
+    seen = np.diff(by_point.indptr) > 0
     squares, freedom = np.full(len(problem.lenses), np.nan), np.zeros(len(problem.lenses))
     for row, columns in enumerate(problem.lenses):
-        rows = np.unique(by_column[:, columns].indices)
+        rows = np.flatnonzero(np.diff(by_shared[:, columns].indptr))
         rows = rows[(photo_of[rows] >= 0) | seen[rows]]
         if len(np.unique(photo_of[rows])) < _LEAST_PHOTOS:
             continue

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from featuredb.adjust.terms import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 
 _DAMPING = 1e-12  # relative; of directions that nothing determines
+_ROWS_AT_ONCE = 60_000  # of a Jacobian, or coordinates of points: products of more need memory
 _CONTROLLED = 1e-3  # least redundancy of a direction in which a residual says something of its observation
 
 
@@ -133,7 +135,7 @@ class TargetMarginals:
 
 
 def target_marginals(
-    jacobian: Any,
+    covariance: FloatArray,
     own: Any,
     residual: FloatArray,
     targets: NDArray[np.int64],
@@ -141,17 +143,15 @@ def target_marginals(
     free: tuple[Sequence[int], Sequence[int]],
     block: Block,
 ) -> TargetMarginals:
-    """From the Jacobian of whitened residuals, of whose points the last are targets.
+    """Of the covariance (q, q) of targets, poses and lenses.
 
     Args:
-        own: Jacobian of the targets' residuals, marks before surveyed points, by targets, poses and lenses.
+        own: Jacobian of the targets' whitened residuals, marks before surveyed points, by the same.
         residual: (r,) the targets' residuals, whitened.
         targets: (t,) rows of the block's points. marks: how many.
         free: photos and cameras that are not held.
     """
     size = 3 * len(targets)
-    plain = jacobian.shape[1] - own.shape[1]
-    covariance = inverse_without_points(jacobian, plain // 3)
     spread = own @ covariance
 
     def whitened(first: int, last: int, axes: int) -> Whitened:
@@ -170,16 +170,30 @@ def target_marginals(
     )
 
 
-def inverse_without_points(jacobian: Any, points: int) -> FloatArray:
-    """(q, q) covariance of all but the first `points`, which are eliminated."""
-    n = 3 * points
-    by_point, by_shared = jacobian[:, :n].tocsc(), jacobian[:, n:].tocsc()
-    inverse = inverse_blocks((by_point.T @ by_point).tocoo(), points)
-    across = (by_point.T @ by_shared).tocsr()
-    normal = (by_shared.T @ by_shared).toarray() - (across.T @ (inverse @ across)).toarray()
+def inverse_without_points(by_point: Any, by_shared: Any) -> FloatArray:
+    """(q, q) covariance of what points share, which are eliminated: from the Jacobian's two parts, CSR."""
+    normal = np.zeros((by_shared.shape[1], by_shared.shape[1]), order="F")
+    for first in range(0, by_shared.shape[0], _ROWS_AT_ONCE):
+        part = by_shared[first : first + _ROWS_AT_ONCE]
+        normal += (part.T.tocsr() @ part).toarray()
+    of_points = by_point.tocsc()
+    for first in range(0, of_points.shape[1], _ROWS_AT_ONCE):
+        part = of_points[:, first : first + _ROWS_AT_ONCE]
+        across = part.T @ by_shared
+        inverse = inverse_blocks((part.T @ part).tocoo(), part.shape[1] // 3)
+        normal -= (across.T.tocsr() @ (inverse @ across)).toarray()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal * scale[:, None] * scale + _DAMPING * np.eye(len(scale))
-    return np.asarray(cho_solve(cho_factor(scaled), np.eye(len(scale))) * scale[:, None] * scale)
+    normal *= scale[:, None]
+    normal *= scale
+    normal[np.diag_indices_from(normal)] += _DAMPING
+    factor, failed = dpotrf(normal, overwrite_a=1)
+    if failed:
+        raise LinAlgError("the normal matrix is not positive definite")
+    upper, _ = dpotri(factor, overwrite_c=1)
+    covariance = np.triu(upper) + np.triu(upper, 1).T
+    covariance *= scale[:, None]
+    covariance *= scale
+    return np.asarray(covariance)
 
 
 def marginals(covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int], block: Block) -> Marginals:

@@ -147,9 +147,7 @@ class Problem:
     def marginals(self) -> Marginals:
         """Covariances at the parameters as they are now, for independent residuals of the stated sigmas."""
         poses, lenses = self._free()
-        rows = list(self._points)
-        covariance = inverse_without_points(self._jacobian(rows, ()), len(rows))
-        return marginals(covariance, poses, lenses, self.block())
+        return marginals(inverse_without_points(*self._by_point_and_shared()), poses, lenses, self.block())
 
     def honest_marginals(self) -> tuple[Marginals, Marginals]:
         """Covariances as the residuals and the priors as they are have them, where `dilution` is a choice of
@@ -165,18 +163,16 @@ class Problem:
     def weighted(self) -> Weighted:
         """The adjustment, linear at the parameters as they are now."""
         poses, lenses = self._free()
-        points = list(self._points)
-        jacobian = self._jacobian(points, ())
-        inverse = inverse_without_points(jacobian, len(points))
+        by_point, by_shared = self._by_point_and_shared()
+        inverse = inverse_without_points(by_point, by_shared)
         ends = 6 * len(poses) + np.cumsum([0, *(len(self._lenses[c]) for c in lenses)])
-        priors = self._jacobian((), self._diluted).toarray() if self._diluted else np.zeros((0, len(inverse)))
         return Weighted(
-            jacobian=jacobian,
+            by_point=by_point,
+            by_shared=by_shared,
             residual=np.asarray(self._ceres.evaluate_residuals()) / self._terms.keypoint_px,
-            points=len(points),
             inverse=inverse,
             lenses=[slice(int(a), int(b)) for a, b in pairwise(ends)],
-            of_priors=priors,
+            of_priors=self._jacobian(self._shared(), self._diluted).toarray(),
             dilution=self._terms.dilution,
         )
 
@@ -204,11 +200,14 @@ class Problem:
         assert self._terms.targets is not None
         poses, lenses = self._free()
         targets = _target_rows(self._terms.targets)
-        rows = [*np.setdiff1d(list(self._points), targets).tolist(), *targets.tolist()]
+        columns = [*(self._points[row] for row in targets.tolist()), *self._shared()]
         residual = self._ceres.evaluate_residuals(self._targets)
         return target_marginals(
-            self._jacobian(rows, ()),
-            self._jacobian(targets.tolist(), self._targets),
+            inverse_without_points(
+                self._jacobian([self._points[row] for row in self._points.keys() - set(targets.tolist())]),
+                self._jacobian(columns),
+            ),
+            self._jacobian(columns, self._targets),
             np.asarray(residual) / self._terms.keypoint_px,
             targets,
             len(self._terms.targets.xy),
@@ -232,18 +231,27 @@ class Problem:
         """Whether anything is observed of them."""
         return bool(self._ceres.has_parameter_block(parameters))
 
-    def _jacobian(self, points: Sequence[int], residuals: Sequence[Any]) -> Any:
-        """Of the whitened residuals, or of some; columns of points, free poses and free lenses."""
+    def _shared(self) -> list[FloatArray]:
+        """Parameters of free poses and lenses."""
         poses, lenses = self._free()
+        return [*(self._poses[k] for k in poses), *(self._lenses[c] for c in lenses)]
+
+    def _by_point_and_shared(self) -> tuple[Any, Any]:
+        """The Jacobian by points, and by free poses and lenses."""
+        poses, lenses = self._free()
+        by_pose = self._jacobian([self._poses[k] for k in poses])
+        by_lens = self._jacobian([self._lenses[c] for c in lenses])
+        by_shared = sparse.hstack([by_pose, by_lens], format="csr")
+        return self._jacobian(list(self._points.values())), by_shared
+
+    def _jacobian(self, parameters: Sequence[FloatArray], residuals: Sequence[Any] | None = None) -> Any:
+        """(r, q) CSR, of all whitened residuals or of some, by parameters."""
+        if not parameters or residuals == []:
+            rows = self._ceres.num_residuals() if residuals is None else 0
+            return sparse.csr_matrix((rows, sum(map(self._ceres.parameter_block_tangent_size, parameters))))
         order = pyceres.EvaluateOptions()
         order.num_threads = self._threads
-        order.set_parameter_blocks(
-            [
-                *(self._points[row] for row in points),
-                *(self._poses[k] for k in poses),
-                *(self._lenses[c] for c in lenses),
-            ]
-        )
+        order.set_parameter_blocks(list(parameters))
         if residuals:
             order.set_residual_blocks(list(residuals))
         found = self._ceres.evaluate_jacobian(order)
