@@ -199,7 +199,11 @@ def inverse_without_points(by_point: Any, by_shared: Any) -> FloatArray:
 def marginals(covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int], block: Block) -> Marginals:
     """Of the covariance of poses, in COLMAP's perturbation, and lenses."""
     size = tuple(len(camera.params) for camera in block.cameras)
-    turn = _house_from_colmap([block.cam_from_block[k].translation for k in poses], len(covariance))
+    shared = covariance.copy()
+    for row, k in enumerate(poses):
+        turn, own = _house_from_colmap(block.cam_from_block[k].translation), slice(6 * row, 6 * row + 6)
+        shared[own] = turn @ shared[own]
+        shared[:, own] = shared[:, own] @ turn.T
     pose_start = np.full(len(block.names), -1, dtype=np.int64)
     pose_start[list(poses)] = 6 * np.arange(len(poses))
     lens_start, first = np.full(len(block.cameras), -1, dtype=np.int64), 6 * len(poses)
@@ -207,22 +211,19 @@ def marginals(covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int
         lens_start[c] = first
         first += size[c]
     return Marginals(
-        shared=np.asarray(turn @ (turn @ covariance).T),
+        shared=shared,
         pose_start=pose_start,
         lens_start=lens_start,
         lens_size=size,
     )
 
 
-def _house_from_colmap(translations: Sequence[FloatArray], size: int) -> Any:
-    """(q, q): COLMAP turns by half an angle from the left and adds to the translation; see `Marginals`."""
-    parts = []
-    for translation in translations:
-        part = np.eye(6)
-        part[:3, :3] *= 2.0
-        part[3:, :3] = 2.0 * skew(translation)
-        parts.append(part)
-    return sparse.block_diag([*parts, sparse.eye(size - 6 * len(parts))], format="csr")
+def _house_from_colmap(translation: FloatArray) -> FloatArray:
+    """(6, 6): COLMAP turns by half an angle from the left and adds to the translation; see `Marginals`."""
+    turn = np.eye(6)
+    turn[:3, :3] *= 2.0
+    turn[3:, :3] = 2.0 * skew(translation)
+    return turn
 
 
 def inverse_blocks(blocks: Any, n: int) -> Any:

@@ -154,11 +154,9 @@ class Problem:
         weights (`featuredb.adjust.lens_agreement`); and `marginals`.
         """
         (poses, lenses), block, weighted = self._free(), self.block(), self.weighted()
-        covariance = honest(weighted, lens_disagreement(weighted))
-        return (
-            marginals(covariance, poses, lenses, block),
-            marginals(weighted.inverse, poses, lenses, block),
-        )
+        covariance, inverse = honest(weighted, lens_disagreement(weighted)), weighted.inverse
+        del weighted  # its Jacobian is large
+        return marginals(covariance, poses, lenses, block), marginals(inverse, poses, lenses, block)
 
     def weighted(self) -> Weighted:
         """The adjustment, linear at the parameters as they are now."""
