@@ -19,10 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.index.area import build_area
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.index.area import Area, build_area
+from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from reloc.localise.answer import placement_covariance
@@ -113,14 +114,20 @@ def map_errors(maps: Sequence[FeatureMap], truth: LaserSet) -> Errors:
         area = build_area([one])
         poses |= poses_in(FRAME, one)
         for image in one.images:
-            pose = image.cam_from_local
-            world_from_cam = np.kron(np.eye(2), pose.rotation.T)
-            own = np.zeros((6, 6)) if image.covariance is None else image.covariance
-            covariance = world_from_cam @ own @ world_from_cam.T
-            covariance += placement_covariance(area, one, pose.center)
+            covariance = stated_covariance(area, one, image)
             told_m.append(error_radius(covariance[3:, 3:]))
             told_deg.append(float(np.degrees(error_radius(covariance[:3, :3]))))
     return replace(errors_of(poses, truth), told_m=told_m, told_deg=told_deg, wanted=len(truth.mapped))
+
+
+def stated_covariance(area: Area, feature_map: FeatureMap, image: MapImage) -> FloatArray:
+    """(6, 6) of a map's camera in its area's axes: rotation (rad) before position (m)."""
+    pose = image.cam_from_local
+    world_from_cam = np.kron(np.eye(2), pose.rotation.T)
+    own = np.zeros((6, 6)) if image.covariance is None else image.covariance
+    return np.asarray(
+        world_from_cam @ own @ world_from_cam.T + placement_covariance(area, feature_map, pose.center)
+    )
 
 
 def answer_errors(database: Database, photos: Path, truth: LaserSet, camera: CameraRequest | None) -> Errors:

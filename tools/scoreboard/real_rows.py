@@ -236,6 +236,19 @@ REAL: tuple[Row, ...] = (
     _laser("fountain-P11", 9, "quick", "map_deg <= 0.1, "),
     _laser("entry-P10", 8, "full"),
     _row(
+        name="small-sets",
+        claim="runs of four, six and eight photos of `brighton` with its GPS and of two sets with exact "
+        "positions, each a map of its own: cameras against the scans, inside what the maps state",
+        commands=f"tools.small_sets {{data}}/strecha/fountain-P11 {{data}}/strecha/entry-P10 {ON_SCAN} "
+        f"--work {{work}}/sets {OUT}",
+        text="{maps} maps of {runs} runs, {active} answer; of {photos} cameras {outside} outside 99.9 % "
+        "(worst squared error {orientation_worst:.1f} of the orientation, {position_worst:.1f}; 16.3 is the "
+        "bound); inside 68 and 95 %: orientation {orientation_68:.0%} and {orientation_95:.0%}, position "
+        "{position_68:.0%} and {position_95:.0%}; focal length off by {focal_off:.1%} at most",
+        limits="outside <= 0, 35 <= maps",
+        minutes=8,
+    ),
+    _row(
         name="lens-widths",
         claim="how wide lenses are around what is known of them, on four real sets: the priors' widths lie "
         "where 95 % of the likelihood is",
