@@ -45,9 +45,12 @@ def at_most_places(values: FloatArray) -> float:
 
 
 def places_of(feature_map: FeatureMap) -> FloatArray:
-    """(n, 3) where a map answers for what it says, in its frame: a sample of its points, and its photos."""
+    """(n, 3) where a map answers for what it says, in its frame: a sample of its points.
+
+    Not its photos: they may be far from what they show, and have covariances of their own.
+    """
     points = feature_map.points_local()
-    return np.concatenate([points[:: max(1, len(points) // 2000)], centers_of(feature_map)])
+    return points[:: max(1, len(points) // 2000)]
 
 
 def growth_of(evidence: Mapping[str, Any]) -> dict[str, Any]:
@@ -62,20 +65,11 @@ def with_growth(feature_map: FeatureMap, **figures: Any) -> FeatureMap:
     return replace(feature_map, placement=replace(placement, evidence={**placement.evidence, GROWTH: growth}))
 
 
-def map_drift_m(feature_map: FeatureMap, covariance_relative: FloatArray) -> float:
-    """`drift_m` of a map, no less than at any of its photos' centres.
-
-    These are few among thousands of places, and may all be in the hundredth that is left out.
-    """
-    at_photos_m = place_sigmas_m(covariance_relative, centers_of(feature_map)).max(initial=0.0)
-    return max(SIGMAS_95 * float(at_photos_m), drift_m(covariance_relative, places_of(feature_map)))
-
-
 def with_overlaps(
     feature_map: FeatureMap, covariance_relative: FloatArray, edges: Sequence[Edge], budget_m: float
 ) -> tuple[FeatureMap, float]:
     """The map with these overlaps and its drift (m), by its covariance (7, 7) to anchors, in its evidence."""
-    drift = map_drift_m(feature_map, covariance_relative)
+    drift = drift_m(covariance_relative, places_of(feature_map))
     noted = with_growth(
         feature_map,
         drift_m=round(drift, 6),
