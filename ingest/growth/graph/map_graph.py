@@ -215,7 +215,7 @@ def rows_within(grown: GrownMap, feature_map: FeatureMap, relative: FloatArray, 
     for row, image, own_m2 in zip(grown.model.rows.tolist(), feature_map.images, lacks_m2, strict=True):
         own = points[seen.point_index[seen.image_id == image.image_id]]
         mine = as_a_whole + np.diag([0.0] * 4 + [min(own_m2, bending_m2)] * 3)
-        places = np.percentile(np.vstack([own, image.cam_from_local.center]), (10, 90), axis=0)
+        places = np.vstack([image.cam_from_local.center, *([np.median(own, axis=0)] if len(own) else [])])
         # A tenth off the budget: the part that is left is held by less, and its own bound is larger.
         if drift_m(mine, places) <= 0.9 * budget_m:
             within.append(row)

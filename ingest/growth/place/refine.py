@@ -141,10 +141,10 @@ def refine_placed(
         return Refused(reason=gate.reason, message=message, gates=placement.gates)
     # Until now the reconstruction was bent as it came, and its residuals said more of that than of where it
     # lies.
-    turning = drift.turning_covariance(adjusted.model, fit.covariance, spread)
+    turning = drift.turning_covariance(fit.covariance, spread)
     bending_m2 = float(np.nanmax(np.append(spread.lacks_m2(fit.covariance + turning), 0.0)))
     covariance = fit.covariance + turning + np.diag([0.0] * 4 + [bending_m2] * 3)
-    shared = drift.shared_turn(adjusted.model, spread)
+    shared = drift.shared_turn(spread)
     edges = tuple(replace(edge, shared=shared) for edge in edges)
     kept = [k for k in range(len(rows)) if k not in left_out]
     return Refinement(
