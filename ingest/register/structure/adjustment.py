@@ -112,17 +112,10 @@ def adjust_to_scan(
     surface = surface_near(cloud, np.clip(start.xyz, low, high), _MAX_SURFACE_POINTS)
     if surface is None:
         return LidarAdjustment(reason="NO_SCAN", message="the scan has no points under the map")
-    first = start
-    if begin is not None:
-        first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
+    first = start if begin is None else block_of_map(begin).moved(to_cloud)
     block = _iterate(first, start.cameras, control, surface)
-    figures = {
-        "control": len(control.xyz),
-        "frames": len(np.unique(control.photo_of)),
-        "before": _state(start, control, surface),
-        "after": _state(block, control, surface),
-        "own": _own_spread(block, control),
-    }
+    before, after = (_state(one, surface) for one in (start, block))
+    figures: dict[str, Any] = {"before": before, "after": after, "own": _own_spread(block, control)}
     reason, message = _gate(block, figures)
     if reason == "LENS":
         return LidarAdjustment(reason=reason, message=message, figures=figures)
@@ -244,19 +237,15 @@ def _control_residuals(block: Block, control: Marks) -> tuple[FloatArray, FloatA
     )
 
 
-def _state(block: Block, control: Marks, surface: Surface) -> dict[str, Any]:
+def _state(block: Block, surface: Surface) -> dict[str, Any]:
     tracks = np.linalg.norm(residuals_of(block)[0], axis=1)
-    seen = np.linalg.norm(_control_residuals(block, control)[0], axis=1)
     distances = nearest_planes(surface, block.xyz, _REACH_M)[0]
     near = np.abs(distances[np.isfinite(distances)])
     return {
         "reprojection_median_px": float(np.median(tracks)),
-        "reprojection_rms_px": float(np.sqrt(np.mean(tracks**2))),
-        "control_median_px": float(np.median(seen)),
         "surface_points": len(near),
         "surface_median_m": float(np.median(near)) if len(near) else None,
         "surface_rms_m": float(np.sqrt((near**2).mean())) if len(near) else None,
-        "cameras": [[camera.model, *camera.params] for camera in block.cameras],
     }
 
 

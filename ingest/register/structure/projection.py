@@ -1,9 +1,7 @@
 """Structure projection: registered frames carry the map's points onto the scan, and the map follows.
 
-Structure-projection paper, 2.4: depth image of the registered frame, the map's visible points projected on
-it, 3D/3D pairs, RANSAC similarity, refinement on SIM(3), ICP against the scan. Here the refinement weighs
-pairs by their own covariance and knows that all pairs of a frame share its pose error. In the place of ICP,
-which slides over flat ground, comes the adjustment by the scan's surface (`adjustment.py`).
+Structure-projection paper, 2.4. Here the refinement weighs pairs by their own covariance and knows that all
+pairs of a frame share its pose error. In the place of ICP comes the adjustment by the scan's surface.
 """
 
 from collections.abc import Mapping
@@ -99,9 +97,15 @@ def project_structure(
     reason, message, figures = _gate_of_pairs(pairs, near, distances)
     if reason is not None:
         return StructurePlacement(reason=reason, message=message, figures=figures)
-    kept = pairs.of(near)
-    fit = refine_similarity(start, kept)
-    figures |= _figures_of_fit(fit, kept, feature_map, registered)
+    fit = refine_similarity(start, pairs.of(near))
+    figures |= {
+        "inliers": int(fit.inliers.sum()),
+        "residual_rms_m": float(np.sqrt((fit.residuals_m[fit.inliers] ** 2).sum(axis=1).mean())),
+        "neighbours_factor": fit.neighbours_factor,
+        "scale_change": fit.target_from_source.scale - 1.0,
+        "scale_sigma": float(np.sqrt(fit.covariance[0, 0])),
+        "previous_scale_sigma": float(np.sqrt(feature_map.placement.covariance[0, 0])),
+    }
     reason, message = _gate_of_fit(fit, distances[near], figures)
     placed = StructurePlacement(reason=reason, message=message, figures=figures)
     if reason is not None:
@@ -119,13 +123,7 @@ def _gate_of_pairs(
         centred = pairs.target[near] - pairs.target[near].mean(axis=0)
         across = float(np.linalg.svd(centred, compute_uv=False)[1]) / np.sqrt(used)
         spread = across / float(np.median(distances[near]))
-    figures: dict[str, Any] = {
-        "frames": len(pairs.frame_covariance),
-        "pairs": len(pairs),
-        "ransac_inliers": used,
-        "ransac_inlier_share": used / len(pairs),
-        "spread_rel": spread,
-    }
+    figures: dict[str, Any] = {"pairs": len(pairs), "ransac_inliers": used, "spread_rel": spread}
     needed = f"at least {_MIN_PAIRS} and {_MIN_INLIER_SHARE:.0%} are needed"
     if used < _MIN_PAIRS or used < _MIN_INLIER_SHARE * len(pairs):
         words = f"{used} of {len(pairs)} pairs agree on a similarity, {needed}"
@@ -134,31 +132,6 @@ def _gate_of_pairs(
         words = f"the pairs lie along a line: {spread:.1%} of their distance across it"
         return "NO_SPREAD", f"{words}, at least {_MIN_SPREAD_REL:.0%} are needed", figures
     return None, "", figures
-
-
-def _figures_of_fit(
-    fit: SimilarityFit, pairs: Pairs, feature_map: FeatureMap, registered: Registered
-) -> dict[str, Any]:
-    """What is written into the evidence."""
-    residuals = np.linalg.norm(fit.residuals_m[fit.inliers], axis=1)
-    sim = fit.target_from_source
-    middle = pairs.source[fit.inliers].mean(axis=0)
-    corrections = fit.frame_corrections
-    return {
-        "inliers": int(fit.inliers.sum()),
-        "inliers_by_frame": np.bincount(pairs.frame_of[fit.inliers], minlength=len(registered)).tolist(),
-        "frame_images": list(registered),
-        "residual_rms_m": float(np.sqrt((residuals**2).mean())),
-        "residual_median_m": float(np.median(residuals)),
-        "sigma_factor": fit.spread,
-        "neighbours_factor": fit.neighbours_factor,
-        "scale_change": sim.scale - 1.0,
-        "scale_sigma": float(np.sqrt(fit.covariance[0, 0])),
-        "previous_scale_sigma": float(np.sqrt(feature_map.placement.covariance[0, 0])),
-        "shift_m": (sim.act(middle) - middle).tolist(),
-        "turn_deg": float(np.degrees(np.linalg.norm(sim.log()[1:4]))),
-        "frame_corrections_m": np.linalg.norm(corrections[:, 3:], axis=1).tolist(),
-    }
 
 
 def _gate_of_fit(

@@ -127,15 +127,9 @@ class MapMove:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapResidual:
-    """How a map lies on a scan.
-
-    Attributes:
-        distance_m: (k,) from each map point that has scan around it to the nearest scan point.
-        points: of the map, all.
-    """
+    """How a map lies on a scan: distances (k,) of the points that have scan around them, metres."""
 
     distance_m: FloatArray
-    points: int
 
     @property
     def median_m(self) -> float:
@@ -144,11 +138,8 @@ class MapResidual:
 
     def as_figures(self) -> dict[str, float]:
         """JSON-able."""
-        figures: dict[str, float] = {"points": self.points, "compared": len(self.distance_m)}
-        if len(self.distance_m):
-            p50, p90 = np.percentile(self.distance_m, (50, 90)).tolist()
-            figures |= {"median_m": p50, "p90_m": p90}
-        return figures
+        compared = {"compared": len(self.distance_m)}
+        return compared | ({"median_m": self.median_m} if len(self.distance_m) else {})
 
 
 def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
@@ -188,6 +179,6 @@ def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[
     in_plan, _ = cKDTree(scan[:, :2]).query(after[:, :2], distance_upper_bound=_PLAN_REACH_M)
     compared = np.isfinite(in_plan)
     tree = cKDTree(scan)
-    far = [np.asarray(tree.query(points[compared])[0]) for points in (before, after)]
-    first, second = (MapResidual(distance_m=one, points=len(old.points)) for one in far)
+    far = (np.asarray(tree.query(points[compared])[0]) for points in (before, after))
+    first, second = (MapResidual(distance_m=one) for one in far)
     return first, second
