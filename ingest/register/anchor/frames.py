@@ -223,12 +223,8 @@ def register_again(
     return again
 
 
-# Do frames that were registered one by one move the map to the same place?
-#
-# A wrong registration may look good on its own. Each frame alone gives a similarity for the whole map
-# (paper, section 2.4); wrong ones do not send the map where another frame sends it. What both see is
-# compared: far from both, small differences of tilt and the bend of the reconstruction grow without anyone
-# being wrong.
+# Do frames that were registered one by one move the map to the same place? What both see is compared: far
+# from both, small differences of tilt and the bend of the reconstruction grow without anyone being wrong.
 
 # Median distance between the places of the same map points, as a share of the distance from which they are
 # seen. `featuredb anchor` prints how far apart right frames are: up to 0.27 m on brighton, from 40 to 50 m,

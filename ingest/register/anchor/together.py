@@ -1,12 +1,8 @@
 """Photos of a map registered to a scan together, from about where the map is: one similarity, one evidence.
 
-The photos are laid out as one picture from straight above (`ingest.register.anchor.start.ortho`), which is
-compared with the scan's at all places, headings and sizes that the placement leaves open. A map that is
-tilted by some degrees looks the same from above; its points against the scan's surface tell tilt and height.
-
-From there the similarity is fitted as one photo's pose is (`ingest.register.frame.dense.fit`), round by
-round: renders are made at the poses that it gives, each piece takes its best place near by, and it is fitted
-to all of them with a robust loss, and held near its start where they tell little.
+The photos as one picture from straight above (`ingest.register.anchor.start.ortho`) tell where to start. From
+there the similarity is fitted as one photo's pose is (`ingest.register.frame.dense.fit`), and held near its
+start where the pieces tell little. Steps: docs/measurements/registration.md, "All photos together".
 """
 
 import logging

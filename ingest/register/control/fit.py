@@ -1,11 +1,8 @@
 """A similarity from marked control points, robust against wrong marks and wrong coordinates.
 
-Each point has several hypotheses of where it lies in the block: the intersection of every set of its marks
-that agree, and for every single mark the place where its ray meets the ground that the block's own points
-show. A wrong mark spoils some of a point's hypotheses but not all, a wrong coordinate all of them. Least
-trimmed squares (Rousseeuw, 1984) over samples of hypotheses finds the similarity that most points agree on.
-
-Where heights are unknown only horizontal distances count; tilt and height come from elsewhere (`Vertical`).
+A wrong mark spoils some of a point's hypotheses but not all, a wrong coordinate all of them. Least trimmed
+squares (Rousseeuw, 1984) over samples of hypotheses finds the similarity that most points agree on. Where
+heights are unknown only horizontal distances count; tilt and height come from elsewhere (`Vertical`).
 """
 
 import itertools

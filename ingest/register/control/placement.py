@@ -1,13 +1,6 @@
 """Placement by ground control points: the whole way from marks to an adjusted block with its uncertainty.
 
-1. Marks are intersected and the similarity is found that most points agree on (`fit`).
-2. The block is adjusted with the points as control (`adjust`).
-3. Marks and points that contradict all others are tested, named and left out (`residuals`), and the block
-   is adjusted again.
-
-Surveyed heights may be unknown. Then position, heading and scale come from the points; tilt and height come
-from where the block was before (GPS), and where there is no such place from the assumption that the ground
-under the photos is level on the whole. The covariance says how little that is.
+Its steps are `fit`, `adjust` and `residuals`; what they do: docs/measurements/control-points.md.
 """
 
 from dataclasses import dataclass, field, replace

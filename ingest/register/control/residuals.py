@@ -1,8 +1,7 @@
 """Residuals of a placement by control points: tests that name what contradicts, and figures for people.
 
 Baarda's data snooping with the variance estimated from the other residuals (Pope, The statistics of residuals
-and the detection of outliers, 1976): an observation is compared with what the others predict for it, by the
-covariance of all residuals, and one is left out at a time.
+and the detection of outliers, 1976); one observation is left out at a time.
 """
 
 from dataclasses import dataclass, replace
@@ -303,11 +302,6 @@ def _likely(adjusted: Adjusted, control: Control, row: int) -> str:
 
 
 # How far the photos' own GPS is from where control points put them, and whether that is more than noise.
-#
-# What all photos share does not average out: a datum of the heights, a base station at wrong coordinates.
-# The offset is compared with what the positions claim, all of which may be shared, with the scatter of the
-# single differences, and with the covariance of the placement. It is told where chance gives as much in one
-# case of a thousand, of the heights and of the horizontal place each.
 
 _TOLD = 0.001  # share of right positions of which an offset is told
 _MEDIAN = np.pi / 2.0  # variance of a median over that of a mean, normal distribution

@@ -1,9 +1,7 @@
 """Final adjustment of a map by a scan: several registered frames and the scan's surface straighten it.
 
-A similarity cannot mend a lens. Over nearly flat ground structure from motion trades focal length against
-height without a trace in its residuals; placed on a scan, such a map fits its own photos and lies on the
-ground, and yet its cameras stand metres too high. What the registered frames see of the scan (their
-correspondences) and the scan's surface under all points of the map determine poses, lens and points together.
+What the registered frames see of the scan (their correspondences) and the scan's surface under all points of
+the map determine poses, lens and points together (docs/measurements/registration.md).
 """
 
 from dataclasses import dataclass, field, replace

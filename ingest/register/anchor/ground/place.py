@@ -1,8 +1,6 @@
 """A map of street photos placed on a scan by its fronts, the ground and what it sees of roofs.
 
-Search in plan, then points to planes of the solid that the scan shows. Photos whose points lie elsewhere are
-left out: maps of fronts that look alike are joined wrongly. Other places of the same search say how often as
-many points agree by chance. Where a map as a whole lies nowhere, its parts are tried.
+Search in plan, then points to planes of the solid that the scan shows: docs/measurements/ground-and-air.md.
 """
 
 import logging

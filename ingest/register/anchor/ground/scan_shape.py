@@ -1,8 +1,6 @@
 """A scan as a solid, ground, roofs and the walls that stand where its heights jump; and a map laid on it.
 
-A laser in the air sees hardly any walls. Where the heights of neighbouring cells differ by a storey,
-something stands upright between them, and that is what a photo from the street shows. A map is laid on it by
-its points' distances from planes, robust, from a start within some metres.
+A map is laid on it by its points' distances from planes, robust, from a start within some metres.
 """
 
 from dataclasses import dataclass

@@ -1,13 +1,9 @@
 """A map without a place, found on a scan of some hundred metres by what both show from above.
 
 The scan is drawn from above, side by side. Features of these pictures have places on the scan, those of the
-map have points of its frame: where they match, a similarity takes the one to the other. SIFT minds neither
-the heading nor the size, so neither needs to be known, nor which way is up. All photos decide together. Only
-places with the cameras above the ground count: seen from below, flat ground is its own mirror image.
-
-How sure that is: the expected number of similarities that as many chance matches would fit as well
-(a-contrario; Moulon, Monasse, Marlet 2012), matches with one point of the map or one spot of the scan being
-one.
+map have points of its frame: where they match, a similarity takes the one to the other. How sure that is: the
+expected number of similarities that as many chance matches would fit as well (a-contrario; Moulon, Monasse,
+Marlet 2012).
 """
 
 from collections.abc import Iterator

@@ -1,10 +1,7 @@
 """A map without a place, found on a scan whose intensities share no features with photos.
 
-Grey values of a photo and a laser's intensities are related by no function; where edges run stays. So the
-map's photos are laid out as one small picture from above (`ortho`), whose oriented gradients are compared
+The map's photos are laid out as one small picture from above (`ortho`), whose oriented gradients are compared
 with the scan's (`dense.pictures`) at all places, headings and sizes: coarse, then the best of them finer.
-All photos decide together.
-
 What comes out is a start. Whether it is right, frames say that are registered from there one by one.
 """
 

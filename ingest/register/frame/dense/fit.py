@@ -2,8 +2,6 @@
 
 Like ICP: a render is made at the pose, each piece takes the highest place of its score map within a few
 pixels, the pose is fitted to all of them with a robust loss, and a render is made anew. Coarse to fine.
-A single piece is off by a pixel or two where laser intensity and photo show an edge differently; some
-three hundred average.
 """
 
 from dataclasses import replace

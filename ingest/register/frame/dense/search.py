@@ -1,10 +1,8 @@
 """Finds the pose of a photo over a scan by summing score maps at the pixels that a pose predicts.
 
-Point features between a photo and laser intensity are right in a few percent of the cases; whole pieces
-matched by oriented gradients in a third to a half. Here no piece has to be right on its own: each has a map
-of scores (`score_maps`), a pose says where in each map to look, and the sum over some hundred pieces is a
-smooth function of the pose with a high maximum at the true one. It is searched coarse to fine: on a grid of
-poses at low resolution, then by downhill simplex, rendering anew at each octave.
+No piece has to be right on its own: each has a map of scores (`score_maps`), a pose says where in each map to
+look, and the sum over some hundred pieces is a smooth function of the pose with a high maximum at the true
+one. It is searched coarse to fine: on a grid of poses at low resolution, then by downhill simplex.
 """
 
 from collections.abc import Sequence

@@ -132,10 +132,9 @@ def consistent_matches(
 ) -> NDArray[np.bool_]:
     """Which matches (m,) have more neighbours that one similarity moves than chance gives them.
 
-    For each match i and each neighbour j, z_ij = (q_j - q_i) / (p_j - p_i), taken as complex numbers, is the
-    rotation and scale that the pair suggests. The support of i is the largest number of neighbours that one
-    such z takes to within the tolerance of where they are. How likely random matches do that follows from
-    the areas of the tolerances: the number of random hits is Poisson.
+    A match and each neighbour suggest a rotation and scale, (q_j - q_i) / (p_j - p_i) as complex numbers.
+    Support is the largest number of neighbours that one of these takes to where they are; by chance it is
+    Poisson.
 
     Args:
         photo: (m, 2) pixels. reference: (m, 2) where the matched scan points appear in one common view;
