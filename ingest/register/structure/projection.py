@@ -5,13 +5,13 @@ pairs of a frame share its pose error. In the place of ICP comes the adjustment 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.arrays import FloatArray, joined
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import skew
@@ -168,7 +168,7 @@ def structure_pairs(
         _pairs_of_frame(feature_map, source, uncertainty, images[image_id], registration, row, cloud)
         for row, (image_id, registration) in enumerate(registered.items())
     ]
-    return Pairs(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Pairs)})
+    return joined(parts)
 
 
 def _pairs_of_frame(

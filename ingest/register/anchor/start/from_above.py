@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.arrays import FloatArray, joined
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian, similarity_closed_form
@@ -20,7 +20,7 @@ from featuredb.index.nearest import nearest
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import Rendering, render
-from ingest.register.frame.features.matching import joined_pools, pool_features
+from ingest.register.frame.features.matching import pool_features
 from ingest.register.frame.views import FEATURES_SPACING_PX, MIN_COVER, available_sources
 from ingest.register.frame_registration import RenderSource
 from reloc.localise.acceptance import log_nfa
@@ -77,7 +77,7 @@ def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> Fo
     pools = [pool_features(view, source, upright=False) for view in _views(cloud, wide_m)]
     if not pools:
         return None
-    pool = joined_pools(pools)
+    pool = joined(pools)
     point, place = _matched(unplaced, pool.descriptors)
     if len(point) <= _SAMPLE:
         return None

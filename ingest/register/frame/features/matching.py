@@ -1,6 +1,5 @@
 """Features of renders, pooled with the scan points that they show, and their matches with a photo."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -39,14 +38,6 @@ class Pool:
 
     def __len__(self) -> int:
         return len(self.points)
-
-
-def joined_pools(pools: Sequence[Pool]) -> Pool:
-    """One pool of all, at least one."""
-    return Pool(
-        points=np.concatenate([p.points for p in pools]),
-        descriptors=np.concatenate([p.descriptors for p in pools]),
-    )
 
 
 def pool_features(rendering: Rendering, source: RenderSource, *, upright: bool = True) -> Pool:
@@ -134,14 +125,6 @@ class FrameMatches:
 
 
 NO_MATCHES = FrameMatches(pixels=np.empty((0, 2)), points=np.empty((0, 3)))
-
-
-def joined(parts: Sequence[FrameMatches]) -> FrameMatches:
-    """All matches of all parts; none for no parts."""
-    parts = [NO_MATCHES, *parts]
-    return FrameMatches(
-        pixels=np.concatenate([p.pixels for p in parts]), points=np.concatenate([p.points for p in parts])
-    )
 
 
 def pooled_matches(features: Features, pool: Pool, same_place_m: float, max_ratio: float) -> FrameMatches:

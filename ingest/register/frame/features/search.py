@@ -16,15 +16,13 @@ from scipy.spatial import cKDTree
 from scipy.special import gammainc
 
 from featuredb.compiled import compiled_module
-from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.arrays import FloatArray, joined
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.renderer import Rendering
 from ingest.register.frame.features.matching import (
     NO_MATCHES,
     FrameMatches,
-    joined,
-    joined_pools,
     pool_features,
     pooled_matches,
 )
@@ -110,13 +108,13 @@ def star_groups(views: FrameViews, prior: FramePrior) -> Iterator[RenderGroup]:
 
 def search(views: FrameViews, groups: Sequence[RenderGroup], source: RenderSource) -> FrameHypothesis | None:
     """A pose from the features of one source, or None where no pose has matches behind it."""
-    raw, kept = [], []
+    raw, kept = [NO_MATCHES], [NO_MATCHES]
     width, height = views.camera.width, views.camera.height
     for pose, renderings in groups:
         if not renderings:
             continue
         with ThreadPoolExecutor(views.threads) as threads:
-            pool = joined_pools(list(threads.map(lambda r: pool_features(r, source), renderings)))
+            pool = joined(list(threads.map(lambda r: pool_features(r, source), renderings)))
         matches = pooled_matches(views.features, pool, _SAME_PLACE * views.look.depth_m, _MAX_RATIO)
         raw.append(matches)
         reference = views.camera.project(pose.act(matches.points))
