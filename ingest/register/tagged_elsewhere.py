@@ -14,6 +14,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.special import bdtrc
 
+from featuredb.geometry.arrays import FloatArray
 from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsPlacement
 from ingest.sfm.links import link_shares, select_photos, tied_parts
@@ -58,22 +59,32 @@ def tagged_elsewhere(model: Model, with_gps: Sequence[int], placed: GpsPlacement
         return []
     least_m = _least_offset_m(placed)
     links = link_shares(model)
-    tied = links[np.ix_(outside, outside)] >= _MIN_LINK
-    count, label = connected_components(sparse.csr_array(tied.astype(np.int8)), directed=False)
     untagged = [k for k in range(len(model.rows)) if k not in offset_of]
     found = []
-    for number in range(count):
-        members = [k for k, of in zip(outside, label.tolist(), strict=True) if of == number]
+    for members in _tied(links, outside):
         offsets = np.array([offset_of[k] for k in members])
         near = np.linalg.norm(offsets[:, None] - offsets[None], axis=2) <= _MAX_SPREAD * least_m
         agreeing = near[near.sum(axis=1).argmax()]  # those near the one that most others are near to
         if agreeing.sum() < max(_MIN_PHOTOS, len(members) // 2 + 1):
             continue
-        hanging = [k for k in untagged if links[k].max() >= _MIN_LINK and links[k].argmax() in members]
         offset_m = float(np.linalg.norm(offsets[agreeing].mean(axis=0)))
         if offset_m >= least_m:
-            found.append(TaggedElsewhere(photos=tuple(sorted([*members, *hanging])), offset_m=offset_m))
+            photos = tuple(_with_hanging(links, untagged, members))
+            found.append(TaggedElsewhere(photos=photos, offset_m=offset_m))
     return found
+
+
+def _tied(links: FloatArray, among: Sequence[int]) -> list[list[int]]:
+    """Groups of photos that are tied to each other by their links or by others of them."""
+    tied = sparse.csr_array((links[np.ix_(among, among)] >= _MIN_LINK).astype(np.int8))
+    count, label = connected_components(tied, directed=False)
+    return [np.asarray(among)[label == number].tolist() for number in range(count)]
+
+
+def _with_hanging(links: FloatArray, untagged: Sequence[int], members: Sequence[int]) -> list[int]:
+    """A group and the photos without position whose firmest tie is to one of it, in their order."""
+    hanging = [k for k in untagged if links[k].max() >= _MIN_LINK and links[k].argmax() in members]
+    return sorted([*members, *hanging])
 
 
 def rightly_joined(model: Model, place: PlaceModel, least_tie: int) -> list[Model]:
@@ -107,19 +118,16 @@ def joined_wrongly(model: Model, with_gps: Sequence[int], placed: GpsPlacement) 
     if all(fits.values()):
         return []
     links = link_shares(model)
-    tied = links >= _MIN_LINK
     untagged = [k for k in range(len(model.rows)) if k not in fits]
     outside = [k for k, yes in fits.items() if not yes]
-    between = np.array([*outside, *untagged], dtype=np.int64)  # photos without position tie others together
-    count, label = connected_components(sparse.csr_array(tied[np.ix_(between, between)].astype(np.int8)))
+    groups = _tied(links, [*outside, *untagged])  # photos without position tie others together
     found = []
-    for number in range(count):
-        members = [k for k in between[label == number].tolist() if k in fits]
-        around = fits.keys() & {*members, *np.flatnonzero(tied[members].any(axis=0)).tolist()}
+    for group in groups:
+        members = [k for k in group if k in fits]
+        around = fits.keys() & {*members, *np.flatnonzero((links[members] >= _MIN_LINK).any(axis=0)).tolist()}
         wrong = sum(not fits[k] for k in around)
-        if wrong and bdtrc(wrong - 1, len(around), _WRONG_SHARE) < _ACCIDENT / count:
-            hanging = [k for k in untagged if tied[k].any() and links[k].argmax() in members]
-            found.append(sorted([*members, *hanging]))
+        if wrong and bdtrc(wrong - 1, len(around), _WRONG_SHARE) < _ACCIDENT / len(groups):
+            found.append(_with_hanging(links, untagged, members))
     return found
 
 
