@@ -255,17 +255,15 @@ def _start(centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> Si
     if not whole.any():  # heights that nobody knows: one height for all
         positions, whole = np.where(np.isfinite(sigmas), positions, 0.0), np.ones(len(sigmas), dtype=np.bool_)
     rows = np.flatnonzero(whole)
-    best: tuple[float, Sim3] | None = None
-    for sample in [rows, *(rows[s] for s in _samples(len(rows)))]:
-        sim = similarity_closed_form(centers[sample], positions[sample])
-        if sim is None:
-            continue
+
+    def cost(sim: Sim3) -> float:
         off = (positions - sim.act(centers)) / sigmas
         off[~np.isfinite(off)] = 0.0
-        cost = float(np.log1p((off[:, :2] ** 2).sum(axis=1)).sum() + 0.5 * np.log1p(off[:, 2] ** 2).sum())
-        if best is None or cost < best[0]:
-            best = (cost, sim)
-    return best[1] if best is not None else None
+        return float(np.log1p((off[:, :2] ** 2).sum(axis=1)).sum() + 0.5 * np.log1p(off[:, 2] ** 2).sum())
+
+    samples = [rows, *(rows[s] for s in _samples(len(rows)))]
+    sims = (similarity_closed_form(centers[sample], positions[sample]) for sample in samples)
+    return min((sim for sim in sims if sim is not None), key=cost, default=None)
 
 
 def _samples(count: int) -> list[NDArray[np.int64]]:

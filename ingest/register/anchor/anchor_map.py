@@ -248,18 +248,9 @@ def _judged(
     contradiction = None if supervised else _contradiction(move)
     if contradiction is not None:
         return replace(found, reason="CONTRADICTS_PLACEMENT", message=contradiction)
-    evidence = new.placement.evidence | {
-        "anchor": checks
-        | {
-            "frames": [image.name for image in old.images if image.image_id in found.used],
-            "rounds": [
-                {"focal_px": list(r.focal_px), "structure_s": r.structure_s, "adjust_s": r.adjust_s}
-                for r in found.rounds
-            ],
-            "supervised": supervised,
-        }
-    }
-    placement = replace(new.placement, evidence=evidence)
+    names = [image.name for image in old.images if image.image_id in found.used]
+    evidence = {"anchor": checks | {"frames": names, "supervised": supervised}}
+    placement = replace(new.placement, evidence=new.placement.evidence | evidence)
     placed = replace(new, placement=placement, generation=0, parents=(), status="active")
     return replace(found, reason=None, feature_map=placed)
 

@@ -150,8 +150,10 @@ def _frame(
             line = escape(command.replace("{image}", shlex.quote(tried.image.name)))
             details += f'<p>If the edges lie on the photo, confirm it:</p><pre class="command">{line}</pre>'
     view = scan_view(cloud, lens, pose)
+    size = (view.camera.width, view.camera.height)
+    photo = np.asarray(cv2.resize(read_rgb(tried.image), size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     stage = (
-        picture(jpeg(resized(read_rgb(tried.image), view.camera)), "photo", "jpeg", "photo")
+        picture(jpeg(photo), "photo", "jpeg", "photo")
         + picture(jpeg(view_rgb(view)), "scan", "jpeg", "scan")
         + picture(png(edge_layer(view)), "edges of the scan", "png", "edges")
     )
@@ -250,12 +252,6 @@ def edge_layer(view: Rendering) -> NDArray[np.uint8]:
     thick = cv2.dilate(depth_edges.astype(np.uint8), np.ones((2, 2), np.uint8)).astype(bool)
     layer[thick] = (*_DEPTH_RGB, 255)
     return layer
-
-
-def resized(photo_rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """The photo at the size of a camera."""
-    size = (camera.width, camera.height)
-    return np.asarray(cv2.resize(photo_rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def png(rgb_or_rgba: NDArray[np.uint8]) -> bytes:

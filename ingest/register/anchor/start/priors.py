@@ -91,10 +91,7 @@ def prior_from_map(feature_map: FeatureMap, image: MapImage, shift: HeightShift 
     covariance, pose = feature_map.placement.covariance, image.cam_from_local
     jacobian = point_jacobian(pose.center)
     spread = jacobian @ covariance @ jacobian.T
-    horizontal, vertical = (
-        float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])),
-        float(np.sqrt(spread[2, 2])),
-    )
+    horizontal, vertical = np.sqrt([np.linalg.eigvalsh(spread[:2, :2])[-1], spread[2, 2]]).tolist()
     if shift is not None:
         pose = Rigid3.from_center(pose.rotation, pose.center + np.array([0.0, 0.0, shift.shift_m]))
         vertical = shift.sigma_m
