@@ -26,6 +26,7 @@ from ingest.register.anchor.frames import TriedFrame
 from ingest.register.anchor.proposals import small_camera
 from ingest.register.anchor.report import FRAME_HEADER, AnchorReport, frame_rows, report_json
 from ingest.register.anchor.together import TOGETHER
+from ingest.register.structure.surface_fit import median_m
 from ingest.workspace import write_json
 
 REPORT_JSON, REPORT_HTML = "anchor.json", "anchor.html"
@@ -181,7 +182,7 @@ def _placed_section(report: AnchorReport, result: AnchorResult, old: FeatureMap,
     assert after is not None
     facts = [
         ("heights", f"{report.datum_before} before, {report.datum_after} after"),
-        ("map points to scan", f"median {before.median_m:.2f} m before, {after.median_m:.3f} m after"),
+        ("map points to scan", f"median {median_m(before):.2f} m before, {median_m(after):.3f} m after"),
         ("moved", f"{move['horizontal_m']:.2f} m in plan, {move['up_m']:+.2f} m up"),
         ("turned", f"{move['heading_deg']:+.2f} degrees about the vertical, {move['tilt_deg']:.2f} tilted"),
         ("scale", f"{move['scale']:.5f}"),
@@ -195,7 +196,7 @@ def _placed_section(report: AnchorReport, result: AnchorResult, old: FeatureMap,
     was_at, is_at = (of.points_local(cloud.frame) for of in (old, new))
     drawn = map_over_scan_png(cloud, was_at, is_at, centers)
     over = picture(drawn, "Map points over the scan, before and after")
-    far = residuals_png(before.distance_m, after.distance_m)
+    far = residuals_png(before, after)
     distances = picture(far, "Distances of map points to the scan, before and after")
     return f"<h2>The map</h2><section>{table((), facts, names=(0,))}{over}{distances}</section>"
 

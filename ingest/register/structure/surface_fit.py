@@ -125,23 +125,6 @@ class MapMove:
     scale_sigmas: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapResidual:
-    """How a map lies on a scan: distances (k,) of the points that have scan around them, metres."""
-
-    distance_m: FloatArray
-
-    @property
-    def median_m(self) -> float:
-        """NaN where nothing could be compared."""
-        return float(np.median(self.distance_m)) if len(self.distance_m) else float("nan")
-
-    def as_figures(self) -> dict[str, float]:
-        """JSON-able."""
-        compared = {"compared": len(self.distance_m)}
-        return compared | ({"median_m": self.median_m} if len(self.distance_m) else {})
-
-
 def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
     """From the placements of the same map in one local frame."""
     move = new.placement.local_from_sfm @ old.placement.local_from_sfm.inverse()
@@ -163,8 +146,8 @@ def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
     )
 
 
-def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[MapResidual, MapResidual]:
-    """Distances of the same map points from the scan, before and after.
+def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[FloatArray, FloatArray]:
+    """Distances (k,) of the same map points from the scan, before and after, metres.
 
     Compared are the points that have scan around them in plan at the new place: elsewhere the scan has a
     hole, and the distance to its rim says nothing.
@@ -179,6 +162,10 @@ def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[
     in_plan, _ = cKDTree(scan[:, :2]).query(after[:, :2], distance_upper_bound=_PLAN_REACH_M)
     compared = np.isfinite(in_plan)
     tree = cKDTree(scan)
-    far = (np.asarray(tree.query(points[compared])[0]) for points in (before, after))
-    first, second = (MapResidual(distance_m=one) for one in far)
+    first, second = (np.asarray(tree.query(points[compared])[0]) for points in (before, after))
     return first, second
+
+
+def median_m(distances: FloatArray) -> float:
+    """Of distances (k,); NaN where nothing could be compared."""
+    return float(np.median(distances)) if len(distances) else float("nan")
