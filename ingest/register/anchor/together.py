@@ -22,7 +22,7 @@ from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.anchor.start.from_ortho import PictureTry, ScanSearch
+from ingest.register.anchor.start.from_ortho import PictureTry, ScanSearch, first_apart
 from ingest.register.anchor.start.ortho import OrthoPicture, picture_of_map, picture_of_scan
 from ingest.register.frame.dense.confirmation import AskedPhoto, evidence_of
 from ingest.register.frame.dense.fit import MAX_SIDE_PX, near_places
@@ -236,14 +236,17 @@ def starts_from_above(
         return [], []
     search = ScanSearch(drawn, _COVER)
     height = float(np.median(picture.height[picture.valid]))  # about as it is
+    apart = _APART * picture.cell * max(picture.gray.shape)
+
+    def same(one: PictureTry, other: PictureTry) -> bool:
+        return bool(np.linalg.norm(one.middle - other.middle) <= apart)
 
     def best(around: float) -> list[Sim3]:
         """Similarities, best first, with headings about one."""
         found = [search.best(picture, one, around + angle) for one in sizes.tolist() for angle in turns]
         tries = sorted((one for one in found if one is not None), key=lambda one: -one.correlation)
-        return [
-            _levelled(one.similarity(picture, height), points, drawn) for one in _distinct(tries, picture)
-        ]
+        distinct = first_apart(tries, same, _PLACES)
+        return [_levelled(one.similarity(picture, height), points, drawn) for one in distinct]
 
     quarters = _QUARTERS if turn < 0.5 * _QUARTERS[0] else ()
     return best(0.0), [one for quarter in quarters for one in best(quarter)[:_WRONG_PLACES]]
@@ -272,18 +275,6 @@ def _around(picture: OrthoPicture, reach_m: float) -> tuple[FloatArray, FloatArr
     middle = picture.corner + picture.cell * corners.mean(axis=0)
     half = 0.5 * picture.cell * float(np.linalg.norm(corners[1] - corners[0])) + reach_m
     return np.asarray(middle - half, np.float64), np.asarray(middle + half, np.float64)
-
-
-def _distinct(tries: Sequence[PictureTry], picture: OrthoPicture) -> list[PictureTry]:
-    """The first of those that lie apart from every better one."""
-    kept: list[PictureTry] = []
-    apart = _APART * picture.cell * max(picture.gray.shape)
-    for one in tries:
-        if all(float(np.linalg.norm(one.middle - other.middle)) > apart for other in kept):
-            kept.append(one)
-        if len(kept) == _PLACES:
-            break
-    return kept
 
 
 def _levelled(new_from_old: Sim3, points: FloatArray, scan: OrthoPicture) -> Sim3:

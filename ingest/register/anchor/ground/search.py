@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape
 from ingest.register.anchor.ground.street_plan import StreetPlan
+from ingest.register.anchor.start.from_ortho import first_apart
 
 _CELL_M = 1.0
 _BLUR_CELLS = 1.0
@@ -113,7 +114,8 @@ class PlanSearch:
             for turn in near:
                 circle = None if tags is None else tags.circle(plan, size, turn)
                 at_size += self._best(*cells, size, turn, circle)
-            found += best_tries(at_size, _OF_SIZE)
+            best = sorted(at_size, key=lambda one: one.agreeing, reverse=True)
+            found += first_apart(best, _same, _OF_SIZE)
         return found
 
     def _best(
@@ -166,17 +168,6 @@ class PlanSearch:
 
     def _forward(self, of: NDArray[np.generic]) -> NDArray[np.complex64]:
         return np.asarray(fft.rfft2(np.asarray(of, dtype=np.float32), self._padded))
-
-
-def best_tries(tries: Sequence[PlanTry], count: int) -> list[PlanTry]:
-    """The best that are apart."""
-    kept: list[PlanTry] = []
-    for one in sorted(tries, key=lambda t: t.agreeing, reverse=True):
-        if not any(_same(one, other) for other in kept):
-            kept.append(one)
-            if len(kept) == count:
-                break
-    return kept
 
 
 def _same(one: PlanTry, other: PlanTry) -> bool:

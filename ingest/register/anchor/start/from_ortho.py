@@ -5,8 +5,9 @@ with the scan's (`dense.pictures`) at all places, headings and sizes: coarse, th
 What comes out is a start. Whether it is right, frames say that are registered from there one by one.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -27,6 +28,8 @@ from ingest.register.frame.dense.pictures import inner_part, oriented_gradients,
 from ingest.register.frame.views import searched_sources
 from ingest.register.frame_registration import RenderSource
 
+Try = TypeVar("Try")
+
 _CELLS = 440  # along the scan's longer side, at most; with 220 a town's streets all look alike
 _LEAST_SHARE, _SIZE_STEP = 0.12, 0.06  # of the map's picture over the scan's shorter side; logarithm
 _TURN_STEP = np.radians(6.0)
@@ -42,9 +45,8 @@ _NEAR_MIDDLE = 3.0  # of the median distance: points that tell the ground
 _SIZE_SIGMA, _TURN_SIGMA = 0.02, np.radians(2.0)
 _TILT_SIGMA, _SLOPE_SIGMA = np.radians(2.0), np.radians(10.0)
 _PLAN_SIGMA_M, _PLAN_CELLS, _HEIGHT_SIGMA_M = 2.0, 1.5, 3.0
-# The harmonic of the angle doubled; the other one tells little more. Edges of a direction and a spacing that
-# the scan is full of, as streets are and rows of seats, agree in many places and count for less: by the root
-# of their power, smoothed over so many frequencies.
+# The harmonic of the angle doubled; the other one tells little more. Frequencies that are strong in the scan
+# count for less: by the root of their power, smoothed over so many frequencies.
 _CHANNELS, _POWER_SIGMA, _LEAST_POWER = 2, 3.0, 1e-3
 _TINY = 1e-12
 _INSIDE = 2  # cells from the border of what is shown that show no edge
@@ -70,6 +72,17 @@ class PictureTry:
         middle = np.array([*picture.middle, float(np.median(picture.height[picture.valid]))])
         there = np.array([*self.middle, up])
         return Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
+
+
+def first_apart(tries: Iterable[Try], same: Callable[[Try, Try], bool], most: int) -> list[Try]:
+    """The first of those that are not the same as a better one, at most so many."""
+    kept: list[Try] = []
+    for one in tries:
+        if not any(same(one, other) for other in kept):
+            kept.append(one)
+        if len(kept) == most:
+            break
+    return kept
 
 
 class ScanSearch:
@@ -223,8 +236,7 @@ def _tried(scan: ScanSearch, picture: OrthoPicture, sizes: FloatArray, turns: Fl
 def _over_chance(tries: Sequence[PictureTry], turns: int) -> Callable[[PictureTry], float] | None:
     """By how many deviations of `tries` of its size a correlation exceeds their median.
 
-    Small pictures agree with anything, streets with streets, and large ones have few places, whose best is
-    the less sure: both figures are smooth in the size. Sizes at which not all `turns` fit say nothing.
+    Both figures are smooth in the size. Sizes at which not all `turns` fit say nothing.
     """
     sizes, fitting = np.unique([one.size for one in tries], return_counts=True)
     sizes = sizes[fitting == turns]
