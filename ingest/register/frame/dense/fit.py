@@ -11,9 +11,9 @@ import numpy as np
 
 from featuredb.render.renderer import Rendering
 from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
-from ingest.register.frame.dense.pictures import oriented_gradients
+from ingest.register.frame.dense.pictures import oriented_gradients, pinhole_view
 from ingest.register.frame.dense.score_maps import cut_templates, peaks, search_around
-from ingest.register.frame.dense.search import register_dense, searched_near
+from ingest.register.frame.dense.search import refined, register_dense, sides
 from ingest.register.frame.features.matching import NO_MATCHES, FrameMatches
 from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
 from ingest.register.frame.prior_fit import fitted_under_prior
@@ -93,7 +93,9 @@ def dense_fitted(views: FrameViews, prior: FramePrior, start: FrameHypothesis) -
 
 def searched_again(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis | None:
     """The dense search's own maximum next to a pose that was fitted; None where there is none."""
-    near = searched_near(views, found.pose.camera, found.pose.cam_from_local, prior, found.source)
+    camera, pose = found.pose.camera, found.pose.cam_from_local
+    view = pinhole_view(views.gray, camera, sides(camera, prior, views.cloud)[-1])
+    near = refined(view, pose, prior, views.cloud, found.source)
     if near is None:
         return None
     return replace(found, kind="dense", pose=replace(found.pose, cam_from_local=near.cam_from_local))
