@@ -2,14 +2,8 @@
 
 How noisy the positions are is estimated with the similarity (`ingest.positions.position_noise`). What noise
 leaves of the stated sigmas is taken for a bias that all positions share, unless many people told them. Two
-tests, each by a rate of error:
-
-- chance: how often would positions that have nothing to do with the reconstruction fit as well? It follows
-  from the ratio of the likelihoods, times the number of ways to leave out the positions that were left out.
-  A map answers where it is less than one in a thousand. Noise that one receiver in twenty exceeds may be that
-  of another way: then neighbours count by as much as they do not follow from each other.
-- contradiction: noise above what one receiver in a thousand has; or in twenty, where chance fits as well in
-  one case of twenty.
+tests, each by a rate of error (docs/measurements/ingest.md): how often positions that have nothing to do with
+the reconstruction would fit as well, and how few receivers are as noisy.
 """
 
 import itertools

@@ -1,9 +1,7 @@
 """Photos whose positions agree with each other on another place than the reconstruction has them at.
 
-Buildings that look alike join photos of one to those of the other, and neither matches nor residuals show it.
-Single positions that do not fit are what GPS in streets is like; a group of photos of one thing whose
-positions are all off by the same way is either at another place, or was tagged with one error. Which of both
-cannot be told, so such photos are in no map.
+Such a group is either at another place, or was tagged with one error. Which of both cannot be told, so its
+photos are in no map (docs/measurements/ingest.md).
 """
 
 from collections.abc import Callable, Sequence
@@ -19,10 +17,6 @@ from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsPlacement
 from ingest.sfm.links import link_shares, select_photos, tied_parts
 
-# When positions that do not fit say that their photos are elsewhere. In two simulated communities (500 and
-# 5,000 photos, geotags of 8 m) five groups that look-alikes had joined were off by 5.4 to 11 times the noise,
-# two that were wrong by 13 and 21 m by less; 62 groups of right photos by up to 4.1 times, one by 1.4 km: its
-# tags were wrong.
 _MIN_LINK = 0.25  # photos of a group are tied by links (see `ingest.sfm.links`) of at least this
 _MIN_PHOTOS = 2  # of a group that agree with each other, and they are more than half of it
 # Common offset over the noise, the root mean square of the horizontal residuals of those that fit, ...
@@ -108,10 +102,9 @@ def rightly_joined(model: Model, place: PlaceModel, least_tie: int) -> list[Mode
 def joined_wrongly(model: Model, with_gps: Sequence[int], placed: GpsPlacement) -> list[list[int]]:
     """Groups of tied photos of which more do not fit their positions than by accident, by place in the model.
 
-    Look-alikes have joined such a part of the reconstruction to the rest, turned or at another place. Of
-    1,000 photos over a simulated town 80 were turned by half a turn and up to 500 m off: their offsets do not
-    agree, as `tagged_elsewhere`, whose arguments these are, wants it. Photos without position that hang on
-    them are of the group. What is wrong in height alone, or by less than that function wants, tells nothing.
+    Look-alikes have joined such a part of the reconstruction to the rest, turned or at another place: their
+    offsets do not agree, as `tagged_elsewhere`, whose arguments these are, wants it. Photos without position
+    that hang on them are of the group. What is wrong in height alone tells nothing.
     """
     near = np.linalg.norm(placed.residuals_m[:, :2], axis=1) < _least_offset_m(placed)
     fits = dict(zip(with_gps, (placed.inliers | near).tolist(), strict=True))

@@ -227,9 +227,7 @@ def register_again(
 # from both, small differences of tilt and the bend of the reconstruction grow without anyone being wrong.
 
 # Median distance between the places of the same map points, as a share of the distance from which they are
-# seen. `featuredb anchor` prints how far apart right frames are: up to 0.27 m on brighton, from 40 to 50 m,
-# 0.07 m in the simulated town; this allows five times that. Wrong frames have not been measured: none has
-# passed the verdict so far.
+# seen. Right frames are up to 0.27 m apart on brighton, from 40 to 50 m; this allows five times that.
 _MAX_APART_SHARE = 0.03
 _MIN_APART_M = 0.3  # and never less than this, for frames that are close to what they see
 

@@ -40,9 +40,8 @@ _MIN_LINE_RATIO = 0.02
 # Of the placed photos from their own GPS, beyond three of its sigmas. EXIF is off by metres, rarely by tens;
 # more means another zone, system or unit.
 _MAX_GPS_OFFSET_M = 150.0
-# Of the plane through the block's points, about each axis. Windows of 60 m of the ground in public airborne
-# scans slope by 1.7 to 3.5 degrees, larger ones by less. The cameras' mean axis is no better: a mount may be
-# tilted by more (7 degrees against the plane in `copr`).
+# Of the plane through the block's points, about each axis. The cameras' mean axis is no better: a mount may
+# be tilted by more (7 degrees against the plane in `copr`).
 _SIGMA_TILT_DEG = 3.5
 _KEPT_SHARE = 0.9  # of the points, nearest to the middle of them; the far ones are trees and errors
 _KEPT_HEIGHT_M = 0.01  # standard deviation of a height that the adjustment is to keep

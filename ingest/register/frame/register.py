@@ -191,9 +191,8 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged) -> FrameRegis
 def frame_covariance(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FloatArray | None:
     """Covariance (6, 6) of the left perturbation of cam_from_local; None where too few matches tell it.
 
-    Residuals of neighbouring correspondences are not independent: they come from one render of one scan. So
-    `CORRELATED_INLIERS` of them count as one. What all share, a shift of the whole scan's appearance by a
-    part of its point spacing, shows in no residual and is added to the position.
+    `CORRELATED_INLIERS` correspondences count as one. What all share, a shift of the whole scan's appearance
+    by a part of its point spacing, shows in no residual and is added to the position.
     """
     if len(found.inliers) < _MIN_FOR_COVARIANCE:
         return None

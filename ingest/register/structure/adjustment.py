@@ -28,9 +28,7 @@ from ingest.register.structure.surface_fit import Surface, nearest_planes, surfa
 
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
 # Least standard deviation of keypoints and of correspondences with the scan, as a share of the photo's longer
-# side: a pixel in 4000. Tracks alone may fit to a third of that, but what lens models leave is common to
-# neighbours and does not average out; trusted to their noise, thousands of tracks outvote the frames'
-# correspondences.
+# side: a pixel in 4000. Trusted to their noise, thousands of tracks outvote the frames' correspondences.
 _MIN_SIGMA_REL = 0.00025
 _MIN_SURFACE_M = 0.03  # of a scan's surface against map points; roughness of grass and pavement
 # Structure from motion over flat ground was 25 % off on `brighton`; most lenses are centred, pixels square.
@@ -43,13 +41,9 @@ _STEPS = 8  # of the solver in each round
 _SETTLED_M = 1e-3  # see above; far below a scan's noise
 _REACH_M = 1.0  # a plane further from a point says nothing of it
 # How often correspondences that agree with the map would be refused: their spread about the adjusted map
-# against that about each frame's own best pose, by F, as if the two had no residuals in common. How far they
-# miss by itself says nothing: where the scan has two points in a metre and the photo 30 pixels, honest ones
-# miss by five.
+# against that about each frame's own best pose, by F, as if the two had no residuals in common.
 _CONTROL_RATE = 1e-4
-# And so much of the photo's longer side is no contradiction (7 pixels in 4000): strips of a scan, lens and
-# shutter displace a frame as a whole, which its own pose takes up. Chosen; it has no rate.
-_CONTROL_REL = 0.0017
+_CONTROL_REL = 0.0017  # so much of the longer side is no contradiction (7 pixels in 4000); it has no rate
 _MAD_EFFICIENCY = 0.37  # of a spread by the median, of normal residuals (Rousseeuw and Croux 1993)
 _OWN_ROUNDS = 8  # of a frame's own pose
 # Of the median reprojection error, or of that share of the longer side where it is smaller: to less, tracks

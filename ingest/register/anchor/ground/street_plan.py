@@ -23,14 +23,11 @@ _PRIOR = 0.02  # of the vertical, against fronts: mean square of a normal's rise
 _LEVEL, _LEVEL_ROUNDS = 0.2, 5  # rise of a photo's level side, at most
 _ON_EDGE = 0.05  # what is held against a photo on edge, as a rise: most are not
 _VOXEL_SHARE = 0.02  # of the median distance at which cameras see points: side of what counts as one
-# Sine of a level view: maps of the simulated towns have 0.03 to 0.18 in the median, a drone that looks 15
-# degrees down 0.26. Rise of the cameras, over their spread.
+# Sine of a level view: a drone that looks 15 degrees down has 0.26. Rise of the cameras, over their spread.
 _STEEPEST, _MOST_RISE = 0.25, 0.25
 _RAYS = 4000
 _BEFORE = 0.9  # of a ray is open ground
-# Normalised weight of a cut from which on a map hangs together. Wrong joins in simulated towns had 0.02 to
-# 0.13, maps that were joined rightly 0.55 to 0.95; what is cut needlessly is only tried in vain.
-_FIRM = 0.5
+_FIRM = 0.5  # normalised weight of a cut from which on a map hangs together
 _LEAST_TIE = 1e-6  # of photos that share no point: each is on a side, too
 
 

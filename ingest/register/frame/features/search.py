@@ -1,8 +1,7 @@
 """From a coarse prior to a first pose: star renders, pooled features, consistent matches, LO-RANSAC.
 
 Between a photo and a render of a scan only 3 to 7 of 100 matches are true (paper, section 3.1.1), too few
-for RANSAC on all of them. The true ones agree locally: near one true match the scene is moved by nearly one
-similarity, so another true match nearby has the same rotation and scale. False ones are spread at random.
+for RANSAC on all of them. Near one true match another one has about the same rotation and scale.
 """
 
 from collections.abc import Iterator, Sequence
