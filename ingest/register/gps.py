@@ -8,7 +8,7 @@ the reconstruction would fit as well, and how few receivers are as noisy.
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ from ingest.positions.held import ANGLES_WRONG, Held
 from ingest.positions.position_noise import NoisyFit, fit_noisy
 from ingest.positions.receivers import receivers
 from ingest.positions.variance_components import NOISE_SHARE, stated_sigma
+from ingest.register.outcome import Outcome
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
@@ -39,27 +40,22 @@ _PLAIN_M = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEF
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GpsPlacement:
-    """Outcome of a placement: there is one when `reason` is None.
+class GpsPlacement(Outcome[GpsReason]):
+    """Outcome of a placement.
 
     Attributes:
-        reason: why there is none, or None; `message` says it for people.
         provisional: why the map may not answer before something confirms it; "" where it may.
         local_from_sfm: the similarity, None where none could be estimated.
         covariance: (7, 7) of its left perturbation (sigma, omega, nu), or None.
         residuals_m: (n, 3) GPS minus placed centre, east, north, up; NaN without a similarity.
         inliers: (n,) bool, those that are not far out.
-        figures: what the decision rests on, JSON-able.
     """
 
-    reason: GpsReason | None
-    message: str
     residuals_m: FloatArray
     inliers: NDArray[np.bool_]
     provisional: str = ""
     local_from_sfm: Sim3 | None = None
     covariance: FloatArray | None = None
-    figures: dict[str, Any] = field(default_factory=dict)
 
     @property
     def residual_rms_m(self) -> float:

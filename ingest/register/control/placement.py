@@ -3,7 +3,7 @@
 Its steps are `fit`, `adjust` and `residuals`; what they do: docs/measurements/control-points.md.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +24,7 @@ from ingest.register.control.residuals import (
     initial_weights,
     residuals_of,
 )
+from ingest.register.outcome import Outcome
 
 GcpReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE", "UPSIDE_DOWN", "CONTRADICTS_GPS"]
 
@@ -65,34 +66,25 @@ class GcpOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GcpPlacement:
-    """Outcome of a placement: accepted when `reason` is None.
+class GcpPlacement(Outcome[GcpReason]):
+    """Outcome of a placement.
 
     Attributes:
         control: what met the photos, and what did not.
-        reason: gate that refused it, or None; `message` says it for people.
         local_from_block: the similarity nearest to what became of the block, None where there is none.
         covariance: (7, 7) of its left perturbation (sigma, omega, nu), or None.
         block: adjusted, in metres in the local frame, or None.
         points: every control point with its residual; marks: every mark.
         notes: what was assumed, for people.
-        figures: what the decision rests on, JSON-able.
     """
 
     control: Control
-    reason: GcpReason | None
-    message: str
     local_from_block: Sim3 | None = None
     covariance: FloatArray | None = None
     block: Block | None = None
     points: tuple[PointResidual, ...] = ()
     marks: tuple[MarkResidual, ...] = ()
     notes: tuple[str, ...] = ()
-    figures: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def accepted(self) -> bool:
-        return self.reason is None
 
     @property
     def residual_rms_m(self) -> float:
@@ -270,13 +262,10 @@ def _adjusted_placement(
         points=points,
         marks=marks,
         figures={
-            "degrees_of_freedom": freedom,
             "points_used": int(weights.points.sum()),
-            "marks_used": int(weights.marks.sum()),
             "control_sigma_m": weights.control_m.tolist(),
             "mark_sigma_px": weights.mark_px,
             "scale_sigma": float(np.sqrt(covariance[0, 0])),
-            "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),
         },
     )
 

@@ -4,7 +4,7 @@ What the registered frames see of the scan (their correspondences) and the scan'
 the map determine poses, lens and points together (docs/measurements/registration.md).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ from featuredb.render.cloud import PointCloud
 from ingest.colmap.adjust import AdjustOptions, longest_side, residuals_of
 from ingest.colmap.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
+from ingest.register.outcome import Outcome
 from ingest.register.structure.projection import Registered, StructurePlacement
 from ingest.register.structure.surface_fit import Surface, nearest_planes, surface_near
 
@@ -57,29 +58,20 @@ AdjustReason = Literal["NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LidarAdjustment:
+class LidarAdjustment(Outcome[AdjustReason]):
     """An adjusted map, or why scan and photos contradict each other.
 
     Attributes:
-        reason: gate that refused it, or None; `message` says it for people.
         block: the map in the cloud's local frame; None without a scan or a lens. A refused one may be the
             start of another round: frames that were registered with a wrong lens contradict the right one.
         poses: (6, 6) of each pose, with all that points and lenses leave open; none without a block.
         lenses: what is left open of the lenses; None without a block, or where no lens has OPENCV's
             parameters.
-        figures: before and after, JSON-able.
     """
 
-    reason: AdjustReason | None
-    message: str
     block: Block | None = None
     poses: tuple[FloatArray, ...] = ()
     lenses: LensUncertainty | None = None
-    figures: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def accepted(self) -> bool:
-        return self.reason is None
 
 
 def adjust_to_scan(

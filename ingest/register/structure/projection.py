@@ -5,7 +5,7 @@ pairs of a frame share its pose error. In the place of ICP comes the adjustment 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +21,7 @@ from featuredb.maps.move import full_covariances
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame_registration import FrameRegistration
+from ingest.register.outcome import Outcome
 from ingest.register.structure.depth_filter import SurfaceHits, surface_at
 from ingest.register.structure.similarity import Pairs, SimilarityFit, ransac_similarity, refine_similarity
 
@@ -55,26 +56,17 @@ _CELLS = 6  # per side of the grid of neighbourhoods in a frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StructurePlacement:
+class StructurePlacement(Outcome[StructureReason]):
     """Where structure projection puts a map, or why it does not.
 
     Attributes:
-        reason: gate that refused it, or None; `message` says it for people.
         new_from_old: similarity of the scan's local frame that moves the map from its present place to
             the new one, None when refused.
         covariance: (7, 7) of its left perturbation, None when refused.
-        figures: what the decision rests on, JSON-able.
     """
 
-    reason: StructureReason | None
-    message: str
     new_from_old: Sim3 | None = None
     covariance: FloatArray | None = None
-    figures: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def accepted(self) -> bool:
-        return self.reason is None
 
 
 def project_structure(

@@ -5,8 +5,8 @@ Search in plan, then points to planes of the solid that the scan shows: docs/mea
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit
 from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
 from ingest.register.anchor.ground.street_plan import StreetPlan, parts, street_plan
 from ingest.register.frame.dense.confirmation import JointEvidence
+from ingest.register.outcome import Outcome
 
 _LOG = logging.getLogger(__name__)
 
@@ -59,23 +60,18 @@ GroundReason = Literal[
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GroundPlace:
-    """Where a map lies, or why that is not known.
+class GroundPlace(Outcome[GroundReason]):
+    """Where a map lies, or why that is not known; `message` has words on the evidence where it is placed.
 
     Attributes:
-        reason, message: of the refusal; None and words on the evidence where it is placed.
         local_from_own: similarity. covariance: (7, 7) of its left perturbation.
         image_ids: of the photos that lie there. residual_rms_m: of the points that agree.
-        figures: JSON-able.
     """
 
-    reason: GroundReason | None
-    message: str
     local_from_own: Sim3 | None = None
     covariance: FloatArray | None = None
     image_ids: tuple[int, ...] = ()
     residual_rms_m: float = 0.0
-    figures: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -194,35 +190,22 @@ def _judged(
         final = _asked(shape, _fitted(plan, shape, sim, rows, _FINE_WIDTHS_M))
         sim = final.fit.local_from_own
         kept = _lie_there(unplaced, plan, shape, sim, rate)
-    figures: dict[str, Any] = {"photos": int(kept.sum()), "of": len(kept), "rate": rate}
     if kept.sum() < _LEAST_PHOTOS:
         few = f"{int(kept.sum())} of its photos lie on the scan"
-        return GroundPlace(reason="TOO_FEW_FRAMES", message=few, figures=figures)
+        return GroundPlace(reason="TOO_FEW_FRAMES", message=few)
     rows = _rows_seen(unplaced, plan, kept)
     there_m = (one.fit.local_from_own.act(plan.points[rows]) - sim.act(plan.points[rows]) for one in there)
     away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])
-    elsewhere = scores[away > _ELSEWHERE_M]
-    log_nfa = _log_nfa(scores[first], elsewhere) - float(np.log10(tests))
+    log_nfa = _log_nfa(scores[first], scores[away > _ELSEWHERE_M]) - float(np.log10(tests))
     others = [
         one
         for one, far in zip(there, away, strict=True)
         if far > _APART_M and abs(np.log(one.fit.local_from_own.scale / sim.scale)) < _ALIKE
     ]
-    rivals = [
-        _rival_p(plan, shape, rows, sim, one.fit.local_from_own)
-        for one in sorted(others, key=lambda one: _over(one, rate))[-_RIVALS:]
-    ]
-    centers = sim.act(plan.centers[kept])
-    figures |= {
-        "places": final.evidence.places,
-        "agreeing": final.evidence.agreeing,
-        "log_nfa": log_nfa,
-        "over_chance": float(scores[first]),
-        "elsewhere": len(elsewhere),
-        "elsewhere_over_chance": float(elsewhere.max(initial=-np.inf)),
-        "rival": max(rivals, default=0.0),
-        "camera_height_m": float((centers[:, 2] - shape.ground[shape.cells(centers[:, :2])]).mean()),
-    }
+    best = sorted(others, key=lambda one: _over(one, rate))[-_RIVALS:]
+    rivals = (_rival_p(plan, shape, rows, sim, one.fit.local_from_own) for one in best)
+    rival = max(rivals, default=0.0)
+    figures = {"photos": int(kept.sum()), "of": len(kept), "rate": rate, "log_nfa": log_nfa, "rival": rival}
     words = (
         f"{int(kept.sum())} of {len(kept)} photos lie on the scan's outlines: "
         f"{final.evidence.agreeing:.0f} of {final.evidence.places} places agree"
@@ -235,11 +218,11 @@ def _judged(
         covariance=covariance,
         image_ids=tuple(i.image_id for i, stays in zip(unplaced.images, kept, strict=True) if stays),
         residual_rms_m=rms_m,
-        figures=figures,
+        figures=figures | asdict(final.evidence),
     )
     if log_nfa < _LOG_RATE:
         return replace(found, reason="STRUCTURE", message=f"{words}, which chance gives, too")
-    if max(rivals, default=0.0) > _RIVAL_RATE:
+    if rival > _RIVAL_RATE:
         return replace(found, reason="AMBIGUOUS", message=f"{words}, and nearly as many at another place")
     return found
 

@@ -14,6 +14,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.render.cloud import PointCloud
 
+Circle = tuple[float, float, float]  # x, y, radius
+
 CELL_M = 0.5
 _VEGETATION = (3, 4, 5)  # ASPRS: crowns are no fronts, and people stand under them
 _WIDEST_M = 30.0  # of a building across: ground is what is left of heights that are narrower
@@ -62,8 +64,8 @@ class ScanShape:
         return np.asarray(there & self.known[self.cells(xy)])
 
 
-def shape_of(cloud: PointCloud, circle: tuple[float, float, float] | None = None) -> ScanShape | None:
-    """The solid that a scan shows within a circle (x, y, radius); None where it shows no surface."""
+def shape_of(cloud: PointCloud, circle: Circle | None) -> ScanShape | None:
+    """The solid that a scan shows within a circle; None where it shows no surface."""
     shown = ~np.isin(cloud.classification, _VEGETATION)
     if circle is not None:
         shown &= np.hypot(cloud.xyz[:, 0] - circle[0], cloud.xyz[:, 1] - circle[1]) < circle[2]

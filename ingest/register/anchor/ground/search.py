@@ -9,7 +9,7 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape
+from ingest.register.anchor.ground.scan_shape import CELL_M, Circle, ScanShape
 from ingest.register.anchor.ground.street_plan import StreetPlan
 from ingest.register.anchor.start.from_ortho import first_apart
 
@@ -54,15 +54,15 @@ class Geotags:
         squared = np.square((off - np.median(off, axis=0)) / self.sigma_m[:, None]).sum(axis=1)
         return float(np.minimum(squared, _WRONG).sum())
 
-    def circle(self, plan: StreetPlan, size: float, turn: float) -> tuple[float, float, float]:
+    def circle(self, plan: StreetPlan, size: float, turn: float) -> Circle:
         """x, y and radius of where the middle of the plan's cameras may be."""
         return self._about(self._offsets(plan, size, turn), _NEAR_M)
 
-    def around(self, reach_m: float) -> tuple[float, float, float]:
+    def around(self, reach_m: float) -> Circle:
         """x, y and radius of what lies within a reach of where the photos may have been taken."""
         return self._about(self.xy, reach_m)
 
-    def _about(self, xy: FloatArray, reach_m: float) -> tuple[float, float, float]:
+    def _about(self, xy: FloatArray, reach_m: float) -> Circle:
         x, y = np.median(xy, axis=0).tolist()
         sigma = _LOOSE * float(np.sum(self.sigma_m**-2.0)) ** -0.5
         return x, y, _SIGMAS * sigma + reach_m
@@ -119,12 +119,7 @@ class PlanSearch:
         return found
 
     def _best(
-        self,
-        fronts: FloatArray,
-        free: FloatArray,
-        size: float,
-        turn: float,
-        circle: tuple[float, float, float] | None,
+        self, fronts: FloatArray, free: FloatArray, size: float, turn: float, circle: Circle | None
     ) -> list[PlanTry]:
         cos, sin = np.cos(turn), np.sin(turn)
         rotation = np.array([[cos, -sin], [sin, cos]])

@@ -74,6 +74,9 @@ class PictureTry:
         return Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
 
 
+_OverChance = Callable[[PictureTry], float]  # deviations
+
+
 def first_apart(tries: Iterable[Try], same: Callable[[Try, Try], bool], most: int) -> list[Try]:
     """The first of those that are not the same as a better one, at most so many."""
     kept: list[Try] = []
@@ -215,10 +218,7 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> tuple[PictureTry, 
 
 
 def _again(
-    scan: ScanSearch,
-    picture: OrthoPicture,
-    tries: Sequence[PictureTry],
-    chance: Callable[[PictureTry], float],
+    scan: ScanSearch, picture: OrthoPicture, tries: Sequence[PictureTry], chance: _OverChance
 ) -> list[PictureTry]:
     """The best of the tries with finer steps around them."""
     steps = np.array([-1.0, 0.0, 1.0]) * _AGAIN_STEP
@@ -233,7 +233,7 @@ def _tried(scan: ScanSearch, picture: OrthoPicture, sizes: FloatArray, turns: Fl
     return [one for one in found if one is not None]
 
 
-def _over_chance(tries: Sequence[PictureTry], turns: int) -> Callable[[PictureTry], float] | None:
+def _over_chance(tries: Sequence[PictureTry], turns: int) -> _OverChance | None:
     """By how many deviations of `tries` of its size a correlation exceeds their median.
 
     Both figures are smooth in the size. Sizes at which not all `turns` fit say nothing.

@@ -116,11 +116,7 @@ def least_picks(focal_rel: float) -> int:
 
 
 def pose_from_picks(
-    picks: Picks,
-    points: FloatArray,
-    camera: Camera,
-    present: Rigid3 | None,
-    focal_rel: float = KNOWN_FOCAL_REL,
+    picks: Picks, points: FloatArray, camera: Camera, present: Rigid3 | None, focal_rel: float
 ) -> tuple[FramePrior, PickFit]:
     """Pose by picked correspondences, if they determine it and do not contradict each other.
 

@@ -81,11 +81,11 @@ def dense_fitted(views: FrameViews, prior: FramePrior, start: FrameHypothesis) -
     rounds = views.options.fit_rounds
     decided = start.kind == "features" and start.log_nfa >= DECISIVE_LOG_NFA
     for sizes in rounds[1:] if decided else rounds:
-        found = found and _fit_round(views, prior, found, *sizes)
+        found = found and _fit_round(views, prior, found, sizes)
     # A pose that is still on its way may look right already: the pieces that lie near have made it.
     for _ in range(views.options.more_rounds):
         before = found
-        found = found and _fit_round(views, prior, found, *rounds[-1])
+        found = found and _fit_round(views, prior, found, rounds[-1])
         if before is None or found is None or _moved_px(views, before, found) < 0.2:
             break
     return found
@@ -102,13 +102,9 @@ def searched_again(views: FrameViews, prior: FramePrior, found: FrameHypothesis)
 
 
 def _fit_round(
-    views: FrameViews,
-    prior: FramePrior,
-    start: FrameHypothesis,
-    spacing_px: float,
-    piece_px: int,
-    near_px: int,
+    views: FrameViews, prior: FramePrior, start: FrameHypothesis, sizes: tuple[float, int, int]
 ) -> FrameHypothesis | None:
+    spacing_px, piece_px, near_px = sizes
     side_px = views.side_px(spacing_px, MAX_SIDE_PX)
     renderings = views.renders([start.pose.cam_from_local], side_px)
     if not renderings:

@@ -50,13 +50,6 @@ _NEIGHBOURS = 180
 # None farther away than this share of the image's longer side: beyond, relief and perspective make more than
 # one similarity of it.
 _REACH_REL = 0.15
-_MIN_GAP_REL = 0.006  # none nearer; keypoints of one structure agree with each other by construction
-# Of a neighbour's place, as a share of its distance; what slopes and perspective do to a similarity within
-# the reach.
-_TOLERANCE = 0.15
-_TOLERANCE_FLOOR_REL = 0.002  # and at least this share of the longer side, the noise of keypoints
-_MAX_TURN_DEG = 45.0  # largest rotation between photo and reference
-_MAX_ZOOM = 2.0  # largest change of scale between them, either way
 # -log10 of the expected number of matches, among all, that random neighbours would support as well. Three
 # false ones do not disturb RANSAC.
 _MIN_LOG_CHANCE = -0.5
@@ -150,11 +143,7 @@ def consistent_matches(
             np.ascontiguousarray(photo[rows], dtype=np.float64),
             np.ascontiguousarray(reference[rows], dtype=np.float64),
             neighbour,
-            _MIN_GAP_REL * side_px,
-            _TOLERANCE,
-            _TOLERANCE_FLOOR_REL * side_px,
-            np.radians(_MAX_TURN_DEG),
-            np.log(_MAX_ZOOM),
+            side_px,
             area_px,
         )
     # -log10 of matches x hypotheses x P(at least so many of the others by chance).
