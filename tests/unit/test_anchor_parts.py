@@ -97,7 +97,7 @@ def test_frames_that_see_more_of_the_scan_come_first_and_others_not_at_all() -> 
     ids = [p.image.image_id for p in ranked]
     assert 3 not in ids
     assert ids[0] in (0, 1)
-    scores = {p.image.image_id: p.score for p in ranked}
+    scores = {p.image.image_id: p for p in ranked}
     assert scores[0].coverage > 0.95 > scores[2].coverage > 0.5
     assert scores[0].downward > 0.9
     assert scores[2].score < scores[0].score

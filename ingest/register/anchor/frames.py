@@ -14,7 +14,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress, no_progress
-from ingest.register.anchor.proposals import FrameProposal, FrameScore, PhotoReader, propose_frames
+from ingest.register.anchor.proposals import FrameProposal, PhotoReader, propose_frames
 from ingest.register.anchor.start.priors import HeightShift, height_shift, prior_from_map
 from ingest.register.anchor.together import TOGETHER, prior_by_others, register_together
 from ingest.register.frame.register import fit_vouched_for, register_frame
@@ -168,9 +168,8 @@ def _tried_together(
 
 
 def _unranked(image: MapImage, prior: FramePrior) -> FrameProposal:
-    nan = float("nan")
-    score = FrameScore(score=nan, coverage=nan, downward=nan, points=0, spread=nan)
-    return FrameProposal(image=image, score=score, prior=prior)
+    unknown = dict.fromkeys(("score", "coverage", "downward", "spread"), float("nan"))
+    return FrameProposal(image=image, prior=prior, points=0, **unknown)
 
 
 def _try(

@@ -154,9 +154,9 @@ def place_by_gcp(
     usable = sorted({h.point for h in found})
     if len(usable) < _MIN_POINTS:
         message = (
-            f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are needed"
+            f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are needed; "
+            "mark each point in two photos or more"
         )
-        message += "; mark each point in two photos or more"
         return GcpPlacement(control=control, reason="TOO_FEW", message=message)
     notes: tuple[str, ...] = ()
     if not _vertical_is_needed(control, usable):

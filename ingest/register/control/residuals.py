@@ -13,7 +13,7 @@ from scipy.special import chdtri, fdtrc
 
 from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import point_jacobian
+from featuredb.geometry.sim3 import place_covariance
 from ingest.register.control.adjust import Adjusted, Task, Weights, adjust
 from ingest.register.control.control_file import Mark
 from ingest.register.control.fit import ControlFit
@@ -324,9 +324,8 @@ def gps_offset(
     if not known.any():
         return {}, []
     median, variance = np.transpose([_middle(off[:, axis]) for axis in range(3)])
-    at = point_jacobian(centers[known].mean(axis=0))
     stated = np.array([sigma_m[0], sigma_m[0], sigma_m[1]])
-    spread = at @ covariance @ at.T + np.diag(stated**2 + variance)
+    spread = place_covariance(covariance, centers[known].mean(axis=0)) + np.diag(stated**2 + variance)
     figures = {
         "gps_offset_m": [None if np.isnan(v) else float(v) for v in median],
         "gps_offset_sigma_m": np.sqrt(np.diag(spread)).tolist(),

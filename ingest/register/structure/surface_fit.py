@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_log
-from featuredb.geometry.sim3 import point_jacobian
+from featuredb.geometry.sim3 import place_covariance
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 
@@ -130,8 +130,7 @@ def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
     move = new.placement.local_from_sfm @ old.placement.local_from_sfm.inverse()
     turn, covariance = so3_log(move.rotation), old.placement.covariance
     middle = np.median(old.points_local(), axis=0)
-    shift, jacobian = move.act(middle) - middle, point_jacobian(middle)
-    spread = jacobian @ covariance @ jacobian.T
+    shift, spread = move.act(middle) - middle, place_covariance(covariance, middle)
     heading, tilt = float(abs(turn[2])), float(np.hypot(turn[0], turn[1]))
     return MapMove(
         horizontal_m=float(np.hypot(shift[0], shift[1])),

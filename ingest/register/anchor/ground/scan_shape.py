@@ -257,8 +257,7 @@ def fitted(
         fit = laid(shape, own, sim, widths_m[min(k, len(widths_m) - 1)])
         step = np.linalg.solve(fit.normal + prior, fit.right)
         step[:4] = np.clip(step[:4], -_MOST_TURN, _MOST_TURN)
-        about = Sim3(scale=1.0, rotation=np.eye(3), translation=fit.middle)
-        sim = about @ Sim3.exp(step) @ about.inverse() @ sim
+        sim = Sim3.exp(step).about(fit.middle) @ sim
         if k >= len(widths_m) and float(np.abs(step).max()) < _SETTLED:
             break
     return laid(shape, own, sim, widths_m[-1])
