@@ -18,8 +18,9 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit, fitted, laid, shape_of
-from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
+from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch
 from ingest.register.anchor.ground.street_plan import StreetPlan, parts, street_plan
+from ingest.register.anchor.start.from_ortho import PlanTry
 from ingest.register.frame.dense.confirmation import JointEvidence
 from ingest.register.outcome import Outcome
 
@@ -152,9 +153,9 @@ def _over(one: _Tried, rate: float) -> float:
 def _start(plan: StreetPlan, shape: ScanShape, one: PlanTry) -> Sim3:
     """The plan there, its cameras at the eyes of people who stand on the scan's ground."""
     rotation = so3_exp([0.0, 0.0, one.turn])
-    centers = one.size * plan.centers @ rotation.T + np.array([one.x, one.y, 0.0])
+    centers = one.size * plan.centers @ rotation.T + np.append(one.middle, 0.0)
     up = float(np.median(shape.ground[shape.cells(centers[:, :2])] + _EYE_M - centers[:, 2]))
-    return Sim3(scale=one.size, rotation=rotation, translation=np.array([one.x, one.y, up]))
+    return Sim3(scale=one.size, rotation=rotation, translation=np.append(one.middle, up))
 
 
 def _fitted(
@@ -248,10 +249,9 @@ def _best_around(plan: StreetPlan, shape: ScanShape, best: _Tried, rate: float) 
     starts = [sim]
     for turn in np.arange(8) * np.pi / 4:
         shift = _AGAIN_M * np.array([np.cos(turn), np.sin(turn), 0.0])
-        starts.append(Sim3(scale=1.0, rotation=np.eye(3), translation=shift) @ sim)
+        starts.append(Sim3.shift(shift) @ sim)
     for size in (-_AGAIN_SIZE, _AGAIN_SIZE):
-        about = Sim3(scale=1.0, rotation=np.eye(3), translation=best.fit.middle)
-        starts.append(about @ Sim3.exp([size, *[0.0] * 6]) @ about.inverse() @ sim)
+        starts.append(Sim3.exp([size, *[0.0] * 6]).about(best.fit.middle) @ sim)
     tried = [_asked(shape, _fitted(plan, shape, start, rows, _COARSE_WIDTHS_M)) for start in starts]
     return max(tried, key=lambda one: _over(one, rate))
 
@@ -316,5 +316,4 @@ def _covariance(final: _Tried) -> tuple[FloatArray, float]:
     offset = inverse @ fit.by_walls * _WALL_SIGMA_M
     covariance = factor * max(rms_m, _LEAST_SIGMA_M) ** 2 * inverse + np.outer(offset, offset)
     covariance[4:, 4:] += np.eye(3) * CELL_M**2 / 12.0
-    about = Sim3(scale=1.0, rotation=np.eye(3), translation=fit.middle)
-    return about.carried(covariance), rms_m
+    return Sim3.shift(fit.middle).carried(covariance), rms_m

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.anchor.ground.scan_shape import CELL_M, Circle, ScanShape
 from ingest.register.anchor.ground.street_plan import StreetPlan
-from ingest.register.anchor.start.from_ortho import first_apart
+from ingest.register.anchor.start.from_ortho import PlanTry, first_apart
 
 _CELL_M = 1.0
 _BLUR_CELLS = 1.0
@@ -25,17 +25,6 @@ _LOOSE = 1.5  # of the mean of geotags: those of one visit err together
 _WRONG = 9.0  # squared sigmas from which on a geotag says nothing; a third of them may be so
 _SIGMAS = 4.0  # of the geotags within which a place is looked for
 _NEAR_M, _NEAR_TURN, _NEAR_SIZE = 4.0, np.radians(10.0), 0.15  # tries that are one
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanTry:
-    """The plan at a size (metres a unit), heading (radians, x to y) and place (metres), and how it agrees."""
-
-    size: float
-    turn: float
-    x: float
-    y: float
-    agreeing: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -149,8 +138,8 @@ class PlanSearch:
         rows, columns = np.unravel_index(best, over.shape)
         places = self._corner + (np.column_stack([columns, rows]) + first[::-1] + 0.5) * _CELL_M
         return [
-            PlanTry(size=size, turn=turn, x=float(x), y=float(y), agreeing=float(values[k]))
-            for k, (x, y) in zip(best, places, strict=True)
+            PlanTry(size=size, turn=turn, middle=place, agreeing=float(values[k]))
+            for k, place in zip(best, places, strict=True)
             if np.isfinite(values[k])
         ]
 
@@ -166,8 +155,7 @@ class PlanSearch:
 
 
 def _same(one: PlanTry, other: PlanTry) -> bool:
-    away = np.hypot(one.x - other.x, one.y - other.y)
-    turn = abs((one.turn - other.turn + np.pi) % (2.0 * np.pi) - np.pi)
+    away, turn = one.apart(other)
     size = abs(np.log(one.size / other.size))
     return bool(away < _NEAR_M and turn < _NEAR_TURN and size < _NEAR_SIZE)
 
