@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from featuredb.atomic import atomic_file
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -27,9 +26,7 @@ from ingest.register.anchor.proposals import small_camera
 from ingest.register.anchor.report import FRAME_HEADER, AnchorReport, frame_rows, report_json
 from ingest.register.anchor.together import TOGETHER
 from ingest.register.structure.surface_fit import median_m
-from ingest.workspace import write_json
-
-REPORT_JSON, REPORT_HTML = "anchor.json", "anchor.html"
+from ingest.workspace import write_json_and_page
 
 _WIDTH_PX = 1280  # of overlays: a screen's width; more only makes the page heavy
 _DEPTH_STEP = 0.015  # share of the depth by which it jumps at an edge: 1 m seen from 70 m
@@ -80,11 +77,8 @@ def write_anchor_report(
     folder: Path, report: AnchorReport, old: FeatureMap, cloud: PointCloud, read_rgb: PhotoRgb, command: str
 ) -> Path:
     """Write `anchor.json` and `anchor.html` (see `anchor_page`) into the folder; the path of the page."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / REPORT_JSON, report_json(report))
-    with atomic_file(folder / REPORT_HTML) as temporary:
-        temporary.write_text(anchor_page(report, old, cloud, read_rgb, command), encoding="utf-8")
-    return folder / REPORT_HTML
+    html = anchor_page(report, old, cloud, read_rgb, command)
+    return write_json_and_page(folder / "anchor", report_json(report), html)
 
 
 def anchor_page(
