@@ -201,8 +201,8 @@ def _too_little(
         return "STRUCTURE", f"the map's points do not fit the scan through any registered frame: {words}"
     if not agreement.agreeing or (len(agreement.agreeing) < needed and len(lone) >= 2):
         words = "; ".join(
-            f"{names[a]} and {names[b]}: {m:.2f} m apart, {agreement.allowed_m[a, b]:.2f} m allowed"
-            for (a, b), m in agreement.apart_m.items()
+            f"{names[a]} and {names[b]}: {metres:.2f} m apart, {allowed:.2f} m allowed"
+            for (a, b), (metres, allowed) in agreement.apart_m.items()
         )
         return "FRAMES_DISAGREE", (
             f"the frames send the map to different places ({words}); look at them in anchor.html and "
@@ -228,15 +228,14 @@ def _judged(
     distance = float(np.median(block_of_map(new).distances()))
     most_m = max(_MAX_RESIDUAL_SHARE * distance, _GOOD_M)
     assert found.agreement is not None
-    allowed = found.agreement.allowed_m
     checks: dict[str, Any] = {
         "before": {"compared": len(before), "median_m": before_m},
         "after": {"compared": len(after), "median_m": after_m},
         "move": asdict(move),
         "viewing_distance_m": distance,
         "frames_apart_m": [
-            {"frames": list(pair), "apart_m": metres, "allowed_m": allowed[pair]}
-            for pair, metres in found.agreement.apart_m.items()
+            {"frames": list(pair), "apart_m": metres, "allowed_m": allowed}
+            for pair, (metres, allowed) in found.agreement.apart_m.items()
         ],
     }
     found = replace(found, before=before, after=after, checks=checks, message="")

@@ -253,34 +253,28 @@ class FrameAgreement:
     Attributes:
         agreeing: ids of the largest set of frames that all agree pairwise; empty where two such sets are
             equally large and neither can be preferred.
-        apart_m: median distance between the places of common points, by pair of ids; allowed_m: likewise.
+        apart_m: median distance between the places of common points, and what is allowed, by pair of ids.
     """
 
     agreeing: tuple[int, ...]
-    apart_m: Mapping[tuple[int, int], float]
-    allowed_m: Mapping[tuple[int, int], float]
+    apart_m: Mapping[tuple[int, int], tuple[float, float]]
 
 
 def frames_that_agree(frames: Sequence[LoneFrame]) -> FrameAgreement:
     """The largest set of frames whose similarities agree."""
-    apart: dict[tuple[int, int], float] = {}
-    allowed: dict[tuple[int, int], float] = {}
+    apart: dict[tuple[int, int], tuple[float, float]] = {}
     for a, b in combinations(frames, 2):
-        pair = (a.image_id, b.image_id)
         points = np.vstack([a.points, b.points])
         difference = a.new_from_old.act(points) - b.new_from_old.act(points)
-        apart[pair] = float(np.median(np.linalg.norm(difference, axis=1)))
-        allowed[pair] = max(_MAX_APART_SHARE * max(a.distance_m, b.distance_m), _MIN_APART_M)
+        allowed = max(_MAX_APART_SHARE * max(a.distance_m, b.distance_m), _MIN_APART_M)
+        apart[a.image_id, b.image_id] = float(np.median(np.linalg.norm(difference, axis=1))), allowed
+    agreeing = {pair for pair, (metres, allowed) in apart.items() if metres <= allowed}
     ids = [frame.image_id for frame in frames]
     for size in range(len(ids), 0, -1):
-        sets = [
-            chosen
-            for chosen in combinations(ids, size)
-            if all(apart[pair] <= allowed[pair] for pair in combinations(chosen, 2))
-        ]
+        sets = [chosen for chosen in combinations(ids, size) if agreeing.issuperset(combinations(chosen, 2))]
         if len(sets) == 1 or (sets and size > len(ids) / 2):
-            best = min(sets, key=lambda s: sum((apart[pair] for pair in combinations(s, 2)), 0.0))
-            return FrameAgreement(agreeing=best, apart_m=apart, allowed_m=allowed)
+            best = min(sets, key=lambda s: sum((apart[pair][0] for pair in combinations(s, 2)), 0.0))
+            return FrameAgreement(agreeing=best, apart_m=apart)
         if sets:
             break
-    return FrameAgreement(agreeing=(), apart_m=apart, allowed_m=allowed)
+    return FrameAgreement(agreeing=(), apart_m=apart)
