@@ -61,7 +61,7 @@ class FrameEvidence:
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
         prior_sigmas: distance from the prior.
         position_sigma_share: standard deviation of the position over the distance to what is seen.
-        places_elsewhere, elsewhere_log_nfa: see `elsewhere`; none where it was not asked.
+        places_elsewhere, elsewhere_log_nfa: see `agreement_elsewhere`; none where it was not asked.
         relief_only: the pictures were compared by shaded relief, which shows nothing of the ground.
     """
 
