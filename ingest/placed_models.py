@@ -19,7 +19,6 @@ from ingest.own_frame import WAYS_TO_A_PLACE, held_of
 from ingest.photos.photo import Photo, capture_seconds, gps_priors, local_frame_of, whose_cameras
 from ingest.positions.receivers import receivers
 from ingest.reconstruction import MapMakingOptions, Reconstructed
-from ingest.register.block import block_of_model, model_of_block
 from ingest.register.control.maps import Survey, place_by_survey, vertical_of
 from ingest.register.control.marks import control_frame
 from ingest.register.control.placement import GcpPlacement
@@ -280,7 +279,8 @@ def _by_control(
     survey: Survey,
 ) -> Component:
     """The component placed by control points; GPS, where it was accepted, says what they leave open."""
-    block = block_of_model(component.model, component.photos, features)
+    block = component.model.block(component.model.pixels([found.features.xy for found in features]))
+    block = replace(block, names=tuple(photo.name for photo in component.photos))
     by_gps, vertical = component.placement, None
     if by_gps.reason is None and by_gps.local_from_sfm is not None and by_gps.covariance is not None:
         vertical = vertical_of(by_gps.local_from_sfm, by_gps.covariance, block.xyz, "the photos' GPS")
@@ -293,7 +293,10 @@ def _by_control(
         return _without_place(component, features, identity, options)
     assert placed.block is not None
     assert placed.local_from_block is not None  # accepted
-    model = model_of_block(component.model, placed.block.moved(placed.local_from_block.inverse()))
+    adjusted = placed.block.moved(placed.local_from_block.inverse())
+    model = replace(
+        component.model, cameras=adjusted.cameras, cam_from_sfm=adjusted.cam_from_block, xyz=adjusted.xyz
+    )
     datum = placed.height_datum(options.maps.height_datum, options.maps.height_datum)
     feature_map = build_map(
         model,

@@ -65,6 +65,15 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
         temporary.write_text(json.dumps(value, indent=1, sort_keys=True), encoding="utf-8")
 
 
+def write_json_and_page(stem: Path, value: Mapping[str, Any], html: str) -> Path:
+    """Write `stem`.json and `stem`.html, each atomically; the path of the page."""
+    write_json(stem.with_name(f"{stem.name}.json"), value)
+    page = stem.with_name(f"{stem.name}.html")
+    with atomic_file(page) as temporary:
+        temporary.write_text(html, encoding="utf-8")
+    return page
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Read what `write_json` wrote."""
     try:

@@ -196,6 +196,25 @@ def inverse_without_points(by_point: Any, by_shared: Any) -> FloatArray:
     return np.asarray(covariance)
 
 
+def points_by_shared(
+    by_point: Any, by_shared: Any, poses: Sequence[int], block: Block
+) -> tuple[Any, FloatArray]:
+    """How points move with the perturbations of `Marginals.shared`, and what their own rays tell of them.
+
+    Args:
+        by_point, by_shared: the Jacobian's two parts, CSR. poses: the free ones.
+
+    Returns:
+        (3 n, q) CSR and (n, 3, 3), information of each point if poses and lenses were exact.
+    """
+    of_points, count = by_point.tocsc(), by_point.shape[1] // 3
+    normal = (of_points.T @ of_points).tocoo()
+    back = [np.linalg.inv(_house_from_colmap(block.cam_from_block[k].translation)) for k in poses]
+    unturned = sparse.block_diag([*back, sparse.eye(by_shared.shape[1] - 6 * len(back))], format="csr")
+    moved = -(inverse_blocks(normal, count) @ (of_points.T @ (by_shared @ unturned)))
+    return moved.tocsr(), _blocks(normal, count)
+
+
 def marginals(covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int], block: Block) -> Marginals:
     """Of the covariance of poses, in COLMAP's perturbation, and lenses."""
     size = tuple(len(camera.params) for camera in block.cameras)
@@ -228,9 +247,15 @@ def _house_from_colmap(translation: FloatArray) -> FloatArray:
 
 def inverse_blocks(blocks: Any, n: int) -> Any:
     """The inverse of a matrix of n blocks of three on its diagonal."""
-    dense = np.zeros((n, 3, 3))
-    dense[blocks.row // 3, blocks.row % 3, blocks.col % 3] = blocks.data
+    dense = _blocks(blocks, n)
     diagonal = np.einsum("nii->ni", dense)
     # No residual of a point behind its cameras depends on it: its block is zero.
     diagonal += _DAMPING * np.maximum(diagonal.sum(axis=1, keepdims=True), _DAMPING)
     return sparse.bsr_matrix((np.linalg.inv(dense), np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
+
+
+def _blocks(blocks: Any, n: int) -> FloatArray:
+    """(n, 3, 3) the blocks on the diagonal of a sparse matrix, COO."""
+    dense = np.zeros((n, 3, 3))
+    dense[blocks.row // 3, blocks.row % 3, blocks.col % 3] = blocks.data
+    return dense

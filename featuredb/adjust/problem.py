@@ -19,6 +19,7 @@ from featuredb.adjust.marginals import (
     TargetMarginals,
     inverse_without_points,
     marginals,
+    points_by_shared,
     target_marginals,
 )
 from featuredb.adjust.terms import (
@@ -157,6 +158,11 @@ class Problem:
         covariance, inverse = honest(weighted, lens_disagreement(weighted)), weighted.inverse
         del weighted  # its Jacobian is large
         return marginals(covariance, poses, lenses, block), marginals(inverse, poses, lenses, block)
+
+    def points_by_shared(self) -> tuple[NDArray[np.int64], Any, FloatArray]:
+        """The block's points that are seen (n,); `featuredb.adjust.marginals.points_by_shared` of them."""
+        moved, information = points_by_shared(*self._by_point_and_shared(), self._free()[0], self.block())
+        return np.array(list(self._points), dtype=np.int64), moved, information
 
     def weighted(self) -> Weighted:
         """The adjustment, linear at the parameters as they are now."""

@@ -1,6 +1,8 @@
 """Small helpers with which the value types check and freeze their arrays."""
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -8,6 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from featuredb.errors import InvalidValueError
 
 FloatArray = NDArray[np.float64]
+_Columns = TypeVar("_Columns")
 
 
 def frozen_array(
@@ -52,6 +55,13 @@ def frozen_array(
         raise InvalidValueError(f"{name}: expected finite numbers, found NaN or infinity")
     array.setflags(write=False)
     return array
+
+
+def joined(parts: Sequence[_Columns]) -> _Columns:
+    """A dataclass of arrays from others of its kind, at least one: their rows one after the other."""
+    first: Any = parts[0]
+    columns = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(first)}
+    return type(parts[0])(**columns)
 
 
 def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:

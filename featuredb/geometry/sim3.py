@@ -45,6 +45,11 @@ class Sim3:
         return cls(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 
     @classmethod
+    def shift(cls, translation: FloatArray) -> Self:
+        """A move by (3,) without turn."""
+        return cls(scale=1.0, rotation=np.eye(3), translation=translation)
+
+    @classmethod
     def from_rigid3(cls, rigid: Rigid3) -> Self:
         return cls(scale=1.0, rotation=rigid.rotation, translation=rigid.translation)
 
@@ -78,6 +83,11 @@ class Sim3:
             rotation=self.rotation @ other.rotation,
             translation=self.scale * self.rotation @ other.translation + self.translation,
         )
+
+    def about(self, middle: FloatArray) -> "Sim3":
+        """The same change about a place (3,) in the origin's stead."""
+        shift = Sim3.shift(middle)
+        return shift @ self @ shift.inverse()
 
     def inverse(self) -> "Sim3":
         inverse_scale = 1.0 / self.scale
@@ -134,6 +144,12 @@ def point_jacobian(points_target: ArrayLike) -> FloatArray:
     jacobian[..., 2, 1], jacobian[..., 2, 2] = y, -x
     jacobian[..., :, 4:] = np.eye(3)
     return jacobian
+
+
+def place_covariance(covariance: FloatArray, place: ArrayLike) -> FloatArray:
+    """(3, 3) of a place (3,) in the target frame, by that (7, 7) of the similarity that put it there."""
+    jacobian = point_jacobian(place)
+    return np.asarray(jacobian @ covariance @ jacobian.T)
 
 
 def turns_about(middle: FloatArray) -> FloatArray:

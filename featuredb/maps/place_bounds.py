@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.error_radius import error_radius
-from featuredb.geometry.sim3 import point_jacobian
+from featuredb.geometry.sim3 import place_covariance
 
 NO_HEIGHT_M = 1e4  # no place is so high; where no photo tells a height, 1e5 m and more are left open
 
@@ -36,8 +36,7 @@ class PlaceBounds:
                 origin.
             middle: (3,) of the map's cameras, in the local frame, metres.
         """
-        jacobian = point_jacobian(middle)
-        place, turn = jacobian @ covariance @ jacobian.T, covariance[1:4, 1:4]
+        place, turn = place_covariance(covariance, middle), covariance[1:4, 1:4]
         tilt, heading, across, up = (
             error_radius(of[a:b, a:b], 0.95)
             for of, a, b in ((turn, 0, 2), (turn, 2, 3), (place, 0, 2), (place, 2, 3))

@@ -5,6 +5,7 @@ import shlex
 from featuredb.cli.common import format_table
 from ingest.anchoring import Anchoring
 from ingest.register.anchor.report import FRAME_HEADER, frame_rows
+from ingest.register.structure.surface_fit import median_m
 
 
 def anchoring_text(done: Anchoring, database: str) -> str:
@@ -28,7 +29,7 @@ def anchoring_text(done: Anchoring, database: str) -> str:
         lines.append(
             f"map {report.map_id} is placed by its scan: version {done.version}; moved "
             f"{move['horizontal_m']:.2f} m in plan and {move['up_m']:+.2f} m up; its points lie "
-            f"{result.after.median_m:.3f} m (median) from the scan, {result.before.median_m:.2f} m before"
+            f"{median_m(result.after):.3f} m (median) from the scan, {median_m(result.before):.2f} m before"
         )
         lines.extend(f"quarantined, since this map had placed it: {map_id}" for map_id in done.flagged)
         lines.append(f"the old placement: featuredb rollback {shlex.quote(database)} {done.version_before}")

@@ -14,17 +14,15 @@ from featuredb.maps.place_bounds import NO_HEIGHT_M
 from ingest.growth.values import Edge
 
 SIGMAS_95 = 1.96  # 95 % of a normal error along the worst axis
-# Of the points of oblique photos a few lie far beyond the scene, at the end of nearly parallel rays.
-_SHARE_OF_PLACES = 0.99
 
 
 def drift_m(covariance_relative: FloatArray, places: FloatArray) -> float:
-    """Bound of 95 % on the position errors of a map against its anchors, metres, at 99 % of the places.
+    """Bound of 95 % on the position errors of a map against its anchors, metres, at all of the places.
 
     Args:
         covariance_relative: (7, 7) relative to the anchors. places: (n, 3) in the same frame.
     """
-    return SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
+    return SIGMAS_95 * float(place_sigmas_m(covariance_relative, places).max(initial=0.0))
 
 
 def centers_of(feature_map: FeatureMap) -> FloatArray:
@@ -39,15 +37,16 @@ def place_sigmas_m(covariance: FloatArray, places: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0.0)))
 
 
-def at_most_places(values: FloatArray) -> float:
-    """The largest of the values (n,), one hundredth of them left out; 0 for none."""
-    return float(np.quantile(values, _SHARE_OF_PLACES, method="higher")) if len(values) else 0.0
-
-
 def places_of(feature_map: FeatureMap) -> FloatArray:
-    """(n, 3) where a map answers for what it says, in its frame: a sample of its points, and its photos."""
-    points = feature_map.points_local()
-    return np.concatenate([points[:: max(1, len(points) // 2000)], centers_of(feature_map)])
+    """(n, 3) where a map answers for what it says, in its frame: photos and the middle of what each shows.
+
+    Of the points of oblique photos some lie far beyond the scene.
+    """
+    seen, points = feature_map.observations, feature_map.points_local()
+    order = np.argsort(seen.image_id, kind="stable")
+    shown = np.split(seen.point_index[order], np.flatnonzero(np.diff(seen.image_id[order])) + 1)
+    middles = [np.median(points[rows], axis=0) for rows in shown if len(rows)]
+    return np.vstack([centers_of(feature_map), *middles])
 
 
 def growth_of(evidence: Mapping[str, Any]) -> dict[str, Any]:
@@ -62,20 +61,11 @@ def with_growth(feature_map: FeatureMap, **figures: Any) -> FeatureMap:
     return replace(feature_map, placement=replace(placement, evidence={**placement.evidence, GROWTH: growth}))
 
 
-def map_drift_m(feature_map: FeatureMap, covariance_relative: FloatArray) -> float:
-    """`drift_m` of a map, no less than at any of its photos' centres.
-
-    These are few among thousands of places, and may all be in the hundredth that is left out.
-    """
-    at_photos_m = place_sigmas_m(covariance_relative, centers_of(feature_map)).max(initial=0.0)
-    return max(SIGMAS_95 * float(at_photos_m), drift_m(covariance_relative, places_of(feature_map)))
-
-
 def with_overlaps(
     feature_map: FeatureMap, covariance_relative: FloatArray, edges: Sequence[Edge], budget_m: float
 ) -> tuple[FeatureMap, float]:
     """The map with these overlaps and its drift (m), by its covariance (7, 7) to anchors, in its evidence."""
-    drift = map_drift_m(feature_map, covariance_relative)
+    drift = drift_m(covariance_relative, places_of(feature_map))
     noted = with_growth(
         feature_map,
         drift_m=round(drift, 6),
@@ -117,4 +107,4 @@ def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> Floa
     alike += np.diag([0.0] * 4 + [shift_m2] * 3)
     places = places_of(feature_map)
     ratio = place_sigmas_m(covariance, places) / place_sigmas_m(alike, places)
-    return np.asarray(max(1.0, at_most_places(ratio)) ** 2 * alike)
+    return np.asarray(max(1.0, float(ratio.max())) ** 2 * alike)

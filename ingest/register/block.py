@@ -1,6 +1,5 @@
-"""Blocks of reconstructions before there is a map, and of maps that have a place; and the way back."""
+"""Blocks of maps that have a place, and the way back."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
 from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
-from ingest.colmap.bridge import Model
 from ingest.colmap.precision import (
     linearise,
     point_covariances,
@@ -18,19 +16,6 @@ from ingest.colmap.precision import (
     residual_variance,
     upper_triangle,
 )
-from ingest.photos.photo import Photo
-from ingest.sfm.extract import PhotoFeatures
-
-
-def block_of_model(model: Model, photos: Sequence[Photo], features: Sequence[PhotoFeatures]) -> Block:
-    """The block of a reconstruction, in its own frame; photos and features in the order of `model.rows`."""
-    block = model.block(model.pixels([found.features.xy for found in features]))
-    return replace(block, names=tuple(photo.name for photo in photos))
-
-
-def model_of_block(model: Model, block: Block) -> Model:
-    """The reconstruction with the block's cameras, poses and points; the block is in the same frame."""
-    return replace(model, cameras=block.cameras, cam_from_sfm=block.cam_from_block, xyz=block.xyz)
 
 
 def block_of_map(feature_map: FeatureMap) -> Block:

@@ -12,7 +12,6 @@ from featuredb.geometry.rigid3 import Rigid3
 
 FrameReason = Literal[
     "NO_SCAN",  # the scan does not cover what the prior sees
-    "TOO_FEW_FEATURES",
     "TOO_FEW_MATCHES",
     "NO_CONSISTENT_POSE",
     "AMBIGUOUS",  # another pose does nearly as well

@@ -2,19 +2,13 @@
 
 How noisy the positions are is estimated with the similarity (`ingest.positions.position_noise`). What noise
 leaves of the stated sigmas is taken for a bias that all positions share, unless many people told them. Two
-tests, each by a rate of error:
-
-- chance: how often would positions that have nothing to do with the reconstruction fit as well? It follows
-  from the ratio of the likelihoods, times the number of ways to leave out the positions that were left out.
-  A map answers where it is less than one in a thousand. Noise that one receiver in twenty exceeds may be that
-  of another way: then neighbours count by as much as they do not follow from each other.
-- contradiction: noise above what one receiver in a thousand has; or in twenty, where chance fits as well in
-  one case of twenty.
+tests, each by a rate of error (docs/measurements/ingest.md): how often positions that have nothing to do with
+the reconstruction would fit as well, and how few receivers are as noisy.
 """
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -29,6 +23,7 @@ from ingest.positions.held import ANGLES_WRONG, Held
 from ingest.positions.position_noise import NoisyFit, fit_noisy
 from ingest.positions.receivers import receivers
 from ingest.positions.variance_components import NOISE_SHARE, stated_sigma
+from ingest.register.outcome import Outcome
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
@@ -45,27 +40,22 @@ _PLAIN_M = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEF
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GpsPlacement:
-    """Outcome of a placement: there is one when `reason` is None.
+class GpsPlacement(Outcome[GpsReason]):
+    """Outcome of a placement.
 
     Attributes:
-        reason: why there is none, or None; `message` says it for people.
         provisional: why the map may not answer before something confirms it; "" where it may.
         local_from_sfm: the similarity, None where none could be estimated.
         covariance: (7, 7) of its left perturbation (sigma, omega, nu), or None.
         residuals_m: (n, 3) GPS minus placed centre, east, north, up; NaN without a similarity.
         inliers: (n,) bool, those that are not far out.
-        figures: what the decision rests on, JSON-able.
     """
 
-    reason: GpsReason | None
-    message: str
     residuals_m: FloatArray
     inliers: NDArray[np.bool_]
     provisional: str = ""
     local_from_sfm: Sim3 | None = None
     covariance: FloatArray | None = None
-    figures: dict[str, Any] = field(default_factory=dict)
 
     @property
     def residual_rms_m(self) -> float:
@@ -255,17 +245,15 @@ def _start(centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> Si
     if not whole.any():  # heights that nobody knows: one height for all
         positions, whole = np.where(np.isfinite(sigmas), positions, 0.0), np.ones(len(sigmas), dtype=np.bool_)
     rows = np.flatnonzero(whole)
-    best: tuple[float, Sim3] | None = None
-    for sample in [rows, *(rows[s] for s in _samples(len(rows)))]:
-        sim = similarity_closed_form(centers[sample], positions[sample])
-        if sim is None:
-            continue
+
+    def cost(sim: Sim3) -> float:
         off = (positions - sim.act(centers)) / sigmas
         off[~np.isfinite(off)] = 0.0
-        cost = float(np.log1p((off[:, :2] ** 2).sum(axis=1)).sum() + 0.5 * np.log1p(off[:, 2] ** 2).sum())
-        if best is None or cost < best[0]:
-            best = (cost, sim)
-    return best[1] if best is not None else None
+        return float(np.log1p((off[:, :2] ** 2).sum(axis=1)).sum() + 0.5 * np.log1p(off[:, 2] ** 2).sum())
+
+    samples = [rows, *(rows[s] for s in _samples(len(rows)))]
+    sims = (similarity_closed_form(centers[sample], positions[sample]) for sample in samples)
+    return min((sim for sim in sims if sim is not None), key=cost, default=None)
 
 
 def _samples(count: int) -> list[NDArray[np.int64]]:

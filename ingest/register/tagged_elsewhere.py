@@ -1,9 +1,7 @@
 """Photos whose positions agree with each other on another place than the reconstruction has them at.
 
-Buildings that look alike join photos of one to those of the other, and neither matches nor residuals show it.
-Single positions that do not fit are what GPS in streets is like; a group of photos of one thing whose
-positions are all off by the same way is either at another place, or was tagged with one error. Which of both
-cannot be told, so such photos are in no map.
+Such a group is either at another place, or was tagged with one error. Which of both cannot be told, so its
+photos are in no map (docs/measurements/ingest.md).
 """
 
 from collections.abc import Callable, Sequence
@@ -14,14 +12,11 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.special import bdtrc
 
+from featuredb.geometry.arrays import FloatArray
 from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsPlacement
 from ingest.sfm.links import link_shares, select_photos, tied_parts
 
-# When positions that do not fit say that their photos are elsewhere. In two simulated communities (500 and
-# 5,000 photos, geotags of 8 m) five groups that look-alikes had joined were off by 5.4 to 11 times the noise,
-# two that were wrong by 13 and 21 m by less; 62 groups of right photos by up to 4.1 times, one by 1.4 km: its
-# tags were wrong.
 _MIN_LINK = 0.25  # photos of a group are tied by links (see `ingest.sfm.links`) of at least this
 _MIN_PHOTOS = 2  # of a group that agree with each other, and they are more than half of it
 # Common offset over the noise, the root mean square of the horizontal residuals of those that fit, ...
@@ -58,22 +53,32 @@ def tagged_elsewhere(model: Model, with_gps: Sequence[int], placed: GpsPlacement
         return []
     least_m = _least_offset_m(placed)
     links = link_shares(model)
-    tied = links[np.ix_(outside, outside)] >= _MIN_LINK
-    count, label = connected_components(sparse.csr_array(tied.astype(np.int8)), directed=False)
     untagged = [k for k in range(len(model.rows)) if k not in offset_of]
     found = []
-    for number in range(count):
-        members = [k for k, of in zip(outside, label.tolist(), strict=True) if of == number]
+    for members in _tied(links, outside):
         offsets = np.array([offset_of[k] for k in members])
         near = np.linalg.norm(offsets[:, None] - offsets[None], axis=2) <= _MAX_SPREAD * least_m
         agreeing = near[near.sum(axis=1).argmax()]  # those near the one that most others are near to
         if agreeing.sum() < max(_MIN_PHOTOS, len(members) // 2 + 1):
             continue
-        hanging = [k for k in untagged if links[k].max() >= _MIN_LINK and links[k].argmax() in members]
         offset_m = float(np.linalg.norm(offsets[agreeing].mean(axis=0)))
         if offset_m >= least_m:
-            found.append(TaggedElsewhere(photos=tuple(sorted([*members, *hanging])), offset_m=offset_m))
+            photos = tuple(_with_hanging(links, untagged, members))
+            found.append(TaggedElsewhere(photos=photos, offset_m=offset_m))
     return found
+
+
+def _tied(links: FloatArray, among: Sequence[int]) -> list[list[int]]:
+    """Groups of photos that are tied to each other by their links or by others of them."""
+    tied = sparse.csr_array((links[np.ix_(among, among)] >= _MIN_LINK).astype(np.int8))
+    count, label = connected_components(tied, directed=False)
+    return [np.asarray(among)[label == number].tolist() for number in range(count)]
+
+
+def _with_hanging(links: FloatArray, untagged: Sequence[int], members: Sequence[int]) -> list[int]:
+    """A group and the photos without position whose firmest tie is to one of it, in their order."""
+    hanging = [k for k in untagged if links[k].max() >= _MIN_LINK and links[k].argmax() in members]
+    return sorted([*members, *hanging])
 
 
 def rightly_joined(model: Model, place: PlaceModel, least_tie: int) -> list[Model]:
@@ -97,29 +102,25 @@ def rightly_joined(model: Model, place: PlaceModel, least_tie: int) -> list[Mode
 def joined_wrongly(model: Model, with_gps: Sequence[int], placed: GpsPlacement) -> list[list[int]]:
     """Groups of tied photos of which more do not fit their positions than by accident, by place in the model.
 
-    Look-alikes have joined such a part of the reconstruction to the rest, turned or at another place. Of
-    1,000 photos over a simulated town 80 were turned by half a turn and up to 500 m off: their offsets do not
-    agree, as `tagged_elsewhere`, whose arguments these are, wants it. Photos without position that hang on
-    them are of the group. What is wrong in height alone, or by less than that function wants, tells nothing.
+    Look-alikes have joined such a part of the reconstruction to the rest, turned or at another place: their
+    offsets do not agree, as `tagged_elsewhere`, whose arguments these are, wants it. Photos without position
+    that hang on them are of the group. What is wrong in height alone tells nothing.
     """
     near = np.linalg.norm(placed.residuals_m[:, :2], axis=1) < _least_offset_m(placed)
     fits = dict(zip(with_gps, (placed.inliers | near).tolist(), strict=True))
     if all(fits.values()):
         return []
     links = link_shares(model)
-    tied = links >= _MIN_LINK
     untagged = [k for k in range(len(model.rows)) if k not in fits]
     outside = [k for k, yes in fits.items() if not yes]
-    between = np.array([*outside, *untagged], dtype=np.int64)  # photos without position tie others together
-    count, label = connected_components(sparse.csr_array(tied[np.ix_(between, between)].astype(np.int8)))
+    groups = _tied(links, [*outside, *untagged])  # photos without position tie others together
     found = []
-    for number in range(count):
-        members = [k for k in between[label == number].tolist() if k in fits]
-        around = fits.keys() & {*members, *np.flatnonzero(tied[members].any(axis=0)).tolist()}
+    for group in groups:
+        members = [k for k in group if k in fits]
+        around = fits.keys() & {*members, *np.flatnonzero((links[members] >= _MIN_LINK).any(axis=0)).tolist()}
         wrong = sum(not fits[k] for k in around)
-        if wrong and bdtrc(wrong - 1, len(around), _WRONG_SHARE) < _ACCIDENT / count:
-            hanging = [k for k in untagged if tied[k].any() and links[k].argmax() in members]
-            found.append(sorted([*members, *hanging]))
+        if wrong and bdtrc(wrong - 1, len(around), _WRONG_SHARE) < _ACCIDENT / len(groups):
+            found.append(_with_hanging(links, untagged, members))
     return found
 
 

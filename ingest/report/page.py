@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from featuredb.atomic import atomic_file
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
 from ingest.plot_parts import plan_png
 from ingest.register.control.report import control_html
 from ingest.report.films import films_html
 from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, report_json
-from ingest.workspace import write_json
+from ingest.workspace import write_json_and_page
 
 REPORT_JSON = "report.json"
 
@@ -55,9 +54,7 @@ FIGURES = {
 
 def write_report(folder: Path, report: IngestReport) -> None:
     """Write `report.json` and `report.html` into the folder, each atomically."""
-    write_json(folder / REPORT_JSON, report_json(report))
-    with atomic_file(folder / "report.html") as temporary:
-        temporary.write_text(report_page(report), encoding="utf-8")
+    write_json_and_page(folder / "report", report_json(report), report_page(report))
 
 
 def report_page(report: IngestReport) -> str:

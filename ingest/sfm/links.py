@@ -19,16 +19,26 @@ from ingest.colmap.bridge import Model, with_observations
 
 def points_in_common(model: Model) -> sparse.csr_array:
     """(k, k): how many points both photos see; on the diagonal those of one."""
-    seen: NDArray[np.float64] = np.ones(len(model.point_of))
-    sees = sparse.csr_array(
-        (seen, (model.photo_of, model.point_of)), shape=(len(model.rows), max(len(model.xyz), 1))
-    )
+    return seen_by_both(model.photo_of, model.point_of, len(model.rows), len(model.xyz))
+
+
+def seen_by_both(
+    photo_of: NDArray[np.int64], point_of: NDArray[np.integer], photos: int, points: int
+) -> sparse.csr_array:
+    """`points_in_common` by observations: their photos (m,) and points (m,)."""
+    seen: NDArray[np.float64] = np.ones(len(point_of))
+    sees = sparse.csr_array((seen, (photo_of, point_of)), shape=(photos, max(points, 1)))
     return sparse.csr_array(sees @ sees.T)
 
 
 def link_shares(model: Model) -> FloatArray:
     """(k, k): the share of the points of the photo that sees fewer which both see; 0 on the diagonal."""
-    common = points_in_common(model).toarray()
+    return shares_of(points_in_common(model))
+
+
+def shares_of(seen_by_both: sparse.csr_array) -> FloatArray:
+    """`link_shares` by points in common."""
+    common = seen_by_both.toarray()
     counts = np.maximum(np.diag(common), 1.0)
     shares = common / np.minimum.outer(counts, counts)
     np.fill_diagonal(shares, 0.0)

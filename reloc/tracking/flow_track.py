@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.arrays import FloatArray, joined
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.tracking.ground import Keyframe
@@ -133,10 +133,7 @@ class Landmarks:
 
     def joined(self, newer: "Landmarks") -> "Landmarks":
         """Both; of a point that is in both the newer one, whose pixel is a fresh match."""
-        old, names = self.take(~np.isin(self.rows, newer.rows)), [field.name for field in fields(self)]
-        return Landmarks(
-            **{name: np.concatenate([getattr(newer, name), getattr(old, name)]) for name in names}
-        )
+        return joined([newer, self.take(~np.isin(self.rows, newer.rows))])
 
     def spread(self, count: int, columns: int, rows: int, width: int, height: int) -> "Landmarks":
         """At most `count`, in turns from the cells of a grid, the newest of a cell first."""

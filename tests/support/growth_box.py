@@ -10,6 +10,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from ingest.growth.place.component import GrownMap
+from ingest.growth.place.drift import PhotoSpread
 from ingest.growth.place.placement import MapsPlacement
 from ingest.growth.place.similarity_fit import Correspondences, FittedSimilarity
 from tests.support.new_photos import FINGERPRINT, NewPhotos
@@ -80,6 +81,7 @@ def grown_map(
     *,
     covariance_relative: FloatArray | None = None,
     bending_m: float = 0.0,
+    spread: PhotoSpread | None = None,
     left_out: Any = (),
 ) -> GrownMap:
     """A grown map of a model, without gates, overlaps or anything that its refinement knows."""
@@ -105,6 +107,6 @@ def grown_map(
         ),
         model=model,
         left_out=dict(left_out),
-        poses=np.zeros((0, 6, 6)),
+        spread=PhotoSpread.unknown(len(feature_map.images)) if spread is None else spread,
         bending_m=bending_m,
     )

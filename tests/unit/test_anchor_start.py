@@ -13,7 +13,7 @@ from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from ingest.register.anchor.start.picks import Picks, pose_from_picks, read_picks
+from ingest.register.anchor.start.picks import KNOWN_FOCAL_REL, Picks, pose_from_picks, read_picks
 from ingest.register.anchor.start.priors import (
     MIN_SIGMA_HORIZONTAL_M,
     MIN_SIGMA_VERTICAL_M,
@@ -45,7 +45,7 @@ def picks_at(pose: Rigid3, count: int = 9, noise_px: float = 1.0, seed: int = 0)
 def test_picks_give_the_pose() -> None:
     truth = looking_down()
     picks, points = picks_at(truth)
-    prior, fit = pose_from_picks(picks, points, CAMERA, truth)
+    prior, fit = pose_from_picks(picks, points, CAMERA, truth, KNOWN_FOCAL_REL)
     assert np.linalg.norm(prior.cam_from_local.center - truth.center) < 0.3
     assert prior.cam_from_local.angle_to_deg(truth) < 0.3
     assert fit.wrong == ()
@@ -57,7 +57,7 @@ def test_an_outlier_among_the_picks_is_named_and_left_out() -> None:
     picks, points = picks_at(truth)
     pixels = picks.pixels.copy()
     pixels[4] += (150.0, -90.0)
-    prior, fit = pose_from_picks(replace(picks, pixels=pixels), points, CAMERA, truth)
+    prior, fit = pose_from_picks(replace(picks, pixels=pixels), points, CAMERA, truth, KNOWN_FOCAL_REL)
     assert fit.wrong == (4,)
     assert np.linalg.norm(prior.cam_from_local.center - truth.center) < 0.3
 
@@ -69,7 +69,9 @@ def test_the_covariance_of_picked_poses_is_honest() -> None:
     for seed in range(30):
         picks, points = picks_at(truth, count=8, noise_px=sigma_px, seed=seed)
         rng = np.random.default_rng(1000 + seed)
-        _, fit = pose_from_picks(picks, points + rng.normal(0, 0.2, points.shape), CAMERA, truth)
+        _, fit = pose_from_picks(
+            picks, points + rng.normal(0, 0.2, points.shape), CAMERA, truth, KNOWN_FOCAL_REL
+        )
         error = (truth @ fit.cam_from_local.inverse()).log()
         squared.append(float(error @ np.linalg.solve(fit.covariance, error)))
     # Six degrees of freedom; residuals of few picks make it a little conservative.
@@ -91,7 +93,9 @@ def test_picks_that_cannot_be_used(change: object, message: str) -> None:
     picks, _ = picks_at(looking_down())
     pixels, utm = change(picks)  # type: ignore[operator]
     with pytest.raises(RegistrationError, match=message):
-        pose_from_picks(Picks(image="a.jpg", pixels=pixels, utm=utm), utm, CAMERA, looking_down())
+        pose_from_picks(
+            Picks(image="a.jpg", pixels=pixels, utm=utm), utm, CAMERA, looking_down(), KNOWN_FOCAL_REL
+        )
 
 
 def test_picks_close_together_leave_the_pose_open() -> None:
@@ -100,7 +104,7 @@ def test_picks_close_together_leave_the_pose_open() -> None:
     points = np.array([5.0, -3.0, 0.0]) + rng.uniform(-0.2, 0.2, (8, 3))
     picks = Picks(image="a.jpg", pixels=CAMERA.project(truth.act(points)), utm=points)
     with pytest.raises(RegistrationError, match="spread them"):
-        pose_from_picks(picks, points, CAMERA, truth)
+        pose_from_picks(picks, points, CAMERA, truth, KNOWN_FOCAL_REL)
 
 
 def test_angles_against_scipy() -> None:

@@ -37,7 +37,7 @@ def rendering(depth: np.ndarray | None = None, hole: bool = False) -> Rendering:
 
 def test_lifted_points_project_back_to_their_pixels() -> None:
     xy = np.random.default_rng(2).uniform((5, 5), (315, 235), (200, 2))
-    points, good = lift(rendering(), xy, 0.04)
+    points, good = lift(rendering(), xy)
     assert good.all()
     np.testing.assert_allclose(CAMERA.project(POSE.act(points)), xy, atol=1e-6)
     np.testing.assert_allclose(POSE.act(points)[:, 2], 40.0, atol=1e-4)
@@ -48,7 +48,7 @@ def test_silhouettes_holes_and_voids_are_not_trusted() -> None:
     depth[:, 160:] = 20.0  # a wall's edge at column 160
     depth[:, :20] = np.nan
     xy = np.array([[160.5, 60.5], [159.5, 60.5], [10.5, 60.5], [120.5, 120.5], [250.5, 60.5], [0.5, 60.5]])
-    _, good = lift(rendering(depth, hole=True), xy, 0.04)
+    _, good = lift(rendering(depth, hole=True), xy)
     assert good.tolist() == [False, False, False, False, True, False]
 
 

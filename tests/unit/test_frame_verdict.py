@@ -10,7 +10,6 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from ingest.register.frame.dense.confirmation import PictureConfirmation, log_nfa_of
 from ingest.register.frame.prior_fit import prior_sigmas
-from ingest.register.frame.register import left_perturbation
 from ingest.register.frame.verdict import (
     FrameEvidence,
     asks_elsewhere,
@@ -19,6 +18,7 @@ from ingest.register.frame.verdict import (
     weighed_log_nfa,
 )
 from ingest.register.frame_registration import FramePrior
+from reloc.tracking.pose_fit import of_camera
 
 CONFIRMED = PictureConfirmation(confirmed=True, pieces=150, agreeing=90, log_nfa=45.0, cells=16, message="")
 GOOD = FrameEvidence(
@@ -176,5 +176,5 @@ def test_covariance_changes_axes_as_finite_differences_say() -> None:
     moved = Rigid3(rotation=rotation, translation=-rotation @ (pose.center + step[3:]))
     left = (moved @ pose.inverse()).log()
     # The centre's displacement and the turn are moved to the camera's origin, about which the pose turns.
-    covariance = left_perturbation(np.outer(step, step), pose)
+    covariance = of_camera(pose.inverse(), np.outer(step, step))
     np.testing.assert_allclose(covariance, np.outer(left, left), rtol=1e-3, atol=1e-13)

@@ -11,18 +11,11 @@ from featuredb.adjust.terms import whole_camera
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.sim3 import Sim3, point_jacobian, similarity_closed_form
 from ingest.colmap.anchored import FixedPoints, Lenses, adjust_anchored
 from ingest.colmap.bridge import Model, with_observations
 from ingest.growth.place import drift
-from ingest.growth.place.drift import (
-    PhotoSpread,
-    bending_variance_m2,
-    center_covariances,
-    photo_covariances,
-    shared_turn,
-    turning_covariance,
-)
+from ingest.growth.place.drift import PhotoSpread, photo_covariances, shared_turn, turning_covariance
 from ingest.growth.place.refine import loose_photos
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors
@@ -75,6 +68,12 @@ def spread_of(
     return photo_covariances(model, keypoints, fixed, kept, lenses)
 
 
+def center_covariances(model: Model, spread: PhotoSpread) -> FloatArray:
+    """(k, 3, 3) of the photos' centres, from those of their poses."""
+    turns = np.array([pose.rotation for pose in model.cam_from_sfm])
+    return np.asarray(np.swapaxes(turns, 1, 2) @ spread.poses[:, 3:, 3:] @ turns)
+
+
 def mean_turn(found: Sequence[Rigid3], true: Sequence[Rigid3], lens: Camera = CAMERA) -> FloatArray:
     """(3,) mean rotation about the local axes by which what the photos see is off, of poses and lens."""
     (fx, fy, cx, cy), (_, _, *middle) = whole_camera(lens).params[:4], whole_camera(CAMERA).params[:4]
@@ -83,9 +82,9 @@ def mean_turn(found: Sequence[Rigid3], true: Sequence[Rigid3], lens: Camera = CA
     return np.asarray(np.mean(turns, axis=0))
 
 
-def test_centres_and_directions_are_off_as_far_as_is_said() -> None:
+def test_centres_are_off_as_far_as_is_said() -> None:
     """Mean squared normalised error of three coordinates is 3; the far end is several times less sure."""
-    lengths, sigmas, turned, turns = [], [], [], []
+    lengths, sigmas = [], []
     for seed in range(10):
         new, _, fixed = walk(seed)
         model = new.model
@@ -99,15 +98,10 @@ def test_centres_and_directions_are_off_as_far_as_is_said() -> None:
         keypoints = list(new.keypoints().values())
         done = adjust_anchored(free, keypoints, fixed, SURE)
         said = spread_of(done.model, keypoints, fixed, done.fixed_kept, SURE)
-        spread = center_covariances(done.model, said.poses)
+        spread = center_covariances(done.model, said)
         off = done.model.centers() - np.array([p.center for p in new.poses])
         lengths.append([float(e @ np.linalg.solve(c, e)) for e, c in zip(off, spread, strict=True)])
         sigmas.append(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))
-        turn = mean_turn(done.model.cam_from_sfm[1:], new.poses[1:])
-        turned.append(float(turn @ np.linalg.solve(said.turns[-1], turn)))
-        turns.append(np.sqrt(np.linalg.eigvalsh(said.turns)[:, -1]))
-    assert 1.5 < np.mean(turned) < 6.0, turned
-    assert np.mean(turns, axis=0)[-1] > 1.5 * np.mean(turns, axis=0)[0]
     assert 1.5 < np.mean(lengths) < 6.0, np.mean(lengths, axis=0)
     assert np.mean(sigmas, axis=0)[-1] > 3.0 * np.mean(sigmas, axis=0)[0]
 
@@ -118,8 +112,36 @@ def test_a_lens_that_may_be_off_widens_it() -> None:
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     narrow = spread_of(new.model, keypoints, fixed, kept, SURE)
     wide = spread_of(new.model, keypoints, fixed, kept, GIVEN)
-    for a, b in ((wide.poses, narrow.poses), (wide.turns, narrow.turns)):
+    for a, b in ((wide.poses, narrow.poses), (wide.shown, narrow.shown)):
         assert (np.trace(a, axis1=1, axis2=2) > np.trace(b, axis1=1, axis2=2)).all()
+
+
+def test_what_photos_show_is_off_as_far_as_is_said() -> None:
+    """Mean squared normalised errors of the three coordinates and turns of what each photo shows are 3."""
+    shifts, turns, bounds = [], [], []
+    for seed in range(10):
+        new, points, fixed = walk(seed)
+        model, keypoints = new.model, list(new.keypoints().values())
+        seen_of = zip(model.photo_of.tolist(), model.keypoint_of.tolist(), strict=True)
+        world = np.array([new.world_of[k][f] for k, f in seen_of])
+        taking_part = (world >= COUNT) | (model.photo_of > 1)
+        done = adjust_anchored(with_observations(model, taking_part), keypoints, fixed, SURE)
+        said = spread_of(done.model, keypoints, fixed, done.fixed_kept, SURE)
+        bounds.append(said.bounds_m())
+        true_of = np.full(len(done.model.xyz), -1)
+        for k, f, p in zip(done.model.photo_of, done.model.keypoint_of, done.model.point_of, strict=True):
+            true_of[p] = new.world_of[int(k)][int(f)]
+        for k in range(2, PHOTOS):  # which show new points alone
+            rows = np.unique(done.model.point_of[done.model.photo_of == k])
+            source, target = points[true_of[rows]], done.model.xyz[rows]
+            lies = similarity_closed_form(source - said.middles[k], target - said.middles[k])
+            assert lies is not None
+            error = lies.log()
+            for of, part in ((shifts, slice(4, 7)), (turns, slice(1, 4))):
+                of.append(float(error[part] @ np.linalg.solve(said.shown[k][part, part], error[part])))
+    assert 1.0 < np.mean(shifts) < 6.0, shifts
+    assert 1.0 < np.mean(turns) < 6.0, turns
+    assert np.mean(bounds, axis=0)[-1] > 3.0 * np.mean(bounds, axis=0)[0]
 
 
 def test_a_similaritys_covariance_grows_until_it_holds_the_far_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,37 +150,34 @@ def test_a_similaritys_covariance_grows_until_it_holds_the_far_end(monkeypatch: 
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     tiny, ample = np.diag([1e-10] * 4 + [1e-8] * 3), np.eye(7)
     arguments = (new.model, keypoints, fixed, kept, GIVEN)
-    spread = spread_of(*arguments).poses
-    more = bending_variance_m2(new.model, tiny, spread)
+    spread = spread_of(*arguments)
+    more = spread.lacks_m2(tiny).max()
     assert more > 1e-4
     wider = tiny + np.diag([0.0] * 4 + [more] * 3)
-    assert bending_variance_m2(new.model, wider, spread) < 1e-9
-    assert bending_variance_m2(new.model, ample, spread) == 0.0
+    assert spread.lacks_m2(wider).max() < 1e-9
+    assert spread.lacks_m2(ample).max() == 0.0
     monkeypatch.setattr(drift, "_LEAST_PX", 5.0)
-    coarse = spread_of(*arguments).poses
-    assert bending_variance_m2(new.model, tiny, coarse) > 2.0 * more
-    # A similarity that covers the far end is widened by what the near photos lack, not at the far end.
-    centers = center_covariances(new.model, spread)
-    assert more == pytest.approx(np.linalg.eigvalsh(centers)[:, -1].max(), rel=0.01)
+    assert spread_of(*arguments).lacks_m2(tiny).max() > 2.0 * more
+    assert more == pytest.approx(np.square(spread.bounds_m() / 1.96).max(), rel=0.01)
 
 
 def test_a_similaritys_covariance_turns_until_it_holds_every_piece() -> None:
-    """What is added turns about the photos' middle, holds the pieces' directions, and is nothing where they
-    are held already."""
+    """What is added turns about the middle of what they show, holds the pieces' directions, and is nothing
+    where they are held already."""
     new, _, fixed = walk(2)
     keypoints = list(new.keypoints().values())
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     spread = spread_of(new.model, keypoints, fixed, kept, GIVEN)
     tiny, ample = np.diag([1e-10] * 4 + [1e-8] * 3), np.eye(7)
-    more = turning_covariance(new.model, tiny, spread)
-    for turn in spread.turns:
+    more = turning_covariance(tiny, spread)
+    for turn in spread.shown[:, 1:4, 1:4]:
         assert np.linalg.eigvalsh(tiny[1:4, 1:4] + more[1:4, 1:4] - turn)[0] > -1e-12
-    assert more[1:4, 1:4].trace() > 0.9 * max(np.trace(spread.turns, axis1=1, axis2=2))
-    middle = point_jacobian(new.model.centers().mean(axis=0))
+    assert more[1:4, 1:4].trace() > 0.9 * max(np.trace(spread.shown[:, 1:4, 1:4], axis1=1, axis2=2))
+    middle = point_jacobian(spread.middles.mean(axis=0))
     np.testing.assert_allclose(middle @ more @ middle.T, 0.0, atol=1e-12)
     end = point_jacobian(new.model.centers()[-1])
     assert (end @ more @ end.T).trace() > 1e-6
-    assert not turning_covariance(new.model, ample, spread).any()
+    assert not turning_covariance(ample, spread).any()
 
 
 def test_what_lenses_turn_is_told_apart_from_what_pixels_do() -> None:
@@ -168,15 +187,19 @@ def test_what_lenses_turn_is_told_apart_from_what_pixels_do() -> None:
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     narrow = spread_of(new.model, keypoints, fixed, kept, SURE)
     wide = spread_of(new.model, keypoints, fixed, kept, FREE)
-    np.testing.assert_allclose(wide.lens_turns, wide.turns - narrow.turns, atol=1e-3 * wide.turns.max())
-    assert np.abs(shared_turn(new.model, narrow)).max() < 1e-3 * np.abs(shared_turn(new.model, wide)).max()
-    turn = shared_turn(new.model, wide)
+    np.testing.assert_allclose(
+        wide.lens_turns,
+        wide.shown[:, 1:4, 1:4] - narrow.shown[:, 1:4, 1:4],
+        atol=1e-3 * wide.shown[:, 1:4, 1:4].max(),
+    )
+    assert np.abs(shared_turn(narrow)).max() < 1e-3 * np.abs(shared_turn(wide)).max()
+    turn = shared_turn(wide)
     most = np.trace(wide.lens_turns, axis1=1, axis2=2).max()
     assert (turn @ turn.T)[1:4, 1:4].trace() == pytest.approx(most, rel=1e-6)
-    middle = point_jacobian(new.model.centers().mean(axis=0))
+    middle = point_jacobian(wide.middles.mean(axis=0))
     np.testing.assert_allclose(middle @ turn, 0.0, atol=1e-12)
     none = spread_of(new.model, keypoints, fixed, np.zeros_like(kept), FREE)
-    assert not shared_turn(new.model, none).any()
+    assert not shared_turn(none).any()
 
 
 def test_what_a_lens_has_changed_by_since_it_was_lent_is_not_shared() -> None:
@@ -202,7 +225,7 @@ def test_what_a_lens_has_changed_by_since_it_was_lent_is_not_shared() -> None:
         keypoints = list(new.keypoints().values())
         done = adjust_anchored(free, keypoints, fixed, lent)
         said = spread_of(done.model, keypoints, fixed, done.fixed_kept, lent)
-        alone = said.turns[-1] - said.lens_turns[-1]
+        alone = said.shown[-1, 1:4, 1:4] - said.lens_turns[-1]
         assert np.trace(said.lens_turns[-1]) > 0.0
         turn = mean_turn(done.model.cam_from_sfm[1:], new.poses[1:], done.model.cameras[0])
         turned.append(float(turn @ np.linalg.solve(alone, turn)))
@@ -217,7 +240,7 @@ def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
     sigmas = [
         np.sqrt(np.linalg.eigvalsh(center_covariances(new.model, spread))[-1, -1])
         for spread in (
-            spread_of(*arguments, lenses).poses
+            spread_of(*arguments, lenses)
             for lenses in (
                 GIVEN,
                 EXIF,
@@ -228,8 +251,9 @@ def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
     assert sigmas[0] < sigmas[1] < sigmas[2]
     none = spread_of(*arguments[:-1], np.zeros_like(kept), GIVEN)
     assert np.isnan(none.poses).all()  # nothing holds it
-    assert bending_variance_m2(new.model, np.eye(7), none.poses) == 0.0
-    assert not turning_covariance(new.model, np.eye(7), none).any()
+    assert np.isnan(none.bounds_m()).all()
+    assert np.isnan(none.lacks_m2(np.eye(7))).all()
+    assert not turning_covariance(np.eye(7), none).any()
 
 
 @pytest.mark.parametrize(
@@ -242,7 +266,7 @@ def test_a_flat_place_from_above_does_not_tell_a_lens_that_no_map_lends(
 ) -> None:
     """2,000 observations of a fifth of a pixel say centimetres; what a lens model leaves over is decimetres.
 
-    EXIF to 2 % is 0.8 m at 40 m.
+    EXIF to 2 % is 0.8 m at 40 m. What the photos show lies where it is.
     """
     rng = np.random.default_rng(4)
     points = np.column_stack([rng.uniform(-25, 25, 2000), rng.uniform(-20, 20, 2000), np.zeros(2000)])
@@ -266,5 +290,6 @@ def test_a_flat_place_from_above_does_not_tell_a_lens_that_no_map_lends(
     )
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     spread = spread_of(new.model, list(new.keypoints().values()), fixed, kept, lenses)
-    loose = loose_photos(new.model, spread.poses, 0.5)
-    assert sorted(loose) == ([] if told else [0, 1])
+    height_m = 1.96 * np.sqrt(center_covariances(new.model, spread)[:, 2, 2])
+    assert (height_m < 0.5).tolist() == [told, told]
+    assert loose_photos(spread, 0.5) == {}

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from featuredb.geometry.rigid3 import Rigid3
+from ingest.growth.place.drift import PhotoSpread
 from ingest.growth.place.refine import loose_photos, weak_photos
 from tests.support.posed_models import model_of
 
@@ -25,18 +25,20 @@ def test_what_hangs_on_a_photo_that_is_left_out_hangs_on_nothing() -> None:
     assert sorted(weak_photos(model, [1], [0])) == [2]
 
 
+def spread_of(*sigmas_m: float) -> PhotoSpread:
+    """Of photos that show their places so surely, NaN where they see nothing."""
+    unknown = PhotoSpread.unknown(len(sigmas_m))
+    return replace(unknown, shown=np.square(sigmas_m)[:, None, None] * np.eye(7))
+
+
 def test_photos_beyond_the_bound_are_named() -> None:
-    model = model_of(range(10), range(10), range(10))
-    model = replace(model, cam_from_sfm=(Rigid3.identity(),) * 3)
-    spread = np.stack([np.diag([1e-6] * 3 + [s**2] * 3) for s in (0.01, 0.3, 0.2)])
-    loose = loose_photos(model, spread, 0.5)
+    spread = spread_of(0.01, 0.3, 0.2)
+    loose = loose_photos(spread, 0.5)
     assert list(loose) == [1]
-    assert "0.59 m off, 0.50 m are allowed" in loose[1][1]
-    assert loose_photos(model, spread, 0.6) == {}
+    assert "what the photo shows may be 0.59 m off, 0.50 m are allowed" in loose[1][1]
+    assert loose_photos(spread, 0.6) == {}
 
 
 def test_photos_that_see_nothing_are_loose_unless_none_was_asked() -> None:
-    model = model_of(range(10), range(10))
-    spread = np.stack([np.eye(6) * 1e-6, np.full((6, 6), np.nan)])
-    assert list(loose_photos(model, spread, 0.5)) == [1]
-    assert loose_photos(model, np.full((2, 6, 6), np.nan), 0.5) == {}
+    assert list(loose_photos(spread_of(1e-3, np.nan), 0.5)) == [1]
+    assert loose_photos(PhotoSpread.unknown(2), 0.5) == {}

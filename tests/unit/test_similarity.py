@@ -63,11 +63,6 @@ def test_ransac_finds_the_similarity_among_outliers(outliers: int) -> None:
     assert np.linalg.norm(found.act(pairs.source[right]) - pairs.target[right], axis=1).mean() < 0.3
 
 
-def test_ransac_needs_three_pairs() -> None:
-    pairs = _pairs(np.random.default_rng(0), 2)
-    assert ransac_similarity(pairs.source, pairs.target, np.full(2, 1.0)) is None
-
-
 def test_exact_pairs_give_the_exact_similarity() -> None:
     pairs = _pairs(np.random.default_rng(2), sigma=1e-9)
     pairs = replace(pairs, covariance=np.tile(np.eye(3) * 0.05**2, (len(pairs), 1, 1)))
@@ -125,4 +120,3 @@ def test_a_poor_frame_does_not_outvote_a_good_one() -> None:
     covariance = np.stack([np.diag([1e-12] * 3 + [s**2] * 3) for s in (0.5, 0.01)])
     fit = refine_similarity(_TRUE, replace(pairs, target=target, frame_covariance=covariance))
     assert np.abs(fit.target_from_source.act(pairs.source) - _TRUE.act(pairs.source)).mean() < 0.03
-    assert fit.frame_corrections[0, 3] == pytest.approx(0.5, abs=0.05)

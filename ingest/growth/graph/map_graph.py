@@ -10,7 +10,7 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import MapSummary, Snapshot
 from featuredb.store.changes import is_imported
@@ -172,7 +172,7 @@ def grow_within_budget(
             return replace(grown, feature_map=feature_map, left_out={**beyond, **grown.left_out})
         refused = Refused.by(gate, *grown.placement.gates)
         rows = grown.model.rows.tolist()
-        within = rows_within(feature_map, rows, relative, grown.bending_m, budget_m)
+        within = rows_within(grown, feature_map, relative, budget_m)
         left = keep_photos(part, within, least=LEAST_PHOTOS) if len(within) < len(rows) else None
         if left is None:
             break
@@ -199,31 +199,23 @@ def with_drift(
     return inflated(with_growth(noted, gates=told)), drift, relative
 
 
-def rows_within(
-    feature_map: FeatureMap, rows: Sequence[int], relative: FloatArray, bending_m: float, budget_m: float
-) -> list[int]:
+def rows_within(grown: GrownMap, feature_map: FeatureMap, relative: FloatArray, budget_m: float) -> list[int]:
     """Rows of the photos that are within the budget, each with its own bending in place of the largest.
 
     Args:
-        rows: of the map's images, in their order.
+        feature_map: of `grown`, as the graph of maps has it.
         relative: (7, 7) covariance of the map relative to the anchors, with its bending.
     """
-    bending_m2 = bending_m**2
+    bending_m2 = grown.bending_m**2
     as_a_whole = relative - np.diag([0.0] * 4 + [bending_m2] * 3)
+    lacks_m2 = np.nan_to_num(grown.spread.lacks_m2(as_a_whole), nan=bending_m2)
     points = feature_map.points_local()
     seen = feature_map.observations
     within = []
-    for row, image in zip(rows, feature_map.images, strict=True):
+    for row, image, own_m2 in zip(grown.model.rows.tolist(), feature_map.images, lacks_m2, strict=True):
         own = points[seen.point_index[seen.image_id == image.image_id]]
-        pose = image.cam_from_local
-        excess = bending_m2
-        if image.covariance is not None:
-            jacobian = point_jacobian(pose.center)
-            spread = pose.rotation.T @ image.covariance[3:, 3:] @ pose.rotation
-            most = np.linalg.eigvalsh(spread - jacobian @ as_a_whole @ jacobian.T)[-1]
-            excess = float(np.clip(most, 0.0, bending_m2))
-        mine = as_a_whole + np.diag([0.0] * 4 + [excess] * 3)
-        places = np.vstack([np.percentile(np.vstack([own, pose.center]), (10, 90), axis=0), pose.center])
+        mine = as_a_whole + np.diag([0.0] * 4 + [min(own_m2, bending_m2)] * 3)
+        places = np.vstack([image.cam_from_local.center, *([np.median(own, axis=0)] if len(own) else [])])
         # A tenth off the budget: the part that is left is held by less, and its own bound is larger.
         if drift_m(mine, places) <= 0.9 * budget_m:
             within.append(row)

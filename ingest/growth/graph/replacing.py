@@ -18,7 +18,7 @@ from featuredb.store.commits import write_time
 from ingest.growth.asked_before import recall, remember
 from ingest.growth.graph.map_graph import OWN, PlacedMap, holds, place_key, placed_maps, solve_maps
 from ingest.growth.graph.pose_graph import GraphSolution
-from ingest.growth.map_places import growth_of, inflated, map_drift_m, with_growth, with_overlaps
+from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth, with_overlaps
 from ingest.growth.place.map_images import measure_overlap
 from ingest.growth.trust.canaries import CanaryRun, check_known
 from ingest.growth.trust.promotion import PARENT_MOVED
@@ -223,7 +223,7 @@ def _with_evidence(
         first = before.own_place
         total = in_frame(solution.corrections[map_id], frame, own) @ first.other_from_map.inverse()
         placed = {"covariance": first.covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
-        return with_growth(feature_map, **{OWN: placed}), map_drift_m(feature_map, relative)
+        return with_growth(feature_map, **{OWN: placed}), drift_m(relative, places_of(feature_map))
     noted, drift = with_overlaps(feature_map, relative, edges, budget_m)
     held, was = [edge.map_id for edge in edges], before.summary.parents
     # Only anchors join the parents: a map never becomes its own ancestor.

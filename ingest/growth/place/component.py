@@ -145,7 +145,7 @@ def _assembled(
         return Refused(reason="NO_POINTS", message=message, gates=placement.gates)
     images = tuple(  # they know what their lenses leave open; as they were where nothing is known
         replace(image, covariance=own) if np.isfinite(own).all() else image
-        for image, own in zip(feature_map.images, refined.poses, strict=True)
+        for image, own in zip(feature_map.images, refined.spread.poses, strict=True)
     )
     grown = replace(
         feature_map,

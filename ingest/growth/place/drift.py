@@ -5,24 +5,22 @@ not. The adjustment does (`featuredb.adjust.marginals`): poses and lenses with t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
-from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import Block, Terms
+from featuredb.adjust.terms import Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian, turns_about
 from ingest.colmap.adjust import longest_side, residuals_of
 from ingest.colmap.anchored import MAPPING, FixedPoints, Lenses, block_and_marks
 from ingest.colmap.bridge import Model, with_observations
-from ingest.colmap.precision import design_effect
+from ingest.colmap.precision import design_effect, linearise
+from ingest.growth.map_places import SIGMAS_95
 
 _LEAST_FREEDOM = 0.1
-_PIECE = 5  # photos; a photo alone says more of its own noise than of where its neighbourhood looks
 # Of the standard deviation of an observation with what its neighbours share; it is measured on the residuals,
 # which a handful of observations keeps too small.
 _LEAST_PX = 0.1
@@ -31,20 +29,54 @@ _MOST_POINTS = 20_000  # free points that take part; fewer know less, so the bou
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PhotoSpread:
-    """How far the photos of a model may be off, relative to the existing points.
+    """How far the photos of a model and what they show may be off, relative to the existing points.
 
+    A photo from far above whose lens nobody knows may be metres higher, and shows its places where they are.
     NaN for photos that see nothing, and for all where no existing point is kept.
 
     Attributes:
         poses: (k, 6, 6) of the left perturbation of each cam_from_local.
-        turns: (k, 3, 3) radians squared, about the local axes: of the mean rotation of each photo and those
-            that share most points with it. What comes next is tied to such a piece of the model.
-        lens_turns: (k, 3, 3) the part of `turns` that the lenses bring and that other maps have as well.
+        middles: (k, 3) of the points that each photo shows.
+        shown: (k, 7, 7) of the similarity by which these points lie elsewhere: left perturbation (sigma,
+            omega, nu) about the middle, local axes.
+        lens_turns: (k, 3, 3) the part of its turns that the lenses bring and that other maps have as well.
     """
 
     poses: FloatArray
-    turns: FloatArray
+    middles: FloatArray
+    shown: FloatArray
     lens_turns: FloatArray
+
+    @classmethod
+    def unknown(cls, photos: int) -> "PhotoSpread":
+        """Of so many photos that nothing holds."""
+        shapes = {"poses": (6, 6), "middles": (3,), "shown": (7, 7), "lens_turns": (3, 3)}
+        return cls(**{name: np.full((photos, *shape), np.nan) for name, shape in shapes.items()})
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(k,)."""
+        return np.isfinite(self.shown[:, 0, 0])
+
+    def of(self, photos: Sequence[int]) -> "PhotoSpread":
+        """Of some of the photos."""
+        return PhotoSpread(**{f.name: getattr(self, f.name)[list(photos)] for f in fields(self)})
+
+    def bounds_m(self) -> FloatArray:
+        """(k,) how far the middle of what each photo shows may be off (95 %, worst axis); NaN: unknown."""
+        bounds = np.full(len(self.known), np.nan)
+        largest = np.linalg.eigvalsh(self.shown[self.known, 4:, 4:])[:, -1]
+        bounds[self.known] = SIGMAS_95 * np.sqrt(np.maximum(largest, 0.0))
+        return bounds
+
+    def lacks_m2(self, covariance: FloatArray) -> FloatArray:
+        """(k,) by how much that middle is less sure, along the worst axis, than a similarity's covariance
+        (7, 7) has it; NaN: unknown."""
+        jacobian = point_jacobian(self.middles[self.known])
+        excess = self.shown[self.known, 4:, 4:] - jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+        lacks = np.full(len(self.known), np.nan)
+        lacks[self.known] = np.maximum(np.linalg.eigvalsh(excess)[:, -1], 0.0)
+        return lacks
 
 
 def photo_covariances(
@@ -61,8 +93,7 @@ def photo_covariances(
         fixed: existing points, those observations of `kept` (m,).
         lenses: as the adjustment had them.
     """
-    unknown = np.full((len(model.rows), 6, 6), np.nan)
-    spread = PhotoSpread(poses=unknown, turns=unknown[:, :3, :3].copy(), lens_turns=unknown[:, :3, :3].copy())
+    spread = PhotoSpread.unknown(len(model.rows))
     if not kept.any():
         return spread
     points = len(model.xyz)
@@ -86,100 +117,70 @@ def photo_covariances(
     problem = Problem(block, terms)
     found, weighted = problem.honest_marginals()
     common = found.by_lenses() - MAPPING.dilution**2 * problem.by_lens_priors(weighted, lenses.lent)
-    seen = np.flatnonzero(found.pose_start >= 0)
-    for k in seen.tolist():
+    rows, moved, information = problem.points_by_shared()
+    marked = _information(model, fixed, kept, sigma_px)
+    for k in np.flatnonzero(found.pose_start >= 0).tolist():
         at = found.pose_start[k] + np.arange(6)
         spread.poses[k] = found.shared[np.ix_(at, at)]
-    turn_of = _view_turns(block, found)
-    for k, piece in _pieces(model, fixed, kept, seen).items():
-        turn = turn_of[piece].mean(axis=0)
-        spread.turns[k] = turn @ found.shared @ turn.T
-        spread.lens_turns[k] = turn @ common @ turn.T
+        free = np.searchsorted(rows, np.unique(block.point_of[block.photo_of == k]))
+        held = np.unique(fixed.point_of[kept][fixed.photo_of[kept] == k])
+        places = np.vstack([block.xyz[rows[free]], fixed.xyz[held]])
+        spread.middles[k] = np.median(places, axis=0)
+        jacobian = point_jacobian(places - spread.middles[k])
+        by_place = np.swapaxes(jacobian, 1, 2) @ np.concatenate([information[free], marked[held]])
+        normal = np.einsum("nij,njk->ik", by_place, jacobian)
+        entries = (3 * free[:, None] + np.arange(3)).ravel()
+        by_free = by_place[: len(free)].transpose(1, 0, 2).reshape(7, -1)
+        similarity = np.linalg.pinv(normal, hermitian=True) @ (moved[entries].T @ by_free.T).T
+        spread.shown[k] = similarity @ found.shared @ similarity.T
+        spread.lens_turns[k] = similarity[1:4] @ common @ similarity[1:4].T
     return spread
 
 
-def _view_turns(block: Block, found: Marginals) -> FloatArray:
-    """(k, 3, q) how what each photo sees turns about the block's axes with poses and lenses.
-
-    A principal point that is off turns the photo, and its points stay where they are.
-    """
-    result = np.zeros((len(block.names), 3, len(found.shared)))
-    for k, pose in enumerate(block.cam_from_block):
-        if found.pose_start[k] < 0:
-            continue
-        by_pose = slice(int(found.pose_start[k]), int(found.pose_start[k]) + 3)
-        result[k, :, by_pose] = pose.rotation.T
-        camera, first = block.camera(k), int(found.lens_start[block.camera_of[k]])
-        if first >= 0:
-            lens = camera.to_pycolmap()
-            focal, (cx, cy) = lens.focal_length_idxs(), lens.principal_point_idxs()
-            fx, fy = camera.params[focal[0]], camera.params[focal[-1]]
-            result[k, :, first + cx] = pose.rotation.T @ [0.0, 1.0 / fx, 0.0]
-            result[k, :, first + cy] = pose.rotation.T @ [-1.0 / fy, 0.0, 0.0]
+def _information(model: Model, fixed: FixedPoints, kept: NDArray[np.bool_], sigma_px: float) -> FloatArray:
+    """(n, 3, 3) of existing points, as if the photos' rays alone told where they are."""
+    linear = linearise(
+        model.cameras,
+        model.camera_of,
+        model.cam_from_sfm,
+        fixed.xyz,
+        fixed.point_of[kept],
+        fixed.photo_of[kept],
+        fixed.pixels[kept],
+    )
+    result = np.zeros((len(fixed.xyz), 3, 3))
+    by_point = np.nan_to_num(linear.by_point) / sigma_px
+    np.add.at(result, linear.point_of, np.swapaxes(by_point, 1, 2) @ by_point)
     return result
 
 
-def _pieces(
-    model: Model, fixed: FixedPoints, kept: NDArray[np.bool_], seen: NDArray[np.int64]
-) -> dict[int, NDArray[np.int64]]:
-    """For each photo that sees something, itself and those that share most points with it."""
-    photo = np.concatenate([model.photo_of, fixed.photo_of[kept]])
-    point = np.concatenate([model.point_of, len(model.xyz) + fixed.point_of[kept]])
-    shape = (len(model.rows), len(model.xyz) + len(fixed.xyz))
-    sees = sparse.csr_array((np.ones(len(photo)), (photo, point)), shape=shape)
-    shared = (sees @ sees.T).toarray()
-    np.fill_diagonal(shared, np.inf)
-    order = {k: np.argsort(-shared[k], kind="stable")[:_PIECE] for k in seen.tolist()}
-    return {k: rows[shared[k, rows] > 0.0] for k, rows in order.items()}
-
-
-def turning_covariance(model: Model, covariance: FloatArray, spread: PhotoSpread) -> FloatArray:
-    """(7, 7) to be added to a similarity's covariance (7, 7) to hold the directions of all pieces of a model.
+def turning_covariance(covariance: FloatArray, spread: PhotoSpread) -> FloatArray:
+    """(7, 7) to be added to a similarity's covariance (7, 7) to hold how all parts of a model are turned.
 
     A reconstruction that bends by centimetres at its far end has turned there, and what is tied to that end
-    goes on in the new direction. About the photos' middle.
+    goes on in the new direction. About the middle of what the photos show, where these agree: what is held
+    by points does not move where these are.
     """
-    seen = np.isfinite(spread.turns[:, 0, 0])
-    if not seen.any():
+    if not spread.known.any():
         return np.zeros((7, 7))
     more = np.zeros((3, 3))
-    for turn in spread.turns[seen]:
+    for turn in spread.shown[spread.known, 1:4, 1:4]:
         values, vectors = np.linalg.eigh(turn - covariance[1:4, 1:4] - more)
         more += (vectors * np.maximum(values, 0.0)) @ vectors.T
-    about = turns_about(model.centers()[seen].mean(axis=0))
+    about = turns_about(spread.middles[spread.known].mean(axis=0))
     return np.asarray(about @ more @ about.T)
 
 
-def shared_turn(model: Model, spread: PhotoSpread) -> FloatArray:
+def shared_turn(spread: PhotoSpread) -> FloatArray:
     """(7, 3) by what a model's end turns, about each local axis, for one sigma of its lenses; zeros for none.
 
-    Columns of a similarity's left perturbation, about the photos' middle. Maps share lenses, so that they
-    turn to the same side, map by map: along a chain such turns add up, where independent ones would not.
+    Columns of a similarity's left perturbation, about the middle of what the photos show. Maps share lenses,
+    so that they turn to the same side, map by map: along a chain such turns add up, where independent ones
+    would not.
     """
-    seen = np.isfinite(spread.lens_turns[:, 0, 0])
-    if not seen.any():
+    if not spread.known.any():
         return np.zeros((7, 3))
-    turns = spread.lens_turns[seen]
+    turns = spread.lens_turns[spread.known]
     values, vectors = np.linalg.eigh(turns[np.argmax(np.trace(turns, axis1=1, axis2=2))])
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return np.asarray(turns_about(model.centers()[seen].mean(axis=0)) @ root)
-
-
-def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray) -> float:
-    """What must be added to a similarity's covariance (7, 7) to hold the positions of all photos, m^2.
-
-    Added, and not multiplied: near what holds the model the similarity says millimetres, where a photo's own
-    position is good to centimetres; a factor that covers this would make metres of it at the far end.
-    """
-    seen = np.isfinite(spread[:, 0, 0])
-    jacobian = point_jacobian(model.centers()[seen])
-    claimed = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
-    excess = center_covariances(model, spread)[seen] - claimed
-    return float(np.linalg.eigvalsh(excess)[:, -1].max(initial=0.0))
-
-
-def center_covariances(model: Model, spread: FloatArray) -> FloatArray:
-    """(k, 3, 3) square metres, of the photos' centres in the local frame, from those of their poses."""
-    turns = np.array([pose.rotation for pose in model.cam_from_sfm])
-    centers = np.swapaxes(turns, 1, 2) @ spread[:, 3:, 3:] @ turns
-    return np.asarray((centers + np.swapaxes(centers, 1, 2)) / 2)
+    return np.asarray(turns_about(spread.middles[spread.known].mean(axis=0)) @ root)

@@ -19,7 +19,6 @@ from ingest.colmap.anchored import Anchored, FixedPoints, Lenses, adjust_anchore
 from ingest.colmap.bridge import Model, with_observations
 from ingest.colmap.precision import linearise
 from ingest.growth import gates
-from ingest.growth.map_places import SIGMAS_95
 from ingest.growth.place import drift
 from ingest.growth.place.placement import CONTRADICTS, MapsPlacement, edges_of
 from ingest.growth.place.similarity_fit import Correspondences, FittedSimilarity, fit_similarity
@@ -47,14 +46,14 @@ class Refinement:
         model: of the photos that are kept, in metres, in the placement's frame; existing points that two of
             them see are its own.
         placement: with the gates asked here and the covariances of the refined model.
-        poses: (k, 6, 6) of `PhotoSpread`, of the photos that are kept.
-        bending_m: what the photos' positions lack beyond the similarity, one sigma along the worst axis.
+        spread: of the photos that are kept.
+        bending_m: by how much what they show is less sure than the similarity, one sigma, worst axis.
         left_out: photos that are not kept although they agree, by row, with reason and message.
     """
 
     model: Model
     placement: MapsPlacement
-    poses: FloatArray
+    spread: drift.PhotoSpread
     bending_m: float
     left_out: Mapping[int, tuple[str, str]]
 
@@ -100,8 +99,8 @@ def refine_placed(
     Args:
         localised: the model's photos that the existing maps localise, by place among them.
         keypoints: pixels of all features of each photo of the model.
-        max_bound_m: photos that may be further off (95 %), against the existing points and with what their
-            lens leaves open, are left out.
+        max_bound_m: photos that show their places further off (95 %), against the existing points and with
+            what their lens leaves open, are left out.
     """
     rows = model.rows.tolist()
     sim = placement.fit.local_from_sfm
@@ -118,7 +117,7 @@ def refine_placed(
         fit = fit_similarity(adjusted.model, Sim3.identity(), held)
         inside = {k: localised[k] for k in placement.agreeing if k not in left_out}
         against = contradicting_photos(adjusted.model, inside, spread.poses, (placement.fit, fit))
-        loose = loose_photos(adjusted.model, spread.poses, max_bound_m)
+        loose = loose_photos(spread, max_bound_m)
         loose = {k: why for k, why in loose.items() if k not in left_out and k not in against}
         left_out |= against | loose
         if not (against or loose) or len(left_out) > len(rows) - 2:
@@ -142,16 +141,16 @@ def refine_placed(
         return Refused(reason=gate.reason, message=message, gates=placement.gates)
     # Until now the reconstruction was bent as it came, and its residuals said more of that than of where it
     # lies.
-    turning = drift.turning_covariance(adjusted.model, fit.covariance, spread)
-    bending_m2 = drift.bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
+    turning = drift.turning_covariance(fit.covariance, spread)
+    bending_m2 = float(np.nanmax(np.append(spread.lacks_m2(fit.covariance + turning), 0.0)))
     covariance = fit.covariance + turning + np.diag([0.0] * 4 + [bending_m2] * 3)
-    shared = drift.shared_turn(adjusted.model, spread)
+    shared = drift.shared_turn(spread)
     edges = tuple(replace(edge, shared=shared) for edge in edges)
     kept = [k for k in range(len(rows)) if k not in left_out]
     return Refinement(
         model=select_photos(whole, [rows[k] for k in kept]),
         placement=replace(placement, edges=edges, covariance=covariance),
-        poses=spread.poses[kept],
+        spread=spread.of(kept),
         bending_m=float(np.sqrt(bending_m2)),
         left_out={rows[k]: why for k, why in left_out.items()},
     )
@@ -231,20 +230,17 @@ def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> di
     return {k: ("WEAK_LINK", f"{100 * firm[k]:.1f} {tied}, {needed}") for k in weak}
 
 
-def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, tuple[str, str]]:
-    """Photos that may be further off than the bound (95 %) against the existing points, and why.
+def loose_photos(spread: drift.PhotoSpread, max_bound_m: float) -> dict[int, tuple[str, str]]:
+    """Photos that may show their places further off than the bound (95 %) against existing points, and why.
 
-    Args:
-        spread: (k, 6, 6) of `PhotoSpread`; photos that see nothing any more are loose, unless none was asked.
+    Those that see nothing any more are loose, unless none was asked.
     """
-    if not np.isfinite(spread).any():
+    bounds = spread.bounds_m()
+    if np.isnan(bounds).all():
         return {}
-    bounds = np.full(len(spread), np.inf)
-    seen = np.isfinite(spread[:, 0, 0])
-    centers = drift.center_covariances(model, spread)[seen]
-    bounds[seen] = SIGMAS_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
+    bounds[np.isnan(bounds)] = np.inf
     loose, allowed = np.flatnonzero(bounds > max_bound_m).tolist(), f"{max_bound_m:.2f} m are allowed"
-    return {k: (_LOOSE, f"the photo may be {bounds[k]:.2f} m off, {allowed}") for k in loose}
+    return {k: (_LOOSE, f"what the photo shows may be {bounds[k]:.2f} m off, {allowed}") for k in loose}
 
 
 def _refined(

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
@@ -27,7 +28,7 @@ from ingest.register.anchor.placing import PlaceRound, place_in_rounds
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.block import block_of_map
 from ingest.register.structure.projection import project_structure
-from ingest.register.structure.surface_fit import MapMove, MapResidual, map_move, map_residuals
+from ingest.register.structure.surface_fit import MapMove, map_move, map_residuals, median_m
 
 # How far the map may move in the plane and turn, in standard deviations of its placement. Six, because
 # receivers understate their errors. Heights are not judged: those of GPS have an unknown datum and differ
@@ -66,7 +67,7 @@ class AnchorResult:
         agreement: of the frames, None where there was nothing to compare.
         used: ids of the images that placed the map.
         rounds: of placing; more than one where the lens changed.
-        before, after: how the map lies on the scan, None where it was not come to.
+        before, after: (k,) distances of map points from the scan, metres; None where it was not come to.
         checks: figures of the gates, JSON-able.
         seconds: wall time by step.
     """
@@ -77,8 +78,8 @@ class AnchorResult:
     agreement: FrameAgreement | None = None
     used: tuple[int, ...] = ()
     rounds: tuple[PlaceRound, ...] = ()
-    before: MapResidual | None = None
-    after: MapResidual | None = None
+    before: FloatArray | None = None
+    after: FloatArray | None = None
     checks: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -200,8 +201,8 @@ def _too_little(
         return "STRUCTURE", f"the map's points do not fit the scan through any registered frame: {words}"
     if not agreement.agreeing or (len(agreement.agreeing) < needed and len(lone) >= 2):
         words = "; ".join(
-            f"{names[a]} and {names[b]}: {m:.2f} m apart, {agreement.allowed_m[a, b]:.2f} m allowed"
-            for (a, b), m in agreement.apart_m.items()
+            f"{names[a]} and {names[b]}: {metres:.2f} m apart, {allowed:.2f} m allowed"
+            for (a, b), (metres, allowed) in agreement.apart_m.items()
         )
         return "FRAMES_DISAGREE", (
             f"the frames send the map to different places ({words}); look at them in anchor.html and "
@@ -222,44 +223,35 @@ def _judged(
 ) -> AnchorResult:
     """The gates on the placed map as a whole."""
     before, after = map_residuals(old, new, cloud)
+    before_m, after_m = median_m(before), median_m(after)
     move = map_move(old, new)
     distance = float(np.median(block_of_map(new).distances()))
     most_m = max(_MAX_RESIDUAL_SHARE * distance, _GOOD_M)
     assert found.agreement is not None
-    allowed = found.agreement.allowed_m
     checks: dict[str, Any] = {
-        "before": before.as_figures(),
-        "after": after.as_figures(),
+        "before": {"compared": len(before), "median_m": before_m},
+        "after": {"compared": len(after), "median_m": after_m},
         "move": asdict(move),
         "viewing_distance_m": distance,
         "frames_apart_m": [
-            {"frames": list(pair), "apart_m": metres, "allowed_m": allowed[pair]}
-            for pair, metres in found.agreement.apart_m.items()
+            {"frames": list(pair), "apart_m": metres, "allowed_m": allowed}
+            for pair, (metres, allowed) in found.agreement.apart_m.items()
         ],
     }
     found = replace(found, before=before, after=after, checks=checks, message="")
-    now, then = f"{before.median_m:.2f} m (median)", f"{after.median_m:.2f} m"
-    if not len(after.distance_m) or after.median_m > most_m:
+    now, then = f"{before_m:.2f} m (median)", f"{after_m:.2f} m"
+    if not after_m <= most_m:  # NaN where nothing could be compared
         words = f"the map's points would lie {then} (median) from the scan, {most_m:.2f} m allowed"
         return replace(found, reason="NOT_BETTER", message=words)
-    if after.median_m > max(before.median_m, _GOOD_M):
+    if after_m > max(before_m, _GOOD_M):
         words = f"the map's points lie {now} from the scan now and would lie {then} from it"
         return replace(found, reason="NOT_BETTER", message=words)
     contradiction = None if supervised else _contradiction(move)
     if contradiction is not None:
         return replace(found, reason="CONTRADICTS_PLACEMENT", message=contradiction)
-    evidence = new.placement.evidence | {
-        "anchor": checks
-        | {
-            "frames": [image.name for image in old.images if image.image_id in found.used],
-            "rounds": [
-                {"focal_px": list(r.focal_px), "structure_s": r.structure_s, "adjust_s": r.adjust_s}
-                for r in found.rounds
-            ],
-            "supervised": supervised,
-        }
-    }
-    placement = replace(new.placement, evidence=evidence)
+    names = [image.name for image in old.images if image.image_id in found.used]
+    evidence = {"anchor": checks | {"frames": names, "supervised": supervised}}
+    placement = replace(new.placement, evidence=new.placement.evidence | evidence)
     placed = replace(new, placement=placement, generation=0, parents=(), status="active")
     return replace(found, reason=None, feature_map=placed)
 

@@ -120,14 +120,9 @@ def find_photos(feature_map: AnyMap, folder: Path) -> PhotoFiles:
             f"--photos: expected the folder of the map's photos, found no folder {folder}"
         )
     search = PhotoFolder(folder)
-    paths: dict[int, Path] = {}
-    missing: dict[int, str] = {}
-    for image in feature_map.images:
-        path, reason = search.find(image)
-        if path is None:
-            missing[image.image_id] = reason
-        else:
-            paths[image.image_id] = path
+    found = {image.image_id: search.find(image) for image in feature_map.images}
+    paths = {image_id: path for image_id, (path, _) in found.items() if path is not None}
+    missing = {image_id: reason for image_id, (path, reason) in found.items() if path is None}
     if not paths:
         reasons = sorted(set(missing.values()))
         raise RegistrationError(

@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from featuredb.atomic import atomic_file
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -26,9 +25,8 @@ from ingest.register.anchor.frames import TriedFrame
 from ingest.register.anchor.proposals import small_camera
 from ingest.register.anchor.report import FRAME_HEADER, AnchorReport, frame_rows, report_json
 from ingest.register.anchor.together import TOGETHER
-from ingest.workspace import write_json
-
-REPORT_JSON, REPORT_HTML = "anchor.json", "anchor.html"
+from ingest.register.structure.surface_fit import median_m
+from ingest.workspace import write_json_and_page
 
 _WIDTH_PX = 1280  # of overlays: a screen's width; more only makes the page heavy
 _DEPTH_STEP = 0.015  # share of the depth by which it jumps at an edge: 1 m seen from 70 m
@@ -79,11 +77,8 @@ def write_anchor_report(
     folder: Path, report: AnchorReport, old: FeatureMap, cloud: PointCloud, read_rgb: PhotoRgb, command: str
 ) -> Path:
     """Write `anchor.json` and `anchor.html` (see `anchor_page`) into the folder; the path of the page."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / REPORT_JSON, report_json(report))
-    with atomic_file(folder / REPORT_HTML) as temporary:
-        temporary.write_text(anchor_page(report, old, cloud, read_rgb, command), encoding="utf-8")
-    return folder / REPORT_HTML
+    html = anchor_page(report, old, cloud, read_rgb, command)
+    return write_json_and_page(folder / "anchor", report_json(report), html)
 
 
 def anchor_page(
@@ -150,8 +145,10 @@ def _frame(
             line = escape(command.replace("{image}", shlex.quote(tried.image.name)))
             details += f'<p>If the edges lie on the photo, confirm it:</p><pre class="command">{line}</pre>'
     view = scan_view(cloud, lens, pose)
+    size = (view.camera.width, view.camera.height)
+    photo = np.asarray(cv2.resize(read_rgb(tried.image), size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     stage = (
-        picture(jpeg(resized(read_rgb(tried.image), view.camera)), "photo", "jpeg", "photo")
+        picture(jpeg(photo), "photo", "jpeg", "photo")
         + picture(jpeg(view_rgb(view)), "scan", "jpeg", "scan")
         + picture(png(edge_layer(view)), "edges of the scan", "png", "edges")
     )
@@ -179,7 +176,7 @@ def _placed_section(report: AnchorReport, result: AnchorResult, old: FeatureMap,
     assert after is not None
     facts = [
         ("heights", f"{report.datum_before} before, {report.datum_after} after"),
-        ("map points to scan", f"median {before.median_m:.2f} m before, {after.median_m:.3f} m after"),
+        ("map points to scan", f"median {median_m(before):.2f} m before, {median_m(after):.3f} m after"),
         ("moved", f"{move['horizontal_m']:.2f} m in plan, {move['up_m']:+.2f} m up"),
         ("turned", f"{move['heading_deg']:+.2f} degrees about the vertical, {move['tilt_deg']:.2f} tilted"),
         ("scale", f"{move['scale']:.5f}"),
@@ -193,7 +190,7 @@ def _placed_section(report: AnchorReport, result: AnchorResult, old: FeatureMap,
     was_at, is_at = (of.points_local(cloud.frame) for of in (old, new))
     drawn = map_over_scan_png(cloud, was_at, is_at, centers)
     over = picture(drawn, "Map points over the scan, before and after")
-    far = residuals_png(before.distance_m, after.distance_m)
+    far = residuals_png(before, after)
     distances = picture(far, "Distances of map points to the scan, before and after")
     return f"<h2>The map</h2><section>{table((), facts, names=(0,))}{over}{distances}</section>"
 
@@ -250,12 +247,6 @@ def edge_layer(view: Rendering) -> NDArray[np.uint8]:
     thick = cv2.dilate(depth_edges.astype(np.uint8), np.ones((2, 2), np.uint8)).astype(bool)
     layer[thick] = (*_DEPTH_RGB, 255)
     return layer
-
-
-def resized(photo_rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """The photo at the size of a camera."""
-    size = (camera.width, camera.height)
-    return np.asarray(cv2.resize(photo_rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def png(rgb_or_rgba: NDArray[np.uint8]) -> bytes:

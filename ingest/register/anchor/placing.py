@@ -52,9 +52,7 @@ def place_in_rounds(
 
     A frame registered with a wrong lens finds matches that fit the wrong lens: the adjustment moves it part
     of the way, and the next registration finds others. Each round places the map as it was. A map of which no
-    adjustment is accepted has no place: the similarity would lay its points on the ground and leave its
-    cameras where the wrong lens has them. Frames may contradict the map until its lens is found; then the
-    last word counts.
+    adjustment is accepted has no place. Frames may contradict the map until its lens is found.
     """
     placed: FeatureMap | None = None
     latest: FeatureMap | None = None

@@ -27,11 +27,12 @@ _ENOUGH_POINTS = 300
 _OVERLAP_PENALTY = 0.5
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameScore:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameProposal:
     """How likely a frame registers, with the figures behind it, each from 0 to 1 unless it says otherwise.
 
     Attributes:
+        prior: that its registration starts from.
         score: product of the others' square roots.
         coverage: share of the photo that shows the scan, from the prior.
         downward: mean cosine between viewing rays and the vertical: airborne scans see roofs and ground well,
@@ -40,20 +41,13 @@ class FrameScore:
         spread: share of the photo's cells that see map points: blur and water show few.
     """
 
+    image: MapImage
+    prior: FramePrior
     score: float
     coverage: float
     downward: float
     points: int
     spread: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameProposal:
-    """A frame with its rank's reasons and the prior that its registration starts from."""
-
-    image: MapImage
-    score: FrameScore
-    prior: FramePrior
 
 
 def propose_frames(
@@ -68,16 +62,18 @@ def propose_frames(
         priors: of the images to be ranked, by image id, in the cloud's frame.
     """
     rough = [
-        FrameProposal(image=image, score=_score(feature_map, image, prior, cloud), prior=prior)
+        _proposal(feature_map, image, prior, cloud)
         for image in feature_map.images
         if (prior := priors.get(image.image_id)) is not None
     ]
-    rough = [p for p in rough if p.score.coverage >= _MIN_COVERAGE]
-    rough.sort(key=lambda p: (-p.score.score, p.image.image_id))
+    rough = [p for p in rough if p.coverage >= _MIN_COVERAGE]
+    rough.sort(key=lambda p: (-p.score, p.image.image_id))
     return _spread_out(feature_map, rough)
 
 
-def _score(feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: PointCloud) -> FrameScore:
+def _proposal(
+    feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: PointCloud
+) -> FrameProposal:
     camera = feature_map.cameras[image.camera_id]
     small = small_camera(camera, _VIEW_WIDTH_PX)
     seen = render(cloud, small, prior.cam_from_local, RenderOptions(attributes=False))
@@ -88,9 +84,9 @@ def _score(feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: P
     cells = xy / [camera.width, camera.height] * _GRID
     spread = len(np.unique(np.floor(cells).clip(0, _GRID - 1), axis=0)) / _GRID**2
     downward = _downward(small, prior.cam_from_local, valid)
-    factors = [coverage, downward, min(points / _ENOUGH_POINTS, 1.0), spread]
-    score = float(np.prod(np.sqrt(factors)))
-    return FrameScore(score=score, coverage=coverage, downward=downward, points=points, spread=spread)
+    score = float(np.prod(np.sqrt([coverage, downward, min(points / _ENOUGH_POINTS, 1.0), spread])))
+    figures = {"score": score, "coverage": coverage, "downward": downward, "spread": spread}
+    return FrameProposal(image=image, prior=prior, points=points, **figures)
 
 
 def _downward(camera: Camera, pose: Rigid3, valid: NDArray[np.bool_]) -> float:
@@ -113,7 +109,7 @@ def _spread_out(feature_map: FeatureMap, proposals: Sequence[FrameProposal]) -> 
     while left:
         of = [seen[sees[p.image.image_id]] for p in left]
         values = [
-            p.score.score * (1.0 - _OVERLAP_PENALTY * already.sum() / max(len(already), 1))
+            p.score * (1.0 - _OVERLAP_PENALTY * already.sum() / max(len(already), 1))
             for p, already in zip(left, of, strict=True)
         ]
         chosen = left.pop(int(np.argmax(values)))

@@ -67,7 +67,7 @@ def frame_rows(report: AnchorReport) -> list[tuple[Any, ...]]:
     proposals += [p for p in report.tried.ranking if p.image.image_id not in tried]
     rows = []
     for proposal in proposals:
-        frame, score = tried.get(proposal.image.image_id), proposal.score
+        frame = tried.get(proposal.image.image_id)
         verdict, inliers, sigma, seconds = "", None, None, None
         if frame is not None:
             registration, seconds = frame.registration, round(frame.seconds, 1)
@@ -77,7 +77,7 @@ def frame_rows(report: AnchorReport) -> list[tuple[Any, ...]]:
                 sigma = round(float(np.sqrt(np.linalg.eigvalsh(registration.covariance[3:, 3:])[-1])), 3)
             if proposal.image.image_id in used:
                 verdict += ", used"
-        figures = (_rounded(score.score), _rounded(score.coverage), score.points)
+        figures = (_rounded(proposal.score), _rounded(proposal.coverage), proposal.points)
         rows.append((proposal.image.name, *figures, verdict, inliers, sigma, seconds))
     return rows
 
@@ -89,6 +89,7 @@ def report_json(report: AnchorReport) -> dict[str, Any]:
     """Everything as JSON of `schemas/ingest/anchor.json`."""
     result, shift = report.result, report.tried.shift
     of_round = ("structure_s", "structure_cpu_s", "adjust_s", "focal_px", "figures")
+    of_rank = ("score", "coverage", "downward", "points", "spread")
     placed = result and {
         **_named(result, "reason", "message", "used", "checks", "seconds"),
         "rounds": [_named(r, *of_round) for r in result.rounds],
@@ -102,7 +103,7 @@ def report_json(report: AnchorReport) -> dict[str, Any]:
             "height_shift": shift and asdict(shift),
             "times_s": report.times_s(),
             "frames": [_frame_json(frame) for frame in report.tried.tried],
-            "ranking": [{"name": p.image.name, **asdict(p.score)} for p in report.tried.ranking],
+            "ranking": [{"name": p.image.name, **_named(p, *of_rank)} for p in report.tried.ranking],
             "placement": placed,
         }
     )

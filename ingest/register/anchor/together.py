@@ -1,12 +1,8 @@
 """Photos of a map registered to a scan together, from about where the map is: one similarity, one evidence.
 
-The photos are laid out as one picture from straight above (`ingest.register.anchor.start.ortho`), which is
-compared with the scan's at all places, headings and sizes that the placement leaves open. A map that is
-tilted by some degrees looks the same from above; its points against the scan's surface tell tilt and height.
-
-From there the similarity is fitted as one photo's pose is (`ingest.register.frame.dense.fit`), round by
-round: renders are made at the poses that it gives, each piece takes its best place near by, and it is fitted
-to all of them with a robust loss, and held near its start where they tell little.
+The photos as one picture from straight above (`ingest.register.anchor.start.ortho`) tell where to start. From
+there the similarity is fitted as one photo's pose is (`ingest.register.frame.dense.fit`), and held near its
+start where the pieces tell little. Steps: docs/measurements/registration.md, "All photos together".
 """
 
 import logging
@@ -22,11 +18,11 @@ from featuredb.errors import ImageError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.sim3 import Sim3, place_covariance
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.anchor.start.from_ortho import PictureTry, ScanSearch
+from ingest.register.anchor.start.from_ortho import PlanTry, ScanSearch, first_apart
 from ingest.register.anchor.start.ortho import OrthoPicture, picture_of_map, picture_of_scan
 from ingest.register.frame.dense.confirmation import AskedPhoto, evidence_of
 from ingest.register.frame.dense.fit import MAX_SIDE_PX, near_places
@@ -198,10 +194,10 @@ def fitted_together(
 def _moved(new_from_old: Sim3, start: Sim3, seen: Sequence[_Seen]) -> Sim3:
     """The similarity fitted to the pieces' places, from one near it."""
     middle = np.median(np.vstack([one.pieces.points for one in seen]), axis=0)
-    about = Sim3(scale=1.0, rotation=np.eye(3), translation=middle)
+    about = Sim3.shift(middle)
 
     def at(step: FloatArray) -> Sim3:
-        return about @ Sim3.exp(step * _SIGMAS) @ about.inverse() @ new_from_old
+        return Sim3.exp(step * _SIGMAS).about(middle) @ new_from_old
 
     def off(step: FloatArray) -> FloatArray:
         similarity, parts = at(step), []
@@ -240,14 +236,17 @@ def starts_from_above(
         return [], []
     search = ScanSearch(drawn, _COVER)
     height = float(np.median(picture.height[picture.valid]))  # about as it is
+    apart = _APART * picture.cell * max(picture.gray.shape)
+
+    def same(one: PlanTry, other: PlanTry) -> bool:
+        return bool(one.apart(other)[0] <= apart)
 
     def best(around: float) -> list[Sim3]:
         """Similarities, best first, with headings about one."""
         found = [search.best(picture, one, around + angle) for one in sizes.tolist() for angle in turns]
-        tries = sorted((one for one in found if one is not None), key=lambda one: -one.correlation)
-        return [
-            _levelled(one.similarity(picture, height), points, drawn) for one in _distinct(tries, picture)
-        ]
+        tries = sorted((one for one in found if one is not None), key=lambda one: -one.agreeing)
+        distinct = first_apart(tries, same, _PLACES)
+        return [_levelled(one.similarity(picture, height), points, drawn) for one in distinct]
 
     quarters = _QUARTERS if turn < 0.5 * _QUARTERS[0] else ()
     return best(0.0), [one for quarter in quarters for one in best(quarter)[:_WRONG_PLACES]]
@@ -257,8 +256,7 @@ def _left_open(feature_map: FeatureMap, picture: OrthoPicture) -> tuple[float, f
     """How far the map may be off: metres in plan, radians of heading, logarithm of its size."""
     covariance = feature_map.placement.covariance
     middle = np.array([*picture.middle, float(np.median(picture.height[picture.valid]))])
-    jacobian = point_jacobian(middle[None])[0]
-    plan = (jacobian @ covariance @ jacobian.T)[:2, :2]
+    plan = place_covariance(covariance, middle)[:2, :2]
     sigmas = np.sqrt([np.linalg.eigvalsh(plan)[-1], covariance[3, 3], covariance[0, 0]])
     reach, turn, size = np.maximum(_REACH * sigmas, [_LEAST_REACH_M, _LEAST_TURN, _LEAST_SIZE]).tolist()
     return min(reach, _MOST_REACH_M), min(turn, float(np.pi)), size
@@ -276,18 +274,6 @@ def _around(picture: OrthoPicture, reach_m: float) -> tuple[FloatArray, FloatArr
     middle = picture.corner + picture.cell * corners.mean(axis=0)
     half = 0.5 * picture.cell * float(np.linalg.norm(corners[1] - corners[0])) + reach_m
     return np.asarray(middle - half, np.float64), np.asarray(middle + half, np.float64)
-
-
-def _distinct(tries: Sequence[PictureTry], picture: OrthoPicture) -> list[PictureTry]:
-    """The first of those that lie apart from every better one."""
-    kept: list[PictureTry] = []
-    apart = _APART * picture.cell * max(picture.gray.shape)
-    for one in tries:
-        if all(float(np.linalg.norm(one.middle - other.middle)) > apart for other in kept):
-            kept.append(one)
-        if len(kept) == _PLACES:
-            break
-    return kept
 
 
 def _levelled(new_from_old: Sim3, points: FloatArray, scan: OrthoPicture) -> Sim3:

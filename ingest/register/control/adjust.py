@@ -1,8 +1,4 @@
-"""A block adjusted with control points as targets, in metres in the local frame.
-
-A file does not tell wrong marks and coordinates from right ones: they keep a quadratic loss here, and tests
-name and leave out the wrong ones (`ingest.register.control.residuals`).
-"""
+"""A block adjusted with control points as targets, in metres in the local frame."""
 
 from dataclasses import dataclass, replace
 

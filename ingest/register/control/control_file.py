@@ -1,12 +1,6 @@
-"""Ground control points as OpenDroneMap writes them: gcp_list.txt.
+"""Ground control points as OpenDroneMap writes them: gcp_list.txt (docs/measurements/control-points.md).
 
-First line: the coordinate reference system (a PROJ string, an EPSG code, or words such as "WGS84 UTM 11N").
-Every further line is one mark, one point seen in one photo, separated by spaces or tabs:
-
-    geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extra ...]
-
-Lines that begin with # and empty lines count for nothing. Pixels are counted from the corner of the top-left
-pixel, whose centre is (0.5, 0.5). See https://docs.opendronemap.org/gcp/.
+See https://docs.opendronemap.org/gcp/.
 """
 
 import math

@@ -1,11 +1,8 @@
 """A similarity from marked control points, robust against wrong marks and wrong coordinates.
 
-Each point has several hypotheses of where it lies in the block: the intersection of every set of its marks
-that agree, and for every single mark the place where its ray meets the ground that the block's own points
-show. A wrong mark spoils some of a point's hypotheses but not all, a wrong coordinate all of them. Least
-trimmed squares (Rousseeuw, 1984) over samples of hypotheses finds the similarity that most points agree on.
-
-Where heights are unknown only horizontal distances count; tilt and height come from elsewhere (`Vertical`).
+A wrong mark spoils some of a point's hypotheses but not all, a wrong coordinate all of them. Least trimmed
+squares (Rousseeuw, 1984) over samples of hypotheses finds the similarity that most points agree on. Where
+heights are unknown only horizontal distances count; tilt and height come from elsewhere (`Vertical`).
 """
 
 import itertools
@@ -169,16 +166,14 @@ def _least_trimmed(
     usable = np.flatnonzero(np.isfinite(surveyed[point, 2])) if vertical is None else np.arange(len(xyz))
     count = len(np.unique(point))
     kept = (count + size + 1) // 2
-    best: tuple[float, Sim3] | None = None
-    for rows in _samples(usable, point, size):
-        sim = _similarity(xyz[rows], surveyed[point[rows]], vertical)
-        if sim is None:
-            continue
-        lengths = _distances(sim, xyz, surveyed[point])
-        cost = float((np.sort(_per_point(lengths, point, len(surveyed)))[:kept] ** 2).sum())
-        if best is None or cost < best[0]:
-            best = (cost, sim)
-    return None if best is None else best[1]
+
+    def cost(sim: Sim3) -> float:
+        lengths = _per_point(_distances(sim, xyz, surveyed[point]), point, len(surveyed))
+        return float((np.sort(lengths)[:kept] ** 2).sum())
+
+    samples = _samples(usable, point, size)
+    sims = (_similarity(xyz[rows], surveyed[point[rows]], vertical) for rows in samples)
+    return min((sim for sim in sims if sim is not None), key=cost, default=None)
 
 
 def _samples(usable: NDArray[np.int64], point: NDArray[np.int64], size: int) -> list[NDArray[np.int64]]:

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from featuredb.adjust.terms import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
+from ingest.colmap.precision import in_cameras, projected
 from ingest.register.control.control_file import ControlFile, Mark
 
 _NEIGHBOURS = 12  # observations around a mark: enough for a plane, few enough to be near
@@ -135,12 +136,8 @@ def intersect(block: Block, control: Control, rows: NDArray[np.int64]) -> FloatA
 def shown(block: Block, photos: NDArray[np.int64], xyz: FloatArray) -> FloatArray:
     """Pixels (m, 2) at which m photos show places (m, 3) or one (3,); NaN behind a camera."""
     places = np.broadcast_to(xyz, (len(photos), 3))
-    return np.array(
-        [
-            block.camera(p).project(block.cam_from_block[p].act(place[None]))[0]
-            for p, place in zip(photos.tolist(), places, strict=True)
-        ]
-    ).reshape(-1, 2)
+    in_camera = in_cameras(block.cam_from_block, places, np.arange(len(photos)), photos)
+    return projected(block.cameras, block.camera_of[photos], in_camera)
 
 
 def mark_residuals(block: Block, control: Control, xyz: FloatArray) -> FloatArray:

@@ -1,16 +1,9 @@
 """Placement by ground control points: the whole way from marks to an adjusted block with its uncertainty.
 
-1. Marks are intersected and the similarity is found that most points agree on (`fit`).
-2. The block is adjusted with the points as control (`adjust`).
-3. Marks and points that contradict all others are tested, named and left out (`residuals`), and the block
-   is adjusted again.
-
-Surveyed heights may be unknown. Then position, heading and scale come from the points; tilt and height come
-from where the block was before (GPS), and where there is no such place from the assumption that the ground
-under the photos is level on the whole. The covariance says how little that is.
+Its steps are `fit`, `adjust` and `residuals`; what they do: docs/measurements/control-points.md.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -31,6 +24,7 @@ from ingest.register.control.residuals import (
     initial_weights,
     residuals_of,
 )
+from ingest.register.outcome import Outcome
 
 GcpReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE", "UPSIDE_DOWN", "CONTRADICTS_GPS"]
 
@@ -47,9 +41,8 @@ _MIN_LINE_RATIO = 0.02
 # Of the placed photos from their own GPS, beyond three of its sigmas. EXIF is off by metres, rarely by tens;
 # more means another zone, system or unit.
 _MAX_GPS_OFFSET_M = 150.0
-# Of the plane through the block's points, about each axis. Windows of 60 m of the ground in public airborne
-# scans slope by 1.7 to 3.5 degrees, larger ones by less. The cameras' mean axis is no better: a mount may be
-# tilted by more (7 degrees against the plane in `copr`).
+# Of the plane through the block's points, about each axis. The cameras' mean axis is no better: a mount may
+# be tilted by more (7 degrees against the plane in `copr`).
 _SIGMA_TILT_DEG = 3.5
 _KEPT_SHARE = 0.9  # of the points, nearest to the middle of them; the far ones are trees and errors
 _KEPT_HEIGHT_M = 0.01  # standard deviation of a height that the adjustment is to keep
@@ -73,34 +66,25 @@ class GcpOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GcpPlacement:
-    """Outcome of a placement: accepted when `reason` is None.
+class GcpPlacement(Outcome[GcpReason]):
+    """Outcome of a placement.
 
     Attributes:
         control: what met the photos, and what did not.
-        reason: gate that refused it, or None; `message` says it for people.
         local_from_block: the similarity nearest to what became of the block, None where there is none.
         covariance: (7, 7) of its left perturbation (sigma, omega, nu), or None.
         block: adjusted, in metres in the local frame, or None.
         points: every control point with its residual; marks: every mark.
         notes: what was assumed, for people.
-        figures: what the decision rests on, JSON-able.
     """
 
     control: Control
-    reason: GcpReason | None
-    message: str
     local_from_block: Sim3 | None = None
     covariance: FloatArray | None = None
     block: Block | None = None
     points: tuple[PointResidual, ...] = ()
     marks: tuple[MarkResidual, ...] = ()
     notes: tuple[str, ...] = ()
-    figures: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def accepted(self) -> bool:
-        return self.reason is None
 
     @property
     def residual_rms_m(self) -> float:
@@ -170,9 +154,9 @@ def place_by_gcp(
     usable = sorted({h.point for h in found})
     if len(usable) < _MIN_POINTS:
         message = (
-            f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are needed"
+            f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are needed; "
+            "mark each point in two photos or more"
         )
-        message += "; mark each point in two photos or more"
         return GcpPlacement(control=control, reason="TOO_FEW", message=message)
     notes: tuple[str, ...] = ()
     if not _vertical_is_needed(control, usable):
@@ -278,13 +262,10 @@ def _adjusted_placement(
         points=points,
         marks=marks,
         figures={
-            "degrees_of_freedom": freedom,
             "points_used": int(weights.points.sum()),
-            "marks_used": int(weights.marks.sum()),
             "control_sigma_m": weights.control_m.tolist(),
             "mark_sigma_px": weights.mark_px,
             "scale_sigma": float(np.sqrt(covariance[0, 0])),
-            "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),
         },
     )
 

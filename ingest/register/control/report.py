@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.atomic import atomic_file
 from featuredb.cli.common import format_table
 from ingest.html_parts import note, page, picture, table
 from ingest.plot_parts import PlanView, plan_png
 from ingest.register.control.placement import GcpPlacement
-from ingest.workspace import write_json
+from ingest.workspace import write_json_and_page
 
 _HEADER = ("control point", "marks", "east m", "north m", "up m", "horizontal m", "without it m", "")
 
@@ -91,11 +90,9 @@ def _rows(placement: GcpPlacement) -> list[tuple[object, ...]]:
 
 def write_control_report(folder: Path, title: str, placement: GcpPlacement) -> None:
     """control.json and control.html into a folder."""
-    write_json(folder / "control.json", placement.evidence)
     verdict = "accepted" if placement.accepted else f"{placement.reason}: {placement.message}"
     body = [f"<h1>{escape(title)}</h1>", note(verdict), control_html(placement)]
-    with atomic_file(folder / "control.html") as temporary:
-        temporary.write_text(page(title, body), encoding="utf-8")
+    write_json_and_page(folder / "control", placement.evidence, page(title, body))
 
 
 def _decimal(value: float) -> Decimal | None:

@@ -1,8 +1,7 @@
 """Residuals of a placement by control points: tests that name what contradicts, and figures for people.
 
 Baarda's data snooping with the variance estimated from the other residuals (Pope, The statistics of residuals
-and the detection of outliers, 1976): an observation is compared with what the others predict for it, by the
-covariance of all residuals, and one is left out at a time.
+and the detection of outliers, 1976); one observation is left out at a time.
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from scipy.special import chdtri, fdtrc
 
 from featuredb.adjust.marginals import Whitened
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import point_jacobian
+from featuredb.geometry.sim3 import place_covariance
 from ingest.register.control.adjust import Adjusted, Task, Weights, adjust
 from ingest.register.control.control_file import Mark
 from ingest.register.control.fit import ControlFit
@@ -303,11 +302,6 @@ def _likely(adjusted: Adjusted, control: Control, row: int) -> str:
 
 
 # How far the photos' own GPS is from where control points put them, and whether that is more than noise.
-#
-# What all photos share does not average out: a datum of the heights, a base station at wrong coordinates.
-# The offset is compared with what the positions claim, all of which may be shared, with the scatter of the
-# single differences, and with the covariance of the placement. It is told where chance gives as much in one
-# case of a thousand, of the heights and of the horizontal place each.
 
 _TOLD = 0.001  # share of right positions of which an offset is told
 _MEDIAN = np.pi / 2.0  # variance of a median over that of a mean, normal distribution
@@ -330,9 +324,8 @@ def gps_offset(
     if not known.any():
         return {}, []
     median, variance = np.transpose([_middle(off[:, axis]) for axis in range(3)])
-    at = point_jacobian(centers[known].mean(axis=0))
     stated = np.array([sigma_m[0], sigma_m[0], sigma_m[1]])
-    spread = at @ covariance @ at.T + np.diag(stated**2 + variance)
+    spread = place_covariance(covariance, centers[known].mean(axis=0)) + np.diag(stated**2 + variance)
     figures = {
         "gps_offset_m": [None if np.isnan(v) else float(v) for v in median],
         "gps_offset_sigma_m": np.sqrt(np.diag(spread)).tolist(),

@@ -122,12 +122,7 @@ def polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> Ju
         return Judged(found=fitted, confirmation=confirmed(views, fitted))
 
 
-# How well a photo agrees with the scan where it was not taken.
-#
-# Chance is not the only way to agreement: streets cross at right angles in every town, parking lots repeat
-# themselves. How far that goes depends on the photo and the scan, so the two are asked: the same search is
-# made around priors beside the place that is to be judged, and what agreement it finds there is what a wrong
-# place can have.
+# How well a photo agrees with the scan where it was not taken (docs/measurements/registration.md, "Verdict").
 
 _APART = 1.2  # of the search's reach: the other search is not to find the place that is judged
 _SAME_VIEW = 0.25  # two poses that put the picture's middle nearer than this share of its width are one

@@ -1,9 +1,4 @@
-"""What a prior says of a pose, and the pose that matches and prior together make most likely.
-
-From a kilometre with a long lens, or over flat ground, matches leave position and tilt open against each
-other by tens of metres while every pixel is right. There the prior decides; where matches determine a pose,
-it weighs nothing.
-"""
+"""What a prior says of a pose, and the pose that matches and prior together make most likely."""
 
 from dataclasses import replace
 

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.candidates import (
@@ -36,6 +35,7 @@ from ingest.register.frame.verdict import (
 from ingest.register.frame.views import DEFAULTS, MIN_COVER, MIN_SIDE_PX, FrameOptions, FrameViews, first_look
 from ingest.register.frame_registration import FramePrior, FrameReason, FrameRegistration, RenderSource
 from reloc.localise.pose import pose_uncertainty
+from reloc.tracking.pose_fit import of_camera
 
 _MIN_FOR_COVARIANCE = 6  # twice the least that determines a pose
 # Standard deviation of what all inliers share, as a share of the scan's spacing; by photos of the simulated
@@ -191,9 +191,8 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged) -> FrameRegis
 def frame_covariance(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FloatArray | None:
     """Covariance (6, 6) of the left perturbation of cam_from_local; None where too few matches tell it.
 
-    Residuals of neighbouring correspondences are not independent: they come from one render of one scan. So
-    `CORRELATED_INLIERS` of them count as one. What all share, a shift of the whole scan's appearance by a
-    part of its point spacing, shows in no residual and is added to the position.
+    `CORRELATED_INLIERS` correspondences count as one. What all share, a shift of the whole scan's appearance
+    by a part of its point spacing, shows in no residual and is added to the position.
     """
     if len(found.inliers) < _MIN_FOR_COVARIANCE:
         return None
@@ -205,17 +204,9 @@ def frame_covariance(views: FrameViews, prior: FramePrior, found: FrameHypothesi
     covariance = CORRELATED_INLIERS * covariance + np.diag([shared / look.depth_m**2] * 3 + [shared] * 3)
     pose = found.pose.cam_from_local
     information = np.linalg.inv(covariance) + prior_information(pose, loosened(prior))
-    return left_perturbation(np.asarray(np.linalg.inv(information), dtype=np.float64), pose)
-
-
-def left_perturbation(covariance: FloatArray, cam_from_local: Rigid3) -> FloatArray:
-    """From small rotations of the camera about local axes and displacements of its centre.
-
-    With R_wc' = exp(dtheta) R_wc and C' = C + dC: cam_from_local' = exp(-R dtheta, -R dC) cam_from_local.
-    """
-    turn = np.kron(np.eye(2), -cam_from_local.rotation)
-    result = turn @ covariance @ turn.T
-    return np.asarray((result + result.T) / 2.0, dtype=np.float64)
+    # `of_camera` of the inverse leads from local axes back to the left perturbation.
+    left = of_camera(pose.inverse(), np.asarray(np.linalg.inv(information), dtype=np.float64))
+    return np.asarray((left + left.T) / 2.0, dtype=np.float64)
 
 
 def _evidence(

@@ -27,22 +27,17 @@ SURE_CONFIRMATION_LOG_NFA = 20.0
 # Or evidence of features and pictures together; features spoke for none of the wrong poses that were
 # measured.
 _SURE_JOINT_LOG_NFA = 30.0
-# With less, it must be so many times what the photo reaches at places of the scan where it cannot be
-# (`elsewhere`), of which MAX_PLACES_ELSEWHERE are tried and _MIN_PLACES_ELSEWHERE must be there. Right poses
-# had 10 times as much and more, those of photos of another town up to 3 times as much with all places tried,
-# but up to 5 with three.
+# With less, it must be so many times what the photo reaches at places of the scan where it cannot be, of
+# which MAX_PLACES_ELSEWHERE are tried and _MIN_PLACES_ELSEWHERE must be there. Right poses had 10 times as
+# much and more, photos of another town up to 3 times with all places tried, but up to 5 with three.
 _MIN_CONFIRMATION_RATIO = 6.0
 MAX_PLACES_ELSEWHERE = 5
 _MIN_PLACES_ELSEWHERE = 1
 # And so much evidence with the prior counted in (`weighed_log_nfa`): what the pictures must say anyway.
-# Blocks of streets alike, 117 m from the photo, agreed with 10^-7.7 at 4.7 deviations from the prior, which
-# leaves 4.3.
 _MIN_WEIGHED_LOG_NFA = 5.0
-# Less is enough where shaded relief was asked, too, and has its say: right windows of `autzen` have 4.8 and
-# more so. Of crossings in other towns one had 6.5 by intensities, and 1 of 78 pieces of relief agreed.
-# A limit against chance; none of 400 photos was accepted on another town's scan (row `frames-on-scan`), so
-# that the rate of error is below 0.75 % (95 % confidence).
-_MIN_WITH_RELIEF = 4.0
+_MIN_WITH_RELIEF = (
+    4.0  # less is enough where shaded relief was asked, too: right windows of `autzen` have 4.8
+)
 _RIVAL_SHARE = 0.5  # a pose elsewhere with this share of the inliers makes the registration ambiguous
 # Largest distance from the prior, in its own standard deviations over all six axes together. Generous: people
 # and devices understate their errors.
@@ -66,9 +61,8 @@ class FrameEvidence:
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
         prior_sigmas: distance from the prior.
         position_sigma_share: standard deviation of the position over the distance to what is seen.
-        places_elsewhere, elsewhere_log_nfa: see `elsewhere`; none where it was not asked.
-        relief_only: the pictures were compared by shaded relief, which shows what stands and nothing of the
-            ground: an ortho image's roofs agreed with 10^-5.8 while the ground lay 6 m off.
+        places_elsewhere, elsewhere_log_nfa: see `agreement_elsewhere`; none where it was not asked.
+        relief_only: the pictures were compared by shaded relief, which shows nothing of the ground.
     """
 
     inliers: int
@@ -95,11 +89,9 @@ def asks_elsewhere(evidence: FrameEvidence) -> bool:
 def weighed_log_nfa(evidence: FrameEvidence) -> float:
     """Evidence of the pictures and of relief, less what the distance from the prior speaks against the pose.
 
-    Crossings of streets look alike wherever they are; houses stand elsewhere around another one. So pieces of
-    both pictures are counted together, where that says less: they show the same parts of the photo.
-
-    Right poses scatter about the prior, normally; poses that repeat the right one lie anywhere within reach.
-    -log10 of the density, from that at the mean squared distance of six axes on: nearer ones gain nothing.
+    Pieces of both pictures are counted together, where that says less: they show the same parts of the photo.
+    -log10 of the prior's density, from that at the mean squared distance of six axes on: nearer ones gain
+    nothing.
     """
     own, relief = evidence.confirmation, evidence.relief
     log_nfa = own.log_nfa

@@ -26,6 +26,7 @@ from ingest.register.anchor.page import edge_layer, jpeg, png, scan_view
 from ingest.register.anchor.start.first_place import StartFiles, scans_of_one_zone
 from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
 from ingest.register.anchor.start.picks import focal_sigma_rel, least_picks, prior_of_picks
+from ingest.register.structure.surface_fit import median_m
 
 _PHOTO_PX = 4096
 _GROUND_PX, _GROUND_GAP_PX, _GROUND_EMPTY = 4000, 5, 24
@@ -193,7 +194,7 @@ class PickSession:
                 "placed": done.placed,
                 "message": result.message,
                 "reason": result.reason or "",
-                "median_m": None if result.after is None else result.after.median_m,
+                "median_m": None if result.after is None else median_m(result.after),
                 "version": done.version,
                 "undo": undo if done.placed else "",
                 "report": str(done.page),

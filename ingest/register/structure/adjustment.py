@@ -1,12 +1,10 @@
 """Final adjustment of a map by a scan: several registered frames and the scan's surface straighten it.
 
-A similarity cannot mend a lens. Over nearly flat ground structure from motion trades focal length against
-height without a trace in its residuals; placed on a scan, such a map fits its own photos and lies on the
-ground, and yet its cameras stand metres too high. What the registered frames see of the scan (their
-correspondences) and the scan's surface under all points of the map determine poses, lens and points together.
+What the registered frames see of the scan (their correspondences) and the scan's surface under all points of
+the map determine poses, lens and points together (docs/measurements/registration.md).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -25,14 +23,13 @@ from featuredb.render.cloud import PointCloud
 from ingest.colmap.adjust import AdjustOptions, longest_side, residuals_of
 from ingest.colmap.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
+from ingest.register.outcome import Outcome
 from ingest.register.structure.projection import Registered, StructurePlacement
 from ingest.register.structure.surface_fit import Surface, nearest_planes, surface_near
 
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
 # Least standard deviation of keypoints and of correspondences with the scan, as a share of the photo's longer
-# side: a pixel in 4000. Tracks alone may fit to a third of that, but what lens models leave is common to
-# neighbours and does not average out; trusted to their noise, thousands of tracks outvote the frames'
-# correspondences.
+# side: a pixel in 4000. Trusted to their noise, thousands of tracks outvote the frames' correspondences.
 _MIN_SIGMA_REL = 0.00025
 _MIN_SURFACE_M = 0.03  # of a scan's surface against map points; roughness of grass and pavement
 # Structure from motion over flat ground was 25 % off on `brighton`; most lenses are centred, pixels square.
@@ -45,13 +42,9 @@ _STEPS = 8  # of the solver in each round
 _SETTLED_M = 1e-3  # see above; far below a scan's noise
 _REACH_M = 1.0  # a plane further from a point says nothing of it
 # How often correspondences that agree with the map would be refused: their spread about the adjusted map
-# against that about each frame's own best pose, by F, as if the two had no residuals in common. How far they
-# miss by itself says nothing: where the scan has two points in a metre and the photo 30 pixels, honest ones
-# miss by five.
+# against that about each frame's own best pose, by F, as if the two had no residuals in common.
 _CONTROL_RATE = 1e-4
-# And so much of the photo's longer side is no contradiction (7 pixels in 4000): strips of a scan, lens and
-# shutter displace a frame as a whole, which its own pose takes up. Chosen; it has no rate.
-_CONTROL_REL = 0.0017
+_CONTROL_REL = 0.0017  # so much of the longer side is no contradiction (7 pixels in 4000); it has no rate
 _MAD_EFFICIENCY = 0.37  # of a spread by the median, of normal residuals (Rousseeuw and Croux 1993)
 _OWN_ROUNDS = 8  # of a frame's own pose
 # Of the median reprojection error, or of that share of the longer side where it is smaller: to less, tracks
@@ -65,29 +58,20 @@ AdjustReason = Literal["NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LidarAdjustment:
+class LidarAdjustment(Outcome[AdjustReason]):
     """An adjusted map, or why scan and photos contradict each other.
 
     Attributes:
-        reason: gate that refused it, or None; `message` says it for people.
         block: the map in the cloud's local frame; None without a scan or a lens. A refused one may be the
             start of another round: frames that were registered with a wrong lens contradict the right one.
         poses: (6, 6) of each pose, with all that points and lenses leave open; none without a block.
         lenses: what is left open of the lenses; None without a block, or where no lens has OPENCV's
             parameters.
-        figures: before and after, JSON-able.
     """
 
-    reason: AdjustReason | None
-    message: str
     block: Block | None = None
     poses: tuple[FloatArray, ...] = ()
     lenses: LensUncertainty | None = None
-    figures: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def accepted(self) -> bool:
-        return self.reason is None
 
 
 def adjust_to_scan(
@@ -112,17 +96,10 @@ def adjust_to_scan(
     surface = surface_near(cloud, np.clip(start.xyz, low, high), _MAX_SURFACE_POINTS)
     if surface is None:
         return LidarAdjustment(reason="NO_SCAN", message="the scan has no points under the map")
-    first = start
-    if begin is not None:
-        first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
+    first = start if begin is None else block_of_map(begin).moved(to_cloud)
     block = _iterate(first, start.cameras, control, surface)
-    figures = {
-        "control": len(control.xyz),
-        "frames": len(np.unique(control.photo_of)),
-        "before": _state(start, control, surface),
-        "after": _state(block, control, surface),
-        "own": _own_spread(block, control),
-    }
+    before, after = (_state(one, surface) for one in (start, block))
+    figures: dict[str, Any] = {"before": before, "after": after, "own": _own_spread(block, control)}
     reason, message = _gate(block, figures)
     if reason == "LENS":
         return LidarAdjustment(reason=reason, message=message, figures=figures)
@@ -244,19 +221,15 @@ def _control_residuals(block: Block, control: Marks) -> tuple[FloatArray, FloatA
     )
 
 
-def _state(block: Block, control: Marks, surface: Surface) -> dict[str, Any]:
+def _state(block: Block, surface: Surface) -> dict[str, Any]:
     tracks = np.linalg.norm(residuals_of(block)[0], axis=1)
-    seen = np.linalg.norm(_control_residuals(block, control)[0], axis=1)
     distances = nearest_planes(surface, block.xyz, _REACH_M)[0]
     near = np.abs(distances[np.isfinite(distances)])
     return {
         "reprojection_median_px": float(np.median(tracks)),
-        "reprojection_rms_px": float(np.sqrt(np.mean(tracks**2))),
-        "control_median_px": float(np.median(seen)),
         "surface_points": len(near),
         "surface_median_m": float(np.median(near)) if len(near) else None,
         "surface_rms_m": float(np.sqrt((near**2).mean())) if len(near) else None,
-        "cameras": [[camera.model, *camera.params] for camera in block.cameras],
     }
 
 

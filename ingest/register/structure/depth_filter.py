@@ -1,8 +1,6 @@
 """Which depths of a rendered scan can be trusted, and the surface patch behind a pixel.
 
-A rendered depth is that of a splat: invalid where nothing is seen (the far plane), wrong where a hole was
-closed across a gap, ambiguous along silhouettes, and amplified by every pixel of misregistration where the
-surface is seen at a grazing angle (structure-projection paper, 3.1: "not all depth values are valid").
+Structure-projection paper, 3.1: "not all depth values are valid".
 """
 
 from dataclasses import dataclass

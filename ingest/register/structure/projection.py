@@ -1,19 +1,17 @@
 """Structure projection: registered frames carry the map's points onto the scan, and the map follows.
 
-Structure-projection paper, 2.4: depth image of the registered frame, the map's visible points projected on
-it, 3D/3D pairs, RANSAC similarity, refinement on SIM(3), ICP against the scan. Here the refinement weighs
-pairs by their own covariance and knows that all pairs of a frame share its pose error. In the place of ICP,
-which slides over flat ground, comes the adjustment by the scan's surface (`adjustment.py`).
+Structure-projection paper, 2.4. Here the refinement weighs pairs by their own covariance and knows that all
+pairs of a frame share its pose error. In the place of ICP comes the adjustment by the scan's surface.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.arrays import FloatArray, joined
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import skew
@@ -23,6 +21,7 @@ from featuredb.maps.move import full_covariances
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame_registration import FrameRegistration
+from ingest.register.outcome import Outcome
 from ingest.register.structure.depth_filter import SurfaceHits, surface_at
 from ingest.register.structure.similarity import Pairs, SimilarityFit, ransac_similarity, refine_similarity
 
@@ -57,26 +56,17 @@ _CELLS = 6  # per side of the grid of neighbourhoods in a frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StructurePlacement:
+class StructurePlacement(Outcome[StructureReason]):
     """Where structure projection puts a map, or why it does not.
 
     Attributes:
-        reason: gate that refused it, or None; `message` says it for people.
         new_from_old: similarity of the scan's local frame that moves the map from its present place to
             the new one, None when refused.
         covariance: (7, 7) of its left perturbation, None when refused.
-        figures: what the decision rests on, JSON-able.
     """
 
-    reason: StructureReason | None
-    message: str
     new_from_old: Sim3 | None = None
     covariance: FloatArray | None = None
-    figures: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def accepted(self) -> bool:
-        return self.reason is None
 
 
 def project_structure(
@@ -99,9 +89,15 @@ def project_structure(
     reason, message, figures = _gate_of_pairs(pairs, near, distances)
     if reason is not None:
         return StructurePlacement(reason=reason, message=message, figures=figures)
-    kept = pairs.of(near)
-    fit = refine_similarity(start, kept)
-    figures |= _figures_of_fit(fit, kept, feature_map, registered)
+    fit = refine_similarity(start, pairs.of(near))
+    figures |= {
+        "inliers": int(fit.inliers.sum()),
+        "residual_rms_m": float(np.sqrt((fit.residuals_m[fit.inliers] ** 2).sum(axis=1).mean())),
+        "neighbours_factor": fit.neighbours_factor,
+        "scale_change": fit.target_from_source.scale - 1.0,
+        "scale_sigma": float(np.sqrt(fit.covariance[0, 0])),
+        "previous_scale_sigma": float(np.sqrt(feature_map.placement.covariance[0, 0])),
+    }
     reason, message = _gate_of_fit(fit, distances[near], figures)
     placed = StructurePlacement(reason=reason, message=message, figures=figures)
     if reason is not None:
@@ -119,13 +115,7 @@ def _gate_of_pairs(
         centred = pairs.target[near] - pairs.target[near].mean(axis=0)
         across = float(np.linalg.svd(centred, compute_uv=False)[1]) / np.sqrt(used)
         spread = across / float(np.median(distances[near]))
-    figures: dict[str, Any] = {
-        "frames": len(pairs.frame_covariance),
-        "pairs": len(pairs),
-        "ransac_inliers": used,
-        "ransac_inlier_share": used / len(pairs),
-        "spread_rel": spread,
-    }
+    figures: dict[str, Any] = {"pairs": len(pairs), "ransac_inliers": used, "spread_rel": spread}
     needed = f"at least {_MIN_PAIRS} and {_MIN_INLIER_SHARE:.0%} are needed"
     if used < _MIN_PAIRS or used < _MIN_INLIER_SHARE * len(pairs):
         words = f"{used} of {len(pairs)} pairs agree on a similarity, {needed}"
@@ -134,31 +124,6 @@ def _gate_of_pairs(
         words = f"the pairs lie along a line: {spread:.1%} of their distance across it"
         return "NO_SPREAD", f"{words}, at least {_MIN_SPREAD_REL:.0%} are needed", figures
     return None, "", figures
-
-
-def _figures_of_fit(
-    fit: SimilarityFit, pairs: Pairs, feature_map: FeatureMap, registered: Registered
-) -> dict[str, Any]:
-    """What is written into the evidence."""
-    residuals = np.linalg.norm(fit.residuals_m[fit.inliers], axis=1)
-    sim = fit.target_from_source
-    middle = pairs.source[fit.inliers].mean(axis=0)
-    corrections = fit.frame_corrections
-    return {
-        "inliers": int(fit.inliers.sum()),
-        "inliers_by_frame": np.bincount(pairs.frame_of[fit.inliers], minlength=len(registered)).tolist(),
-        "frame_images": list(registered),
-        "residual_rms_m": float(np.sqrt((residuals**2).mean())),
-        "residual_median_m": float(np.median(residuals)),
-        "sigma_factor": fit.spread,
-        "neighbours_factor": fit.neighbours_factor,
-        "scale_change": sim.scale - 1.0,
-        "scale_sigma": float(np.sqrt(fit.covariance[0, 0])),
-        "previous_scale_sigma": float(np.sqrt(feature_map.placement.covariance[0, 0])),
-        "shift_m": (sim.act(middle) - middle).tolist(),
-        "turn_deg": float(np.degrees(np.linalg.norm(sim.log()[1:4]))),
-        "frame_corrections_m": np.linalg.norm(corrections[:, 3:], axis=1).tolist(),
-    }
 
 
 def _gate_of_fit(
@@ -195,7 +160,7 @@ def structure_pairs(
         _pairs_of_frame(feature_map, source, uncertainty, images[image_id], registration, row, cloud)
         for row, (image_id, registration) in enumerate(registered.items())
     ]
-    return Pairs(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Pairs)})
+    return joined(parts)
 
 
 def _pairs_of_frame(

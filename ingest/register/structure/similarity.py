@@ -23,7 +23,7 @@ _SAMPLES = 300  # of three pairs, at most. With half of the pairs wrong, these m
 _MISSED = 1e-17  # so often; with fewer wrong pairs, fewer samples miss as rarely.
 _SCORE_PAIRS = 800  # pairs that score a sample; more only take longer
 
-_ROUNDS = 100  # of reweighting, at most: ten are usual, sixty where a wrong lens bends the map
+_ROUNDS = 100  # of reweighting: ten are usual, sixty where a wrong lens bends the map
 # Steps of reweighting fall short, most where pairs say little; up to twice as far they still go downhill.
 _STRIDE = 1.4
 _SEED = 0  # of the samples
@@ -69,8 +69,6 @@ class SimilarityFit:
         covariance: (7, 7) of its left perturbation.
         inliers: (n,) bool.
         residuals_m: (n, 3) target, moved by its frame's correction, minus placed source.
-        frame_corrections: (f, 6) left perturbations of the frames' poses that were estimated along.
-        spread: how many times its claimed sigma the typical residual is.
         neighbours_factor: how many times larger the variance of cell means is than independence predicts.
     """
 
@@ -78,8 +76,6 @@ class SimilarityFit:
     covariance: FloatArray
     inliers: NDArray[np.bool_]
     residuals_m: FloatArray
-    frame_corrections: FloatArray
-    spread: float
     neighbours_factor: float
 
 
@@ -89,10 +85,7 @@ def ransac_similarity(source: FloatArray, target: FloatArray, tolerance: FloatAr
     Args:
         source, target: (n, 3). tolerance: (n,) distance beyond which a pair does not count.
     """
-    n = len(source)
-    if n < 3:
-        return None
-    generator = np.random.default_rng(_SEED)
+    n, generator = len(source), np.random.default_rng(_SEED)
     samples = generator.integers(0, n, (_SAMPLES, 3))
     rows = np.arange(n) if n <= _SCORE_PAIRS else generator.choice(n, _SCORE_PAIRS, replace=False)
     best: tuple[float, Sim3] | None = None
@@ -139,8 +132,7 @@ def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
         solution = solved
         sim = Sim3.exp(solution[:7]) @ sim
     covariance = np.linalg.inv(normal)[:7, :7]
-    frames = solution[7:].reshape(-1, 6)
-    moved = np.einsum("nij,nj->ni", pairs.by_frame, frames[pairs.frame_of])
+    moved = np.einsum("nij,nj->ni", pairs.by_frame, solution[7:].reshape(-1, 6)[pairs.frame_of])
     residual = pairs.target + moved - sim.act(pairs.source)
     squared = ((root @ residual[:, :, None]) ** 2).sum(axis=(1, 2))
     return SimilarityFit(
@@ -148,8 +140,6 @@ def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
         covariance=np.asarray((covariance + covariance.T) / 2),
         inliers=squared <= 2 * _CHI2_3_95 * spread**2,  # 99.9 % of honest pairs
         residuals_m=residual,
-        frame_corrections=frames,
-        spread=spread,
         neighbours_factor=factor,
     )
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_log
-from featuredb.geometry.sim3 import point_jacobian
+from featuredb.geometry.sim3 import place_covariance
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 
@@ -125,39 +125,12 @@ class MapMove:
     scale_sigmas: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapResidual:
-    """How a map lies on a scan.
-
-    Attributes:
-        distance_m: (k,) from each map point that has scan around it to the nearest scan point.
-        points: of the map, all.
-    """
-
-    distance_m: FloatArray
-    points: int
-
-    @property
-    def median_m(self) -> float:
-        """NaN where nothing could be compared."""
-        return float(np.median(self.distance_m)) if len(self.distance_m) else float("nan")
-
-    def as_figures(self) -> dict[str, float]:
-        """JSON-able."""
-        figures: dict[str, float] = {"points": self.points, "compared": len(self.distance_m)}
-        if len(self.distance_m):
-            p50, p90 = np.percentile(self.distance_m, (50, 90)).tolist()
-            figures |= {"median_m": p50, "p90_m": p90}
-        return figures
-
-
 def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
     """From the placements of the same map in one local frame."""
     move = new.placement.local_from_sfm @ old.placement.local_from_sfm.inverse()
     turn, covariance = so3_log(move.rotation), old.placement.covariance
     middle = np.median(old.points_local(), axis=0)
-    shift, jacobian = move.act(middle) - middle, point_jacobian(middle)
-    spread = jacobian @ covariance @ jacobian.T
+    shift, spread = move.act(middle) - middle, place_covariance(covariance, middle)
     heading, tilt = float(abs(turn[2])), float(np.hypot(turn[0], turn[1]))
     return MapMove(
         horizontal_m=float(np.hypot(shift[0], shift[1])),
@@ -172,8 +145,8 @@ def map_move(old: FeatureMap, new: FeatureMap) -> MapMove:
     )
 
 
-def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[MapResidual, MapResidual]:
-    """Distances of the same map points from the scan, before and after.
+def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[FloatArray, FloatArray]:
+    """Distances (k,) of the same map points from the scan, before and after, metres.
 
     Compared are the points that have scan around them in plan at the new place: elsewhere the scan has a
     hole, and the distance to its rim says nothing.
@@ -188,6 +161,10 @@ def map_residuals(old: FeatureMap, new: FeatureMap, cloud: PointCloud) -> tuple[
     in_plan, _ = cKDTree(scan[:, :2]).query(after[:, :2], distance_upper_bound=_PLAN_REACH_M)
     compared = np.isfinite(in_plan)
     tree = cKDTree(scan)
-    far = [np.asarray(tree.query(points[compared])[0]) for points in (before, after)]
-    first, second = (MapResidual(distance_m=one, points=len(old.points)) for one in far)
+    first, second = (np.asarray(tree.query(points[compared])[0]) for points in (before, after))
     return first, second
+
+
+def median_m(distances: FloatArray) -> float:
+    """Of distances (k,); NaN where nothing could be compared."""
+    return float(np.median(distances)) if len(distances) else float("nan")

@@ -1,14 +1,12 @@
 """A map of street photos placed on a scan by its fronts, the ground and what it sees of roofs.
 
-Search in plan, then points to planes of the solid that the scan shows. Photos whose points lie elsewhere are
-left out: maps of fronts that look alike are joined wrongly. Other places of the same search say how often as
-many points agree by chance. Where a map as a whole lies nowhere, its parts are tried.
+Search in plan, then points to planes of the solid that the scan shows: docs/measurements/ground-and-air.md.
 """
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +18,11 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape, SolidFit, fitted, laid, shape_of
-from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch, PlanTry
+from ingest.register.anchor.ground.search import SIZE_STEP, TURN_STEP, Geotags, PlanSearch
 from ingest.register.anchor.ground.street_plan import StreetPlan, parts, street_plan
+from ingest.register.anchor.start.from_ortho import PlanTry
 from ingest.register.frame.dense.confirmation import JointEvidence
+from ingest.register.outcome import Outcome
 
 _LOG = logging.getLogger(__name__)
 
@@ -61,23 +61,18 @@ GroundReason = Literal[
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GroundPlace:
-    """Where a map lies, or why that is not known.
+class GroundPlace(Outcome[GroundReason]):
+    """Where a map lies, or why that is not known; `message` has words on the evidence where it is placed.
 
     Attributes:
-        reason, message: of the refusal; None and words on the evidence where it is placed.
         local_from_own: similarity. covariance: (7, 7) of its left perturbation.
         image_ids: of the photos that lie there. residual_rms_m: of the points that agree.
-        figures: JSON-able.
     """
 
-    reason: GroundReason | None
-    message: str
     local_from_own: Sim3 | None = None
     covariance: FloatArray | None = None
     image_ids: tuple[int, ...] = ()
     residual_rms_m: float = 0.0
-    figures: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -158,9 +153,9 @@ def _over(one: _Tried, rate: float) -> float:
 def _start(plan: StreetPlan, shape: ScanShape, one: PlanTry) -> Sim3:
     """The plan there, its cameras at the eyes of people who stand on the scan's ground."""
     rotation = so3_exp([0.0, 0.0, one.turn])
-    centers = one.size * plan.centers @ rotation.T + np.array([one.x, one.y, 0.0])
+    centers = one.size * plan.centers @ rotation.T + np.append(one.middle, 0.0)
     up = float(np.median(shape.ground[shape.cells(centers[:, :2])] + _EYE_M - centers[:, 2]))
-    return Sim3(scale=one.size, rotation=rotation, translation=np.array([one.x, one.y, up]))
+    return Sim3(scale=one.size, rotation=rotation, translation=np.append(one.middle, up))
 
 
 def _fitted(
@@ -196,35 +191,22 @@ def _judged(
         final = _asked(shape, _fitted(plan, shape, sim, rows, _FINE_WIDTHS_M))
         sim = final.fit.local_from_own
         kept = _lie_there(unplaced, plan, shape, sim, rate)
-    figures: dict[str, Any] = {"photos": int(kept.sum()), "of": len(kept), "rate": rate}
     if kept.sum() < _LEAST_PHOTOS:
         few = f"{int(kept.sum())} of its photos lie on the scan"
-        return GroundPlace(reason="TOO_FEW_FRAMES", message=few, figures=figures)
+        return GroundPlace(reason="TOO_FEW_FRAMES", message=few)
     rows = _rows_seen(unplaced, plan, kept)
     there_m = (one.fit.local_from_own.act(plan.points[rows]) - sim.act(plan.points[rows]) for one in there)
     away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])
-    elsewhere = scores[away > _ELSEWHERE_M]
-    log_nfa = _log_nfa(scores[first], elsewhere) - float(np.log10(tests))
+    log_nfa = _log_nfa(scores[first], scores[away > _ELSEWHERE_M]) - float(np.log10(tests))
     others = [
         one
         for one, far in zip(there, away, strict=True)
         if far > _APART_M and abs(np.log(one.fit.local_from_own.scale / sim.scale)) < _ALIKE
     ]
-    rivals = [
-        _rival_p(plan, shape, rows, sim, one.fit.local_from_own)
-        for one in sorted(others, key=lambda one: _over(one, rate))[-_RIVALS:]
-    ]
-    centers = sim.act(plan.centers[kept])
-    figures |= {
-        "places": final.evidence.places,
-        "agreeing": final.evidence.agreeing,
-        "log_nfa": log_nfa,
-        "over_chance": float(scores[first]),
-        "elsewhere": len(elsewhere),
-        "elsewhere_over_chance": float(elsewhere.max(initial=-np.inf)),
-        "rival": max(rivals, default=0.0),
-        "camera_height_m": float((centers[:, 2] - shape.ground[shape.cells(centers[:, :2])]).mean()),
-    }
+    best = sorted(others, key=lambda one: _over(one, rate))[-_RIVALS:]
+    rivals = (_rival_p(plan, shape, rows, sim, one.fit.local_from_own) for one in best)
+    rival = max(rivals, default=0.0)
+    figures = {"photos": int(kept.sum()), "of": len(kept), "rate": rate, "log_nfa": log_nfa, "rival": rival}
     words = (
         f"{int(kept.sum())} of {len(kept)} photos lie on the scan's outlines: "
         f"{final.evidence.agreeing:.0f} of {final.evidence.places} places agree"
@@ -237,11 +219,11 @@ def _judged(
         covariance=covariance,
         image_ids=tuple(i.image_id for i, stays in zip(unplaced.images, kept, strict=True) if stays),
         residual_rms_m=rms_m,
-        figures=figures,
+        figures=figures | asdict(final.evidence),
     )
     if log_nfa < _LOG_RATE:
         return replace(found, reason="STRUCTURE", message=f"{words}, which chance gives, too")
-    if max(rivals, default=0.0) > _RIVAL_RATE:
+    if rival > _RIVAL_RATE:
         return replace(found, reason="AMBIGUOUS", message=f"{words}, and nearly as many at another place")
     return found
 
@@ -267,10 +249,9 @@ def _best_around(plan: StreetPlan, shape: ScanShape, best: _Tried, rate: float) 
     starts = [sim]
     for turn in np.arange(8) * np.pi / 4:
         shift = _AGAIN_M * np.array([np.cos(turn), np.sin(turn), 0.0])
-        starts.append(Sim3(scale=1.0, rotation=np.eye(3), translation=shift) @ sim)
+        starts.append(Sim3.shift(shift) @ sim)
     for size in (-_AGAIN_SIZE, _AGAIN_SIZE):
-        about = Sim3(scale=1.0, rotation=np.eye(3), translation=best.fit.middle)
-        starts.append(about @ Sim3.exp([size, *[0.0] * 6]) @ about.inverse() @ sim)
+        starts.append(Sim3.exp([size, *[0.0] * 6]).about(best.fit.middle) @ sim)
     tried = [_asked(shape, _fitted(plan, shape, start, rows, _COARSE_WIDTHS_M)) for start in starts]
     return max(tried, key=lambda one: _over(one, rate))
 
@@ -335,5 +316,4 @@ def _covariance(final: _Tried) -> tuple[FloatArray, float]:
     offset = inverse @ fit.by_walls * _WALL_SIGMA_M
     covariance = factor * max(rms_m, _LEAST_SIGMA_M) ** 2 * inverse + np.outer(offset, offset)
     covariance[4:, 4:] += np.eye(3) * CELL_M**2 / 12.0
-    about = Sim3(scale=1.0, rotation=np.eye(3), translation=fit.middle)
-    return about.carried(covariance), rms_m
+    return Sim3.shift(fit.middle).carried(covariance), rms_m

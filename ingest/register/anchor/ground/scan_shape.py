@@ -1,8 +1,6 @@
 """A scan as a solid, ground, roofs and the walls that stand where its heights jump; and a map laid on it.
 
-A laser in the air sees hardly any walls. Where the heights of neighbouring cells differ by a storey,
-something stands upright between them, and that is what a photo from the street shows. A map is laid on it by
-its points' distances from planes, robust, from a start within some metres.
+A map is laid on it by its points' distances from planes, robust, from a start within some metres.
 """
 
 from dataclasses import dataclass
@@ -15,6 +13,8 @@ from scipy.spatial import cKDTree
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.render.cloud import PointCloud
+
+Circle = tuple[float, float, float]  # x, y, radius
 
 CELL_M = 0.5
 _VEGETATION = (3, 4, 5)  # ASPRS: crowns are no fronts, and people stand under them
@@ -64,8 +64,8 @@ class ScanShape:
         return np.asarray(there & self.known[self.cells(xy)])
 
 
-def shape_of(cloud: PointCloud, circle: tuple[float, float, float] | None = None) -> ScanShape | None:
-    """The solid that a scan shows within a circle (x, y, radius); None where it shows no surface."""
+def shape_of(cloud: PointCloud, circle: Circle | None) -> ScanShape | None:
+    """The solid that a scan shows within a circle; None where it shows no surface."""
     shown = ~np.isin(cloud.classification, _VEGETATION)
     if circle is not None:
         shown &= np.hypot(cloud.xyz[:, 0] - circle[0], cloud.xyz[:, 1] - circle[1]) < circle[2]
@@ -257,8 +257,7 @@ def fitted(
         fit = laid(shape, own, sim, widths_m[min(k, len(widths_m) - 1)])
         step = np.linalg.solve(fit.normal + prior, fit.right)
         step[:4] = np.clip(step[:4], -_MOST_TURN, _MOST_TURN)
-        about = Sim3(scale=1.0, rotation=np.eye(3), translation=fit.middle)
-        sim = about @ Sim3.exp(step) @ about.inverse() @ sim
+        sim = Sim3.exp(step).about(fit.middle) @ sim
         if k >= len(widths_m) and float(np.abs(step).max()) < _SETTLED:
             break
     return laid(shape, own, sim, widths_m[-1])

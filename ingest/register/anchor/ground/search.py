@@ -9,8 +9,9 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.anchor.ground.scan_shape import CELL_M, ScanShape
+from ingest.register.anchor.ground.scan_shape import CELL_M, Circle, ScanShape
 from ingest.register.anchor.ground.street_plan import StreetPlan
+from ingest.register.anchor.start.from_ortho import PlanTry, first_apart
 
 _CELL_M = 1.0
 _BLUR_CELLS = 1.0
@@ -24,17 +25,6 @@ _LOOSE = 1.5  # of the mean of geotags: those of one visit err together
 _WRONG = 9.0  # squared sigmas from which on a geotag says nothing; a third of them may be so
 _SIGMAS = 4.0  # of the geotags within which a place is looked for
 _NEAR_M, _NEAR_TURN, _NEAR_SIZE = 4.0, np.radians(10.0), 0.15  # tries that are one
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanTry:
-    """The plan at a size (metres a unit), heading (radians, x to y) and place (metres), and how it agrees."""
-
-    size: float
-    turn: float
-    x: float
-    y: float
-    agreeing: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,15 +43,15 @@ class Geotags:
         squared = np.square((off - np.median(off, axis=0)) / self.sigma_m[:, None]).sum(axis=1)
         return float(np.minimum(squared, _WRONG).sum())
 
-    def circle(self, plan: StreetPlan, size: float, turn: float) -> tuple[float, float, float]:
+    def circle(self, plan: StreetPlan, size: float, turn: float) -> Circle:
         """x, y and radius of where the middle of the plan's cameras may be."""
         return self._about(self._offsets(plan, size, turn), _NEAR_M)
 
-    def around(self, reach_m: float) -> tuple[float, float, float]:
+    def around(self, reach_m: float) -> Circle:
         """x, y and radius of what lies within a reach of where the photos may have been taken."""
         return self._about(self.xy, reach_m)
 
-    def _about(self, xy: FloatArray, reach_m: float) -> tuple[float, float, float]:
+    def _about(self, xy: FloatArray, reach_m: float) -> Circle:
         x, y = np.median(xy, axis=0).tolist()
         sigma = _LOOSE * float(np.sum(self.sigma_m**-2.0)) ** -0.5
         return x, y, _SIGMAS * sigma + reach_m
@@ -113,16 +103,12 @@ class PlanSearch:
             for turn in near:
                 circle = None if tags is None else tags.circle(plan, size, turn)
                 at_size += self._best(*cells, size, turn, circle)
-            found += best_tries(at_size, _OF_SIZE)
+            best = sorted(at_size, key=lambda one: one.agreeing, reverse=True)
+            found += first_apart(best, _same, _OF_SIZE)
         return found
 
     def _best(
-        self,
-        fronts: FloatArray,
-        free: FloatArray,
-        size: float,
-        turn: float,
-        circle: tuple[float, float, float] | None,
+        self, fronts: FloatArray, free: FloatArray, size: float, turn: float, circle: Circle | None
     ) -> list[PlanTry]:
         cos, sin = np.cos(turn), np.sin(turn)
         rotation = np.array([[cos, -sin], [sin, cos]])
@@ -152,8 +138,8 @@ class PlanSearch:
         rows, columns = np.unravel_index(best, over.shape)
         places = self._corner + (np.column_stack([columns, rows]) + first[::-1] + 0.5) * _CELL_M
         return [
-            PlanTry(size=size, turn=turn, x=float(x), y=float(y), agreeing=float(values[k]))
-            for k, (x, y) in zip(best, places, strict=True)
+            PlanTry(size=size, turn=turn, middle=place, agreeing=float(values[k]))
+            for k, place in zip(best, places, strict=True)
             if np.isfinite(values[k])
         ]
 
@@ -168,20 +154,8 @@ class PlanSearch:
         return np.asarray(fft.rfft2(np.asarray(of, dtype=np.float32), self._padded))
 
 
-def best_tries(tries: Sequence[PlanTry], count: int) -> list[PlanTry]:
-    """The best that are apart."""
-    kept: list[PlanTry] = []
-    for one in sorted(tries, key=lambda t: t.agreeing, reverse=True):
-        if not any(_same(one, other) for other in kept):
-            kept.append(one)
-            if len(kept) == count:
-                break
-    return kept
-
-
 def _same(one: PlanTry, other: PlanTry) -> bool:
-    away = np.hypot(one.x - other.x, one.y - other.y)
-    turn = abs((one.turn - other.turn + np.pi) % (2.0 * np.pi) - np.pi)
+    away, turn = one.apart(other)
     size = abs(np.log(one.size / other.size))
     return bool(away < _NEAR_M and turn < _NEAR_TURN and size < _NEAR_SIZE)
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.spatial import cKDTree
 
 from featuredb.geometry.arrays import FloatArray
@@ -16,6 +15,7 @@ from featuredb.geometry.rotation import rotation_to_up
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import UnplacedMap
+from ingest.sfm.links import seen_by_both, shares_of
 
 _NEIGHBOURS = 12  # of which a plane is made
 _THIN, _STEEP = 0.15, 0.25  # of a front: third over second spread, and its normal's rise
@@ -23,14 +23,11 @@ _PRIOR = 0.02  # of the vertical, against fronts: mean square of a normal's rise
 _LEVEL, _LEVEL_ROUNDS = 0.2, 5  # rise of a photo's level side, at most
 _ON_EDGE = 0.05  # what is held against a photo on edge, as a rise: most are not
 _VOXEL_SHARE = 0.02  # of the median distance at which cameras see points: side of what counts as one
-# Sine of a level view: maps of the simulated towns have 0.03 to 0.18 in the median, a drone that looks 15
-# degrees down 0.26. Rise of the cameras, over their spread.
+# Sine of a level view: a drone that looks 15 degrees down has 0.26. Rise of the cameras, over their spread.
 _STEEPEST, _MOST_RISE = 0.25, 0.25
 _RAYS = 4000
 _BEFORE = 0.9  # of a ray is open ground
-# Normalised weight of a cut from which on a map hangs together. Wrong joins in simulated towns had 0.02 to
-# 0.13, maps that were joined rightly 0.55 to 0.95; what is cut needlessly is only tried in vain.
-_FIRM = 0.5
+_FIRM = 0.5  # normalised weight of a cut from which on a map hangs together
 _LEAST_TIE = 1e-6  # of photos that share no point: each is on a side, too
 
 
@@ -157,15 +154,10 @@ def halves(unplaced: UnplacedMap) -> tuple[UnplacedMap, ...]:
 
 def weakest_cut(unplaced: UnplacedMap) -> tuple[NDArray[np.bool_], float]:
     """(i,) whether an image is on one side of it, and its normalised weight, 0 to 2."""
-    count = len(unplaced.images)
-    rows = unplaced.image_rows(unplaced.observations.image_id)
-    sees = sparse.csr_array(
-        (np.ones(len(rows)), (rows, unplaced.observations.point_index)),
-        shape=(count, max(len(unplaced.points), 1)),
-    )
-    shared = (sees @ sees.T).toarray()
-    seen = np.maximum(np.diagonal(shared), 1.0)
-    ties = np.maximum(shared / np.minimum.outer(seen, seen), _LEAST_TIE)
+    count, observations = len(unplaced.images), unplaced.observations
+    rows = unplaced.image_rows(observations.image_id)
+    shares = shares_of(seen_by_both(rows, observations.point_index, count, len(unplaced.points)))
+    ties = np.maximum(shares, _LEAST_TIE)
     np.fill_diagonal(ties, 0.0)
     degree = ties.sum(axis=1)
     root = np.sqrt(degree)

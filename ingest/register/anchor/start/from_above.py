@@ -1,13 +1,9 @@
 """A map without a place, found on a scan of some hundred metres by what both show from above.
 
 The scan is drawn from above, side by side. Features of these pictures have places on the scan, those of the
-map have points of its frame: where they match, a similarity takes the one to the other. SIFT minds neither
-the heading nor the size, so neither needs to be known, nor which way is up. All photos decide together. Only
-places with the cameras above the ground count: seen from below, flat ground is its own mirror image.
-
-How sure that is: the expected number of similarities that as many chance matches would fit as well
-(a-contrario; Moulon, Monasse, Marlet 2012), matches with one point of the map or one spot of the scan being
-one.
+map have points of its frame: where they match, a similarity takes the one to the other. How sure that is: the
+expected number of similarities that as many chance matches would fit as well (a-contrario; Moulon, Monasse,
+Marlet 2012).
 """
 
 from collections.abc import Iterator
@@ -16,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.arrays import FloatArray, joined
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian, similarity_closed_form
@@ -24,7 +20,7 @@ from featuredb.index.nearest import nearest
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import Rendering, render
-from ingest.register.frame.features.matching import joined_pools, pool_features
+from ingest.register.frame.features.matching import pool_features
 from ingest.register.frame.views import FEATURES_SPACING_PX, MIN_COVER, available_sources
 from ingest.register.frame_registration import RenderSource
 from reloc.localise.acceptance import log_nfa
@@ -81,7 +77,7 @@ def _found(unplaced: UnplacedMap, cloud: PointCloud, source: RenderSource) -> Fo
     pools = [pool_features(view, source, upright=False) for view in _views(cloud, wide_m)]
     if not pools:
         return None
-    pool = joined_pools(pools)
+    pool = joined(pools)
     point, place = _matched(unplaced, pool.descriptors)
     if len(point) <= _SAMPLE:
         return None

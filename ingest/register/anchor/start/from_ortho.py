@@ -1,14 +1,11 @@
 """A map without a place, found on a scan whose intensities share no features with photos.
 
-Grey values of a photo and a laser's intensities are related by no function; where edges run stays. So the
-map's photos are laid out as one small picture from above (`ortho`), whose oriented gradients are compared
+The map's photos are laid out as one small picture from above (`ortho`), whose oriented gradients are compared
 with the scan's (`dense.pictures`) at all places, headings and sizes: coarse, then the best of them finer.
-All photos decide together.
-
 What comes out is a start. Whether it is right, frames say that are registered from there one by one.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -45,9 +42,8 @@ _NEAR_MIDDLE = 3.0  # of the median distance: points that tell the ground
 _SIZE_SIGMA, _TURN_SIGMA = 0.02, np.radians(2.0)
 _TILT_SIGMA, _SLOPE_SIGMA = np.radians(2.0), np.radians(10.0)
 _PLAN_SIGMA_M, _PLAN_CELLS, _HEIGHT_SIGMA_M = 2.0, 1.5, 3.0
-# The harmonic of the angle doubled; the other one tells little more. Edges of a direction and a spacing that
-# the scan is full of, as streets are and rows of seats, agree in many places and count for less: by the root
-# of their power, smoothed over so many frequencies.
+# The harmonic of the angle doubled; the other one tells little more. Frequencies that are strong in the scan
+# count for less: by the root of their power, smoothed over so many frequencies.
 _CHANNELS, _POWER_SIGMA, _LEAST_POWER = 2, 3.0, 1e-3
 _TINY = 1e-12
 _INSIDE = 2  # cells from the border of what is shown that show no edge
@@ -55,17 +51,23 @@ _LEAST_SHOWN = 100  # cells inside: fewer agree with anything
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PictureTry:
-    """A picture with cells of `size` metres, turned by `turn` (radians, x to y), its middle at `middle` (2,).
+class PlanTry:
+    """A map from above, tried at a place.
 
     Attributes:
-        correlation: of the gradients there.
+        size: metres of a cell or unit. turn: radians, x to y. middle: (2,) metres, where its middle lies.
+        agreeing: with the scan there.
     """
 
     size: float
     turn: float
     middle: FloatArray
-    correlation: float
+    agreeing: float
+
+    def apart(self, other: "PlanTry") -> tuple[float, float]:
+        """Metres and radians between two."""
+        turn = abs((self.turn - other.turn + np.pi) % (2.0 * np.pi) - np.pi)
+        return float(np.linalg.norm(self.middle - other.middle)), float(turn)
 
     def similarity(self, picture: OrthoPicture, up: float) -> Sim3:
         """That lays the picture there, the median of its heights at `up`."""
@@ -73,6 +75,22 @@ class PictureTry:
         middle = np.array([*picture.middle, float(np.median(picture.height[picture.valid]))])
         there = np.array([*self.middle, up])
         return Sim3(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
+
+
+_OverChance = Callable[[PlanTry], float]  # deviations
+
+
+def first_apart(
+    tries: Iterable[PlanTry], same: Callable[[PlanTry, PlanTry], bool], most: int
+) -> list[PlanTry]:
+    """The first of those that are not the same as a better one, at most so many."""
+    kept: list[PlanTry] = []
+    for one in tries:
+        if not any(same(one, other) for other in kept):
+            kept.append(one)
+        if len(kept) == most:
+            break
+    return kept
 
 
 class ScanSearch:
@@ -94,7 +112,7 @@ class ScanSearch:
         self._energy, self._valid = self._forward(energy), self._forward(picture.valid)
         self._mean = float(energy[picture.valid].mean()) if picture.valid.any() else np.inf
 
-    def best(self, of: OrthoPicture, size: float, turn: float) -> PictureTry | None:
+    def best(self, of: OrthoPicture, size: float, turn: float) -> PlanTry | None:
         """The best place of a picture; None where it lies nowhere on the scan."""
         scale = size / self.picture.cell
         gray, valid, matrix = _turned(of, scale, turn)
@@ -126,7 +144,7 @@ class ScanSearch:
         first = np.array([column - held[1][0], row - held[0][0]])
         at = first + matrix @ np.array([of.gray.shape[1] / 2, of.gray.shape[0] / 2, 1.0])
         middle = self.picture.corner + at * self.picture.cell
-        return PictureTry(size=size, turn=turn, middle=middle, correlation=float(score[row, column]))
+        return PlanTry(size=size, turn=turn, middle=middle, agreeing=float(score[row, column]))
 
     def _forward(self, of: NDArray[np.generic]) -> NDArray[np.complex64]:
         return np.asarray(fft.rfft2(np.asarray(of, dtype=np.float32), self._shape))
@@ -167,10 +185,9 @@ def _found(
     tilt = _TILT_SIGMA if by_photos else _SLOPE_SIGMA
     plan_m = float(np.hypot(_PLAN_SIGMA_M, _PLAN_CELLS * drawn.cell))
     sigmas = [_SIZE_SIGMA, tilt, tilt, _TURN_SIGMA, plan_m, plan_m, _HEIGHT_SIGMA_M]
-    about = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([*best.middle, up]))
     return FoundPlace(
         local_from_own=best.similarity(picture, up) @ upright,
-        covariance=about.carried(np.diag(np.square(sigmas))),
+        covariance=Sim3.shift(np.array([*best.middle, up])).carried(np.diag(np.square(sigmas))),
         evidence=over_chance,
         sure=False,  # chance alone passes in one case of two: it is up to the photos that are registered
         words=f"its photos from above agree with the scan's {source} by {over_chance:.1f} deviations "
@@ -178,7 +195,7 @@ def _found(
     )
 
 
-def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> tuple[PictureTry, float, float] | None:
+def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> tuple[PlanTry, float, float] | None:
     """Where a picture of whatever unit agrees best with one in metres; None where it fits nowhere on it.
 
     Returns:
@@ -205,35 +222,31 @@ def best_place(picture: OrthoPicture, drawn: OrthoPicture) -> tuple[PictureTry, 
 
 
 def _again(
-    scan: ScanSearch,
-    picture: OrthoPicture,
-    tries: Sequence[PictureTry],
-    chance: Callable[[PictureTry], float],
-) -> list[PictureTry]:
+    scan: ScanSearch, picture: OrthoPicture, tries: Sequence[PlanTry], chance: _OverChance
+) -> list[PlanTry]:
     """The best of the tries with finer steps around them."""
     steps = np.array([-1.0, 0.0, 1.0]) * _AGAIN_STEP
-    found: list[PictureTry] = []
+    found: list[PlanTry] = []
     for one in sorted(tries, key=chance, reverse=True)[:_AGAIN]:
         found += _tried(scan, picture, one.size * np.exp(_SIZE_STEP * steps), one.turn + _TURN_STEP * steps)
     return found
 
 
-def _tried(scan: ScanSearch, picture: OrthoPicture, sizes: FloatArray, turns: FloatArray) -> list[PictureTry]:
+def _tried(scan: ScanSearch, picture: OrthoPicture, sizes: FloatArray, turns: FloatArray) -> list[PlanTry]:
     found = (scan.best(picture, size, turn) for size in sizes.tolist() for turn in turns.tolist())
     return [one for one in found if one is not None]
 
 
-def _over_chance(tries: Sequence[PictureTry], turns: int) -> Callable[[PictureTry], float] | None:
+def _over_chance(tries: Sequence[PlanTry], turns: int) -> _OverChance | None:
     """By how many deviations of `tries` of its size a correlation exceeds their median.
 
-    Small pictures agree with anything, streets with streets, and large ones have few places, whose best is
-    the less sure: both figures are smooth in the size. Sizes at which not all `turns` fit say nothing.
+    Both figures are smooth in the size. Sizes at which not all `turns` fit say nothing.
     """
     sizes, fitting = np.unique([one.size for one in tries], return_counts=True)
     sizes = sizes[fitting == turns]
     if len(sizes) <= _SMOOTH:
         return None
-    at_size = [[one.correlation for one in tries if one.size == size] for size in sizes]
+    at_size = [[one.agreeing for one in tries if one.size == size] for size in sizes]
     middle, high = np.percentile(at_size, (50.0, _HIGH_PERCENT), axis=1)
     if middle.min() <= 0.0 or (high <= middle).any():
         return None
@@ -241,23 +254,22 @@ def _over_chance(tries: Sequence[PictureTry], turns: int) -> Callable[[PictureTr
     spreads = np.polyfit(np.log(sizes), np.log(high - middle), 1)
     play = float(np.exp(_SIZE_STEP / 2))
 
-    def over(one: PictureTry) -> float:
+    def over(one: PlanTry) -> float:
         if not sizes[0] / play <= one.size <= sizes[-1] * play:
             return -np.inf
         at, spread = (float(np.exp(np.polyval(of, np.log(one.size)))) for of in (middles, spreads))
-        return (one.correlation - at) / spread
+        return (one.agreeing - at) / spread
 
     return over
 
 
-def _apart(one: PictureTry, other: PictureTry, cells: int) -> bool:
+def _apart(one: PlanTry, other: PlanTry, cells: int) -> bool:
     """Whether two tries lie a tenth of the picture or two steps of the heading apart."""
-    turn = np.abs((one.turn - other.turn + np.pi) % (2.0 * np.pi) - np.pi)
-    away = float(np.linalg.norm(one.middle - other.middle))
-    return bool(turn > 2.0 * _TURN_STEP or away > 0.1 * cells * other.size)
+    away, turn = one.apart(other)
+    return turn > 2.0 * _TURN_STEP or away > 0.1 * cells * other.size
 
 
-def _under(scan: OrthoPicture, picture: OrthoPicture, found: PictureTry) -> FloatArray:
+def _under(scan: OrthoPicture, picture: OrthoPicture, found: PlanTry) -> FloatArray:
     """Heights of the scan under the map's picture."""
     _, valid, matrix = _turned(picture, found.size / scan.cell, found.turn)
     half = matrix @ np.array([picture.gray.shape[1] / 2, picture.gray.shape[0] / 2, 1.0])

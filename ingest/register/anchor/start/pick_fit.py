@@ -1,9 +1,8 @@
 """The pose that picked points give, weighed as evidence: adjustment, chi-square, leave-one-out.
 
-A person's picks are measurements with a known deviation. Their residuals therefore tell by chi-square whether
-they can all be right (Baarda's data snooping where they cannot): a set of picks is believed if the sum of its
-squared whitened residuals is likely for its redundancy, and a pick is called wrong if the others fit
-without it and no other pick's removal does nearly as well.
+A set of picks is believed if the sum of its squared whitened residuals is likely for its redundancy, by
+chi-square, and a pick is called wrong if the others fit without it and no other pick's removal does nearly as
+well (Baarda's data snooping).
 """
 
 from dataclasses import dataclass, replace

@@ -13,11 +13,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import MapImage
 from featuredb.maps.unplaced_map import AnyMap
 from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
-from ingest.register.anchor.start.priors import (
-    MIN_SIGMA_ANGLE_DEG,
-    MIN_SIGMA_HORIZONTAL_M,
-    MIN_SIGMA_VERTICAL_M,
-)
+from ingest.register.anchor.start.priors import honest_prior
 from ingest.register.frame_registration import FramePrior
 from reloc.tracking.pose_fit import of_camera
 
@@ -116,11 +112,7 @@ def least_picks(focal_rel: float) -> int:
 
 
 def pose_from_picks(
-    picks: Picks,
-    points: FloatArray,
-    camera: Camera,
-    present: Rigid3 | None,
-    focal_rel: float = KNOWN_FOCAL_REL,
+    picks: Picks, points: FloatArray, camera: Camera, present: Rigid3 | None, focal_rel: float
 ) -> tuple[FramePrior, PickFit]:
     """Pose by picked correspondences, if they determine it and do not contradict each other.
 
@@ -160,19 +152,14 @@ def prior_of_picks(image: str, points: FloatArray, fit: PickFit, present: Rigid3
     if objection:
         raise RegistrationError(f"picks of {image}: {objection}")
     pose = fit.cam_from_local
-    sigma = np.sqrt(np.diag(of_camera(pose, fit.covariance)))
-    angles = np.maximum(np.degrees(sigma[:3]), MIN_SIGMA_ANGLE_DEG)
-    prior = FramePrior(
-        cam_from_local=pose,
-        sigma_horizontal_m=max(float(sigma[3:5].max()), MIN_SIGMA_HORIZONTAL_M),
-        sigma_vertical_m=max(float(sigma[5]), MIN_SIGMA_VERTICAL_M),
-        sigma_heading_deg=float(angles[2]),
-        sigma_tilt_deg=float(angles[:2].max()),
-    )
-    if prior.sigma_horizontal_m > _MAX_PICK_SIGMA_M or angles.max() > _MAX_PICK_SIGMA_DEG:
+    tilt, other, heading, *plan, up = np.sqrt(np.diag(of_camera(pose, fit.covariance))).tolist()
+    heading_deg, tilt_deg = np.degrees([heading, max(tilt, other)]).tolist()
+    prior = honest_prior(pose, max(plan), up, heading_deg, tilt_deg)
+    turn_deg = max(prior.sigma_heading_deg, prior.sigma_tilt_deg)
+    if prior.sigma_horizontal_m > _MAX_PICK_SIGMA_M or turn_deg > _MAX_PICK_SIGMA_DEG:
         raise RegistrationError(
             f"picks of {image}: they leave the pose open to {prior.sigma_horizontal_m:.0f} m and "
-            f"{angles.max():.0f} degrees; spread them over the photo"
+            f"{turn_deg:.0f} degrees; spread them over the photo"
         )
     return prior
 

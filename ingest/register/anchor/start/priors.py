@@ -15,7 +15,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.sim3 import Sim3, place_covariance
 from featuredb.maps.feature_map import FeatureMap, MapImage, Placement
 from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
@@ -28,7 +28,7 @@ from ingest.register.frame_registration import SIGMAS, FramePrior
 # motion).
 MIN_SIGMA_HORIZONTAL_M = 1.0
 MIN_SIGMA_VERTICAL_M = 1.0  # after the heights of map and scan have been compared
-MIN_SIGMA_ANGLE_DEG = 1.0  # bent reconstructions turn single frames by some tenths of a degree
+_MIN_SIGMA_ANGLE_DEG = 1.0  # bent reconstructions turn single frames by some tenths of a degree
 # A map point that finds no scan point within this horizontal distance says nothing of the height; a few times
 # the spacing of sparse airborne scans.
 _SHIFT_REACH_M = 3.0
@@ -89,22 +89,25 @@ def prior_from_map(feature_map: FeatureMap, image: MapImage, shift: HeightShift 
         shift: moves the prior to the scan's heights, and takes the place of the placement's vertical sigma.
     """
     covariance, pose = feature_map.placement.covariance, image.cam_from_local
-    jacobian = point_jacobian(pose.center)
-    spread = jacobian @ covariance @ jacobian.T
-    horizontal, vertical = (
-        float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])),
-        float(np.sqrt(spread[2, 2])),
-    )
+    spread = place_covariance(covariance, pose.center)
+    horizontal, vertical = np.sqrt([np.linalg.eigvalsh(spread[:2, :2])[-1], spread[2, 2]]).tolist()
     if shift is not None:
         pose = Rigid3.from_center(pose.rotation, pose.center + np.array([0.0, 0.0, shift.shift_m]))
         vertical = shift.sigma_m
     tilt, heading = np.degrees(np.sqrt([max(covariance[1, 1], covariance[2, 2]), covariance[3, 3]])).tolist()
+    return honest_prior(pose, horizontal, vertical, heading, tilt)
+
+
+def honest_prior(
+    pose: Rigid3, horizontal_m: float, vertical_m: float, heading_deg: float, tilt_deg: float
+) -> FramePrior:
+    """A pose with its standard deviations, none smaller than what scans and maps disagree by."""
     return FramePrior(
         cam_from_local=pose,
-        sigma_horizontal_m=max(horizontal, MIN_SIGMA_HORIZONTAL_M),
-        sigma_vertical_m=max(vertical, MIN_SIGMA_VERTICAL_M),
-        sigma_heading_deg=max(heading, MIN_SIGMA_ANGLE_DEG),
-        sigma_tilt_deg=max(tilt, MIN_SIGMA_ANGLE_DEG),
+        sigma_horizontal_m=max(horizontal_m, MIN_SIGMA_HORIZONTAL_M),
+        sigma_vertical_m=max(vertical_m, MIN_SIGMA_VERTICAL_M),
+        sigma_heading_deg=max(heading_deg, _MIN_SIGMA_ANGLE_DEG),
+        sigma_tilt_deg=max(tilt_deg, _MIN_SIGMA_ANGLE_DEG),
     )
 
 
@@ -246,7 +249,7 @@ def place_by_photo(
             *(prior.sigma_horizontal_m, prior.sigma_horizontal_m, prior.sigma_vertical_m),
         ]
     )
-    at_camera = Sim3(scale=1.0, rotation=np.eye(3), translation=pose.center)
+    at_camera = Sim3.shift(pose.center)
     evidence = {"start": {"image": image.name, "no_place": unplaced.no_place.reason_code}}
     return placed_on(unplaced, cloud, local_from_own, at_camera.carried(np.diag(sigmas**2)), evidence)
 

@@ -1,15 +1,8 @@
 """Whether pictures confirm a pose, of one photo or of all photos of a map together.
 
-Do pieces of a photo, each on its own, put the scan where the pose does?
-
 Each piece of the rendering at the pose is searched in the photo within a window; without any relation between
-the two its best place is anywhere in the window, and near the middle with the small probability that the area
-gives. A pose that is right has a third or more of its pieces at the middle; a wrong one, even when it was
-fitted to the same pictures, as many as chance and six free parameters give. The evidence is the binomial
-tail. It does not ask how the pose was found.
-
-All photos of a map are asked together of one similarity, which gives each its pose. How often chance agrees
-is then taken from wrong places, too.
+the two its best place is anywhere there. The evidence is the binomial tail. All photos of a map are asked
+together of one similarity; how often chance agrees is then taken from wrong places, too.
 """
 
 from collections.abc import Sequence
@@ -161,8 +154,7 @@ def _layers_differ(found: Pieces) -> str:
     return ""
 
 
-# How many pieces of all photos of a map lie where one similarity of it puts them, and how often chance would:
-# photos that say little alone say enough together. Pieces that show the same place of the scan count as one.
+# All photos of a map together: pieces that show the same place of the scan count as one.
 
 # Of a piece's side, half of its area: pieces that overlap by half say about half as much as ones that do not.
 _CELL = 0.7

@@ -2,8 +2,6 @@
 
 Like ICP: a render is made at the pose, each piece takes the highest place of its score map within a few
 pixels, the pose is fitted to all of them with a robust loss, and a render is made anew. Coarse to fine.
-A single piece is off by a pixel or two where laser intensity and photo show an edge differently; some
-three hundred average.
 """
 
 from dataclasses import replace
@@ -13,9 +11,9 @@ import numpy as np
 
 from featuredb.render.renderer import Rendering
 from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
-from ingest.register.frame.dense.pictures import oriented_gradients
+from ingest.register.frame.dense.pictures import oriented_gradients, pinhole_view
 from ingest.register.frame.dense.score_maps import cut_templates, peaks, search_around
-from ingest.register.frame.dense.search import register_dense, searched_near
+from ingest.register.frame.dense.search import refined, register_dense, sides
 from ingest.register.frame.features.matching import NO_MATCHES, FrameMatches
 from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
 from ingest.register.frame.prior_fit import fitted_under_prior
@@ -83,11 +81,11 @@ def dense_fitted(views: FrameViews, prior: FramePrior, start: FrameHypothesis) -
     rounds = views.options.fit_rounds
     decided = start.kind == "features" and start.log_nfa >= DECISIVE_LOG_NFA
     for sizes in rounds[1:] if decided else rounds:
-        found = found and _fit_round(views, prior, found, *sizes)
+        found = found and _fit_round(views, prior, found, sizes)
     # A pose that is still on its way may look right already: the pieces that lie near have made it.
     for _ in range(views.options.more_rounds):
         before = found
-        found = found and _fit_round(views, prior, found, *rounds[-1])
+        found = found and _fit_round(views, prior, found, rounds[-1])
         if before is None or found is None or _moved_px(views, before, found) < 0.2:
             break
     return found
@@ -95,20 +93,18 @@ def dense_fitted(views: FrameViews, prior: FramePrior, start: FrameHypothesis) -
 
 def searched_again(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis | None:
     """The dense search's own maximum next to a pose that was fitted; None where there is none."""
-    near = searched_near(views, found.pose.camera, found.pose.cam_from_local, prior, found.source)
+    camera, pose = found.pose.camera, found.pose.cam_from_local
+    view = pinhole_view(views.gray, camera, sides(camera, prior, views.cloud)[-1])
+    near = refined(view, pose, prior, views.cloud, found.source)
     if near is None:
         return None
     return replace(found, kind="dense", pose=replace(found.pose, cam_from_local=near.cam_from_local))
 
 
 def _fit_round(
-    views: FrameViews,
-    prior: FramePrior,
-    start: FrameHypothesis,
-    spacing_px: float,
-    piece_px: int,
-    near_px: int,
+    views: FrameViews, prior: FramePrior, start: FrameHypothesis, sizes: tuple[float, int, int]
 ) -> FrameHypothesis | None:
+    spacing_px, piece_px, near_px = sizes
     side_px = views.side_px(spacing_px, MAX_SIDE_PX)
     renderings = views.renders([start.pose.cam_from_local], side_px)
     if not renderings:

@@ -1,13 +1,8 @@
 """What photo and scan look like to the dense search: pinhole views, pictures of a scan, oriented gradients.
 
-Grey values of the two are related by no function, and contrast turns round from one material to the next;
-where edges run stays. CFOG (Ye, Bruzzone, Shan, Bovolo, Zhu, "Fast and robust matching for multimodal remote
-sensing image registration", IEEE TGRS 2019) therefore keeps the gradient's strength in some directions
-modulo 180 degrees. Those channels share a large constant part, "there is texture", which swamps the
-correlation. The channels here are the Fourier series of the same function of direction without its constant
-term: strength times cosine and sine of twice and four times the gradient's angle. Four channels do the work
-of eight, they average to zero, and on aerial photos against laser intensity they found the right place far
-more often (docs/measurements/registration.md).
+The channels are the Fourier series, without its constant term, of what CFOG keeps of gradients (Ye, Bruzzone,
+Shan, Bovolo, Zhu, "Fast and robust matching for multimodal remote sensing image registration", IEEE TGRS
+2019). Why: docs/measurements/registration.md, "Intensity-only scans".
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 """Where in a photo each small piece of a rendering may lie: maps of agreement, one per piece.
 
-A map is kept instead of its highest peak. With laser intensity the peak is the right one in less than half
-of the pieces; summed over all pieces at the pixels that one pose predicts, the maps still have their maximum
-at the true pose (`ingest/register/frame/dense/search.py`).
+A map is kept instead of its highest peak, for `ingest.register.frame.dense.search`.
 """
 
 from dataclasses import dataclass

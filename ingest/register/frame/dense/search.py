@@ -1,10 +1,8 @@
 """Finds the pose of a photo over a scan by summing score maps at the pixels that a pose predicts.
 
-Point features between a photo and laser intensity are right in a few percent of the cases; whole pieces
-matched by oriented gradients in a third to a half. Here no piece has to be right on its own: each has a map
-of scores (`score_maps`), a pose says where in each map to look, and the sum over some hundred pieces is a
-smooth function of the pose with a high maximum at the true one. It is searched coarse to fine: on a grid of
-poses at low resolution, then by downhill simplex, rendering anew at each octave.
+No piece has to be right on its own: each has a map of scores (`score_maps`), a pose says where in each map to
+look, and the sum over some hundred pieces is a smooth function of the pose with a high maximum at the true
+one. It is searched coarse to fine: on a grid of poses at low resolution, then by downhill simplex.
 """
 
 from collections.abc import Sequence
@@ -80,22 +78,14 @@ def register_dense(views: FrameViews, prior: FramePrior, source: RenderSource) -
     They are hypotheses: whether the first is right is for `confirm_pose` to say.
     """
     camera, cloud = views.camera, views.cloud
-    octaves = [pinhole_view(views.gray, camera, side) for side in _sides(camera, prior, cloud)]
+    octaves = [pinhole_view(views.gray, camera, side) for side in sides(camera, prior, cloud)]
     poses = _vote(octaves[0], prior, cloud, source)
     for octave, view in enumerate(octaves):
-        refined = [_refined(view, pose, prior, cloud, source) for pose in poses]
-        found = sorted((p for p in refined if p is not None), key=lambda p: -p.score)
+        near = [refined(view, pose, prior, cloud, source) for pose in poses]
+        found = sorted((p for p in near if p is not None), key=lambda p: -p.score)
         distinct = _distinct(found, view.camera, prior)
         poses = [p.cam_from_local for p in distinct[: max(1, _KEPT // 2**octave)]]
     return distinct
-
-
-def searched_near(
-    views: FrameViews, camera: Camera, pose: Rigid3, prior: FramePrior, source: RenderSource
-) -> DensePose | None:
-    """The highest sum of score maps near a pose, at the finest octave; None where it shows too little."""
-    view = pinhole_view(views.gray, camera, _sides(camera, prior, views.cloud)[-1])
-    return _refined(view, pose, prior, views.cloud, source)
 
 
 def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: RenderSource) -> list[Rigid3]:
@@ -194,10 +184,10 @@ def _pan_tilts(reach_px: float, camera: Camera) -> FloatArray:
     return np.asarray(Rotation.from_rotvec(axes).as_matrix())
 
 
-def _refined(
+def refined(
     view: PinholeView, pose: Rigid3, prior: FramePrior, cloud: PointCloud, source: RenderSource
 ) -> DensePose | None:
-    """Downhill simplex on the score maps of a render made at the pose."""
+    """Downhill simplex on the score maps of a render made at the pose; None where it shows too little."""
     radius = _REFINE_RADIUS_PX
     maps = score_maps_of(view, pose, radius, cloud, source, radius, _MAX_PIECES)
     if len(maps) < 4:
@@ -253,8 +243,7 @@ def _distinct(poses: Sequence[DensePose], camera: Camera, prior: FramePrior) -> 
     return kept
 
 
-def _sides(camera: Camera, prior: FramePrior, cloud: PointCloud) -> list[int]:
+def sides(camera: Camera, prior: FramePrior, cloud: PointCloud) -> list[int]:
     """Longer sides of the octaves that photo and scan can fill."""
     most = finest_side_px(camera, prior.cam_from_local, cloud, _FINEST_SPACING)
-    sides = [side for side in _SIDES_PX if side <= 1.2 * most]
-    return sides or [_SIDES_PX[0]]
+    return [side for side in _SIDES_PX if side <= 1.2 * most] or [_SIDES_PX[0]]

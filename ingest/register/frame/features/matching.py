@@ -1,6 +1,5 @@
 """Features of renders, pooled with the scan points that they show, and their matches with a photo."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -41,14 +40,6 @@ class Pool:
         return len(self.points)
 
 
-def joined_pools(pools: Sequence[Pool]) -> Pool:
-    """One pool of all, at least one."""
-    return Pool(
-        points=np.concatenate([p.points for p in pools]),
-        descriptors=np.concatenate([p.descriptors for p in pools]),
-    )
-
-
 def pool_features(rendering: Rendering, source: RenderSource, *, upright: bool = True) -> Pool:
     """Features of a render, lifted to the scan by its depth.
 
@@ -60,7 +51,7 @@ def pool_features(rendering: Rendering, source: RenderSource, *, upright: bool =
     """
     image = filled(source_image(rendering, source), rendering.valid)
     features = extract(image, replace(_EXTRACTOR, upright=upright))
-    points, good = lift(rendering, features.xy, _MAX_DEPTH_STEP)
+    points, good = lift(rendering, features.xy)
     clear = cv2.distanceTransform(np.pad(rendering.valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     column = np.clip(features.xy[:, 0].astype(np.int64), 0, image.shape[1] - 1)
     row = np.clip(features.xy[:, 1].astype(np.int64), 0, image.shape[0] - 1)
@@ -85,9 +76,7 @@ def filled(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uin
     return np.asarray(np.clip(np.where(missing, rest, result), 0, 255), dtype=np.uint8)
 
 
-def lift(
-    rendering: Rendering, xy: NDArray[np.floating], max_depth_step: float
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+def lift(rendering: Rendering, xy: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Scan points (n, 3) under pixels (n, 2) of a render, and which of them can be trusted.
 
     Not trusted: nothing seen, a closed hole, or a silhouette among the pixel and its neighbours. Points that
@@ -104,7 +93,7 @@ def lift(
     depth = rendering.depth[row, column].astype(np.float64)
     good &= np.isfinite(around).all(axis=1) & (rendering.index[row, column] >= 0)
     span = np.where(good, np.ptp(np.where(np.isfinite(around), around, 0.0), axis=1), np.inf)
-    good &= span <= max_depth_step * np.where(good, depth, 1.0)
+    good &= span <= _MAX_DEPTH_STEP * np.where(good, depth, 1.0)
     rays = np.column_stack([rendering.camera.unproject(xy), np.ones(len(xy))])
     good &= np.isfinite(rays).all(axis=1)
     in_camera = np.where(good[:, None], rays * np.where(good, depth, 0.0)[:, None], 0.0)
@@ -134,14 +123,6 @@ class FrameMatches:
 
 
 NO_MATCHES = FrameMatches(pixels=np.empty((0, 2)), points=np.empty((0, 3)))
-
-
-def joined(parts: Sequence[FrameMatches]) -> FrameMatches:
-    """All matches of all parts; none for no parts."""
-    parts = [NO_MATCHES, *parts]
-    return FrameMatches(
-        pixels=np.concatenate([p.pixels for p in parts]), points=np.concatenate([p.points for p in parts])
-    )
 
 
 def pooled_matches(features: Features, pool: Pool, same_place_m: float, max_ratio: float) -> FrameMatches:

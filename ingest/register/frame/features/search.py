@@ -1,8 +1,7 @@
 """From a coarse prior to a first pose: star renders, pooled features, consistent matches, LO-RANSAC.
 
 Between a photo and a render of a scan only 3 to 7 of 100 matches are true (paper, section 3.1.1), too few
-for RANSAC on all of them. The true ones agree locally: near one true match the scene is moved by nearly one
-similarity, so another true match nearby has the same rotation and scale. False ones are spread at random.
+for RANSAC on all of them. Near one true match another one has about the same rotation and scale.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,15 +15,13 @@ from scipy.spatial import cKDTree
 from scipy.special import gammainc
 
 from featuredb.compiled import compiled_module
-from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.arrays import FloatArray, joined
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.renderer import Rendering
 from ingest.register.frame.features.matching import (
     NO_MATCHES,
     FrameMatches,
-    joined,
-    joined_pools,
     pool_features,
     pooled_matches,
 )
@@ -53,13 +50,6 @@ _NEIGHBOURS = 180
 # None farther away than this share of the image's longer side: beyond, relief and perspective make more than
 # one similarity of it.
 _REACH_REL = 0.15
-_MIN_GAP_REL = 0.006  # none nearer; keypoints of one structure agree with each other by construction
-# Of a neighbour's place, as a share of its distance; what slopes and perspective do to a similarity within
-# the reach.
-_TOLERANCE = 0.15
-_TOLERANCE_FLOOR_REL = 0.002  # and at least this share of the longer side, the noise of keypoints
-_MAX_TURN_DEG = 45.0  # largest rotation between photo and reference
-_MAX_ZOOM = 2.0  # largest change of scale between them, either way
 # -log10 of the expected number of matches, among all, that random neighbours would support as well. Three
 # false ones do not disturb RANSAC.
 _MIN_LOG_CHANCE = -0.5
@@ -110,13 +100,13 @@ def star_groups(views: FrameViews, prior: FramePrior) -> Iterator[RenderGroup]:
 
 def search(views: FrameViews, groups: Sequence[RenderGroup], source: RenderSource) -> FrameHypothesis | None:
     """A pose from the features of one source, or None where no pose has matches behind it."""
-    raw, kept = [], []
+    raw, kept = [NO_MATCHES], [NO_MATCHES]
     width, height = views.camera.width, views.camera.height
     for pose, renderings in groups:
         if not renderings:
             continue
         with ThreadPoolExecutor(views.threads) as threads:
-            pool = joined_pools(list(threads.map(lambda r: pool_features(r, source), renderings)))
+            pool = joined(list(threads.map(lambda r: pool_features(r, source), renderings)))
         matches = pooled_matches(views.features, pool, _SAME_PLACE * views.look.depth_m, _MAX_RATIO)
         raw.append(matches)
         reference = views.camera.project(pose.act(matches.points))
@@ -132,10 +122,9 @@ def consistent_matches(
 ) -> NDArray[np.bool_]:
     """Which matches (m,) have more neighbours that one similarity moves than chance gives them.
 
-    For each match i and each neighbour j, z_ij = (q_j - q_i) / (p_j - p_i), taken as complex numbers, is the
-    rotation and scale that the pair suggests. The support of i is the largest number of neighbours that one
-    such z takes to within the tolerance of where they are. How likely random matches do that follows from
-    the areas of the tolerances: the number of random hits is Poisson.
+    A match and each neighbour suggest a rotation and scale, (q_j - q_i) / (p_j - p_i) as complex numbers.
+    Support is the largest number of neighbours that one of these takes to where they are; by chance it is
+    Poisson.
 
     Args:
         photo: (m, 2) pixels. reference: (m, 2) where the matched scan points appear in one common view;
@@ -154,11 +143,7 @@ def consistent_matches(
             np.ascontiguousarray(photo[rows], dtype=np.float64),
             np.ascontiguousarray(reference[rows], dtype=np.float64),
             neighbour,
-            _MIN_GAP_REL * side_px,
-            _TOLERANCE,
-            _TOLERANCE_FLOOR_REL * side_px,
-            np.radians(_MAX_TURN_DEG),
-            np.log(_MAX_ZOOM),
+            side_px,
             area_px,
         )
     # -log10 of matches x hypotheses x P(at least so many of the others by chance).
