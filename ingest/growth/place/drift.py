@@ -6,6 +6,7 @@ not. The adjustment does (`featuredb.adjust.marginals`): poses and lenses with t
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,15 +127,25 @@ def photo_covariances(
         held = np.unique(fixed.point_of[kept][fixed.photo_of[kept] == k])
         places = np.vstack([block.xyz[rows[free]], fixed.xyz[held]])
         spread.middles[k] = np.median(places, axis=0)
-        jacobian = point_jacobian(places - spread.middles[k])
-        by_place = np.swapaxes(jacobian, 1, 2) @ np.concatenate([information[free], marked[held]])
-        normal = np.einsum("nij,njk->ik", by_place, jacobian)
+        told = np.concatenate([information[free], marked[held]])
         entries = (3 * free[:, None] + np.arange(3)).ravel()
-        by_free = by_place[: len(free)].transpose(1, 0, 2).reshape(7, -1)
-        similarity = np.linalg.pinv(normal, hermitian=True) @ (moved[entries].T @ by_free.T).T
+        similarity = _similarity(places - spread.middles[k], told, moved[entries])
         spread.shown[k] = similarity @ found.shared @ similarity.T
         spread.lens_turns[k] = similarity[1:4] @ common @ similarity[1:4].T
     return spread
+
+
+def _similarity(places: FloatArray, information: FloatArray, moved: Any) -> FloatArray:
+    """(7, q) the similarity that fits best how places (n, 3) move with unknowns, each as its rays tell it.
+
+    Args:
+        information: (n, 3, 3). moved: (3 m, q) CSR, of the first m places; the others stay.
+    """
+    jacobian = point_jacobian(places)
+    by_place = np.swapaxes(jacobian, 1, 2) @ information
+    normal = np.einsum("nij,njk->ik", by_place, jacobian)
+    by_moved = by_place[: moved.shape[0] // 3].transpose(1, 0, 2).reshape(7, -1)
+    return np.asarray(np.linalg.pinv(normal, hermitian=True) @ (moved.T @ by_moved.T).T)
 
 
 def _information(model: Model, fixed: FixedPoints, kept: NDArray[np.bool_], sigma_px: float) -> FloatArray:
