@@ -234,6 +234,29 @@ def _squares(problem: Problem, truth: Block, found: Marginals) -> tuple[float, f
     )
 
 
+def test_points_move_with_poses_and_lenses_as_is_said() -> None:
+    """Against points that are intersected anew after a pose and a lens have changed by little."""
+    block, px = _block(), 0.5
+    problem = Problem(block, Terms(keypoint_px=px, lenses=(lens_prior(TRUE, WIDTHS),)))
+    found, (rows, moved, information) = problem.marginals(), problem.points_by_shared()
+    np.testing.assert_array_equal(rows, np.arange(len(block.xyz)))
+    change = np.zeros(len(found.shared))
+    change[found.pose_start[3] + np.arange(6)] = [2e-5, -1e-5, 3e-5, 4e-4, -2e-4, 3e-4]
+    change[found.lens_start[0] + np.arange(4)] = [0.02, -0.01, 0.03, 0.02]
+    poses = list(block.cam_from_block)
+    poses[3] = Rigid3.exp(change[found.pose_start[3] + np.arange(6)]) @ poses[3]
+    lens = np.array(TRUE.params) + change[found.lens_start[0] + np.arange(8)]
+    camera = replace(TRUE, params=tuple(lens))
+    linear = linearise([camera], block.camera_of, poses, block.xyz, block.point_of, block.photo_of, block.xy)
+    expected = np.zeros_like(block.xyz)
+    for k in range(len(block.xyz)):
+        seen = linear.point_of == k
+        by_point = linear.by_point[seen].reshape(-1, 3)
+        expected[k] = np.linalg.lstsq(by_point, linear.residual[seen].ravel(), rcond=None)[0]
+        np.testing.assert_allclose(information[k], by_point.T @ by_point / px**2, rtol=1e-2, atol=1.0)
+    np.testing.assert_allclose((moved @ change).reshape(-1, 3), expected, atol=0.02 * np.abs(expected).max())
+
+
 def test_a_point_behind_all_cameras_breaks_no_covariance() -> None:
     """No residual depends on it: as if it were not there."""
     block = whole_lens(_block())
