@@ -10,7 +10,8 @@ survey at the far end is ingested and growth runs again.
 Exit code 0 if: coverage follows for the way between the surveys; the true drift of every
 map stays inside its bound at every step; growth stopped by itself or came to the end, and no active map
 exceeds the budget; after the second anchor every probe that is answered is within 0.3 m, and the maps that
-were there moved in one commit. At no step may a probe be answered more than 2 m off: one that shows land beyond the maps, too.
+were there moved in one commit. At no step may a probe be answered more than 2 m off: one that shows land
+beyond the maps, too.
 """
 
 import sys
