@@ -42,6 +42,21 @@ class Marginals:
         """(6, 6) of a photo's pose; zero where it is held."""
         return self._part(int(self.pose_start[photo]), 6)
 
+    def poses(self, lens_dilution: float = 1.0) -> FloatArray:
+        """(k, 6, 6) of all poses; zero where they are held.
+
+        Args:
+            lens_dilution: so much less than their number says do the observations tell of lenses: what comes
+                from lenses grows by it.
+        """
+        by_lens = self.by_lenses()
+        result = np.zeros((len(self.pose_start), 6, 6))
+        for photo, start in enumerate(self.pose_start.tolist()):
+            if start >= 0:
+                rows = slice(start, start + 6)
+                result[photo] = self.shared[rows, rows] + (lens_dilution - 1.0) * by_lens[rows, rows]
+        return result
+
     def by_lenses(self) -> FloatArray:
         """(q, q) the part of `shared` that would be gone if the lenses were exact."""
         first = 6 * int((self.pose_start >= 0).sum())

@@ -100,12 +100,14 @@ def test_more_photos_leave_less_open() -> None:
     assert 1e-6 < many.focal_rel < 0.03  # EXIF says 0.02, and counts less where other parameters are off
 
 
-def test_what_lenses_leave_open_is_what_goes_once_they_are_known() -> None:
+def test_what_lenses_leave_open_counts_as_often_as_it_is_told_to() -> None:
     root = np.random.default_rng(5).normal(size=(14, 14))
     shared = root @ root.T
     found = Marginals(shared=shared, pose_start=np.array([0]), lens_start=np.array([6]), lens_size=(8,))
     exact = np.linalg.inv(np.linalg.inv(shared)[:6, :6])  # with lenses known
-    np.testing.assert_allclose(found.pose(0) - found.by_lenses()[:6, :6], exact, rtol=1e-6)
+    by_lens = shared[:6, :6] - exact
+    np.testing.assert_allclose(found.poses(9.0)[0], exact + 9.0 * by_lens, rtol=1e-6)
+    np.testing.assert_allclose(found.poses()[0], shared[:6, :6])
 
 
 def test_of_a_block_with_photos_that_share_no_points() -> None:

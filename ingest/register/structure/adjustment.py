@@ -34,7 +34,7 @@ _MIN_SIGMA_REL = 0.00025
 _MIN_SURFACE_M = 0.03  # of a scan's surface against map points; roughness of grass and pavement
 # Structure from motion over flat ground was 25 % off on `brighton`; most lenses are centred, pixels square.
 _LENS = LensWidths(focal_rel=0.3, aspect_rel=0.002, center_rel=0.02, radial=0.1, tangential=0.003)
-# So many times less do photos say of the lens that is told to a query: they agree on a wrong one
+# What lenses leave open counts so many times in the poses' covariances
 # (`ingest.colmap.adjust.AdjustOptions.dilution`, measured there).
 _LENS_DILUTION = AdjustOptions().dilution
 _ROUNDS = 25  # of looking up the scan's planes; it ends earlier when points move by less than _SETTLED_M
@@ -196,16 +196,15 @@ def _left_open(
     """(6, 6) of each pose with all that points and lenses leave open, and what is left open of the lenses.
 
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
-    or the pairs of structure projection do; what photos say of their lens, by as much less as they disagree.
+    or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
     """
-    problem = Problem(block, _terms(block, control, surface, start.cameras, 1e-6, 1e-3))
-    found, independent = problem.honest_marginals()
+    found = Problem(block, _terms(block, control, surface, start.cameras, 1e-6, 1e-3)).marginals()
     shared = design_effect(*residuals_of(block), longest_side(block.cameras))
     factor = max(float(structure.figures["neighbours_factor"]), shared)
-    lenses = [factor * _LENS_DILUTION * independent.lens(c) for c in range(len(block.cameras))]
+    lenses = [factor * _LENS_DILUTION * found.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
     uncertainty = uncertainty_of_lenses(block.cameras, lenses, photos, _LENS_DILUTION)
-    return tuple(factor * found.pose(k) for k in range(len(block.names))), uncertainty
+    return tuple(factor * found.poses(_LENS_DILUTION)), uncertainty
 
 
 def _spread(residuals: FloatArray) -> float:
