@@ -129,6 +129,15 @@ def inside_figures(name: str, squares: Sequence[float] | FloatArray, size: int =
     return {f"{name}_{100 * level:.0f}": inside(squares, level, size) for level in _LEVELS}
 
 
+def bounds_figures(squares: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """Of squared errors of three axes by name: `inside_figures`, the worst; of all, those outside 99.9 %."""
+    figures: dict[str, float] = {"outside": 0}
+    for name, of in squares.items():
+        figures |= inside_figures(name, of) | {f"{name}_worst": max(of, default=float("nan"))}
+        figures["outside"] += sum(value > chi2.ppf(0.999, 3) for value in of)
+    return figures
+
+
 def say(text: str) -> None:
     """Print a line at once, with the time."""
     sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")

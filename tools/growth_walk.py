@@ -8,9 +8,10 @@ ask where they were taken, and the new maps are compared with the truth. When ev
 survey at the far end is ingested and growth runs again.
 
 Exit code 0 if: coverage follows for the way between the surveys; the true drift of every
-map stays inside its bound at every step; growth stopped by itself and no active map exceeds the budget; after
-the second anchor every probe that is answered is within 0.3 m, and the maps that were there moved in one
-commit. At no step may a probe be answered more than 2 m off: one that shows land beyond the maps, too.
+map stays inside its bound at every step; growth stopped by itself or came to the end, and no active map
+exceeds the budget; after the second anchor every probe that is answered is within 0.3 m, and the maps that
+were there moved in one commit. At no step may a probe be answered more than 2 m off: one that shows land
+beyond the maps, too.
 """
 
 import sys
@@ -164,7 +165,10 @@ def judge(steps: Sequence[Step], end: Step, commits: int, world: WalkOptions) ->
     mean = float(np.mean([p.normalised or 0.0 for p in asked])) if asked else float("nan")
     answers = [p.error_m for s in (*steps, end) for p in s.probes if p.error_m is not None]
     errors = [p.error_m for p in end.probes if p.error_m is not None]
-    why = "not stopped" if stopped is None else f"stopped for the budget at step {stopped.step + 1}"
+    whole = reach >= world.end_m - world.start_m
+    why = "the whole way is covered" if whole else "not stopped"
+    if stopped is not None:
+        why = f"stopped for the budget at step {stopped.step + 1}"
     return [
         Verdict(
             "coverage follows",
@@ -190,7 +194,7 @@ def judge(steps: Sequence[Step], end: Step, commits: int, world: WalkOptions) ->
         Verdict(
             "budget",
             f"largest claimed drift of an active map {over:.2f} of {DRIFT_BUDGET_M:.2f} m, {why}",
-            over <= DRIFT_BUDGET_M and stopped is not None,
+            over <= DRIFT_BUDGET_M and (whole or stopped is not None),
         ),
         Verdict(
             "second anchor",

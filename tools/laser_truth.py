@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
@@ -30,7 +31,7 @@ from reloc.localise.answer import placement_covariance
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
 from reloc.wire.query import CameraRequest
 from tools.commands import all_maps, make
-from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
+from tools.figures import median, pose_errors, pose_offset, poses_in, squared, study_parser, write_figures
 from tools.laser_set import FRAME, LaserSet, colmap_given_the_lens, read_laser_set, with_exif
 from tools.real_photos import ask_poses
 
@@ -128,6 +129,25 @@ def stated_covariance(area: Area, feature_map: FeatureMap, image: MapImage) -> F
     return np.asarray(
         world_from_cam @ own @ world_from_cam.T + placement_covariance(area, feature_map, pose.center)
     )
+
+
+def camera_squares(
+    feature_map: FeatureMap, frame: LocalFrame, true: Mapping[str, Rigid3]
+) -> dict[str, list[float]]:
+    """Squared errors of a map's cameras over their covariances, of orientation and position.
+
+    Args:
+        true: cam_from_local in `frame`, by name.
+    """
+    area, poses = build_area([feature_map]), poses_in(frame, feature_map)
+    turn = np.kron(np.eye(2), frame.enu_from(feature_map.frame).rotation)
+    result: dict[str, list[float]] = {"orientation": [], "position": []}
+    for image in feature_map.images:
+        covariance = turn @ stated_covariance(area, feature_map, image) @ turn.T
+        error = pose_offset(poses[image.name], true[image.name])
+        result["orientation"].append(squared(error[:3], covariance[:3, :3]))
+        result["position"].append(squared(error[3:], covariance[3:, 3:]))
+    return result
 
 
 def answer_errors(database: Database, photos: Path, truth: LaserSet, camera: CameraRequest | None) -> Errors:

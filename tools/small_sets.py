@@ -15,23 +15,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from scipy.stats import chi2
-
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
 from tools.commands import all_maps, make
-from tools.figures import inside_figures, pose_offset, poses_in, squared, write_figures
+from tools.figures import bounds_figures, write_figures
 from tools.laser_set import FRAME, read_laser_set, with_exif
-from tools.laser_truth import stated_covariance
+from tools.laser_truth import camera_squares
 from tools.photo_files import copied
 from tools.scan_poses import scan_parser, scan_truth
 
 _SIZES, _EVERY = (4, 6, 8), 2
-_BOUND = float(chi2.ppf(0.999, 3))
 
 
 class Run(NamedTuple):
@@ -58,25 +53,10 @@ def main() -> None:
         active += sum(one.status == "active" for one in placed)
         for one in placed:
             focal_off = max([focal_off, *(abs(c.focal_px / run.lens.focal_px - 1.0) for c in one.cameras)])
-            for name, of in squares.items():
-                of += _squares(one, run, slice(3) if name == "orientation" else slice(3, 6))
-    figures = {"runs": runs, "maps": maps, "active": active, "focal_off": focal_off}
-    for name, of in squares.items():
-        figures |= inside_figures(name, of) | {f"{name}_worst": max(of, default=float("nan"))}
-    figures["outside"] = sum(value > _BOUND for of in squares.values() for value in of)
-    write_figures(args.json, figures | {"photos": len(squares["position"])})
-
-
-def _squares(feature_map: FeatureMap, run: Run, axes: slice) -> list[float]:
-    """Squared errors of a map's cameras over their covariances."""
-    area, poses = build_area([feature_map]), poses_in(run.frame, feature_map)
-    turn = np.kron(np.eye(2), run.frame.enu_from(feature_map.frame).rotation)
-    result = []
-    for image in feature_map.images:
-        covariance = turn @ stated_covariance(area, feature_map, image) @ turn.T
-        error = pose_offset(poses[image.name], run.true[image.name])
-        result.append(squared(error[axes], covariance[axes, axes]))
-    return result
+            for name, of in camera_squares(one, run.frame, run.true).items():
+                squares[name] += of
+    counts = {"runs": runs, "maps": maps, "active": active, "photos": len(squares["position"])}
+    write_figures(args.json, counts | {"focal_off": focal_off} | bounds_figures(squares))
 
 
 def _by_scan(args: argparse.Namespace) -> Iterator[Run]:

@@ -4,6 +4,7 @@ import json
 from dataclasses import fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from ingest.growth.graph.replacing import MovedMap, Replacement, overlaps_to_mea
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.map_places import drift_m, growth_of, places_of
 from ingest.growth.place.map_images import model_of
+from ingest.growth.trust import canaries
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.confirmation import OutsidePhoto, Source, confirm
 from ingest.growth.trust.promotion import Promotion
@@ -319,3 +321,27 @@ def test_a_report_tells_all_in_both_forms() -> None:
     assert told["photos"][1]["reason_code"] == "ALONE"
     assert told["replacements"][0]["moved"][0]["drift_before_m"] == 0.4
     assert Path(told["database"]).name == "db"
+
+
+@pytest.mark.parametrize(
+    ("right", "elsewhere", "refused"), [(3, 1, 0), (0, 1, 1), (1, 1, 1), (2, 2, 2), (0, 0, 0)]
+)
+def test_images_that_a_new_map_alone_has_elsewhere_count_unless_most_are_where_they_are(
+    monkeypatch: pytest.MonkeyPatch, right: int, elsewhere: int, refused: int
+) -> None:
+    verdicts = ["right"] * right + ["moved"] * elsewhere + ["lost"] * 4
+    told = iter(verdicts)
+
+    def check(*_: object) -> tuple[CanaryCheck, str]:
+        alone: Any = next(told)
+        found = CanaryCheck(name="a", before="right", after="right", alone=alone)
+        return found, "the new map alone has it 100 m off" if alone == "moved" else ""
+
+    monkeypatch.setattr(canaries, "_check_own", check)
+    monkeypatch.setattr(canaries, "own_canaries", lambda *_: [(None, None)] * len(verdicts))
+    monkeypatch.setattr(canaries, "list_canaries", lambda _: [])
+    nothing: Any = SimpleNamespace(areas=())
+    run = canaries.run_canaries(nothing, nothing, nothing, [])
+    assert len(run.checks) == len(verdicts)
+    assert len(run.regressions) == refused
+    assert run.gate.passes == (refused == 0)

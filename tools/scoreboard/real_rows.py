@@ -103,6 +103,17 @@ REAL: tuple[Row, ...] = (
         minutes=4,
     ),
     _row(
+        name="brighton-part-scans",
+        claim="`brighton` anchored on its whole scan, on its halves and on its middle: cameras against poses "
+        "that the whole scan alone gives, inside what the maps state",
+        commands=f"tools.part_scans {ON_SCAN} --work {{work}}/parts {OUT}",
+        text="{placed} of {parts} placed; cameras {median_m:.2f} m off at the median, at most "
+        "{largest_m:.2f} m; of {cameras} {outside} outside 99.9 %; inside 68 and 95 %: position "
+        "{position_68:.0%} and {position_95:.0%}, orientation {orientation_68:.0%} and {orientation_95:.0%}",
+        limits="5 <= placed, outside <= 0, 0.95 <= position_95, 0.95 <= orientation_95",
+        minutes=6,
+    ),
+    _row(
         name="brighton-located-pixels",
         claim="`brighton` anchored on its scan: pixels of the 4 others, located on the scan and by the map "
         "alone, against the scan's points that they show from poses that the scan alone gives",

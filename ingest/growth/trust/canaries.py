@@ -7,6 +7,7 @@ the new map takes away, makes ambiguous or pulls along, or has somewhere else.
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,7 +22,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.plain_json import plain
 from featuredb.store import Database
 from featuredb.store.canaries import TOLERANCE_DEG, Canary, KnownPose, list_canaries, load_canary_image
-from ingest.growth.gates import SIGMAS, Gate
+from ingest.growth.gates import SIGMAS, Gate, agreement
 from ingest.growth.place.map_images import LEAST_FEATURES, NEAR_M, features_and_points
 from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localise.acceptance import AcceptanceOptions
@@ -47,13 +48,14 @@ class CanaryCheck:
     """One canary.
 
     Attributes:
-        before, after: verdict on the answers.
+        before, after: verdict on the answers. alone: on that of the new maps without the others, if asked.
         error_before_m, error_m: of the answers; NaN where there is none.
     """
 
     name: str
     before: Verdict
     after: Verdict
+    alone: Verdict = "lost"
     error_before_m: float = float("nan")
     error_m: float = float("nan")
     regression: str = ""
@@ -109,7 +111,12 @@ def run_canaries(
     known = list_canaries(database)
     checks = [check_known(database, canary, before, after) for canary in known]
     own, new_ids = own_canaries(database, before, new_maps), tuple(m.map_id for m in new_maps)
-    checks += [_check_own(feature_map, image, before, after, new_ids) for feature_map, image in own]
+    asked = [_check_own(feature_map, image, before, after, new_ids) for feature_map, image in own]
+    alone = Counter(check.alone for check, _ in asked)
+    # As of photos that are localised by themselves: a few may be taken in by another place that looks alike.
+    agree = agreement(alone["right"], alone["moved"]).passes
+    for check, elsewhere in asked:
+        checks.append(check if agree or check.regression else replace(check, regression=elsewhere))
     note = f"{len(known)} known queries, {len(own)} images of the active maps"
     if not known:
         note += "; the database has no known queries, `featuredb canary add` adds them"
@@ -200,8 +207,8 @@ def own_canaries(
 
 def _check_own(
     feature_map: FeatureMap, image: MapImage, before: Localiser, after: Localiser, new_ids: tuple[str, ...]
-) -> CanaryCheck:
-    """Ask an image of a map of both, and of the new maps alone.
+) -> tuple[CanaryCheck, str]:
+    """Ask an image of a map of both, and of the new maps alone; and where these have it, if elsewhere.
 
     An answer may miss by the drift budget, one by the new maps alone by `SIGMAS` of its own, if that is more.
     """
@@ -217,9 +224,8 @@ def _check_own(
     may_miss_m = SIGMAS * misses[2].sigma_m if misses[2] else 0.0
     alone = _verdict(misses[2], max(DRIFT_BUDGET_M, may_miss_m), TOLERANCE_DEG)
     check = _checked(f"{image.name} of map {feature_map.map_id}", verdicts, misses, results[1])
-    if alone == "moved" and not check.regression:
-        return replace(check, regression=f"the new map alone has it {misses[2]} from where it is")
-    return check
+    elsewhere = f"the new map alone has it {misses[2]} from where it is" if alone == "moved" else ""
+    return replace(check, alone=alone), elsewhere
 
 
 def _checked(
