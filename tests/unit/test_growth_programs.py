@@ -95,7 +95,9 @@ def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
     assert all(holding(growth_walk.judge(good, good[0], 1, WALK)).values())
     near = steps(reach=100.0, stopped=9)
     assert not holding(growth_walk.judge(near, good[0], 1, WALK))["coverage follows"]
-    assert not holding(growth_walk.judge(steps(stopped=0), good[0], 1, WALK))["budget"]
+    whole_m = WALK.end_m - WALK.start_m
+    for reach, holds in ((whole_m - 1.0, False), (whole_m, True)):  # nothing need stop who has arrived
+        assert holding(growth_walk.judge(steps(reach=reach, stopped=0), good[0], 1, WALK))["budget"] == holds
     far = steps(ratio=1.2)
     assert not holding(growth_walk.judge(far, good[0], 1, WALK))["true error inside the bound"]
     over = steps(drift=0.6, stopped=9)
