@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import sparse
 
 from featuredb.adjust.terms import whole_camera
 from featuredb.geometry.arrays import FloatArray
@@ -142,6 +143,19 @@ def test_what_photos_show_is_off_as_far_as_is_said() -> None:
     assert 1.0 < np.mean(shifts) < 6.0, shifts
     assert 1.0 < np.mean(turns) < 6.0, turns
     assert np.mean(bounds, axis=0)[-1] > 3.0 * np.mean(bounds, axis=0)[0]
+
+
+@pytest.mark.parametrize(
+    ("spread_m", "told"), [((9.0, 7.0, 3.0), True), ((9.0, 7.0, 0.0), True), ((9.0, 0.0, 0.0), False)]
+)
+def test_places_on_a_line_do_not_tell_how_they_are_turned(
+    spread_m: tuple[float, float, float], told: bool
+) -> None:
+    places = np.random.default_rng(3).normal(size=(30, 3)) * spread_m
+    moved = sparse.csr_matrix(np.random.default_rng(4).normal(size=(90, 5)))
+    found = drift._similarity(places, np.tile(1e4 * np.eye(3), (30, 1, 1)), moved)
+    assert np.isfinite(found).all() == told
+    assert np.isnan(found).all() != told
 
 
 def test_a_similaritys_covariance_grows_until_it_holds_the_far_end(monkeypatch: pytest.MonkeyPatch) -> None:

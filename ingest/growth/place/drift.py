@@ -25,6 +25,7 @@ _LEAST_FREEDOM = 0.1
 # Of the standard deviation of an observation with what its neighbours share; it is measured on the residuals,
 # which a handful of observations keeps too small.
 _LEAST_PX = 0.1
+_LEAST_TOLD = 1e-12  # least eigenvalue of a normal matrix of unit diagonal: numerically singular below
 _MOST_POINTS = 20_000  # free points that take part; fewer know less, so the bound stays one
 
 
@@ -138,6 +139,8 @@ def photo_covariances(
 def _similarity(places: FloatArray, information: FloatArray, moved: Any) -> FloatArray:
     """(7, q) the similarity that fits best how places (n, 3) move with unknowns, each as its rays tell it.
 
+    NaN where they do not tell it, such as two places or those on a line.
+
     Args:
         information: (n, 3, 3). moved: (3 m, q) CSR, of the first m places; the others stay.
     """
@@ -145,7 +148,10 @@ def _similarity(places: FloatArray, information: FloatArray, moved: Any) -> Floa
     by_place = np.swapaxes(jacobian, 1, 2) @ information
     normal = np.einsum("nij,njk->ik", by_place, jacobian)
     by_moved = by_place[: moved.shape[0] // 3].transpose(1, 0, 2).reshape(7, -1)
-    return np.asarray(np.linalg.pinv(normal, hermitian=True) @ (moved.T @ by_moved.T).T)
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    if np.linalg.eigvalsh(normal * unit[:, None] * unit)[0] < _LEAST_TOLD:
+        return np.full((7, moved.shape[1]), np.nan)
+    return np.asarray(np.linalg.solve(normal, (moved.T @ by_moved.T).T))
 
 
 def _information(model: Model, fixed: FixedPoints, kept: NDArray[np.bool_], sigma_px: float) -> FloatArray:
